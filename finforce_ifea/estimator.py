@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from finforce.errors import ObservationError
 from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics
-from finforce_ifea.contact_mechanics.torsion import measure_torsion
 from finforce_ifea.errors import ContactError, NotEnoughDataError, UnobservableError
 from finforce_ifea.jaw.calibration import Calibration
 from finforce_ifea.jaw.jaw import Jaw
@@ -28,14 +27,13 @@ from finforce_ifea.observation import (
 )
 from finforce_ifea.relaxation import Relaxation
 from finforce_ifea.settings import EstimatorSettings
-from finforce_ifea.tare import TareKeeper, TareReport
+from finforce_ifea.tare import TareKeeper
 from finforce_ifea.tracking.contact_state import UNSEEN_ALONG, ContactState, compute_force, find_rejection_reason
 from finforce_ifea.tracking.contact_tracker import ContactTracker
 from finforce_ifea.tracking.friction import SMOOTH, Coefficient
 from finforce_ifea.tracking.given_contact import GivenContactTracker
 from finforce_ifea.tracking.influence import ReachWatch
-
-__all__ = ["Contact", "JawEstimator", "Observation", "Solution", "TareReport"]
+from finforce_ifea.tracking.lateral_load import measure_torsion
 
 _LONGEST_GAP = 1.0
 _TOLERANCE = 1e-3
@@ -144,10 +142,6 @@ class JawEstimator:
         """Return the deformed mesh vertices (n, 3) [m], in mesh order."""
         return self._tracker.vertices()
 
-    def keypoints_model(self) -> NDArray:
-        """Return the key points (K, 3) [m] of the deformed model."""
-        return self._tracker.positions()
-
     def update(self, observation: Observation, contact: Contact | None) -> Solution:
         """Take one image's key points and return what they say.
 
@@ -195,8 +189,8 @@ class JawEstimator:
         """Learn what the last image tells in addition to its force; the next image does it where there was no time."""
         self._tracked.learn()
 
-    def tare(self) -> TareReport:
-        """Take the last frames as unloaded and learn each key point's offset.
+    def tare(self) -> str:
+        """Take the last frames as unloaded and learn each key point's offset; return what was found, a sentence.
 
         Raises:
             NotEnoughDataError: Too few unloaded frames or visible key points.

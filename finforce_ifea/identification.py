@@ -152,12 +152,12 @@ class _Fit:
         self.plateaus = find_plateaus(cases, jaw, settings, per_case=_PER_CASE)
         self._starts: list[_PlateauShape | None] = [None] * len(self.plateaus)
         self.objects = [expect_object(case.contact, settings) for case in cases]
-        bounds = [item.indenter.shape_range for item in self.objects]
+        indenters = [item.indenter for item in self.objects]
         self.mean = np.r_[_PRIOR, [item.mean[0] for item in self.objects]]
         self.stddev = np.r_[_PRIOR_STDDEV, [np.sqrt(item.variance[0]) for item in self.objects]]
-        self.low = np.r_[_LOW, [item.low for item in bounds]]
-        self.high = np.r_[_HIGH, [item.high for item in bounds]]
-        self.difference = np.r_[_DIFFERENCE, [item.largest_change / 15 for item in bounds]]
+        self.low = np.r_[_LOW, [indenter.lowest for indenter in indenters]]
+        self.high = np.r_[_HIGH, [indenter.highest for indenter in indenters]]
+        self.difference = np.r_[_DIFFERENCE, [indenter.largest_change / 15 for indenter in indenters]]
         self.stills = all(_starts_loaded(case) for case in cases)
         # only a drawing can be thickened, and only what has a course of time relaxes
         self.frozen = set() if jaw.drawing is not None else set(range(*_GEOMETRY.indices(len(_NAMES))))

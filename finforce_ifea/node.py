@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from functools import partial
 from threading import Timer
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import Any
 
 from geometry_msgs.msg import PoseStamped, Vector3Stamped, WrenchStamped
 from rclpy.node import Node
@@ -40,14 +40,7 @@ from finforce_ifea.publishers import (
 )
 from finforce_ifea.settings import EstimatorSettings
 
-SLOW = 4.0  # s of preparation, after which somebody may wonder
-
-
-class WaitingImage(NamedTuple):
-    """Key points that wait for their contact, and when they came (perf_counter) [s]."""
-
-    cloud: PointCloud2
-    began: float
+_SLOW = 4.0  # s of preparation, after which somebody may wonder
 
 
 class IfeaSolverNode(Node):
@@ -81,7 +74,7 @@ class IfeaSolverNode(Node):
         self.health = Health(source=f"{parameters.jaw_name}/keypoints", stale_after=parameters.max_age)
         self.pairing = ForcePairing(parameters.jaw_name)
         self.idling = Idling()
-        self.waiting: WaitingImage | None = None
+        self.waiting: tuple[PointCloud2, float] | None = None  # key points without their contact, and when they came
         self.last: Solution | None = None
         self.qos = ros.QosWatch(self, stage)
         self.out = SolverOutputs(self.qos, parameters, self.skips)
@@ -94,7 +87,7 @@ class IfeaSolverNode(Node):
     def _announce_wait(self, jaw: str) -> Iterator[None]:
         """Say what takes so long, if it does."""
         words = f"preparing jaw '{jaw}': a minute or two at its first start, seconds later on"
-        late = Timer(SLOW, lambda: self.get_logger().info(words))
+        late = Timer(_SLOW, lambda: self.get_logger().info(words))
         late.start()
         try:
             yield
@@ -103,7 +96,7 @@ class IfeaSolverNode(Node):
 
     def _serve(self, side: str) -> None:
         """Offer services and diagnostics."""
-        ros.serve_trigger(self.qos, f"{side}/tare", lambda: str(self.estimator.tare()))
+        ros.serve_trigger(self.qos, f"{side}/tare", lambda: self.estimator.tare())
         ros.serve_trigger(self.qos, f"{side}/reset", lambda: self._restart("reset by service"))
         longest = self.parameters.contact_timeout
         self.overdue = self.create_timer(longest, self.qos.guard(self._solve_waiting), clock=ros.STEADY_CLOCK)
@@ -132,7 +125,7 @@ class IfeaSolverNode(Node):
         if self.idling.passes(stamp):
             self.skips.count(IDLE)
             return
-        self.waiting = WaitingImage(cloud, began)
+        self.waiting = (cloud, began)
         if self.contacts.expect(stamp, began):
             self.overdue.reset()
         else:

@@ -76,39 +76,35 @@ class SolverOutputs:
         due = monotonic() - self._markers_sent >= 1.0 / self._parameters.marker_rate
         if due and self.markers.get_subscription_count():
             self._markers_sent = monotonic()
-            markers = build_markers(header, observation, solution, estimator)
+            markers = _build_markers(header, observation, solution, estimator)
             self.markers.publish(ros.MarkerArray(markers=markers))
 
 
-if TYPE_CHECKING:
-    from finforce_ifea.estimator import JawEstimator
-    from finforce_ifea.observation import Observation, Solution
-
-SURFACE = (0.45, 0.55, 0.65, 0.6)
-USED = (0.1, 0.8, 0.2, 1.0)
-UNUSED = (0.9, 0.2, 0.1, 1.0)
-KEYPOINT_DIAMETER = 0.003
+_SURFACE = (0.45, 0.55, 0.65, 0.6)
+_USED = (0.1, 0.8, 0.2, 1.0)
+_UNUSED = (0.9, 0.2, 0.1, 1.0)
+_KEYPOINT_DIAMETER = 0.003
 
 
-def build_markers(header: Any, observation: Observation, solution: Solution, estimator: JawEstimator) -> list[Any]:
+def _build_markers(header: Any, observation: Observation, solution: Solution, estimator: JawEstimator) -> list[Any]:
     """Return the markers of one image, in the jaw frame: contact and force only where they are trusted."""
     triangles = np.asarray(estimator.surface())[np.asarray(estimator.surface_triangles)].reshape(-1, 3)
     seen = np.isfinite(observation.points).all(axis=1)
-    colors = [USED if used else UNUSED for used in np.asarray(solution.keypoints_used)[seen]]
+    colors = [_USED if used else _UNUSED for used in np.asarray(solution.keypoints_used)[seen]]
     touched = solution.trusted and np.any(solution.force)
     place = np.asarray(solution.contact_point)
     # the arrow ends on the surface that the object presses on
     arrow = np.stack([place - np.asarray(solution.force) / NEWTONS_PER_METRE, place]) if touched else ()
     return [
-        points_marker(header, "surface", "triangles", triangles, color=SURFACE, scale=(1.0, 1.0, 1.0)),
+        points_marker(header, "surface", "triangles", triangles, color=_SURFACE, scale=(1.0, 1.0, 1.0)),
         points_marker(
             header,
             "keypoints",
             "spheres",
             observation.points[seen],
-            color=USED,
+            color=_USED,
             colors=colors,
-            scale=(KEYPOINT_DIAMETER,) * 3,
+            scale=(_KEYPOINT_DIAMETER,) * 3,
         ),
         points_marker(
             header,
@@ -122,15 +118,12 @@ def build_markers(header: Any, observation: Observation, solution: Solution, est
     ]
 
 
-if TYPE_CHECKING:
-    from finforce_ifea.observation import Solution
-
-LEVELS = {"ok": Level.OK, "unloaded": Level.OK, "diverged": Level.ERROR}  # any other status: WARN
+_LEVELS = {"ok": Level.OK, "unloaded": Level.OK, "diverged": Level.ERROR}  # any other status: WARN
 
 
 def outcome_of_solution(solution: Solution) -> Outcome:
     """Return the level of a solution's status and its sentence."""
-    level = LEVELS.get(solution.status, Level.WARN)
+    level = _LEVELS.get(solution.status, Level.WARN)
     return Outcome(level=level, reason=solution.status, text=solution.message or solution.status)
 
 

@@ -46,11 +46,6 @@ class Relaxation:
         """The last elastic force (3,) and overstresses (n, 3) [N], shares and time constants (n,) of `relax_force`."""
         return self._elastic, self._over, self._share, self._tau
 
-    @property
-    def gain(self) -> float:
-        """How much a sudden change of the elastic force is magnified."""
-        return float(1.0 + self._share.sum())
-
 
 def invert_relaxation(measured: NDArray, stamps: NDArray, terms: Sequence[RelaxationTerm]) -> NDArray:
     """Return the elastic forces (n,) [N] that relax into measured ones (n,) [N] at stamps (n,) [s]."""

@@ -251,30 +251,6 @@ _REST_FRAMES = 10
 _REST_REACH, _REST_REACH_MEAN = 1e-3, 0.45e-3
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class TareReport:
-    """What a tare found.
-
-    Attributes:
-        frames: averaged.
-        keypoints: that have an offset now.
-        largest_offset: [m].
-        noise: standard deviation of one key point along one axis [m].
-    """
-
-    frames: int
-    keypoints: int
-    largest_offset: float
-    noise: float
-
-    def __str__(self) -> str:
-        """Return the report as one sentence."""
-        return (
-            f"tared {self.keypoints} key points over {self.frames} frames: largest offset "
-            f"{1e3 * self.largest_offset:.2f} mm, noise {1e3 * self.noise:.2f} mm"
-        )
-
-
 class TareKeeper:
     """Collects unloaded frames, tares once there are enough, and goes on averaging until the first load."""
 
@@ -343,8 +319,8 @@ class TareKeeper:
             frames, stddevs = list(self._frames)[older], list(self._stddevs)[older]
             self.tare = compute_tare(frames, self._keypoints, stddevs) or self.tare
 
-    def take(self) -> TareReport:
-        """Take the last frames as unloaded and learn each key point's offset.
+    def take(self) -> str:
+        """Take the last frames as unloaded and learn each key point's offset; return what was found, a sentence.
 
         Raises:
             NotEnoughDataError: Too few unloaded frames or visible key points.
@@ -366,11 +342,10 @@ class TareKeeper:
             self._check_unloaded(tare)
             self._check_steady(frames)
         self.tare = tare
-        return TareReport(
-            frames=count,
-            keypoints=int((tare.counts > 0).sum()),
-            largest_offset=float(np.linalg.norm(tare.offsets, axis=1).max()),
-            noise=float(np.sqrt(np.trace(tare.noise) / 3.0)),
+        largest, noise = np.linalg.norm(tare.offsets, axis=1).max(), np.sqrt(np.trace(tare.noise) / 3.0)
+        return (
+            f"tared {int((tare.counts > 0).sum())} key points over {count} frames: largest offset "
+            f"{1e3 * largest:.2f} mm, noise {1e3 * noise:.2f} mm"
         )
 
     def _check_unloaded(self, tare: Tare) -> None:

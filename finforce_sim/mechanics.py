@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from finforce.gripper_frames import BENCH_ORIGIN_X
 from finforce_contact.localization.section import cut_outline
-from finforce_ifea.contact_mechanics.indenter import OutlineIndenter, flat_profile
-from finforce_ifea.contact_mechanics.penalty import PenaltyContact
+from finforce_ifea.contact_mechanics.indenter import OutlineIndenter, PenaltyContact, flat_profile
 from finforce_ifea.contact_mechanics.pressed_jaw import build_contact_surface, limit_step, profile_surface
 from finforce_ifea.fem.model import JawModel
 from finforce_ifea.fem.solid import SolidModel
@@ -114,7 +113,7 @@ class PressedJaw:
         else:
             profile = profile_surface(self.surface, self.jaw.face)
         depth = self._indenter.find_touch(place, profile)
-        return self.jaw.inner_face_x + self._indenter.field.front - depth
+        return self.jaw.inner_face_x + self._indenter.pressed.front - depth
 
     def find_pressure(self, q: NDArray, load: Load) -> NDArray:
         """Return the force of the pressure alone (3,) [N] at unknowns q (size,)."""
@@ -164,7 +163,7 @@ class PressedJaw:
 
     def _press(self, q: NDArray, load: Load) -> PenaltyContact:
         points = self.model.positions(self.surface.probe, q)
-        place = np.array([self._indenter.field.front - load.origin[0], load.tilt, load.origin[1]])
+        place = np.array([self._indenter.pressed.front - load.origin[0], load.tilt, load.origin[1]])
         return self._indenter.press(points, self.surface.stiffness, 0.0, place)
 
 

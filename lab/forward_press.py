@@ -8,8 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from finforce_ifea.contact_mechanics.indenter import RoundIndenter
-from finforce_ifea.contact_mechanics.penalty import SMOOTH_DEPTH, PenaltyContact, resist
+from finforce_ifea.contact_mechanics.indenter import SMOOTH_DEPTH, PenaltyContact, RoundIndenter, resist
 from finforce_ifea.contact_mechanics.pressed_jaw import ContactSurface, limit_step
 from finforce_ifea.errors import ContactError
 from finforce_ifea.fem.model import JawModel
@@ -82,8 +81,7 @@ def press_box(
         half: half sizes along x and z [m].
         edge: radius of the edges [m], above zero.
     """
-    forces, springs = _press_box(points, stiffness, *centre, *half, edge)
-    return PenaltyContact(forces, springs, np.zeros_like(forces))
+    return PenaltyContact(*_press_box(points, stiffness, *centre, *half, edge))
 
 
 @dataclass(frozen=True, kw_only=True)

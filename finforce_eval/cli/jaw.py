@@ -32,7 +32,7 @@ def run(options: argparse.Namespace) -> None:
     """Read a finger, say what was found, and write jaw file, section and picture."""
     from finforce_eval.errors import OptionError
     from finforce_ifea.jaw.cad.make_jaw import make_jaw
-    from finforce_ifea.jaw.cad.recognition import Wishes
+    from finforce_ifea.jaw.cad.recognition import Overrides
 
     for name in ("width", "clamp", "face_x"):
         value = getattr(options, name)
@@ -40,7 +40,7 @@ def run(options: argparse.Namespace) -> None:
             raise OptionError(f"--{name.replace('_', '-')} {value:g}: expected metres, such as {value / 1e3:g}")
     started = time.monotonic()
     output = options.output or Path(f"{options.file.stem}.yaml")
-    made = make_jaw(
+    files, notes = make_jaw(
         options.file,
         output,
         name=options.name or options.file.stem,
@@ -48,9 +48,11 @@ def run(options: argparse.Namespace) -> None:
         unit=options.unit,
         body=options.body,
         width=options.width,
-        wishes=Wishes(flip=options.flip, other_face=options.other_face, clamp_z=options.clamp, face_x=options.face_x),
+        overrides=Overrides(
+            flip=options.flip, other_face=options.other_face, clamp_z=options.clamp, face_x=options.face_x
+        ),
         picture=options.picture,
     )
-    for note in made.notes:
+    for note in notes:
         print(f"  {note}")
-    print(f"{', '.join(str(path) for path in made.files)}, {time.monotonic() - started:.1f} s")
+    print(f"{', '.join(str(path) for path in files)}, {time.monotonic() - started:.1f} s")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from finforce_eval.evaluation.scoring import match_samples
 from finforce_eval.recordings.tracks import Recording
-from finforce_ifea.jaw.face import FaceLine
+from finforce_ifea.jaw.section import FaceLine
 
 # A vertex farther than this from the plane of the inner surface is not on it [m]; rows closer than this are one.
 _ON_FACE = 1e-4

@@ -5,7 +5,7 @@ exceeds the cone,
 
     T = clamp(T_before - k t . (x - x_before - X + X_before), +- c N),
 
-with the normal n and N = |normal force|, the tangent t = (n_z, -n_x), the point's place x and the object's X.
+with the normal n and N = |normal force|, the tangent t = (n_z, -n_x), the point's position x and the object's X.
 """
 
 from typing import NamedTuple
@@ -14,28 +14,29 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from finforce_ifea.contact_mechanics.penalty import PenaltyContact, Touch
-
 _OPTIONS = {"cache": True, "error_model": "numpy"}
 
 
-class TangentialContact(NamedTuple):
-    """Contact at surface points, tangential forces included.
+class Touch(NamedTuple):
+    """What an object does to one surface point.
 
     Attributes:
-        forces: on the points (p, 3) [N].
-        springs: negative derivatives of the forces by the points' positions (p, 3, 3) [N/m].
-        changes: derivatives of the forces by the object's depth, shape and height and by a traction ratio of all forces
-            (p, 3, 4).
-        shear: along the tangents (p,) [N].
-        mobilised: what the shear adds up to over what the cone allows, from -1 to 1.
+        fx: force along x [N].
+        fz: along z [N].
+        kxx: negative derivative of the force along x by the point's x [N/m].
+        kxz: of either by the other [N/m].
+        kzz: of the force along z by z [N/m].
+        bx: derivative of the force along x by the object's size [N/m], its centre held, or by its tilt [N/rad].
+        bz: of that along z.
     """
 
-    forces: NDArray
-    springs: NDArray
-    changes: NDArray
-    shear: NDArray
-    mobilised: float
+    fx: float
+    fz: float
+    kxx: float
+    kxz: float
+    kzz: float
+    bx: float
+    bz: float
 
 
 class Traction(NamedTuple):
@@ -62,6 +63,9 @@ _NO_HISTORY = np.zeros(0), np.zeros((0, 3)), np.zeros(2)
 def constant_traction(ratio: float) -> Traction:
     """Return tangential forces that are one share of all normal forces, as where everything slides the same way."""
     return Traction(ratio, -1.0, *_NO_HISTORY)
+
+
+FRICTIONLESS = constant_traction(0.0)
 
 
 class Friction:
@@ -96,35 +100,25 @@ class Friction:
         before, start = self._before or (_NO_HISTORY[1], origin)
         return Traction(0.0, self.coefficient, self._shear, before, origin - start)
 
-    def settle(self, contact: PenaltyContact, points: NDArray, stiffness: NDArray, origin: NDArray) -> float:
-        """Remember an equilibrium and return how far the cone is used, from -1 to 1.
+    def settle(self, shear: NDArray, points: NDArray, origin: NDArray) -> None:
+        """Remember an equilibrium.
 
         Args:
-            contact: without friction.
+            shear: of each point (p,) [N].
             points: deformed positions (p, 3) [m].
-            stiffness: of each point (p,) [N/m].
             origin: of the object (x, z) [m].
         """
-        there = apply_traction(contact, points, stiffness, self.describe(origin))
-        self._before, self._shear = (points.copy(), origin.copy()), there.shear
-        return there.mobilised
+        self._before, self._shear = (points.copy(), origin.copy()), shear
 
 
-_FORCE, _SPRING, _CHANGE = 0, 1, 3
+_SPRING, _CHANGE = 1, 3
 # What `add_traction` writes of each point: force, two columns of springs, four of changes, along x and z.
 POINT_SHAPE = (2, 7)
 
 
-def apply_traction(
-    contact: PenaltyContact, points: NDArray, stiffness: NDArray, traction: Traction
-) -> TangentialContact:
-    """Return the contact of surface points (p, 3) [m] of some stiffness (p,) [N/m] with what acts along the surface."""
-    return _apply((contact.forces, contact.springs, contact.by_shape), points, stiffness, traction)
-
-
 @njit(**_OPTIONS)
 def _add_ratio(ratio, touch, out):
-    """Add what a traction ratio makes of the springs of one point and of its derivatives by the place, in place."""
+    """Add what a traction ratio makes of a point's springs and of its derivatives by the contact state, in place."""
     out[0, _SPRING] += ratio * touch.kxz
     out[0, _SPRING + 1] += ratio * touch.kzz
     out[1, _SPRING] -= ratio * touch.kxx
@@ -171,24 +165,3 @@ def add_traction(traction, touch, p, x, z, stiffness, out):
     out[0, 0] += shear * tx
     out[1, 0] += shear * tz
     return shear, limit
-
-
-@njit(**_OPTIONS)
-def _apply(contact, points, stiffness, traction):
-    """Return the contact (forces, springs, by_shape) at all points with what acts along the surface."""
-    forces, springs, by_shape = contact
-    count = len(points)
-    pushed, stiff, changes = np.zeros((count, 3)), np.zeros((count, 3, 3)), np.zeros((count, 3, 4))
-    shear, total, allowed, out = np.zeros(count), 0.0, 0.0, np.zeros(POINT_SHAPE)
-    for p in range(count):
-        xz = springs[p, 0, 2]
-        parts = forces[p, 0], forces[p, 2], springs[p, 0, 0], xz, springs[p, 2, 2], by_shape[p, 0], by_shape[p, 2]
-        shear[p], limit = add_traction(traction, Touch(*parts), p, points[p, 0], points[p, 2], stiffness[p], out)
-        total += shear[p]
-        allowed += limit
-        for a in range(2):
-            pushed[p, 2 * a] = out[a, _FORCE]
-            stiff[p, 2 * a, 0], stiff[p, 2 * a, 2] = out[a, _SPRING], out[a, _SPRING + 1]
-            for i in range(4):
-                changes[p, 2 * a, i] = out[a, _CHANGE + i]
-    return TangentialContact(pushed, stiff, changes, shear, total / allowed if allowed > 0.0 else 0.0)

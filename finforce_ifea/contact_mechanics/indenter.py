@@ -1,7 +1,11 @@
-"""Rigid objects pressed into a jaw: what they do to surface points at a place (depth, shape, height).
+"""Rigid objects pressed into a jaw: what they do to surface points in a contact state (depth, shape, height).
 
-The second number of a place is the one more thing that key points can tell of an object: of an unknown object its
-logarithmic radius, of a known outline its tilt.
+The second number of a contact state is the one more thing that key points can tell of an object: of an unknown object
+its logarithmic radius, of a known outline its tilt.
+
+Surface points are pushed out by a smoothed penalty. The penetration into an outline is a smooth field, twice
+differentiable: signed distances to the polygons are the coefficients of a uniform cubic B-spline, which smooths over
+half a cell, so that corners and the facets of a mesh do not make the contact rattle.
 """
 
 from dataclasses import dataclass
@@ -12,28 +16,25 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from finforce_ifea.contact_mechanics.penalty import (
-    CELL,
-    DistanceField,
-    PenaltyContact,
-    Touch,
-    build_distance_field,
-    find_leading,
-    read_value,
-    touch_cylinder,
-    touch_field,
-)
+from finforce_ifea.contact_mechanics.friction import FRICTIONLESS, POINT_SHAPE, Touch, Traction, add_traction
+from finforce_ifea.errors import ContactError
 from finforce_ifea.observation import Contact, ObjectOutline, are_same_polygons
 from finforce_ifea.settings import EstimatorSettings
 
 DEPTH, SHAPE, HEIGHT = 0, 1, 2
+CELL = 0.6e-3
+# What can be touched: this far behind the leading point, and not what faces away from the jaw.
+_REACH = 25e-3
+_MARGIN = 4 * CELL
+_FACES_AWAY = 0.6
+# Steps per cell of the traced front, and halvings of a cell that place it.
+_TRACE = 3
+_HALVINGS = 14
 _OTHER_SIZE = 3.0
 # Uncertainty of a known outline's tilt in addition to that of its pose [rad].
 _TILT_STDDEV = 0.02
 # What leads by more [m] is outside of the heights.
 _OUTSIDE = 1.0
-
-
 _OPTIONS = {"cache": True, "error_model": "numpy"}
 
 
@@ -42,10 +43,10 @@ class PressedObject(NamedTuple):
 
     Attributes:
         is_round: whether it is a cylinder, of which the rest tells nothing.
-        coefficients: of an outline's distance field (a, b) [m].
+        coefficients: depth below the outline over a grid in its own frame, negative outside (a, b) [m].
         low: x and z of the first coefficient (2,) [m].
         front: distance from the origin to the leading point, against x [m].
-        segments: of the side that faces the jaw (s, 4) [m].
+        segments: of the side that faces the jaw, as the field has it (s, 4): x, z of begin and end [m].
     """
 
     is_round: bool
@@ -53,6 +54,198 @@ class PressedObject(NamedTuple):
     low: NDArray
     front: float
     segments: NDArray
+
+
+def build_outline(polygons: tuple[NDArray, ...]) -> PressedObject:
+    """Return the object with an outline of polygons, (n, 2) [m] each, about its origin.
+
+    Raises:
+        ContactError: The polygons span less than a cell of the grid.
+    """
+    # of one type, so that nothing is compiled anew while a jaw waits
+    segments = np.concatenate([np.hstack([p, np.roll(p, -1, axis=0)]) for p in polygons]).astype(float)
+    low, high = segments[:, :2].min(0), segments[:, :2].max(0)
+    if (high - low < CELL).any():
+        raise ContactError(f"the outline spans {1e3 * (high - low)} mm, expected at least {1e3 * CELL:g} mm")
+    high = np.array([min(high[0], low[0] + _REACH), high[1]]) + _MARGIN
+    low = low - _MARGIN
+    shape = np.ceil((high - low) / CELL).astype(int) + 1
+    depth = _measure_depth(segments, low, CELL, shape[0], shape[1], _FACES_AWAY)
+    traced = _trace_front(depth, low, CELL, _TRACE)
+    traced = traced[np.isfinite(traced[:, 0])]
+    if len(traced) < 2:
+        raise ContactError(f"the outline is thinner than {1e3 * CELL:g} mm where it faces the jaw")
+    front = np.hstack([traced[:-1], traced[1:]])
+    return PressedObject(False, depth, low, -float(traced[:, 0].min()), front)
+
+
+@njit(**_OPTIONS)
+def _measure_depth(segments, low, cell, rows, columns, faces_away):
+    """Return the depth (rows, columns) below the segments that an object turns to the jaw; negative outside."""
+    count = len(segments)
+    nearest = np.empty((rows, columns))
+    for i in range(rows):
+        x = low[0] + cell * i
+        for j in range(columns):
+            z = low[1] + cell * j
+            inside, best, best_turned = 0, 1e9, 1e9
+            for s in range(count):
+                ax, az, bx, bz = segments[s, 0], segments[s, 1], segments[s, 2], segments[s, 3]
+                if (az > z) != (bz > z) and x < ax + (bx - ax) * (z - az) / (bz - az):
+                    inside += 1 if bz > az else -1
+                ex, ez = bx - ax, bz - az
+                square = ex * ex + ez * ez
+                if square <= 0.0:
+                    continue
+                t = min(max(((x - ax) * ex + (z - az) * ez) / square, 0.0), 1.0)
+                gap = (x - ax - t * ex) ** 2 + (z - az - t * ez) ** 2
+                best = min(best, gap)
+                # counterclockwise: the outward normal is (ez, -ex)
+                if ez < faces_away * np.sqrt(square):
+                    best_turned = min(best_turned, gap)
+            nearest[i, j] = np.sqrt(best_turned) if inside != 0 else -np.sqrt(best)
+    return nearest
+
+
+@njit(**_OPTIONS)
+def _weigh(t, value, slope, bend):
+    """Fill the four weights of a uniform cubic B-spline and of its derivatives by t in [0, 1)."""
+    s = 1.0 - t
+    value[0], value[3] = s * s * s / 6.0, t * t * t / 6.0
+    value[1], value[2] = 2.0 / 3.0 - t * t + 0.5 * t * t * t, 2.0 / 3.0 - s * s + 0.5 * s * s * s
+    slope[0], slope[3] = -0.5 * s * s, 0.5 * t * t
+    slope[1], slope[2] = -2.0 * t + 1.5 * t * t, 2.0 * s - 1.5 * s * s
+    bend[0], bend[3] = s, t
+    bend[1], bend[2] = -2.0 + 3.0 * t, -2.0 + 3.0 * s
+
+
+@njit(**_OPTIONS)
+def _read_value(coefficients, low, cell, x, z, weights):
+    """Return the depth [m] at one point, -1 mm beyond the grid, and fill in weights (6, 4) of x and z there."""
+    rows, columns = coefficients.shape
+    a, b = (x - low[0]) / cell, (z - low[1]) / cell
+    i, j = int(np.floor(a)), int(np.floor(b))
+    if i < 1 or j < 1 or i > rows - 3 or j > columns - 3:
+        return -1e-3, i, j
+    _weigh(a - i, weights[0], weights[1], weights[2])
+    _weigh(b - j, weights[3], weights[4], weights[5])
+    depth = 0.0
+    for k in range(4):
+        for m in range(4):
+            depth += coefficients[i - 1 + k, j - 1 + m] * weights[0, k] * weights[3, m]
+    return depth, i, j
+
+
+@njit(**_OPTIONS)
+def _read_slopes(coefficients, cell, i, j, weights):
+    """Return gradient (x, z) and second derivatives (xx, xz, zz) where `_read_value` has read the depth."""
+    gx, gz, gxx, gxz, gzz = 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(4):
+        for m in range(4):
+            c = coefficients[i - 1 + k, j - 1 + m]
+            gx += c * weights[1, k] * weights[3, m] / cell
+            gz += c * weights[0, k] * weights[4, m] / cell
+            gxx += c * weights[2, k] * weights[3, m] / cell**2
+            gxz += c * weights[1, k] * weights[4, m] / cell**2
+            gzz += c * weights[0, k] * weights[5, m] / cell**2
+    return gx, gz, gxx, gxz, gzz
+
+
+@njit(**_OPTIONS)
+def _trace_front(coefficients, low, cell, steps):
+    """Return the first x [m] of depth zero at each height (n, 2) [m]; NaN where the object is not met."""
+    rows, columns = coefficients.shape
+    weights = np.zeros((6, 4))
+    count = (columns - 4) * steps
+    front = np.full((count, 2), np.nan)
+    for n in range(count):
+        z = low[1] + cell * (1.0 + n / steps)
+        front[n, 1] = z
+        for i in range(1, rows - 3):
+            x = low[0] + cell * (i + 1)
+            if i + 1 > rows - 3 or _read_value(coefficients, low, cell, x, z, weights)[0] <= 0.0:
+                continue
+            outside, inside = x - cell, x
+            for _ in range(_HALVINGS):
+                middle = 0.5 * (outside + inside)
+                if _read_value(coefficients, low, cell, middle, z, weights)[0] > 0.0:
+                    inside = middle
+                else:
+                    outside = middle
+            front[n, 0] = inside
+            break
+    return front
+
+
+@njit(**_OPTIONS)
+def _find_leading(segments, c, s, low, high):
+    """Return the least x [m] of segments (s, 4) turned by (cos, sin) of the tilt, between two heights, else 1e9."""
+    least = 1e9
+    for k in range(len(segments)):
+        ax, az = c * segments[k, 0] - s * segments[k, 1], s * segments[k, 0] + c * segments[k, 1]
+        bx, bz = c * segments[k, 2] - s * segments[k, 3], s * segments[k, 2] + c * segments[k, 3]
+        if max(az, bz) < low or min(az, bz) > high:
+            continue
+        begin, end = 0.0, 1.0
+        if bz != az:
+            one, other = (low - az) / (bz - az), (high - az) / (bz - az)
+            begin, end = max(0.0, min(one, other)), min(1.0, max(one, other))
+        least = min(least, ax + begin * (bx - ax), ax + end * (bx - ax))
+    return least
+
+
+# The penalty rises quadratically over this depth [m] before it is linear, so that Newton's method sees no kink.
+SMOOTH_DEPTH = 2e-5
+
+
+@njit(**_OPTIONS)
+def resist(depth, stiffness):
+    """Return force [N] and its derivative [N/m] at a depth above zero [m]."""
+    if depth < SMOOTH_DEPTH:
+        return 0.5 * stiffness * depth * depth / SMOOTH_DEPTH, stiffness * depth / SMOOTH_DEPTH
+    return stiffness * (depth - 0.5 * SMOOTH_DEPTH), stiffness
+
+
+@njit(**_OPTIONS)
+def _touch_cylinder(x, z, stiffness, centre_x, centre_z, radius):
+    """Return the `Touch` of a cylinder on a point at x and z [m].
+
+    With the penetration d = radius - r the force is stiffness d n (quadratic below 20 um), n from the axis outwards.
+    """
+    dx, dz = x - centre_x, z - centre_z
+    square = dx * dx + dz * dz
+    if square >= radius * radius or square < 1e-24:
+        return Touch(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    r = np.sqrt(square)
+    depth = radius - r
+    nx, nz = dx / r, dz / r
+    push, slope = resist(depth, stiffness)
+    side = push / r
+    xx, xz = slope * nx * nx - side * nz * nz, (slope + side) * nx * nz
+    return Touch(push * nx, push * nz, xx, xz, slope * nz * nz - side * nx * nx, slope * nx, slope * nz)
+
+
+@njit(**_OPTIONS)
+def _touch_field(x, z, stiffness, coefficients, low, cell, origin_x, origin_z, c, s, weights):
+    """Return the `Touch` of an outline turned by (cos, sin) of its tilt; `weights` is (6, 4).
+
+    With the depth d(p) below the outline the force is -stiffness d grad d, and its springs follow from d's second
+    derivatives. A tilt is positive from x towards z.
+    """
+    rx, rz = x - origin_x, z - origin_z
+    depth, i, j = _read_value(coefficients, low, cell, c * rx + s * rz, c * rz - s * rx, weights)
+    if depth <= 0.0:
+        return Touch(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    hx, hz, a, b, d = _read_slopes(coefficients, cell, i, j, weights)
+    push, slope = resist(depth, stiffness)
+    gx, gz = c * hx - s * hz, s * hx + c * hz
+    hxx = c * c * a - 2.0 * c * s * b + s * s * d
+    hzz = s * s * a + 2.0 * c * s * b + c * c * d
+    hxz = c * s * (a - d) + (c * c - s * s) * b
+    fx, fz = -push * gx, -push * gz
+    xx, xz, zz = slope * gx * gx + push * hxx, slope * gx * gz + push * hxz, slope * gz * gz + push * hzz
+    # the object turns: its force turns along, and the point slides against it
+    return Touch(fx, fz, xx, xz, zz, -fz - xx * rz + xz * rx, fx - xz * rz + zz * rx)
 
 
 class FaceProfile(NamedTuple):
@@ -69,8 +262,8 @@ class FaceProfile(NamedTuple):
     x: float
 
 
-class ObjectPose(NamedTuple):
-    """Where an object of a place (depth, shape, height) is.
+class IndenterPose(NamedTuple):
+    """Where an object in a contact state (depth, shape, height) is.
 
     Attributes:
         x: of a cylinder's axis or an outline's origin [m].
@@ -88,12 +281,12 @@ class ObjectPose(NamedTuple):
 
 
 @njit(**_OPTIONS)
-def pose_object(pressed, face_x, place):
-    """Return the `ObjectPose` at a place (3,)."""
+def pose_object(pressed, face_x, x):
+    """Return the `IndenterPose` in a contact state (3,)."""
     if pressed.is_round:
-        radius = np.exp(place[1])
-        return ObjectPose(face_x + radius - place[0], place[2], radius, 1.0, 0.0)
-    return ObjectPose(face_x + pressed.front - place[0], place[2], 0.0, np.cos(place[1]), np.sin(place[1]))
+        radius = np.exp(x[1])
+        return IndenterPose(face_x + radius - x[0], x[2], radius, 1.0, 0.0)
+    return IndenterPose(face_x + pressed.front - x[0], x[2], 0.0, np.cos(x[1]), np.sin(x[1]))
 
 
 @njit(**_OPTIONS)
@@ -110,13 +303,13 @@ def is_clear_of(pressed, pose, x, z):
 
 @njit(**_OPTIONS)
 def touch_object(pressed, pose, x, z, stiffness, weights):
-    """Return the `Touch` of one point at x and z [m], derivatives by the place's shape; `weights` is (6, 4)."""
+    """Return the `Touch` of one point at x and z [m], derivatives by its shape; `weights` is (6, 4)."""
     if pressed.is_round:
-        touch = touch_cylinder(x, z, stiffness, pose.x, pose.z, pose.radius)
+        touch = _touch_cylinder(x, z, stiffness, pose.x, pose.z, pose.radius)
         bx, bz = pose.radius * (touch.bx + touch.kxx), pose.radius * (touch.bz + touch.kxz)
         return Touch(touch.fx, touch.fz, touch.kxx, touch.kxz, touch.kzz, bx, bz)
     field = pressed.coefficients, pressed.low, CELL
-    return touch_field(x, z, stiffness, *field, pose.x, pose.z, pose.c, pose.s, weights)
+    return _touch_field(x, z, stiffness, *field, pose.x, pose.z, pose.c, pose.s, weights)
 
 
 @njit(**_OPTIONS)
@@ -129,32 +322,32 @@ def measure_gap(pressed, pose, points):
             gap = np.sqrt(dx * dx + dz * dz) - pose.radius
         else:
             x, z = pose.c * dx + pose.s * dz, pose.c * dz - pose.s * dx
-            gap = -read_value(pressed.coefficients, pressed.low, CELL, x, z, weights)[0]
+            gap = -_read_value(pressed.coefficients, pressed.low, CELL, x, z, weights)[0]
         least = min(least, gap)
     return least
 
 
 @njit(**_OPTIONS)
-def find_first_touch(pressed, face, place):
-    """Return the depth [m] at which an object of a place (3,) first touches an undeformed `FaceProfile`."""
+def _find_first_touch(pressed, face, state):
+    """Return the depth [m] at which an object with a contact state (3,) first touches an undeformed `FaceProfile`."""
     points = face.points
     if pressed.is_round:
-        radius = np.exp(place[1])
+        radius = np.exp(state[1])
         least = 0.0 if face.is_flat else radius
         for p in range(0 if face.is_flat else len(points)):
-            dz = points[p, 1] - place[2]
+            dz = points[p, 1] - state[2]
             if abs(dz) < radius:
                 least = min(least, face.x + radius - np.sqrt(radius * radius - dz * dz) - points[p, 0])
         return least
-    c, s = np.cos(place[1]), np.sin(place[1])
+    c, s = np.cos(state[1]), np.sin(state[1])
     if face.is_flat:
-        low, high = points[0, 1] - place[2], points[-1, 1] - place[2]
-        least = find_leading(pressed.segments, c, s, low, high)
+        low, high = points[0, 1] - state[2], points[-1, 1] - state[2]
+        least = _find_leading(pressed.segments, c, s, low, high)
         return least + pressed.front if least < _OUTSIDE else 0.0
     least = np.inf
     for p in range(len(points)):
-        z = points[p, 1] - place[2]
-        lead = find_leading(pressed.segments, c, s, z, z)
+        z = points[p, 1] - state[2]
+        lead = _find_leading(pressed.segments, c, s, z, z)
         if lead < _OUTSIDE:
             least = min(least, face.x + lead - points[p, 0])
     return least + pressed.front if np.isfinite(least) else 0.0
@@ -165,27 +358,42 @@ def flat_profile(low: float, high: float, x: float = 0.0) -> FaceProfile:
     return FaceProfile(np.array([[x, low], [x, high]]), True, x)
 
 
-@dataclass(frozen=True, kw_only=True)
-class ShapeRange:
-    """What the second number of a place may do: its bounds, its change at once, and a change that matters no more."""
-
-    low: float
-    high: float
-    largest_change: float
-    settled_change: float
-
-
 @njit(**_OPTIONS)
-def _press_points(pressed, pose, points, stiffness):
-    """Return forces (p, 3), springs (p, 3, 3) and derivatives by the shape (p, 3) of points (p, 3)."""
-    count, weights = len(points), np.zeros((6, 4))
-    forces, springs, by_shape = np.zeros((count, 3)), np.zeros((count, 3, 3)), np.zeros((count, 3))
+def _press_points(pressed, pose, traction, points, stiffness):
+    """Return forces, springs, changes, shear and the used share of the cone at points; see `PenaltyContact`."""
+    count, out, weights = len(points), np.zeros(POINT_SHAPE), np.zeros((6, 4))
+    forces, springs, changes = np.zeros((count, 3)), np.zeros((count, 3, 3)), np.zeros((count, 3, 4))
+    shear, total, allowed = np.zeros(count), 0.0, 0.0
     for p in range(count):
-        touch = touch_object(pressed, pose, points[p, 0], points[p, 2], stiffness[p], weights)
-        forces[p, 0], forces[p, 2], by_shape[p, 0], by_shape[p, 2] = touch.fx, touch.fz, touch.bx, touch.bz
-        springs[p, 0, 0], springs[p, 2, 2] = touch.kxx, touch.kzz
-        springs[p, 0, 2] = springs[p, 2, 0] = touch.kxz
-    return forces, springs, by_shape
+        x, z = points[p, 0], points[p, 2]
+        touch = touch_object(pressed, pose, x, z, stiffness[p], weights)
+        shear[p], limit = add_traction(traction, touch, p, x, z, stiffness[p], out)
+        total += shear[p]
+        allowed += limit
+        for a in range(2):
+            forces[p, 2 * a], springs[p, 2 * a, 0], springs[p, 2 * a, 2] = out[a, 0], out[a, 1], out[a, 2]
+            for i in range(4):
+                changes[p, 2 * a, i] = out[a, 3 + i]
+    return forces, springs, changes, shear, total / allowed if allowed > 0.0 else 0.0
+
+
+class PenaltyContact(NamedTuple):
+    """Contact at surface points.
+
+    Attributes:
+        forces: on the points (p, 3) [N].
+        springs: negative derivatives of the forces by the points' positions (p, 3, 3) [N/m].
+        changes: derivatives of the forces by the object's depth, shape and height and by a traction ratio of all forces
+            (p, 3, 4).
+        shear: along the tangents (p,) [N].
+        mobilised: what the shear adds up to over what the cone allows, from -1 to 1.
+    """
+
+    forces: NDArray
+    springs: NDArray
+    changes: NDArray | None = None
+    shear: NDArray | None = None
+    mobilised: float = 0.0
 
 
 class Indenter:
@@ -193,64 +401,70 @@ class Indenter:
 
     Attributes:
         pressed: the object for compiled code.
-        shape_range: what the second number of its places may do.
+        lowest: least shape, the second number of its contact states.
+        highest: largest shape.
+        largest_change: of the shape at once.
+        settled_change: of the shape that no longer matters.
         has_corners: whether it has corners.
     """
 
     pressed: PressedObject
-    shape_range: ShapeRange
+    lowest: float
+    highest: float
+    largest_change: float
+    settled_change: float
     has_corners: bool
 
-    def press(self, points: NDArray, stiffness: NDArray, face_x: float, place: NDArray) -> PenaltyContact:
+    def press(
+        self, points: NDArray, stiffness: NDArray, face_x: float, x: NDArray, traction: Traction = FRICTIONLESS
+    ) -> PenaltyContact:
         """Return the contact with surface points.
 
         Args:
             points: deformed positions (p, 3) [m].
             stiffness: of each point (p,) [N/m].
             face_x: from which depths count [m].
-            place: of the object (3,).
+            x: state of the contact (3,).
+            traction: what acts along the surface.
         """
-        return PenaltyContact(*_press_points(self.pressed, self._pose(face_x, place), points, stiffness))
+        pose = pose_object(self.pressed, face_x, x)
+        return PenaltyContact(*_press_points(self.pressed, pose, traction, points, stiffness))
 
-    def find_gap(self, points: NDArray, face_x: float, place: NDArray) -> float:
-        """Return the least distance [m] of points (p, 3) [m] from the object, negative inside."""
-        return float(measure_gap(self.pressed, self._pose(face_x, place), np.ascontiguousarray(points)))
+    def find_gap(self, points: NDArray, face_x: float, x: NDArray) -> float:
+        """Return the least distance [m] of points (p, 3) [m] from the object in a state (3,), negative inside."""
+        return float(measure_gap(self.pressed, pose_object(self.pressed, face_x, x), np.ascontiguousarray(points)))
 
-    def find_touch(self, place: NDArray, face: FaceProfile) -> float:
-        """Return the depth [m] of first touch with an undeformed surface.
+    def find_touch(self, x: NDArray, face: FaceProfile) -> float:
+        """Return the depth [m] of first touch with an undeformed surface, at the shape and height of a state (3,).
 
         An outline beyond the ends of a plane surface touches with its leading point all the same.
         """
-        return find_first_touch(self.pressed, face, place)
-
-    def _pose(self, face_x: float, place: NDArray) -> ObjectPose:
-        return pose_object(self.pressed, face_x, place)
+        return _find_first_touch(self.pressed, face, x)
 
 
 class RoundIndenter(Indenter):
-    """A cylinder of any radius: place (depth [m], ln radius, height of its axis [m]).
+    """A cylinder of any radius, in states of depth [m], ln radius, and height of its axis [m].
 
-    A larger radius moves the axis away, so that the depth stays.
+    A larger radius moves the axis back, so that the depth stays.
     """
 
-    shape_range = ShapeRange(low=float(np.log(3e-3)), high=float(np.log(0.2)), largest_change=0.15, settled_change=5e-2)
+    lowest, highest = float(np.log(3e-3)), float(np.log(0.2))
+    largest_change, settled_change = 0.15, 5e-2
     has_corners = False
     pressed = PressedObject(True, np.zeros((1, 1)), np.zeros(2), 0.0, np.zeros((0, 4)))
 
 
 class OutlineIndenter(Indenter):
-    """A known outline: place (depth [m], tilt [rad], height of its origin [m]); depth 0 touches without tilt."""
+    """A known outline, in states of depth [m], tilt [rad], and height of its origin [m]; untilted it touches at 0."""
 
-    shape_range = ShapeRange(low=-1.0, high=1.0, largest_change=0.03, settled_change=5e-3)
+    lowest, highest, largest_change, settled_change = -1.0, 1.0, 0.03, 5e-3
     has_corners = True
 
     def __init__(self, polygons: tuple[NDArray, ...]) -> None:
         """Build the distance field of the polygons (n, 2) [m]; raises ContactError for one that is too small."""
         self.polygons = polygons
         self._size = np.ptp(np.concatenate(polygons), axis=0)
-        self.field: DistanceField = build_distance_field(polygons)
-        field = self.field
-        self.pressed = PressedObject(False, field.coefficients, field.low, field.front, field.segments)
+        self.pressed = build_outline(polygons)
 
     def describes(self, outline: ObjectOutline) -> bool:
         """Whether an outline has this object's polygons."""

@@ -6,8 +6,6 @@ and spreads along the finger by itself as the finger bends.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -15,19 +13,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_ifea.contact_mechanics.friction import (
-    Friction,
-    TangentialContact,
-    Traction,
-    apply_traction,
-    constant_traction,
-)
-from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, FaceProfile, Indenter, RoundIndenter
+from finforce_ifea.contact_mechanics.friction import FRICTIONLESS, Traction
+from finforce_ifea.contact_mechanics.indenter import FaceProfile, Indenter, PenaltyContact, RoundIndenter
 from finforce_ifea.errors import MeshError
 from finforce_ifea.fem.model import Across, JawModel
-from finforce_ifea.jaw.face import FaceLine
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_ifea.jaw.mesh import VolumeMesh
+from finforce_ifea.jaw.section import FaceLine
 
 # Where along the surface the line loads stand, as shares of its points.
 _HEIGHTS = (0.25, 0.5, 0.75)
@@ -89,7 +81,6 @@ class RigidContact:
 
     Attributes:
         indenter: the object.
-        traction_ratio: of tangential to normal force at all points, where friction is not followed.
         bearable: force beyond which no equilibrium is believed [N], infinite where unknown.
     """
 
@@ -107,66 +98,41 @@ class RigidContact:
         )
         self.face, self.face_x = face, face.plane
         self.indenter: Indenter = RoundIndenter()
-        self.traction_ratio, self._friction = 0.0, None
 
     def set_indenter(self, indenter: Indenter) -> None:
         """Take another object, which is pressed in from now on."""
         self.indenter = indenter
 
-    def set_traction_ratio(self, ratio: float) -> None:
-        """Take another ratio of tangential to normal force from now on."""
-        self.traction_ratio = ratio
-
     def begin(self, height: float) -> NDArray:
         """Return the unknowns (size,) of the unloaded jaw that is to be touched at a height [m]."""
         return np.zeros(self.model.size)
 
-    def find_touch(self, place: NDArray) -> float:
-        """Return the depth [m] at which the object at a place (3,) first touches the undeformed jaw."""
-        return self.indenter.find_touch(place, self.profile)
+    def find_touch(self, x: NDArray) -> float:
+        """Return the depth [m] at which the object first touches the undeformed jaw, in a contact state x (3,)."""
+        return self.indenter.find_touch(x, self.profile)
 
     @cached_property
     def profile(self) -> FaceProfile:
         """The undeformed surface, for objects to touch."""
         return profile_surface(self.surface, self.face)
 
-    def press(self, points: NDArray, place: NDArray) -> TangentialContact:
-        """Return the contact of surface points (p, 3) [m] with the object at a place (3,)."""
-        stiffness = self.surface.stiffness
-        contact = self.indenter.press(points, stiffness, self.face_x, place)
-        return apply_traction(contact, points, stiffness, self._describe_traction(place))
-
-    def _describe_traction(self, place: NDArray) -> Traction:
-        """Return what acts along the surface with the object at a place (3,)."""
-        if self._friction is None:
-            return constant_traction(self.traction_ratio)
-        return self._friction.describe(_find_origin(place))
-
-    def with_friction(self, friction: Friction) -> RigidContact:
-        """Return another contact of the same jaw, whose friction is followed."""
-        other = copy(self)
-        other._friction = friction
-        return other
-
-    def settle(self, q: NDArray, place: NDArray) -> float:
-        """Remember an equilibrium for the friction; return how far the cone is used, from -1 to 1."""
-        points, stiffness = self.place_points(q), self.surface.stiffness
-        contact = self.indenter.press(points, stiffness, self.face_x, place)
-        return self._friction.settle(contact, points, stiffness, _find_origin(place))
+    def press(self, points: NDArray, x: NDArray, traction: Traction) -> PenaltyContact:
+        """Return the contact of surface points (p, 3) [m] with the object in a state x (3,)."""
+        return self.indenter.press(points, self.surface.stiffness, self.face_x, x, traction)
 
     def place_points(self, q: NDArray) -> NDArray:
         """Return the surface points (p, 3) [m] of the deformed jaw."""
         return self.model.positions(self.surface.probe, q)
 
-    def linearize(self, q: NDArray, place: NDArray) -> PressedState:
-        """Linearise the equilibrium f_int(q) = J^T p(J q, place) at unknowns q and place (depth, shape, height).
+    def linearize(self, q: NDArray, x: NDArray, traction: Traction = FRICTIONLESS) -> PressedState:
+        """Linearise the equilibrium f_int(q) = J^T p(J q, x) at unknowns q and contact state x (depth, shape, height).
 
         The springs of tangential forces are not symmetric; the tangent takes their symmetric part, which Newton's
         method forgives.
         """
         model, probe = self.model, self.surface.probe
         points = self.place_points(q)
-        contact = self.press(points, place)
+        contact = self.press(points, x, traction)
         state = model.linearize(q)
         model.stiffen(state.tangent, probe, q, 0.5 * (contact.springs + contact.springs.transpose(0, 2, 1)))
         imbalance = model.load(probe, q, contact.forces) - state.force
@@ -190,30 +156,16 @@ class RigidContact:
             size=reached,
         )
 
-    def approach(self, q: NDArray, step: NDArray, place: NDArray) -> NDArray:
+    def approach(self, q: NDArray, step: NDArray, x: NDArray) -> NDArray:
         """Return the step of a jaw that has lost contact, cut where its surface meets the object again."""
-
-        def find_gap(share: float) -> float:
-            return self.indenter.find_gap(self.place_points(q + share * step), self.face_x, place)
-
-        return find_share_that_meets(find_gap) * step
-
-
-def _find_origin(place: NDArray) -> NDArray:
-    """Return x and z [m] that move as the object at a place (3,) does."""
-    return np.array([-place[DEPTH], place[HEIGHT]])
-
-
-def find_share_that_meets(find_gap: Callable[[float], float]) -> float:
-    """Return the share from 0 to 1 of a step at which the gap [m] to an object closes, by bisection."""
-    low, high = 0.0, 1.0
-    for _ in range(BISECTIONS):
-        share = 0.5 * (low + high)
-        if find_gap(share) < -TOUCH:
-            high = share
-        else:
-            low = share
-    return high
+        low, high = 0.0, 1.0
+        for _ in range(BISECTIONS):
+            share = 0.5 * (low + high)
+            if self.indenter.find_gap(self.place_points(q + share * step), self.face_x, x) < -TOUCH:
+                high = share
+            else:
+                low = share
+        return high * step
 
 
 def measure_step(model: JawModel, step: NDArray) -> float:

@@ -4,7 +4,6 @@ A rotation about y is positive from z to x: R(a) (x, z) = (x cos a + z sin a, z 
 angle turns (x, z) into (z, -x): the normal of a direction, and the derivative of a vector by its rotation.
 """
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -14,8 +13,16 @@ from scipy import sparse
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from finforce_ifea.errors import MeshError
-from finforce_ifea.fem.factorisation import Factor, SparseFactor, factorise_banded, sparse_from_banded
-from finforce_ifea.fem.model import LARGEST_MOVE, LARGEST_TURN, Across, Linearization
+from finforce_ifea.fem.model import (
+    LARGEST_MOVE,
+    LARGEST_TURN,
+    Across,
+    Factor,
+    Linearization,
+    SparseFactor,
+    factorise_banded,
+    sparse_from_banded,
+)
 from finforce_ifea.jaw.drawing import Drawing, Rib
 from finforce_ifea.jaw.jaw_file import Material
 from finforce_ifea.jaw.mesh import VolumeMesh
@@ -315,24 +322,6 @@ _SHEAR_CORRECTION = 5.0 / 6.0
 _OVERLAP, _ROOT = 0.53, 0.12
 
 
-@dataclass(frozen=True, kw_only=True)
-class FrameDivisions:
-    """How many beams a drawing is divided into.
-
-    Attributes:
-        between_ribs: along the bands, between two ribs, below the first and above the last.
-        along_rib: along each elastic rib.
-    """
-
-    between_ribs: int = 4
-    along_rib: int = 3
-
-    def __post_init__(self) -> None:
-        """Refuse less than one beam; raises MeshError."""
-        if min(self.between_ribs, self.along_rib) < 1:
-            raise MeshError(f"frame divisions: got {self}, expected whole numbers from 1 on")
-
-
 class FrameModel:
     """A planar co-rotational frame; see `finforce_ifea.fem.model.JawModel` for what its methods take and return.
 
@@ -352,7 +341,8 @@ class FrameModel:
         material: Material,
         *,
         mesh: VolumeMesh | None = None,
-        divisions: FrameDivisions | None = None,
+        between_ribs: int = 4,
+        along_rib: int = 3,
     ) -> None:
         """Divide the drawing into beams.
 
@@ -360,9 +350,10 @@ class FrameModel:
             drawing: the finger [m], jaw frame.
             material: Young's modulus [Pa] and Poisson's ratio.
             mesh: whose nodes `vertices` moves; without one there are no vertices.
-            divisions: how many beams; None for 4 between ribs and 3 along a rib.
+            between_ribs: beams along the bands, between two ribs, below the first and above the last.
+            along_rib: beams along each elastic rib.
         """
-        sketch = _Sketch(drawing, divisions or FrameDivisions())
+        sketch = _Sketch(drawing, between_ribs, along_rib)
         self.drawing, self.size = drawing, sketch.count
         self.beams, self._parts = sketch.number_beams(material), sketch.parts
         dof = self.beams.dof.reshape(-1, 8)
@@ -441,8 +432,8 @@ class _Part(NamedTuple):
 class _Sketch:
     """The growing frame: unknowns, beams between joints, and the parts of the drawing that they are."""
 
-    def __init__(self, drawing: Drawing, divisions: FrameDivisions) -> None:
-        self.drawing, self.divisions = drawing, divisions
+    def __init__(self, drawing: Drawing, between_ribs: int, along_rib: int) -> None:
+        self.drawing, self._between_ribs, self._along_rib = drawing, between_ribs, along_rib
         self.count = 0
         self.parts: list[_Part] = []
         self._dof, self._ends, self._arms, self._thickness = [], [], [], []
@@ -486,7 +477,7 @@ class _Sketch:
     def _add_band(self, side: int, joints: list[_Joint]) -> None:
         """Add a band from the clamped height over its junctions to the tip."""
         drawing, band = self.drawing, self._bands[side]
-        thickness, count = band.normal_thickness, self.divisions.between_ribs
+        thickness, count = band.normal_thickness, self._between_ribs
         top = drawing.length if drawing.tip_z is None else drawing.tip_z
         heights = (drawing.clamped_z, top, 0.0, drawing.length)
         base, top, start, end = (np.array([band.centre_x(z), z]) for z in heights)
@@ -508,7 +499,7 @@ class _Sketch:
         rib, hinged = self.drawing.ribs[number], self.drawing.joints == "hinged"
         axis = self.drawing.junctions[:, number]
         if self._welded:
-            below = self.parts[0].beams[[(number + 1) * self.divisions.between_ribs - 1]]
+            below = self.parts[0].beams[[(number + 1) * self._between_ribs - 1]]
             self.parts.append(_Part(axis, rib.thickness, below, low=1.0))
             return
         along = (axis[1] - axis[0]) / np.linalg.norm(axis[1] - axis[0])
@@ -520,7 +511,7 @@ class _Sketch:
             beams = self._add_chain(joints, ends, 0.0, 1)
         else:
             turns = tuple(self._add_unknowns(2)) if hinged else (None, None)
-            beams = self._add_chain(joints, ends, rib.thickness, self.divisions.along_rib, turns)
+            beams = self._add_chain(joints, ends, rib.thickness, self._along_rib, turns)
         self.parts.append(_Part(axis, rib.thickness, beams))
 
     def number_beams(self, material: Material) -> Beams:

@@ -9,7 +9,7 @@ of the undeformed shape, K0 S is formed from d alone.
 Source: Felippa, Haugen, A unified formulation of small-strain corotational finite elements, CMAME 194 (2005).
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -18,8 +18,16 @@ from scipy import sparse
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from finforce_ifea.fem.elements import centre_gradient, elasticity_matrix, hex_stiffness, tet_stiffness
-from finforce_ifea.fem.factorisation import Factor, SparseFactor, factorise_banded, order_unknowns, sparse_from_banded
-from finforce_ifea.fem.model import LARGEST_MOVE, Across, Linearization
+from finforce_ifea.fem.model import (
+    LARGEST_MOVE,
+    Across,
+    Factor,
+    Linearization,
+    SparseFactor,
+    factorise_banded,
+    order_unknowns,
+    sparse_from_banded,
+)
 from finforce_ifea.jaw.attachment import attach_points
 from finforce_ifea.jaw.jaw_file import Material
 from finforce_ifea.jaw.mesh import VolumeMesh
@@ -29,19 +37,11 @@ _BANDED_COST_LIMIT = 1e10
 _ON_PLANE = 1e-9
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class SolidProbe:
-    """Material points of a solid.
-
-    Attributes:
-        points: undeformed positions (p, 3) [m].
-        dof: unknowns of the nodes around each point (p, m, 3); the model's size marks a clamped one.
-        weights: shape functions with the mirror's sign (p, m, 3).
-    """
+class _Probe(NamedTuple):
+    """Material points of a solid: undeformed (p, 3) [m], and what each unknown moves them (3 p, size)."""
 
     points: NDArray
-    dof: NDArray
-    weights: NDArray
+    matrix: sparse.csr_matrix
 
 
 class SolidModel:
@@ -148,7 +148,7 @@ class SolidModel:
     def linearize(self, q: NDArray, *, tangent: bool = True) -> Linearization:
         """Evaluate internal force, energy and, unless `tangent` is False, the tangent stiffness at q (size,) [m]."""
         f = np.zeros_like(self.mesh.nodes)
-        energy, smallest = corotational_elements(
+        energy, smallest = _add_elements(
             self.expand(q), self._elements, self._X, self._K0, self._g, tangent, f, self._Ke
         )
         force = np.bincount(self.dof.ravel(), f.ravel(), self.size + 1)[: self.size]
@@ -160,7 +160,7 @@ class SolidModel:
             values = np.bincount(self._slot, self._Ke.ravel()[self._source], len(self._keys))
             return sparse.csc_matrix((values, self._index, self._pointer), (self.size, self.size), copy=False)
         storage = np.zeros((self.bandwidth + 1, self.size), order="F")
-        scatter_lower(self._Ke.ravel(), self._source, self._row, self._col, storage)
+        _scatter_lower(self._Ke.ravel(), self._source, self._row, self._col, storage)
         return storage
 
     def factorise(self, tangent: NDArray | sparse.csc_matrix) -> Factor:
@@ -173,40 +173,38 @@ class SolidModel:
         """Return a stored tangent as the full symmetric matrix (size, size) [N/m]."""
         return sparse_from_banded(tangent) if self.banded else tangent
 
-    def attach(self, points: NDArray, max_distance: float = 1e-3) -> SolidProbe:
+    def attach(self, points: NDArray, max_distance: float = 1e-3) -> _Probe:
         """Return a probe of material points (p, 3) [m, undeformed]; raises MeshError when one is off the jaw."""
         attachment = attach_points(self.mesh, points, max_distance)
-        return SolidProbe(
-            points=np.array(points, float),
-            dof=np.ascontiguousarray(self.dof[attachment.nodes]),
-            weights=np.ascontiguousarray(self.sign[attachment.nodes] * attachment.weights[:, :, None]),
-        )
+        column = self.dof[attachment.nodes]
+        weights = self.sign[attachment.nodes] * attachment.weights[:, :, None]
+        row = np.broadcast_to(np.arange(3 * len(points)).reshape(-1, 1, 3), column.shape)
+        free = column < self.size
+        matrix = sparse.csr_matrix((weights[free], (row[free], column[free])), (3 * len(points), self.size))
+        return _Probe(np.array(points, float), matrix)
 
-    def positions(self, probe: SolidProbe, q: NDArray) -> NDArray:
+    def positions(self, probe: _Probe, q: NDArray) -> NDArray:
         """Return the deformed positions (p, 3) [m] of a probe."""
-        return probe_positions(probe.points, probe.dof, probe.weights, q)
+        return probe.points + (probe.matrix @ q).reshape(-1, 3)
 
-    def project(self, probe: SolidProbe, q: NDArray, modes: NDArray) -> NDArray:
+    def project(self, probe: _Probe, q: NDArray, modes: NDArray) -> NDArray:
         """Return the motions (p, 3, k) [m] of a probe for changes modes (size, k) of the unknowns."""
-        return probe_motions(probe.dof, probe.weights, np.ascontiguousarray(modes))
+        return (probe.matrix @ modes).reshape(*probe.points.shape, -1)
 
-    def load(self, probe: SolidProbe, q: NDArray, forces: NDArray) -> NDArray:
+    def load(self, probe: _Probe, q: NDArray, forces: NDArray) -> NDArray:
         """Return the generalised load (size,) [N] of forces (p, 3) [N] at a probe's points."""
-        return probe_loads(probe.dof, probe.weights, forces, self.size)
+        return forces.ravel() @ probe.matrix
 
-    def stiffen(self, tangent: NDArray | sparse.csc_matrix, probe: SolidProbe, q: NDArray, blocks: NDArray) -> None:
+    def stiffen(self, tangent: NDArray | sparse.csc_matrix, probe: _Probe, q: NDArray, blocks: NDArray) -> None:
         """Add springs blocks (p, 3, 3) [N/m] at a probe's points to a stored tangent, in place."""
+        matrix = probe.matrix
         if self.banded:
-            _add_banded_springs(probe.dof, probe.weights, blocks, self.size, tangent)
+            _add_banded_springs(matrix.indptr, matrix.indices, matrix.data, blocks, tangent)
             return
-        active = np.flatnonzero(np.abs(blocks).max((1, 2)) > 0.0)
-        rows = probe.dof[active].reshape(len(active), probe.dof[0].size)
-        weights = probe.weights[active]
-        values = np.einsum("pma,pab,pkb->pmakb", weights, blocks[active], weights).reshape(*rows.shape, rows.shape[1])
-        row, col = np.broadcast_arrays(rows[:, :, None], rows[:, None, :])
-        keep = (row < self.size) & (col < self.size) & (values != 0.0)
-        slot = np.searchsorted(self._keys, col[keep] * self.size + row[keep])
-        tangent.data += np.bincount(slot, values[keep], len(self._keys))
+        springs = sparse.bsr_matrix((blocks, np.arange(len(blocks)), np.arange(len(blocks) + 1)))
+        added = (matrix.T @ springs @ matrix).tocoo()
+        added.eliminate_zeros()
+        tangent.data[np.searchsorted(self._keys, added.col * self.size + added.row)] += added.data
 
 
 def _order_nodes(elements: NDArray) -> NDArray:
@@ -405,7 +403,7 @@ def _tangent(K0, G, L, B, R, T, scratch, Ke):
 
 
 @njit(**_OPTIONS)
-def corotational_elements(
+def _add_elements(
     u: NDArray, conn: NDArray, X: NDArray, K0: NDArray, g: NDArray, with_tangent: bool, f: NDArray, Ke: NDArray
 ) -> tuple[float, float]:
     """Add internal forces to f and write element tangents.
@@ -444,70 +442,22 @@ def corotational_elements(
     return energy, smallest
 
 
-_EXACT = {"cache": True, "error_model": "numpy"}
-
-
-@njit(**_EXACT)
-def scatter_lower(values, source, row, col, storage):
+@njit(cache=True, error_model="numpy")
+def _scatter_lower(values, source, row, col, storage):
     """Add values[source[i]] to storage[row[i], col[i]] for all i."""
     for i in range(len(source)):
         storage[row[i], col[i]] += values[source[i]]
 
 
-@njit(**_EXACT)
-def probe_positions(points, dof, weights, q):
-    """Return points (p, 3) moved by sum_m weights (p, m, 3) q[dof (p, m, 3)], shape (p, 3)."""
-    out = points.copy()
-    n = len(q)
-    for p in range(dof.shape[0]):
-        for m in range(dof.shape[1]):
-            for a in range(3):
-                if dof[p, m, a] < n:
-                    out[p, a] += weights[p, m, a] * q[dof[p, m, a]]
-    return out
-
-
-@njit(**_EXACT)
-def probe_motions(dof, weights, modes):
-    """Return the motions (p, 3, k) of the points for changes modes (n, k) of the unknowns."""
-    n, k = modes.shape
-    out = np.zeros((dof.shape[0], 3, k))
-    for p in range(dof.shape[0]):
-        for m in range(dof.shape[1]):
-            for a in range(3):
-                d = dof[p, m, a]
-                if d < n:
-                    for c in range(k):
-                        out[p, a, c] += weights[p, m, a] * modes[d, c]
-    return out
-
-
-@njit(**_EXACT)
-def probe_loads(dof, weights, forces, n):
-    """Return the generalised load (n,) of forces (p, 3)."""
-    out = np.zeros(n)
-    for p in range(dof.shape[0]):
-        if forces[p, 0] == 0.0 and forces[p, 1] == 0.0 and forces[p, 2] == 0.0:
-            continue
-        for m in range(dof.shape[1]):
-            for a in range(3):
-                if dof[p, m, a] < n:
-                    out[dof[p, m, a]] += weights[p, m, a] * forces[p, a]
-    return out
-
-
-@njit(**_EXACT)
-def _add_banded_springs(dof, weights, blocks, n, storage):
-    for p in range(dof.shape[0]):
-        if blocks[p, 0, 0] == 0.0 and blocks[p, 1, 1] == 0.0 and blocks[p, 2, 2] == 0.0:
-            continue
-        for m in range(dof.shape[1]):
-            for a in range(3):
-                row = dof[p, m, a]
-                if row >= n or weights[p, m, a] == 0.0:
+@njit(cache=True, error_model="numpy")
+def _add_banded_springs(start, column, weight, blocks, storage):
+    """Add the springs blocks (p, 3, 3) of points, each three rows of a sparse matrix, to lower banded storage."""
+    for p in range(len(blocks)):
+        for a in range(3):
+            for b in range(3):
+                if blocks[p, a, b] == 0.0:
                     continue
-                for k in range(dof.shape[1]):
-                    for b in range(3):
-                        col = dof[p, k, b]
-                        if col <= row and weights[p, k, b] != 0.0:
-                            storage[row - col, col] += weights[p, m, a] * blocks[p, a, b] * weights[p, k, b]
+                for i in range(start[3 * p + a], start[3 * p + a + 1]):
+                    for j in range(start[3 * p + b], start[3 * p + b + 1]):
+                        if column[j] <= column[i]:
+                            storage[column[i] - column[j], column[j]] += weight[i] * blocks[p, a, b] * weight[j]

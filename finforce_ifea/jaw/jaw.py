@@ -14,11 +14,10 @@ from finforce.typed_yaml import read_model
 from finforce_ifea.errors import JawFileError, MeshError
 from finforce_ifea.jaw.attachment import attach_points, attach_surface_points
 from finforce_ifea.jaw.drawing import Drawing, MeshDensity, mesh_drawing
-from finforce_ifea.jaw.face import FaceLine, find_face
 from finforce_ifea.jaw.jaw_file import CandidateRule, JawEntry, JunctionRule, Material, MeshFile
 from finforce_ifea.jaw.mesh import VolumeMesh
 from finforce_ifea.jaw.mesh_file import read_volume_mesh
-from finforce_ifea.jaw.section import Section
+from finforce_ifea.jaw.section import FaceLine, Section, find_face
 from finforce_ifea.jaw.section_mesh import SHARES, PlaneMesh, extrude_section, mesh_section
 
 __all__ = ["Jaw", "Material", "list_shipped_jaws", "load_jaw"]

@@ -11,9 +11,8 @@ from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Stri
 from finforce.typed_yaml import TAGS, Count, FileModel, Length, Number, Point, Thickness
 from finforce_ifea.errors import JawFileError
 from finforce_ifea.jaw.drawing import Band, Drawing, Rib
-from finforce_ifea.jaw.face import FaceLine
 from finforce_ifea.jaw.mesh_file import ClampRule
-from finforce_ifea.jaw.section import Section, join_loops, order_rings, read_loops
+from finforce_ifea.jaw.section import FaceLine, Section, join_loops, order_rings, read_loops
 
 LIST, MAPPING = TAGS
 Text = Annotated[str, Field(pattern=r"\S")]

@@ -1,4 +1,6 @@
-"""The section of a finger, extruded along its width: polygons, where they are held, and the file of both."""
+"""The section of a finger, extruded along its width: polygons, their file, where they are held, and the inner face."""
+
+from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -75,12 +77,6 @@ class Section:
         """The largest z [m]."""
         return float(self.rings[0][:, 1].max())
 
-    def reach(self, z: NDArray) -> NDArray:
-        """Return the largest x (n,) [m] of the section at heights z (n,) [m], NaN where there is none."""
-        low, _, high, _ = self.polygon.bounds
-        lines = shapely.linestrings([[(low - 1.0, height), (high + 1.0, height)] for height in z])
-        return shapely.bounds(shapely.intersection(self.polygon, lines))[:, 2]
-
     def find_clamped(self, points: NDArray) -> NDArray:
         """Return which of points (n, 2) [m] are clamped, (n,) bool."""
         held = np.zeros(len(points), bool)
@@ -95,6 +91,13 @@ class Section:
         beside = np.maximum(np.abs(points[:, 1]) - 0.5 * self.read_width(points[:, [0, 2]]), 0.0)
         in_plane = shapely.distance(self.polygon, shapely.points(points[:, [0, 2]]))
         return np.hypot(beside, in_plane)
+
+
+def find_reach(polygon: shapely.Polygon, z: NDArray) -> NDArray:
+    """Return the largest x (n,) [m] of a section at heights z (n,) [m], NaN where there is none."""
+    low, _, high, _ = polygon.bounds
+    lines = shapely.linestrings([[(low - 1.0, height), (high + 1.0, height)] for height in z])
+    return shapely.bounds(shapely.intersection(polygon, lines))[:, 2]
 
 
 def order_rings(polygon: shapely.Polygon) -> tuple[NDArray, ...]:
@@ -176,3 +179,62 @@ def check_loops(loops: list[NDArray], name: str) -> None:
         raise JawFileError(
             f"{name}: {len(loops)} loops, {sum(map(len, loops))} points; expected 1 to {_MOST_VERTICES} points"
         )
+
+
+# A point this close to the line [m] is on it; a face that leaves its plane by no more is one.
+_ON_FACE = 1e-4
+# Spacing of the places [m] at which a curved face is read.
+_FACE_SPACING = 0.1e-3
+# Where a face falls away towards the tip more steeply than this [-] it has ended.
+_STEEPEST = 1.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FaceLine:
+    """The undeformed inner face as x over z, the same all along y.
+
+    Attributes:
+        heights: z (n,) [m], rising.
+        x: at the heights (n,) [m], linear in between.
+        plane: x [m] of the plane from which an object's depth is counted; that of a flat face.
+        is_flat: whether it is a plane x = const.
+    """
+
+    heights: NDArray
+    x: NDArray
+    plane: float
+    is_flat: bool
+
+    @classmethod
+    def flat(cls, x: float) -> FaceLine:
+        """Return the plane x [m]."""
+        return cls(heights=np.array([-10.0, 10.0]), x=np.full(2, float(x)), plane=float(x), is_flat=True)
+
+    def read(self, z: float | NDArray) -> float | NDArray:
+        """Return x [m] at heights z [m]."""
+        return np.interp(z, self.heights, self.x)
+
+    def holds(self, points: NDArray, tolerance: float = _ON_FACE) -> NDArray:
+        """Return which of points (n, 3) [m] are on the face within a tolerance [m], (n,) bool."""
+        z = points[:, 2]
+        within = (z >= self.heights[0] - _ON_FACE) & (z <= self.heights[-1] + _ON_FACE)
+        return within & (np.abs(points[:, 0] - self.read(z)) < tolerance)
+
+
+def find_face(section: Section, face_x: float) -> FaceLine:
+    """Return the inner face of a section: the plane x = face_x [m] where most of it is on that, else what is in front.
+
+    It begins at the clamp and ends where it falls away towards the tip.
+    """
+    low = section.rings[0][:, 1].min() if section.clamped_z is None else section.clamped_z
+    z = np.arange(low, section.length - 0.5 * _FACE_SPACING, _FACE_SPACING)
+    x = find_reach(section.polygon, z)
+    near = np.abs(x - face_x) < _ON_FACE
+    if near.mean() > 0.5 and x[: int(0.8 * len(x))].max() < face_x + _ON_FACE:
+        return FaceLine.flat(face_x)
+    # from the middle on upwards, where it stays in front
+    upper = np.flatnonzero((np.diff(x) < -_STEEPEST * _FACE_SPACING) & (z[:-1] > 0.5 * (low + section.length)))
+    end = len(z)
+    while len(upper) and upper[-1] >= end - 2:
+        end, upper = int(upper[-1]) + 1, upper[:-1]
+    return FaceLine(heights=z[:end], x=x[:end], plane=float(face_x), is_flat=False)

@@ -27,25 +27,6 @@ _EVERY = 3
 _LEADING = 12
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class FaceTangent:
-    """One equilibrium at the rows, x and z of each interleaved (2 n,).
-
-    Attributes:
-        load: that holds the jaw (2 n,) [N].
-        move: of the rows (2 n,) [m].
-        compliance: of the rows (2 n, 2 n) [m/N].
-        shape: of the unknowns in the basis (r,).
-        shape_compliance: (r, 2 n).
-    """
-
-    load: NDArray
-    move: NDArray
-    compliance: NDArray
-    shape: NDArray
-    shape_compliance: NDArray
-
-
 class Face:
     """The rows of the inner face as the full model moves them.
 
@@ -84,21 +65,21 @@ class Face:
                     table[2 * row + 2 + number, column] = share
         return table.tocsr()
 
-    def describe(self, q: NDArray) -> FaceTangent:
-        """Return the equilibrium of unknowns q (size,) and what unit loads at the rows do to it."""
+    def describe(self, q: NDArray) -> dict[str, NDArray]:
+        """Return the equilibrium of unknowns q (size,) and what unit loads at the rows do to it, as in `Manifold`."""
         model, count = self._model, 2 * self._count
         responses, state = self._respond(q), model.linearize(q, tangent=False)
         moves = self._average(model.project(self._probe, q, responses)).reshape(count, count)
         moved = model.positions(self._probe, q) - model.positions(self._probe, np.zeros(model.size))
-        return FaceTangent(
-            load=self._find_load(q, state.force),
-            move=self._average(moved[:, :, None]).reshape(count),
-            compliance=0.5 * (moves + moves.T),
-            shape=self.basis.T @ q,
-            shape_compliance=self.basis.T @ responses,
-        )
+        return {
+            "loads": self._find_load(q, state.force),
+            "moves": self._average(moved[:, :, None]).reshape(count),
+            "compliance": (0.5 * (moves + moves.T)).astype(np.float32),
+            "shapes": self.basis.T @ q,
+            "shape_compliance": (self.basis.T @ responses).astype(np.float32),
+        }
 
-    def describe_all(self, states: NDArray) -> list[FaceTangent]:
+    def describe_all(self, states: NDArray) -> list[dict[str, NDArray]]:
         """Return the equilibria of unknowns (n, size); see `describe`."""
         return [self.describe(q) for q in states]
 
@@ -375,21 +356,11 @@ class _Rod:
         return None
 
 
-def _store(young_modulus: float, grid: _Grid, heights: NDArray, parts: list[list[FaceTangent]], face: Face) -> Manifold:
-    """Return the manifold of a grid of equilibria and their tangents (T, Z)."""
-
-    def collect(name: str, kind: type = np.float64) -> NDArray:
-        return np.array([[getattr(part, name) for part in row] for row in parts], kind)
-
+def _store(
+    young_modulus: float, grid: _Grid, heights: NDArray, parts: list[list[dict[str, NDArray]]], face: Face
+) -> Manifold:
+    """Return the manifold of a grid of equilibria as `Face` describes them (T, Z)."""
+    tables = {name: np.array([[part[name] for part in row] for row in parts]) for name in parts[0][0]}
     return Manifold(
-        young_modulus=young_modulus,
-        heights=heights,
-        rods=grid.rods,
-        depths=grid.depths,
-        loads=collect("load"),
-        moves=collect("move"),
-        compliance=collect("compliance", np.float32),
-        shapes=collect("shape"),
-        shape_compliance=collect("shape_compliance", np.float32),
-        basis=face.basis,
+        young_modulus=young_modulus, heights=heights, rods=grid.rods, depths=grid.depths, basis=face.basis, **tables
     )

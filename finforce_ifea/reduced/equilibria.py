@@ -53,7 +53,7 @@ class Manifold:
 
 
 @njit(**_OPTIONS)
-def weigh_cubic(x: float, count: int, weights: NDArray, slopes: NDArray) -> int:
+def _weigh_cubic(x: float, count: int, weights: NDArray, slopes: NDArray) -> int:
     """Write the four weights of cubic Lagrange interpolation at x on 0 ... count - 1 and their derivatives.
 
     Returns:
@@ -79,7 +79,7 @@ def weigh_cubic(x: float, count: int, weights: NDArray, slopes: NDArray) -> int:
 def interpolate(table, m, out):
     """Write the values out (k,) of a table (T, Z, k) at grid coordinates m (2,)."""
     wt, wz, slope = np.empty(STENCIL), np.empty(STENCIL), np.empty(STENCIL)
-    t, z = weigh_cubic(m[0], table.shape[0], wt, slope), weigh_cubic(m[1], table.shape[1], wz, slope)
+    t, z = _weigh_cubic(m[0], table.shape[0], wt, slope), _weigh_cubic(m[1], table.shape[1], wz, slope)
     out[:] = 0.0
     for i in range(STENCIL):
         for j in range(STENCIL):
@@ -89,10 +89,10 @@ def interpolate(table, m, out):
 
 
 @njit(**_OPTIONS)
-def interpolate_slopes(table, m, step, out):
+def _interpolate_slopes(table, m, step, out):
     """Write every `step`-th pair of a table (T, Z, 2 n) at grid coordinates m (2,), and derivatives, out (3, k)."""
     wt, wz, dt, dz = np.empty(STENCIL), np.empty(STENCIL), np.empty(STENCIL), np.empty(STENCIL)
-    t, z = weigh_cubic(m[0], table.shape[0], wt, dt), weigh_cubic(m[1], table.shape[1], wz, dz)
+    t, z = _weigh_cubic(m[0], table.shape[0], wt, dt), _weigh_cubic(m[1], table.shape[1], wz, dz)
     out[:] = 0.0
     for i in range(STENCIL):
         for j in range(STENCIL):
@@ -178,7 +178,7 @@ def find_grid_step(moves, now, m):
     """
     count = (moves.shape[2] // 2 + WATCHED - 1) // WATCHED
     at = np.empty((3, 2 * count))
-    interpolate_slopes(moves, m, WATCHED, at)
+    _interpolate_slopes(moves, m, WATCHED, at)
     a = b = c = u = v = square = 0.0
     for k in range(count):
         for axis in range(2):

@@ -13,7 +13,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from finforce.elimination import eliminate
-from finforce_ifea.contact_mechanics.friction import POINT_SHAPE, Traction, add_traction
+from finforce_ifea.contact_mechanics.friction import FRICTIONLESS, POINT_SHAPE, Traction, add_traction
 from finforce_ifea.contact_mechanics.indenter import (
     Indenter,
     PressedObject,
@@ -30,9 +30,8 @@ from finforce_ifea.contact_mechanics.pressed_jaw import (
     PressedState,
     RigidContact,
 )
-from finforce_ifea.fem.factorisation import Factor
-from finforce_ifea.fem.model import LARGEST_MOVE, Across, JawModel, Linearization
-from finforce_ifea.jaw.face import FaceLine
+from finforce_ifea.fem.model import LARGEST_MOVE, Across, Factor, JawModel, Linearization
+from finforce_ifea.jaw.section import FaceLine
 from finforce_ifea.reduced.equilibria import (
     LARGEST_GRID_STEP,
     WATCHED,
@@ -52,7 +51,7 @@ _ON_FACE = 1e-9
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class ReducedProbe:
+class _Probe:
     """Material points of a reduced jaw.
 
     Attributes:
@@ -69,7 +68,7 @@ class ReducedProbe:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class FacePoints:
+class _FacePoints:
     """Points of the inner face, which the rows beside them move.
 
     Attributes:
@@ -120,7 +119,7 @@ class ReducedModel:
         """Return the loads that q (size,) holds, and how far its grid coordinates are from the nearest equilibrium."""
         moves = self.moves(q)
         step = find_grid_step(self.manifold.moves, moves, q[-2:])[:2]
-        if q[-2] < SHALLOW:
+        if q[-2] < _SHALLOW:
             step = self._find_shallow_step(q, step[0])
         force = np.r_[q[:-2], -step]
         return Linearization(force=force, energy=0.5 * float(moves @ q[:-2]), smallest_det=1.0, tangent=None)
@@ -136,38 +135,38 @@ class ReducedModel:
 
     def moves(self, q: NDArray) -> NDArray:
         """Return the motions of the rows (2 n,) [m], x and z interleaved."""
-        return follow(self.manifold.moves, self.compliance, self.loads, q)
+        return _follow(self.manifold.moves, self.compliance, self.loads, q)
 
-    def attach(self, points: NDArray, max_distance: float = 1e-3) -> ReducedProbe | FacePoints:
+    def attach(self, points: NDArray, max_distance: float = 1e-3) -> _Probe | _FacePoints:
         """Return a probe of material points (p, 3) [m, undeformed]; raises MeshError when one is off the jaw."""
         points = np.array(points, float)
         low, high = self.manifold.heights[[0, -1]]
         on_face = self._face.holds(points, _ON_FACE) & (points[:, 2] >= low) & (points[:, 2] <= high)
         if on_face.all():
-            return FacePoints(points=points, rows=share_rows(self.manifold.heights, points[:, 2]))
+            return _FacePoints(points=points, rows=_share_rows(self.manifold.heights, points[:, 2]))
         full, basis, zero = self._full, self.manifold.basis, np.zeros(self._full.size)
         motion = full.project(full.attach(points, max_distance), zero, basis).reshape(3 * len(points), -1)
-        return ReducedProbe(
+        return _Probe(
             points=points,
             shapes=self.manifold.shapes @ motion.T,
             compliance=np.ascontiguousarray(motion.astype(np.float32) @ self.shape_compliance),
-            rows=share_rows(self.manifold.heights, points[:, 2]),
+            rows=_share_rows(self.manifold.heights, points[:, 2]),
         )
 
-    def positions(self, probe: ReducedProbe | FacePoints, q: NDArray) -> NDArray:
+    def positions(self, probe: _Probe | _FacePoints, q: NDArray) -> NDArray:
         """Return the deformed positions (p, 3) [m] of a probe."""
-        if isinstance(probe, FacePoints):
+        if isinstance(probe, _FacePoints):
             return probe.points + probe.spread(self.moves(q))
-        return place_points(probe.points, probe.shapes, probe.compliance, self.loads, q)
+        return _move_tables(probe.points, probe.shapes, probe.compliance, self.loads, q)
 
-    def project(self, probe: ReducedProbe | FacePoints, q: NDArray, modes: NDArray) -> NDArray:
+    def project(self, probe: _Probe | _FacePoints, q: NDArray, modes: NDArray) -> NDArray:
         """Return the motions (p, 3, k) [m] of a probe for changes modes (size, k) of the loads alone."""
-        if isinstance(probe, FacePoints):
+        if isinstance(probe, _FacePoints):
             now = self.moves(q)
             return np.stack([probe.spread(self.moves(q + mode) - now) for mode in modes.T], axis=2)
-        return move_points(probe.compliance, q, np.ascontiguousarray(modes))
+        return _move_points(probe.compliance, q, np.ascontiguousarray(modes))
 
-    def load(self, probe: ReducedProbe | FacePoints, q: NDArray, forces: NDArray) -> NDArray:
+    def load(self, probe: _Probe | _FacePoints, q: NDArray, forces: NDArray) -> NDArray:
         """Return the loads (size,) [N] at the rows of forces (p, 3) [N] at points of the inner face."""
         return np.r_[(probe.rows.T @ forces[:, [0, 2]]).ravel(), 0.0, 0.0]
 
@@ -182,7 +181,7 @@ class ReducedModel:
     def expand(self, q: NDArray) -> NDArray:
         """Return the unknowns of the full model (m,) at this one's (size,), as far as its basis goes."""
         still = np.zeros((self.manifold.basis.shape[1], 1))
-        shape = place_points(still, self.manifold.shapes, self.shape_compliance, self.loads, q)
+        shape = _move_tables(still, self.manifold.shapes, self.shape_compliance, self.loads, q)
         return self.manifold.basis @ shape.ravel()
 
 
@@ -201,7 +200,7 @@ def scale_manifold(manifold: Manifold, young_modulus: float) -> Manifold:
     )
 
 
-def share_rows(heights: NDArray, places: NDArray) -> NDArray:
+def _share_rows(heights: NDArray, places: NDArray) -> NDArray:
     """Return what share each row has in points at `places` (p,) [m] along the face, (p, n), linear between rows.
 
     Args:
@@ -226,7 +225,7 @@ class ReducedContact(RigidContact):
     """A reduced model, its contact surface, and the object pressed into it.
 
     Attributes:
-        packed: `ReducedJaw` as a plain tuple.
+        packed: `_Jaw` as a plain tuple.
         bearable: force beyond which no equilibrium is believed [N]: half of the largest that is stored, beside the
             clamp; in its middle the bench finger bears a sixth of that.
     """
@@ -235,8 +234,7 @@ class ReducedContact(RigidContact):
         """Keep the model, its contact surface, one point per height, and the undeformed inner face."""
         self.model, self.surface, self.face, self.face_x = model, surface, face, face.plane
         self.indenter: Indenter = RoundIndenter()
-        self.traction_ratio, self._friction = 0.0, None
-        shares = share_rows(model.manifold.heights, surface.heights)
+        shares = _share_rows(model.manifold.heights, surface.heights)
         upper = np.clip(np.searchsorted(model.manifold.heights, surface.heights) - 1, 0, shares.shape[1] - 1)
         share = shares[np.arange(len(upper)), upper]
         length = surface.heights[-1] - surface.heights[0]
@@ -244,7 +242,7 @@ class ReducedContact(RigidContact):
         farthest = _FARTHEST_SHAPE * length if model.manifold.depths.any() else np.inf
         x, z = (model.loads[:, :, axis::2].sum(axis=2) for axis in (0, 1))
         self.bearable = _BEARABLE * float(np.hypot(x, z).max()) if np.isfinite(farthest) else np.inf
-        self._jaw = ReducedJaw(
+        self._jaw = _Jaw(
             moves=model.manifold.moves,
             compliance=model.compliance,
             loads=model.loads,
@@ -253,17 +251,14 @@ class ReducedContact(RigidContact):
             share=share,
             rods=model.manifold.rods,
             stiffness=surface.stiffness,
-            face_points=self.profile.points,
-            is_flat=self.profile.is_flat,
-            face_x=self.profile.x,
+            face_x=face.plane,
             farthest=farthest,
-            reach=model.reach,
         )
         self.packed = tuple(self._jaw)
 
     def place_points(self, q: NDArray) -> NDArray:
         """See `RigidContact`."""
-        return place_contact(self._jaw.points, self._jaw.low, self._jaw.share, self.model.moves(q))
+        return _place_contact(self._jaw.points, self._jaw.low, self._jaw.share, self.model.moves(q))
 
     def begin(self, height: float) -> NDArray:
         """Return the unknowns (size,) of the unloaded jaw that is to be touched at a height [m]."""
@@ -271,14 +266,13 @@ class ReducedContact(RigidContact):
         q[-1] = np.interp(height, rods, np.arange(len(rods)))
         return q
 
-    def linearize(self, q: NDArray, place: NDArray) -> PressedState:
-        """Linearise the equilibrium with the object at a place (depth, shape, height); see `RigidContact`."""
-        traction = self._describe_traction(place)
-        return linearize_reduced(self.packed, tuple(self.indenter.pressed), tuple(traction), q, place)
+    def linearize(self, q: NDArray, x: NDArray, traction: Traction = FRICTIONLESS) -> PressedState:
+        """Linearise the equilibrium with the object in a contact state x (depth, shape, height); see `RigidContact`."""
+        return linearize_reduced(self.packed, tuple(self.indenter.pressed), tuple(traction), q, x)
 
-    def approach(self, q: NDArray, step: NDArray, place: NDArray) -> NDArray:
+    def approach(self, q: NDArray, step: NDArray, x: NDArray) -> NDArray:
         """See `RigidContact`."""
-        return approach_reduced(self.packed, tuple(self.indenter.pressed), q, step, place)
+        return _approach_reduced(self.packed, tuple(self.indenter.pressed), q, step, x)
 
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
@@ -286,10 +280,10 @@ _OPTIONS = {"cache": True, "error_model": "numpy"}
 # little of the nearest one.
 _CALM = 0.15
 # Below this grid coordinate of the depth a jaw is too little bent to tell the height by its shape.
-SHALLOW = 0.5
+_SHALLOW = 0.5
 
 
-class ReducedJaw(NamedTuple):
+class _Jaw(NamedTuple):
     """A reduced model and its contact surface for compiled code.
 
     Attributes:
@@ -301,11 +295,8 @@ class ReducedJaw(NamedTuple):
         share: of the row above in each point (p,).
         rods: heights of the grid (Z,) [m].
         stiffness: penalty of each point (p,) [N/m].
-        face_points: of the undeformed surface, x and z (h, 2) [m].
-        is_flat: whether that is a plane.
         face_x: from which depths count [m].
         farthest: distance of a shape from the stored ones that these are good for [m].
-        reach: largest change of each unknown at once (2 n + 2,).
     """
 
     moves: NDArray
@@ -316,11 +307,8 @@ class ReducedJaw(NamedTuple):
     share: NDArray
     rods: NDArray
     stiffness: NDArray
-    face_points: NDArray
-    is_flat: bool
     face_x: float
     farthest: float
-    reach: NDArray
 
 
 class _Gathered(NamedTuple):
@@ -333,7 +321,7 @@ class _Gathered(NamedTuple):
         grip: springs between the clamp and the first row (2, 2) [N/m].
         size: sum of the sizes of the forces [N].
         point: pressure centre (3,) [m], NaN without contact.
-        place: the same on the undeformed surface (3,) [m].
+        location: the same on the undeformed surface (3,) [m].
     """
 
     loads: NDArray
@@ -342,11 +330,11 @@ class _Gathered(NamedTuple):
     grip: NDArray
     size: float
     point: NDArray
-    place: NDArray
+    location: NDArray
 
 
 @njit(**_OPTIONS)
-def follow(moves, compliance, loads, q):
+def _follow(moves, compliance, loads, q):
     """Return motions (k,) [m] of a table moves (T, Z, k) with its compliance (T, Z, k, 2 n) for unknowns q."""
     count = loads.shape[2]
     m, extra, out = q[count:], np.empty(count), np.empty(moves.shape[2])
@@ -360,9 +348,9 @@ def follow(moves, compliance, loads, q):
 
 
 @njit(**_OPTIONS)
-def place_points(points, shapes, compliance, loads, q):
+def _move_tables(points, shapes, compliance, loads, q):
     """Return points (p, c) [m] moved as the table shapes (T, Z, p c) [m] and its compliance say."""
-    placed = follow(shapes, compliance, loads, q).reshape(points.shape)
+    placed = _follow(shapes, compliance, loads, q).reshape(points.shape)
     for k in range(len(points)):
         for a in range(points.shape[1]):
             placed[k, a] += points[k, a]
@@ -370,7 +358,7 @@ def place_points(points, shapes, compliance, loads, q):
 
 
 @njit(**_OPTIONS)
-def move_points(compliance, q, modes):
+def _move_points(compliance, q, modes):
     """Return the motions (p, 3, k) [m] of points whose compliance is (T, Z, 3 p, 2 n), for modes (2 n + 2, k)."""
     count, k = compliance.shape[3], modes.shape[1]
     first, last = count, 0
@@ -391,7 +379,7 @@ def move_points(compliance, q, modes):
 
 
 @njit(**_OPTIONS)
-def place_contact(points, low, share, moves):
+def _place_contact(points, low, share, moves):
     """Return contact points (p, 3) [m], moved by the rows beside them, whose motions are (2 n,) [m]."""
     placed = points.copy()
     for p in range(len(points)):
@@ -432,7 +420,7 @@ def _gather(jaw, pressed, pose, traction, points):
     """Return the contact of an object with contact points (p, 3) [m] at the rows."""
     count = jaw.loads.shape[2]
     loads, stiffness, held, grip = np.zeros((count, 5)), np.zeros((count, 7)), np.zeros((2, 5)), np.zeros((2, 2))
-    total, point, place = 0.0, np.zeros(3), np.zeros(3)
+    total, point, location = 0.0, np.zeros(3), np.zeros(3)
     out, weights = np.zeros(POINT_SHAPE), np.zeros((6, 4))
     for p in range(len(points)):
         x, z = points[p, 0], points[p, 2]
@@ -446,7 +434,7 @@ def _gather(jaw, pressed, pose, traction, points):
         total += size
         for a in range(3):
             point[a] += size * points[p, a]
-            place[a] += size * jaw.points[p, a]
+            location[a] += size * jaw.points[p, a]
         low, share = jaw.low[p], jaw.share[p]
         for i in range(2):
             row, w = low + i, (share if i else 1.0 - share)
@@ -460,18 +448,18 @@ def _gather(jaw, pressed, pose, traction, points):
             _add_springs(out, w, row, low, share, stiffness)
     for a in range(3):
         point[a] /= total
-        place[a] /= total
-    return _Gathered(loads, stiffness, held, grip, total, point, place)
+        location[a] /= total
+    return _Gathered(loads, stiffness, held, grip, total, point, location)
 
 
 @njit(**_OPTIONS)
 def _solve_rows(q, compliance, loads, stiffness):
-    """Return (2 n, 5): the step of the loads to equilibrium, and their derivatives by the place; and its motion [m].
+    """Return (2 n, 5): the step of the loads to equilibrium, and their derivatives by the state; and its motion [m].
 
     With loads p(u) of the object at the rows, springs S = -dp/du and compliance C, one step of Newton's method on
     lambda = p(u(lambda)) solves
 
-        (I + S C) [step, modes] = [p - lambda, dp/dplace].
+        (I + S C) [step, modes] = [p - lambda, dp/dx].
     """
     out, known = np.zeros(loads.shape), np.zeros(len(loads))
     for k in range(len(loads)):
@@ -524,8 +512,8 @@ def _find_share(jaw, pressed, pose, traction, points, moves, q, step):
     Along a step of the loads that moves the rows by du and contact points (p, 3) by dx, it changes by
     (lambda - p)^T du, all as far as the step has gone.
     """
-    moved = follow(jaw.moves, jaw.compliance, jaw.loads, q + step)
-    motion = place_contact(jaw.points, jaw.low, jaw.share, moved) - points
+    moved = _follow(jaw.moves, jaw.compliance, jaw.loads, q + step)
+    motion = _place_contact(jaw.points, jaw.low, jaw.share, moved) - points
     work = np.zeros(2)
     for k in range(len(moves)):
         work[0] += q[k] * (moved[k] - moves[k])
@@ -548,7 +536,7 @@ def _step_grid(jaw, q, moves, steps, size, contact):
     """Return the step (2,) of the grid coordinates after a step of the loads, and the distance from the grid [m].
 
     Args:
-        jaw: see `ReducedJaw`.
+        jaw: see `_Jaw`.
         q: unknowns (2 n + 2,).
         moves: of the rows now (2 n,) [m].
         steps: of the loads, and their derivatives (2 n, 5).
@@ -564,14 +552,14 @@ def _step_grid(jaw, q, moves, steps, size, contact):
     nearest = find_grid_step(jaw.moves, after, q[count:])
     if size <= _CALM:
         approach_grid(tables, there, q[count:], nearest)
-    if q[count] < SHALLOW and contact.size > 0.0:
-        nearest[1] = read_grid(jaw.rods, contact.place[2]) - q[count + 1]
+    if q[count] < _SHALLOW and contact.size > 0.0:
+        nearest[1] = _read_grid(jaw.rods, contact.location[2]) - q[count + 1]
         bound_grid_step(nearest, q[count:], jaw.moves)
     return nearest
 
 
 @njit(**_OPTIONS)
-def read_grid(rods, height):
+def _read_grid(rods, height):
     """Return the grid coordinate of a height [m] among rising ones (Z,) [m]."""
     last = len(rods) - 1
     if not height > rods[0]:
@@ -583,22 +571,22 @@ def read_grid(rods, height):
 
 
 @njit(**_OPTIONS)
-def linearize_reduced(jaw, pressed, traction, q, place):
+def linearize_reduced(jaw, pressed, traction, q, x):
     """Return one linearised equilibrium as `PressedState`.
 
     Plain tuples are handed over from Python several times as fast as named ones.
 
     Args:
-        jaw: `ReducedJaw` as a plain tuple.
+        jaw: `_Jaw` as a plain tuple.
         pressed: `PressedObject` as a plain tuple.
         traction: `Traction` as a plain tuple.
         q: unknowns (2 n + 2,).
-        place: depth [m], shape and height [m] of the object (3,).
+        x: depth [m], shape and height [m] of the object (3,).
     """
-    jaw, pressed, traction = ReducedJaw(*jaw), PressedObject(*pressed), Traction(*traction)
+    jaw, pressed, traction = _Jaw(*jaw), PressedObject(*pressed), Traction(*traction)
     count = jaw.loads.shape[2]
-    moves = follow(jaw.moves, jaw.compliance, jaw.loads, q)
-    points, pose = place_contact(jaw.points, jaw.low, jaw.share, moves), pose_object(pressed, jaw.face_x, place)
+    moves = _follow(jaw.moves, jaw.compliance, jaw.loads, q)
+    points, pose = _place_contact(jaw.points, jaw.low, jaw.share, moves), pose_object(pressed, jaw.face_x, x)
     contact = _gather(jaw, pressed, pose, traction, points)
     touches = contact.size > 0.0
     steps, moved = _solve_rows(q, jaw.compliance, contact.loads, contact.stiffness)
@@ -627,8 +615,8 @@ def linearize_reduced(jaw, pressed, traction, q, place):
             correction[k] *= share
         for axis in range(0, 3, 2):
             force[axis] = share * force[axis] + (1.0 - share) * q[axis // 2 : count : 2].sum()
-    away = nearest[2] / jaw.farthest
-    return PressedState(touches, correction, modes, force, force_modes, contact.point, contact.place, 1.0, size, away)
+    far = nearest[2] / jaw.farthest
+    return PressedState(touches, correction, modes, force, force_modes, contact.point, contact.location, 1.0, size, far)
 
 
 @njit(**_OPTIONS)
@@ -653,14 +641,14 @@ def _hold_base(jaw, q, contact, steps, force, force_modes):
 
 
 @njit(**_OPTIONS)
-def approach_reduced(jaw, pressed, q, step, place):
+def _approach_reduced(jaw, pressed, q, step, x):
     """Return the step of a jaw that has lost contact, cut where it meets the object again; see `linearize_reduced`."""
-    jaw, pressed = ReducedJaw(*jaw), PressedObject(*pressed)
-    low, high, pose = 0.0, 1.0, pose_object(pressed, jaw.face_x, place)
+    jaw, pressed = _Jaw(*jaw), PressedObject(*pressed)
+    low, high, pose = 0.0, 1.0, pose_object(pressed, jaw.face_x, x)
     for _ in range(BISECTIONS):
         share = 0.5 * (low + high)
-        moves = follow(jaw.moves, jaw.compliance, jaw.loads, q + share * step)
-        if measure_gap(pressed, pose, place_contact(jaw.points, jaw.low, jaw.share, moves)) < -TOUCH:
+        moves = _follow(jaw.moves, jaw.compliance, jaw.loads, q + share * step)
+        if measure_gap(pressed, pose, _place_contact(jaw.points, jaw.low, jaw.share, moves)) < -TOUCH:
             high = share
         else:
             low = share

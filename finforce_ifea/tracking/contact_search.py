@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from finforce_ifea.contact_mechanics.friction import Traction
 from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, SHAPE
 from finforce_ifea.contact_mechanics.pressed_jaw import PressedState, RigidContact, limit_step
 from finforce_ifea.settings import EstimatorSettings
@@ -87,11 +88,12 @@ class ContactSearch:
         self.state["x"][1:] += change
         self._average["count"] *= kept
 
-    def find(self, contact: RigidContact, probe: Any, dt: float, *, is_sudden: bool) -> bool:
+    def find(self, contact: RigidContact, traction: Traction, probe: Any, dt: float, *, is_sudden: bool) -> bool:
         """Find the contact in the image of `points`; False, all as it was, where too few key points agree.
 
         Args:
             contact: of the jaw with the object.
+            traction: what acts along the surface.
             probe: of its key points.
             dt: time since the last image [s].
             is_sudden: whether that did not show the speed.
@@ -105,7 +107,7 @@ class ContactSearch:
         last, moved, depth, far, in_vain = np.zeros(3), np.zeros(3), 0.0, np.inf, 0
         while not settled and iteration < self.settings.iterations and in_vain < 2:
             iteration += 1
-            pressed = contact.linearize(q, x_model)
+            pressed = contact.linearize(q, x_model, traction)
             if not pressed.touches:
                 q = q + contact.approach(q, pressed.correction, x_model)
                 continue

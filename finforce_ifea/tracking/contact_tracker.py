@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce_ifea.contact_mechanics.friction import FRICTIONLESS, constant_traction
 from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, OutlineIndenter, RoundIndenter, expect_object
 from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics, RigidContact
-from finforce_ifea.contact_mechanics.torsion import Torsion
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE
 from finforce_ifea.observation import Contact
 from finforce_ifea.settings import EstimatorSettings
@@ -27,7 +27,7 @@ from finforce_ifea.tracking.contact_state import (
 from finforce_ifea.tracking.friction import SMOOTH, Coefficient, FrictionEstimate, SlipHistory, leave_play
 from finforce_ifea.tracking.held_weight import LARGEST_RATIO, HeldWeight, project_response
 from finforce_ifea.tracking.influence import explain_offsets, measure_influence
-from finforce_ifea.tracking.lateral_load import LateralLoad
+from finforce_ifea.tracking.lateral_load import LateralLoad, Torsion
 
 _IMAGES_RELEASED = 15
 _LOST_STDDEV = 1e-3
@@ -105,7 +105,7 @@ class ContactTracker:
         self._use(0)
         height = float(np.median(self._contact.surface.heights)) if height is None else height
         self._press(RoundIndenter())
-        self._contact.set_traction_ratio(0.0)
+        self._traction = FRICTIONLESS
         self._expect(
             np.array([np.log(settings.radius), height]),
             np.array([settings.radius_log_stddev, settings.height_stddev]) ** 2,
@@ -120,10 +120,8 @@ class ContactTracker:
     def _press(self, indenter: RoundIndenter | OutlineIndenter) -> None:
         """Take another object, and what the search is allowed with it."""
         self._contact.set_indenter(indenter)
-        expectation, shapes = self._search.expectation, indenter.shape_range
-        expectation["lowest"], expectation["highest"] = shapes.low, shapes.high
-        expectation["largest_change"], expectation["settled_change"] = shapes.largest_change, shapes.settled_change
-        expectation["has_corners"] = indenter.has_corners
+        for name in ("lowest", "highest", "largest_change", "settled_change", "has_corners"):
+            self._search.expectation[name] = getattr(indenter, name)
 
     def _expect(self, mean: NDArray, variance: NDArray) -> None:
         """Expect an object of some shape and height (2,), each with its variance (2,)."""
@@ -147,16 +145,11 @@ class ContactTracker:
         else:
             return
         self._contact.set_indenter(before.indenter)
-        self._contact.set_traction_ratio(before.traction_ratio)
         self._search.resume(q)
 
     def vertices(self) -> NDArray:
         """Return the deformed mesh vertices (n, 3) [m], in mesh order."""
         return self._contact.model.vertices(self.q)
-
-    def positions(self) -> NDArray:
-        """Return the key points (K, 3) [m] of the deformed jaw."""
-        return self._contact.model.positions(self._probe, self.q)
 
     @property
     def q(self) -> NDArray:
@@ -206,18 +199,18 @@ class ContactTracker:
             measured -= self._lateral.motions + held
         self._fill(measured, tare, noise)
         is_sudden = bool(self._released or self._jumped)
-        if not self._search.find(self._contact, self._probe, dt, is_sudden=is_sudden):
+        if not self._search.find(self._contact, self._traction, self._probe, dt, is_sudden=is_sudden):
             self._search.lose(_LOST_STDDEV)
             return None
         state = self._search.state
-        state["traction_ratio"] = self._contact.traction_ratio
+        state["traction_ratio"] = self._traction.ratio
         self._jumped = bool(state["jumped"])
         self._released = self._released + 1 if state["depth"] < TOUCH_DEPTH else 0
         if self._released >= _IMAGES_RELEASED:  # the next object may be any again, and nothing hangs on the jaw yet
             self._forget_contact()
             if self.settings.held == "yes":
                 self._held.reset()
-                self._contact.set_traction_ratio(0.0)
+                self._traction = FRICTIONLESS
         if held is not None and state["converged"] and state["depth"] >= LOADED_DEPTH and not self._jumped:
             self._follow_traction(noise.gain, dt, gravity)
         self._complete(state)
@@ -263,7 +256,7 @@ class ContactTracker:
         response = tuple(project_response(each, gain) for each in (self._lateral.by_force, self._lateral.by_moment))
         search, prior = self._search, self._search.expectation["variance"]
         wanted = self._held.update(search.points, search.state, response, prior, dt, gravity)
-        self._contact.set_traction_ratio(min(max(wanted, -LARGEST_RATIO), LARGEST_RATIO))
+        self._traction = constant_traction(min(max(wanted, -LARGEST_RATIO), LARGEST_RATIO))
 
     def learn(self) -> None:
         """Learn what the last image tells of friction, which its force did not wait for."""
@@ -272,11 +265,11 @@ class ContactTracker:
         self._slides = False
         state, mean = self._search.state, self._mean
         before, known = self.slips.mobilised, self.roughness.coefficient.mean
-        self.slips.set_indenter(self._contact.indenter)
+        self._fidelities[0].contact.set_indenter(self._contact.indenter)
         expected = np.r_[state["x_model"][DEPTH], mean]
         mobilised = self.slips.follow(self.give_shape(), expected, sqrt(state["depth_variance"]), known)
         self.roughness.update(self._search.points, state, mean, self._search.expectation["variance"], before)
-        self._contact.set_traction_ratio(self.roughness.coefficient.mean * mobilised)
+        self._traction = constant_traction(self.roughness.coefficient.mean * mobilised)
 
     def resume(self, q: NDArray) -> None:
         """Start anew from the shape (size,) that another tracker has found."""
@@ -316,7 +309,7 @@ class ContactTracker:
         if is_off or not is_same:
             self._begin()
         elif after is not before:
-            change = after.field.front - before.field.front
+            change = after.pressed.front - before.pressed.front
             self._search.shift(change)
             self.slips.shift(change)
 

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from finforce.elimination import eliminate
 from finforce_ifea.contact_mechanics.friction import Friction
-from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, Indenter
+from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT
 from finforce_ifea.contact_mechanics.pressed_jaw import RigidContact, limit_step
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tracking.contact_state import ContactState
@@ -267,9 +267,8 @@ class SlipHistory:
     """
 
     def __init__(self, contact: RigidContact) -> None:
-        """Follow the object on a contact of the same jaw, whose friction is followed."""
-        self._friction = Friction(len(contact.surface.points))
-        self._contact = contact.with_friction(self._friction)
+        """Follow the object that is pressed into a jaw."""
+        self._contact, self._friction = contact, Friction(len(contact.surface.points))
         self.reset()
 
     def reset(self) -> None:
@@ -277,10 +276,6 @@ class SlipHistory:
         self.mobilised = 0.0
         self._x: NDArray | None = None
         self._friction.reset()
-
-    def set_indenter(self, indenter: Indenter) -> None:
-        """Take the object as it is pressed in from now on."""
-        self._contact.set_indenter(indenter)
 
     def shift(self, change: float) -> None:
         """Count the depth `change` [m] more, as of an object that was cut anew."""
@@ -318,10 +313,10 @@ class SlipHistory:
 
     def _press(self, q: NDArray, x: NDArray) -> bool:
         """Press the jaw of unknowns q (size,) in the next state; return False, all as it was, where that fails."""
-        contact, calm = self._contact, 1.0
+        contact, origin, calm = self._contact, np.array([-x[DEPTH], x[HEIGHT]]), 1.0
         corrected = np.zeros(contact.model.size)
         for _ in range(_ITERATIONS):
-            state = contact.linearize(q, x)
+            state = contact.linearize(q, x, self._friction.describe(origin))
             if not state.touches:
                 q = q + contact.approach(q, state.correction, x)
                 continue
@@ -330,7 +325,10 @@ class SlipHistory:
             q, corrected = q + calm * correction, correction
             if state.size < _SETTLED:
                 self._q, self._x = q, x
-                self.mobilised = contact.settle(q, x)
+                points = contact.place_points(q)
+                pressed = contact.press(points, x, self._friction.describe(origin))
+                self._friction.settle(pressed.shear, points, origin)
+                self.mobilised = pressed.mobilised
                 return True
         return False
 

@@ -1,7 +1,7 @@
 """Force at a given contact from key points, image after image, and whether they contradict its location."""
 
 from functools import cached_property, lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,14 @@ _MEDIAN_SQUARE = 2.4
 _TOLERATED_MISFIT = 2.0
 
 
+class _Load(NamedTuple):
+    """Points of a load (p, 3) [m], undeformed; the model's probes of them and of those shortly below and above each."""
+
+    points: NDArray
+    contacts: Any
+    neighbours: Any
+
+
 class GivenContactTracker:
     """Solves the inverse problem of each frame from the last state.
 
@@ -47,11 +55,10 @@ class GivenContactTracker:
         self, jaw: Jaw, mechanics: Mechanics, settings: EstimatorSettings, response: InfluenceCoefficients
     ) -> None:
         """Keep the jaw, whose key points lie on it; `response` is that of the unloaded one."""
-        self._watch = LocationWatch(response, settings)
+        self._watch = _LocationWatch(response, settings)
         self.jaw, self.mechanics, self.settings = jaw, mechanics, settings
         self.paper = settings.solver == "paper"
-        self._known: dict[tuple[float, ...], tuple[Any, Any]] = {}
-        self._load = lru_cache(maxsize=256)(self._build_load)
+        self._attach = lru_cache(maxsize=_KNOWN_LOADS)(self._attach_load)
         self.reset()
 
     @cached_property
@@ -81,10 +88,6 @@ class GivenContactTracker:
         """Return the deformed mesh vertices (n, 3) [m], in mesh order."""
         return self.mechanics.model.vertices(self.q)
 
-    def positions(self) -> NDArray:
-        """Return the key points (K, 3) [m] of the deformed jaw."""
-        return self.mechanics.model.positions(self.probe, self.q)
-
     def give_shape(self) -> NDArray:
         """Return the shape (size,) for another tracker to begin with."""
         return self.q
@@ -101,48 +104,35 @@ class GivenContactTracker:
         self._watch.follow(heights, contact.weights)
         self._weights = np.asarray(contact.weights, float)
 
-    def _build_load(self, height: float) -> tuple[NDArray, NDArray]:
-        """Return the points of a load at one height and their neighbours along the finger."""
-        surface = self.mechanics.contact.surface
-        if self.paper:
-            points = np.array([[self.jaw.face.read(height), 0.0, height]])
-        else:
+    def _attach_load(self, heights: tuple[float, ...]) -> _Load:
+        """Return the points of a load at some heights, those of one height together, attached to the model."""
+        surface, model, parts = self.mechanics.contact.surface, self.mechanics.model, []
+        low, high = surface.heights[[0, -1]]
+        for height in heights:
+            if self.paper:
+                parts.append(np.array([[self.jaw.face.read(height), 0.0, height]]))
+                continue
             row = int(np.argmin(np.abs(surface.heights - height)))
-            points = surface.points[row * surface.across : (row + 1) * surface.across].copy()
-            points[:, 2] = np.clip(height, surface.heights[0], surface.heights[-1])
-        low, high = surface.heights[0], surface.heights[-1]
-        shifted = np.repeat(points, 2, axis=0)
-        shifted[::2, 2] = np.clip(points[:, 2] - _NEIGHBOUR, low, high)
-        shifted[1::2, 2] = np.clip(points[:, 2] + _NEIGHBOUR, low, high)
-        return points, shifted
+            parts.append(surface.points[row * surface.across : (row + 1) * surface.across].copy())
+            parts[-1][:, 2] = np.clip(height, low, high)
+        points = np.concatenate(parts)
+        beside = np.repeat(points, 2, axis=0)
+        beside[:, 2] = np.clip(beside[:, 2] + np.tile([-_NEIGHBOUR, _NEIGHBOUR], len(points)), low, high)
+        return _Load(points, model.attach(points, 1e-3), model.attach(beside, 1e-3))
 
     def _problem(self, targets: NDArray, precision: NDArray | None) -> Problem:
-        parts = [self._load(height) for height in self._heights]
-        points = np.concatenate([part[0] for part in parts])
-        shares = np.repeat(self._weights, [len(part[0]) for part in parts])
-        key = tuple(self._heights)
-        contacts, neighbours = self._probes(key, points, np.concatenate([part[1] for part in parts]))
+        load = self._attach(self._heights)
         return Problem(
             effectors=self.probe,
             targets=targets,
-            contacts=contacts,
-            neighbours=neighbours,
-            weights=shares,
+            contacts=load.contacts,
+            neighbours=load.neighbours,
+            weights=np.repeat(self._weights, len(load.points) // len(self._heights)),
             axes="three" if self.settings.force_axes == "three" else "normal",
             precision=precision,
             energy_weight=self.settings.energy_weight if self.paper else 0.0,
             energy_form=self.settings.energy_form,
         )
-
-    def _probes(self, key: tuple[float, ...], points: NDArray, neighbours: NDArray) -> tuple[Any, Any]:
-        """Return the probes of a load's points and neighbours; those of the last loads are kept."""
-        if key not in self._known:
-            if len(self._known) >= _KNOWN_LOADS:
-                del self._known[next(iter(self._known))]
-            model = self.mechanics.model
-            self._known[key] = (model.attach(points, 1e-3), model.attach(neighbours, 1e-3))
-        self._probe_pair = self._known[key]
-        return self._probe_pair
 
     def update(
         self, points: NDArray, tare: Tare, dt: float, stddev: NDArray | None = None, gravity: NDArray | None = None
@@ -196,7 +186,7 @@ class GivenContactTracker:
         force, model = result.forces.sum(0), self.mechanics.model
         size = np.linalg.norm(result.forces, axis=1)
         share = size / size.sum() if size.any() else np.full(len(size), 1.0 / len(size))
-        undeformed = np.concatenate([self._load(height)[0] for height in self._heights])
+        load = self._attach(self._heights)
         covariance = result.covariance
         if self.paper:
             covariance = covariance * float(np.mean(variance[np.isfinite(targets[:, 0])]))
@@ -206,8 +196,8 @@ class GivenContactTracker:
         state["force"], state["magnitude"] = force, magnitude
         state["covariance"][:m, :m], state["force_modes"][:, :m] = covariance, result.directions
         state["stddev"] = measure_along(force, state["force_modes"].copy(), state["covariance"].copy())
-        state["pressure_point"] = share @ model.positions(self._probe_pair[0], result.q)
-        state["pressure_location"] = share @ undeformed
+        state["pressure_point"] = share @ model.positions(load.contacts, result.q)
+        state["pressure_location"] = share @ load.points
         for name in ("residual", "condition", "kkt", "iterations", "converged"):
             state[name] = getattr(result, name)
         state["misfit"] = self._misfit
@@ -241,7 +231,7 @@ _TRAVEL = 0.3
 _SUREST = 2e-3
 
 
-class LocationWatch:
+class _LocationWatch:
     """Averages where the key points would have the load, and says how far the given place can be believed.
 
     A load F at the height z moves the key points by F U(z). What is left of their residuals r once F has been fitted,

@@ -67,28 +67,22 @@ class InfluenceCoefficients:
             deviations: of the key points from their places at rest (K, 3) [m], NaN where unseen.
         """
         seen = np.isfinite(deviations[:, 0])
-        fit = self._fit(seen.tobytes())
-        loads = fit.gains @ deviations[seen][:, ::2].ravel()
-        return float(np.sqrt((np.maximum(loads, 0.0) ** 2 + fit.stddevs**2).mean()))
+        gains, stddevs = self._fit(seen.tobytes())
+        loads = gains @ deviations[seen][:, ::2].ravel()
+        return float(np.sqrt((np.maximum(loads, 0.0) ** 2 + stddevs**2).mean()))
 
-    def _fit(self, seen: bytes) -> "_PointFit":
-        """Return the fits for the key points that are seen, (K,) bool as bytes; kept, for they are mostly the same."""
+    def _fit(self, seen: bytes) -> tuple[NDArray, NDArray]:
+        """Return gains (m, 2 n) [N/m] of the key points that are seen, (K,) bool as bytes, and standard deviations [N].
+
+        They are kept, for the same points are seen most of the time.
+        """
         if seen not in self.fits:
             rows = np.frombuffer(seen, bool)
-            fits = [fit_load(motions[rows], np.full(int(rows.sum()), OFFSET_STDDEV)) for motions in self.motions]
+            fits = [_fit_load(motions[rows], np.full(int(rows.sum()), OFFSET_STDDEV)) for motions in self.motions]
+            gains, stddevs = zip(*fits, strict=True)
             self.fits.clear()
-            self.fits[seen] = _PointFit(
-                gains=np.stack([fit.gain for fit in fits]), stddevs=np.array([fit.stddev for fit in fits])
-            )
+            self.fits[seen] = np.stack(gains), np.array(stddevs)
         return self.fits[seen]
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _PointFit:
-    """Gains (m, 2 n) [N/m] of the seen key points' deviations at each height, and standard deviations (m,) [N]."""
-
-    gains: NDArray
-    stddevs: NDArray
 
 
 def measure_influence(contact: RigidContact, probe: Any, keypoints: int) -> InfluenceCoefficients:
@@ -103,7 +97,7 @@ def measure_influence(contact: RigidContact, probe: Any, keypoints: int) -> Infl
     # the ends of the surface are left out: next to the clamp a force moves hardly anything
     heights = np.linspace(low + 0.12 * (high - low), high - 0.05 * (high - low), _HEIGHTS)
     motions, stiffness = np.zeros((_HEIGHTS, keypoints, 2)), np.zeros(_HEIGHTS)
-    shape = 0.5 * (contact.indenter.shape_range.low + contact.indenter.shape_range.high)
+    shape = 0.5 * (contact.indenter.lowest + contact.indenter.highest)
     for row, height in enumerate(heights):
         q = contact.begin(height)
         place = np.array([0.0, shape, height])
@@ -119,32 +113,24 @@ def measure_influence(contact: RigidContact, probe: Any, keypoints: int) -> Infl
 _COMMON_OFFSET = 1.5e-3
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class LoadFit:
-    """Least squares of one mode: its gain (2 n,) on the offsets, and the standard deviation of what it finds."""
+def _fit_load(modes: NDArray, deviation: NDArray) -> tuple[NDArray, float]:
+    """Return the gain (2 n,) of the least squares of one mode (n, 2) on offsets of n key points, and its deviation.
 
-    gain: NDArray
-    stddev: float
-
-
-def fit_load(modes: NDArray, deviation: NDArray) -> LoadFit:
-    """Return the fit of one mode (n, 2) to offsets of n key points, each off by chance by its deviation (n,) [m].
-
-    All together are off by chance, too, as a wrong depth scale moves them alike.
+    Each is off by chance by its deviation (n,) [m]; all together are, too, as a wrong depth scale moves them alike.
     """
     common = np.broadcast_to(np.eye(2), (len(modes), 2, 2))
     design = np.concatenate([modes[:, :, None], common], axis=2) / deviation[:, None, None]
     design = np.concatenate([design.reshape(-1, 3), np.diag([0.0, 1.0, 1.0]) / _COMMON_OFFSET])
     covariance = np.linalg.pinv(design.T @ design)
     gain = (covariance @ design.T)[0, :-3] / np.repeat(deviation, 2)
-    return LoadFit(gain=gain, stddev=float(np.sqrt(max(covariance[0, 0], 1e-300))))
+    return gain, float(np.sqrt(max(covariance[0, 0], 1e-300)))
 
 
 def explain_offsets(modes: NDArray, tare: Tare, offset_stddev: float) -> float:
-    """Return by how many standard deviations one mode (K, 2) explains the offsets of a tare; see `fit_load`."""
+    """Return by how many standard deviations one mode (K, 2) explains the offsets of a tare; see `_fit_load`."""
     seen = tare.counts > 0
-    fit = fit_load(modes[seen], np.sqrt(offset_stddev**2 + tare.offset_variance(0.0)[seen]))
-    return float(fit.gain @ tare.offsets[seen][:, [0, 2]].ravel() / fit.stddev)
+    gain, stddev = _fit_load(modes[seen], np.sqrt(offset_stddev**2 + tare.offset_variance(0.0)[seen]))
+    return float(gain @ tare.offsets[seen][:, [0, 2]].ravel() / stddev)
 
 
 # An object is away that stands in front of the undeformed surface by more than this and what its place may err [m].

@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.linalg import LinearOperator, onenormest
 
-from finforce_ifea.contact_mechanics.penalty import PenaltyContact
+from finforce_ifea.contact_mechanics.indenter import PenaltyContact
 from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics, limit_step
 from finforce_ifea.errors import ContactError
-from finforce_ifea.fem.factorisation import sparse_from_banded
-from finforce_ifea.fem.model import JawModel
+from finforce_ifea.fem.model import JawModel, sparse_from_banded
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE, Jaw, load_jaw
 from finforce_ifea.jaw.jaw_file import Material
 from finforce_ifea.mechanics import build_mechanics

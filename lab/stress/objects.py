@@ -13,8 +13,7 @@ from finforce_contact.localization.section import cut_outline
 from finforce_contact.loop import ForceLoop
 from finforce_contact.mesh.object_mesh import ObjectMesh
 from finforce_contact.parameters import ContactSettings
-from finforce_ifea.contact_mechanics.indenter import OutlineIndenter, flat_profile
-from finforce_ifea.contact_mechanics.penalty import PenaltyContact
+from finforce_ifea.contact_mechanics.indenter import OutlineIndenter, PenaltyContact, flat_profile
 from finforce_ifea.errors import ContactError
 from finforce_ifea.observation import Solution
 from lab.forward_press import PressState, press_jaw
@@ -36,7 +35,7 @@ class PressedOutline:
 
     def find_origin(self, face_x: float, depth: float, height: float) -> float:
         """Return x [m] of the outline's origin at a depth and height [m]."""
-        return face_x + self._indenter.field.front - float(self._place(depth, height)[0])
+        return face_x + self._indenter.pressed.front - float(self._place(depth, height)[0])
 
     def press(self, points: NDArray, stiffness: NDArray, face_x: float, depth: float, height: float) -> PenaltyContact:
         """See `lab.forward_press.RigidObject`."""

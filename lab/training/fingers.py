@@ -8,8 +8,8 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from finforce_ifea.fem.factorisation import factorise_banded
 from finforce_ifea.fem.frame import BeamPoints, add_beams, build_beams, point_positions, shape_weights
+from finforce_ifea.fem.model import factorise_banded
 from finforce_ifea.jaw.cad.proposal import FEW
 from finforce_ifea.jaw.jaw_file import Material
 from finforce_ifea.jaw.section import order_rings

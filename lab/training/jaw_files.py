@@ -19,7 +19,7 @@ import numpy as np
 from finforce_eval.cli.parser import whole_number
 from finforce_ifea.errors import JawFileError
 from finforce_ifea.jaw.cad.make_jaw import make_jaw
-from finforce_ifea.jaw.cad.recognition import Wishes
+from finforce_ifea.jaw.cad.recognition import Overrides
 from finforce_ifea.jaw.section import order_rings
 from lab.training.commands import one_line_errors
 from lab.training.fingers import FIRST_VALIDATION, SEED, Finger, draw_finger
@@ -63,7 +63,7 @@ def write_jaws(folder: Path, wanted: int, first: int) -> list[Path]:
                 write_section(finger, folder / f"random_{number}.json"),
                 path,
                 name=path.stem,
-                wishes=Wishes(clamp_z=finger.clamped_z),
+                overrides=Overrides(clamp_z=finger.clamped_z),
             )
         except JawFileError as error:
             print(f"left out: {error}")

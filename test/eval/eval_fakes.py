@@ -8,7 +8,7 @@ import numpy as np
 
 from finforce_eval.recordings.tracks import JawTrack, KeypointTrack, PoseTrack, Recording, WrenchTrack, parse_phases
 from finforce_ifea.errors import ContactError
-from finforce_ifea.jaw.face import FaceLine
+from finforce_ifea.jaw.section import FaceLine
 from finforce_ifea.observation import Contact
 from lab.stress.stress import Family, Trial, attempt
 

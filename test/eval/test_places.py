@@ -8,7 +8,7 @@ from eval_fakes import BOX, PERIOD, START, make_recording
 
 from finforce_eval.evaluation.places import InnerSurface, true_lines
 from finforce_eval.recordings.tracks import parse_phases
-from finforce_ifea.jaw.face import FaceLine
+from finforce_ifea.jaw.section import FaceLine
 
 FACE = 0.014
 HEIGHTS = np.linspace(0.0, 0.08, 41)

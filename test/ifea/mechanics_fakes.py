@@ -10,8 +10,8 @@ import yaml
 
 from finforce_ifea.contact_mechanics.indenter import flat_profile
 from finforce_ifea.contact_mechanics.pressed_jaw import limit_step
+from finforce_ifea.fem.elements import to_tet4, to_tet10
 from finforce_ifea.fem.solid import find_mirror_nodes
-from finforce_ifea.fem.tetrahedra import to_tet4, to_tet10
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.jaw.jaw_file import Material
 from finforce_ifea.jaw.mesh import build_volume_mesh

@@ -12,13 +12,13 @@ import pytest
 from estimator_fakes import BENCH, PERIOD, circle
 from scipy.interpolate import interp1d
 
-from finforce_ifea.contact_mechanics.torsion import measure_torsion
 from finforce_ifea.errors import ContactError
 from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.jaw.calibration import Calibration, load_calibration
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.observation import Contact, ObjectOutline, Observation
 from finforce_ifea.settings import EstimatorSettings
+from finforce_ifea.tracking.lateral_load import measure_torsion
 
 TRUTH = np.load(Path(__file__).parents[1] / "data" / "shaped_bench.npz")
 CALIBRATION = Calibration(**{**load_calibration("bench").__dict__, "relaxation": ()})

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from finforce_ifea.errors import MeshError
-from finforce_ifea.fem.tetrahedra import to_tet4, to_tet10
+from finforce_ifea.fem.elements import to_tet4, to_tet10
 from finforce_ifea.jaw.attachment import attach_points, attach_surface_points, find_closest_surface
 from finforce_ifea.jaw.drawing import Rib, mesh_drawing
 from finforce_ifea.jaw.jaw import load_jaw

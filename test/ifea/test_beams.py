@@ -5,8 +5,8 @@ import pytest
 from scipy.optimize import brentq
 from scipy.special import ellipeinc, ellipk, ellipkinc
 
-from finforce_ifea.fem.factorisation import factorise_banded
 from finforce_ifea.fem.frame import Beams, add_beams
+from finforce_ifea.fem.model import factorise_banded
 
 
 def straight_beams(length, count, *, EA, EI, GA=np.inf):

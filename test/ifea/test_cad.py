@@ -16,7 +16,7 @@ from finforce_eval.cli.main import main
 from finforce_ifea.errors import JawFileError
 from finforce_ifea.jaw.cad.cad_file import read_section
 from finforce_ifea.jaw.cad.proposal import propose
-from finforce_ifea.jaw.cad.recognition import Wishes, recognize
+from finforce_ifea.jaw.cad.recognition import Overrides, recognize
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.jaw.section import order_rings
 from finforce_ifea.jaw.section_mesh import extrude_section
@@ -62,7 +62,7 @@ def test_a_finger_is_found_in_any_unit_and_any_way_round(tmp_path, surface, unit
     raw = read_section(path)
     assert not raw.taper.any()
     assert f"unit: {unit}" in raw.notes[0]
-    check_found(recognize(raw.polygon, raw.width, Wishes()))
+    check_found(recognize(raw.polygon, raw.width, Overrides()))
 
 
 def taper_surface(surface, slope, lean):
@@ -86,7 +86,7 @@ def test_a_tapered_finger_is_taken_as_symmetric_about_its_middle(tmp_path, surfa
     mesh.export(tmp_path / "finger.stl")
     raw = read_section(tmp_path / "finger.stl")
     assert any("tapered" in note for note in raw.notes)
-    finger = recognize(raw.polygon, raw.width, Wishes(), raw.taper)
+    finger = recognize(raw.polygon, raw.width, Overrides(), raw.taper)
     stretch = np.hypot(1.0, lean)  # along the walls
     assert finger.taper == pytest.approx([0.0, -0.12 * stretch], abs=2e-3)
     assert finger.width == pytest.approx(WIDTH * MILLIMETRE * stretch, abs=5e-5)
@@ -118,7 +118,7 @@ def test_a_surface_that_is_inside_out_is_turned(tmp_path, surface):
     mesh.export(tmp_path / "finger.stl")
     raw = read_section(tmp_path / "finger.stl")
     assert any("inside out" in note for note in raw.notes)
-    check_found(recognize(raw.polygon, raw.width, Wishes()))
+    check_found(recognize(raw.polygon, raw.width, Overrides()))
 
 
 def test_one_body_of_several_is_chosen(tmp_path, surface):
@@ -130,12 +130,12 @@ def test_one_body_of_several_is_chosen(tmp_path, surface):
     with pytest.raises(JawFileError, match="no number 3"):
         read_section(tmp_path / "two.stl", body=3)
     raw = read_section(tmp_path / "two.stl", body=1)
-    check_found(recognize(raw.polygon, raw.width, Wishes()))
+    check_found(recognize(raw.polygon, raw.width, Overrides()))
 
 
 def test_junctions_are_where_rib_and_band_were_drawn():
     """The centre line of rib k meets that of the inner band, 0.8 mm behind the face, where it was drawn."""
-    finger = recognize(shapely.affinity.scale(draw_polygon(), 1e-3, 1e-3, origin=(0, 0)), 0.02, Wishes())
+    finger = recognize(shapely.affinity.scale(draw_polygon(), 1e-3, 1e-3, origin=(0, 0)), 0.02, Overrides())
     heights = np.linspace(BASE + 10.0, LENGTH - 16.0, RIBS) * MILLIMETRE
     slope = 4.0 / 28.0
     for z, rib in zip(heights, finger.ribs, strict=True):
@@ -145,9 +145,9 @@ def test_junctions_are_where_rib_and_band_were_drawn():
 
 def test_wishes_go_before_guesses():
     polygon = shapely.affinity.scale(draw_polygon(), 1e-3, 1e-3, origin=(0, 0))
-    finger = recognize(polygon, 0.02, Wishes(clamp_z=0.02, face_x=0.014))
+    finger = recognize(polygon, 0.02, Overrides(clamp_z=0.02, face_x=0.014))
     assert finger.clamped_z == 0.02 and finger.face_x == pytest.approx(0.014)
-    other = recognize(polygon, 0.02, Wishes(other_face=True))
+    other = recognize(polygon, 0.02, Overrides(other_face=True))
     assert np.linalg.norm(other.inner.line[-1] - finger.inner.line[-1]) > 1e-3
 
 
@@ -156,7 +156,7 @@ def test_a_bolt_above_a_whole_cell_is_held_by_itself():
     inside = shapely.union_all([shapely.Polygon(ring) for ring in drawn.interiors])
     lug, hole = shapely.Point(-6.0, 40.0).buffer(5.0), shapely.Point(-7.0, 40.0).buffer(1.5, quad_segs=12)
     polygon = drawn.union(lug.difference(inside)).difference(hole)
-    finger = recognize(shapely.affinity.scale(polygon, 1e-3, 1e-3, origin=(0, 0)), 0.02, Wishes())
+    finger = recognize(shapely.affinity.scale(polygon, 1e-3, 1e-3, origin=(0, 0)), 0.02, Overrides())
     assert len(finger.clamped_circles) == 1
     assert finger.clamped_circles[0, 1:] == pytest.approx([0.040, 3e-3], abs=2e-4)
 
@@ -184,7 +184,7 @@ def test_a_drawing_is_read_and_needs_a_width(tmp_path, capsys, suffix, write):
     write(path, [ring.tolist() for ring in order_rings(draw_polygon())])
     raw = read_section(path)
     assert raw.width is None
-    check_found(recognize(raw.polygon, WIDTH * MILLIMETRE, Wishes()))
+    check_found(recognize(raw.polygon, WIDTH * MILLIMETRE, Overrides()))
     assert main(["jaw", str(path), "-o", str(tmp_path / "out.yaml")]) == 2
     assert "a drawing has no width; give it in metres: --width" in capsys.readouterr().err
 
@@ -207,7 +207,7 @@ def test_the_command_writes_a_jaw_that_loads(tmp_path, capsys, surface):
 
 def test_of_few_key_points_those_between_are_taken_too(tmp_path, surface):
     polygon = shapely.affinity.scale(draw_polygon(), MILLIMETRE, MILLIMETRE, origin=(0, 0))
-    finger = recognize(polygon, WIDTH * MILLIMETRE, Wishes())
+    finger = recognize(polygon, WIDTH * MILLIMETRE, Overrides())
     points = propose(finger, "few", "tpu95a").keypoints
     assert list(points)[9:14] == ["inner_clamp_1", "inner_1_2", "inner_2_3", "inner_3_4", "inner_4_tip"]
     for name, (x, _, z) in list(points.items())[9:]:

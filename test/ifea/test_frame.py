@@ -8,8 +8,8 @@ from mechanics_fakes import Press, line_stiffness
 
 from finforce_ifea.errors import MeshError
 from finforce_ifea.fem import frame as frame_module
-from finforce_ifea.fem.factorisation import BandedFactor, SparseFactor, sparse_from_banded
-from finforce_ifea.fem.frame import FrameDivisions, FrameModel
+from finforce_ifea.fem.frame import FrameModel
+from finforce_ifea.fem.model import BandedFactor, SparseFactor, sparse_from_banded
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.jaw.jaw_file import Material
 
@@ -257,11 +257,6 @@ def test_finger_without_ribs_is_two_bands():
     assert 0 < line_stiffness(model, 0.04) < line_stiffness(FrameModel(BENCH.drawing, TPU), 0.04)
 
 
-def test_divisions_below_one_are_refused():
-    with pytest.raises(MeshError, match="along_rib=0"):
-        FrameDivisions(along_rib=0)
-
-
 # ---- against the independent finite elements and the measured finger
 
 
@@ -280,7 +275,7 @@ def test_key_points_are_those_of_independent_finite_elements(bench):
 
 
 def test_finer_division_changes_the_force_by_less_than_a_percent(bench):
-    fine = FrameModel(BENCH.drawing, TPU, divisions=FrameDivisions(between_ribs=10, along_rib=8))
+    fine = FrameModel(BENCH.drawing, TPU, between_ribs=10, along_rib=8)
     forces = [Press(model, BENCH, 0.0125, 0.060).to(0.010).force for model in (bench, fine)]
     np.testing.assert_allclose(forces[0], forces[1], atol=0.01 * np.linalg.norm(forces[1]))
 

@@ -10,12 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from estimator_fakes import BENCH, PERIOD, circle, contact_with
+from estimator_fakes import BENCH, PERIOD, box, circle, contact_with
 from scipy.interpolate import interp1d
 
-from finforce_ifea.contact_mechanics.friction import Friction, apply_traction, constant_traction
+from finforce_ifea.contact_mechanics.friction import Friction, constant_traction
 from finforce_ifea.contact_mechanics.indenter import OutlineIndenter, RoundIndenter
-from finforce_ifea.contact_mechanics.penalty import PenaltyContact
 from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.jaw.calibration import Calibration, load_calibration
 from finforce_ifea.mechanics import build_chosen
@@ -35,49 +34,55 @@ def mechanics():
     return build_chosen(load_calibration("bench").apply(BENCH), EstimatorSettings())
 
 
-def flat(count=5):
-    """Points on a face that an object presses along -x with 1 N each, and the stiffness of their springs."""
-    points = np.stack([np.zeros(count), np.zeros(count), 1e-3 * np.arange(count)], axis=1)
-    forces, springs = np.zeros((count, 3)), np.zeros((count, 3, 3))
-    forces[:, 0], springs[:, 0, 0] = -1.0, 1e4
-    return PenaltyContact(forces=forces, springs=springs, by_shape=np.zeros((count, 3))), points, np.full(count, 1e4)
+class Dragged:
+    """Points of a flat face that a block presses along -x with 1 N each and drags along z."""
+
+    def __init__(self, coefficient):
+        self.friction = Friction(5, coefficient)
+        self.block, self.points = OutlineIndenter(box(0.02, 0.02)), np.zeros((5, 3))
+        self.points[:, 2] = 1e-3 * np.arange(5)
+
+    def press(self, shift=0.0, moved=0.0):
+        """The contact with the points shifted along z and the object moved."""
+        points = self.points + [0.0, 0.0, shift]
+        traction, x = self.friction.describe(np.array([0.0, moved])), np.array([1.1e-4, 0.0, moved])
+        return points, self.block.press(points, np.full(5, 1e4), 0.0, x, traction)
+
+    def settle(self, shift=0.0):
+        """Remember that contact, and how far the cone is used there."""
+        points, contact = self.press(shift)
+        self.friction.settle(contact.shear, points, np.zeros(2))
+        return contact.mobilised
 
 
 class TestCone:
     def test_a_point_that_is_dragged_pulls_back_until_it_slides(self):
-        friction, (contact, points, stiffness), rest = Friction(5, 0.5), flat(), np.zeros(2)
-        assert friction.settle(contact, points, stiffness, rest) == 0.0
-        moved = points + [0.0, 0.0, 20e-6]  # 0.2 N of 0.5
-        stuck = apply_traction(contact, moved, stiffness, friction.describe(rest))
-        np.testing.assert_allclose(stuck.forces[:, 2], -0.2)
+        face = Dragged(0.5)
+        assert face.settle() == 0.0
+        _, stuck = face.press(20e-6)  # 0.2 N of 0.5
+        np.testing.assert_allclose(stuck.forces, np.tile([-1.0, 0.0, -0.2], (5, 1)), atol=1e-9)
         assert stuck.mobilised == pytest.approx(-0.4)
-        far = apply_traction(contact, points + [0.0, 0.0, 1e-3], stiffness, friction.describe(rest))
+        _, far = face.press(1e-3)
         np.testing.assert_allclose(far.forces[:, 2], -0.5)
         assert far.mobilised == -1.0
 
     def test_an_object_that_is_dragged_takes_the_points_along(self):
-        friction, (contact, points, stiffness), rest = Friction(5, 0.5), flat(), np.zeros(2)
-        friction.settle(contact, points, stiffness, rest)
-        np.testing.assert_allclose(
-            apply_traction(contact, points, stiffness, friction.describe(np.array([0.0, 20e-6]))).forces[:, 2],
-            0.2,
-            atol=1e-12,
-        )
+        face = Dragged(0.5)
+        face.settle()
+        np.testing.assert_allclose(face.press(moved=20e-6)[1].forces[:, 2], 0.2, atol=1e-9)
 
     def test_the_way_back_begins_where_the_way_there_ended(self):
-        friction, (contact, points, stiffness), rest = Friction(5, 0.5), flat(), np.zeros(2)
-        friction.settle(contact, points, stiffness, rest)
-        friction.settle(contact, points + [0.0, 0.0, 1e-3], stiffness, rest)
-        back = apply_traction(contact, points + [0.0, 0.0, 0.95e-3], stiffness, friction.describe(rest))
-        np.testing.assert_allclose(back.forces[:, 2], 0.0, atol=1e-9)
-        friction.reset()
-        assert apply_traction(contact, points, stiffness, friction.describe(rest)).mobilised == 0.0
+        face = Dragged(0.5)
+        face.settle()
+        face.settle(1e-3)
+        np.testing.assert_allclose(face.press(0.95e-3)[1].forces[:, 2], 0.0, atol=1e-9)
+        face.friction.reset()
+        assert face.press()[1].mobilised == 0.0
 
     def test_without_friction_nothing_acts_along_the_face(self):
-        friction, (contact, points, stiffness), rest = Friction(5), flat(), np.zeros(2)
-        friction.settle(contact, points, stiffness, rest)
-        rubbed = apply_traction(contact, points + [0.0, 0.0, 1e-3], stiffness, friction.describe(rest))
-        np.testing.assert_array_equal(rubbed.forces, contact.forces)
+        face = Dragged(0.0)
+        face.settle()
+        np.testing.assert_allclose(face.press(1e-3)[1].forces, np.tile([-1.0, 0.0, 0.0], (5, 1)), atol=1e-9)
 
     @pytest.mark.parametrize("ratio", [0.0, 0.4, -0.3])
     def test_changes_at_a_constant_traction_ratio_are_derivatives(self, ratio):
@@ -86,8 +91,8 @@ class TestCone:
 
         def press(depth=1e-3, height=0.04, turn=0.0, shift=(0.0, 0.0, 0.0)):
             moved = points + shift
-            contact = RoundIndenter().press(moved, stiffness, 0.014, np.array([depth, np.log(0.0125), height]))
-            return apply_traction(contact, moved, stiffness, constant_traction(ratio + turn))
+            x = np.array([depth, np.log(0.0125), height])
+            return RoundIndenter().press(moved, stiffness, 0.014, x, constant_traction(ratio + turn))
 
         there, step = press(), 1e-8
         by_depth = (press(depth=1e-3 + step).forces - press(depth=1e-3 - step).forces) / (2 * step)
@@ -113,8 +118,7 @@ class TestHistory:
     def test_friction_is_used_as_the_independent_program_has_it(self, place, loading, unloading):
         """The share of the cone, from the force's inclination to the normal force of the model; 1 mm is left out."""
         contact, height = mechanics().contact, HEIGHTS[place]
-        history = SlipHistory(contact)
-        history.set_indenter(OutlineIndenter(circle(0.0125)))
+        history, traction = SlipHistory(contact), constant_traction(0.0)
         contact.set_indenter(OutlineIndenter(circle(0.0125)))
         depths, forces = 1e-3 * RUBBED[f"25_{place}_depth"], RUBBED[f"25_{place}_force"]
         q, last, errors = contact.begin(height), 0.0, []
@@ -122,12 +126,11 @@ class TestHistory:
             for step in np.linspace(last, depth, 1 + int(np.ceil(abs(depth - last) / 0.07e-3)))[1:]:
                 here = np.array([step, 0.0, height])
                 for _ in range(12):
-                    state = contact.linearize(q, here)
+                    state = contact.linearize(q, here, traction)
                     q = q + (state.correction if state.touches else contact.approach(q, state.correction, here))
-                contact.set_traction_ratio(0.3 * history.follow(q, here, 0.0, 0.3))
+                traction = constant_traction(0.3 * history.follow(q, here, 0.0, 0.3))
             last = depth
-            errors.append(np.linalg.norm(contact.linearize(q, here).force - force) / np.linalg.norm(force))
-        contact.set_traction_ratio(0.0)
+            errors.append(np.linalg.norm(contact.linearize(q, here, traction).force - force) / np.linalg.norm(force))
         there = np.arange(len(depths)) <= np.argmax(depths)
         assert np.sqrt(np.mean(np.array(errors)[there & (depths > 1.5e-3)] ** 2)) < loading
         assert np.sqrt(np.mean(np.array(errors)[~there & (depths > 1.5e-3)] ** 2)) < unloading

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from mechanics_fakes import shoelace_area
 
 from finforce_ifea.errors import JawFileError, MeshError
-from finforce_ifea.fem.tetrahedra import split_hexes, to_tet4, to_tet10
+from finforce_ifea.fem.elements import split_hexes, to_tet4, to_tet10
 from finforce_ifea.jaw.drawing import PRESETS, MeshDensity, Rib, mesh_drawing
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.jaw.mesh import FACES_HEX, FACES_TET, build_volume_mesh, compute_volume

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from finforce_ifea.errors import MeshError
-from finforce_ifea.fem.tetrahedra import to_tet4, to_tet10
+from finforce_ifea.fem.elements import to_tet4, to_tet10
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.jaw.mesh import compute_volume
 from finforce_ifea.jaw.mesh_file import ClampRule, read_volume_mesh

@@ -46,7 +46,7 @@ def test_cylinder_pushes_from_its_axis_in_proportion_to_the_depth(angle):
 def test_nothing_outside_is_pushed():
     point, _ = on_cylinder(-1e-9, 0.7)
     contact = cylinder(point[None])
-    for part in (contact.forces, contact.springs, contact.by_shape):
+    for part in (contact.forces, contact.springs, contact.changes):
         assert not part.any()
     outside = np.array([CENTRE[0] + HALF[0] + 1e-9, 0.0, CENTRE[1]])
     assert not box(outside[None]).forces.any()
@@ -74,7 +74,7 @@ def test_springs_are_the_negative_derivatives_of_the_forces(press):
 def test_force_derivative_by_the_radius():
     points, h = around(), 1e-7
     change = (cylinder(points, LOG_RADIUS + h).forces - cylinder(points, LOG_RADIUS - h).forces) / (2 * h)
-    np.testing.assert_allclose(cylinder(points).by_shape, change, atol=1e-5 * STIFFNESS * RADIUS)
+    np.testing.assert_allclose(cylinder(points).changes[:, :, 1], change, atol=1e-5 * STIFFNESS * RADIUS)
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from mechanics_fakes import BENCH, EDGE, TPU, bench_mechanics, block, unknowns_from_displacements, wobble
 
-from finforce_ifea.fem.factorisation import SparseFactor, order_unknowns
+from finforce_ifea.fem.model import SparseFactor, order_unknowns
 from finforce_ifea.fem.solid import SolidModel
 
 

@@ -50,7 +50,6 @@ def test_uneven_time_steps_give_the_same():
 
 def test_sudden_load_is_magnified_by_the_gain_and_decays_to_the_elastic_force():
     filter_ = Relaxation(TERMS)
-    assert filter_.gain == pytest.approx(1.45)
     filter_.update(np.zeros(3), 0.0)
     peak = filter_.update(2.0 * ALONG, 1e-9)
     np.testing.assert_allclose(peak, 2.0 * 1.45 * ALONG, rtol=1e-6)
@@ -59,7 +58,6 @@ def test_sudden_load_is_magnified_by_the_gain_and_decays_to_the_elastic_force():
 
 def test_without_branches_nothing_changes():
     filter_ = Relaxation(())
-    assert filter_.gain == 1.0
     for size in (0.0, 1.0, 0.3):
         np.testing.assert_array_equal(filter_.update(size * ALONG, 0.1), size * ALONG)
 

@@ -163,7 +163,7 @@ def test_no_load_is_lost_between_two_rows(tmp_path, name):
     face = Face(mechanics, heights[1:])
     for height in (0.0303, 0.0391, 0.0507):
         pressed = press(mechanics, jaw, height)
-        load = face.describe(pressed.q).load.reshape(-1, 2)
+        load = face.describe(pressed.q)["loads"].reshape(-1, 2)
         np.testing.assert_allclose(load.sum(0), pressed.force[[0, 2]], atol=2e-3 * np.linalg.norm(pressed.force))
         assert load[:, 0] @ heights[1:] / load[:, 0].sum() == pytest.approx(pressed.pressure_location[2], abs=2e-4)
 

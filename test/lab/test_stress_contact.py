@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from finforce_contact.localization.section import cut_outline
-from finforce_ifea.contact_mechanics.indenter import expect_object
-from finforce_ifea.contact_mechanics.penalty import build_distance_field
+from finforce_ifea.contact_mechanics.indenter import build_outline, expect_object
 from finforce_ifea.errors import ContactError
 from finforce_ifea.observation import Contact, ObjectOutline
 from finforce_ifea.settings import EstimatorSettings
@@ -81,7 +80,7 @@ def contact_of(shape):
 
 
 def test_a_field_of_single_precision_is_that_of_double():
-    double, single = (build_distance_field(outline("rod", kind).polygons) for kind in (float, np.float32))
+    double, single = (build_outline(outline("rod", kind).polygons) for kind in (float, np.float32))
     assert single.coefficients.dtype == single.segments.dtype == float
     # 60 mm have 4e-9 m of rounding
     np.testing.assert_allclose(single.coefficients, double.coefficients, atol=2e-8)

@@ -8,10 +8,10 @@ import pytest
 from mechanics_fakes import BENCH, bench_mechanics, block
 
 from finforce_ifea.errors import ContactError, MeshError
-from finforce_ifea.fem.factorisation import SparseFactor, factorise_banded
-from finforce_ifea.fem.locking import LockingWarning, measure_locking, warn_of_locking
-from finforce_ifea.fem.tetrahedra import to_tet4, to_tet10
+from finforce_ifea.fem.elements import to_tet4, to_tet10
+from finforce_ifea.fem.model import SparseFactor, factorise_banded
 from finforce_ifea.jaw.mesh import build_volume_mesh, check_connection
+from finforce_ifea.mechanics import LockingWarning, measure_locking, warn_of_locking
 from lab.forward_press import RigidCylinder, press_jaw
 from lab.stress.mechanics import (
     MODULUS,

@@ -1,27 +1,13 @@
 """From the file of a finger to its jaw file, section and picture."""
 
-from dataclasses import dataclass
 from pathlib import Path
 
 from finforce_ifea.errors import JawFileError
 from finforce_ifea.jaw.cad.cad_file import read_section
 from finforce_ifea.jaw.cad.picture import draw_finger
 from finforce_ifea.jaw.cad.proposal import propose, write_jaw
-from finforce_ifea.jaw.cad.recognition import Wishes, recognize
+from finforce_ifea.jaw.cad.recognition import Overrides, recognize
 from finforce_ifea.jaw.jaw import load_jaw
-
-
-@dataclass(frozen=True, kw_only=True)
-class MadeJaw:
-    """What was written.
-
-    Attributes:
-        files: jaw file, section, picture.
-        notes: what was found and guessed, a line each.
-    """
-
-    files: tuple[Path, ...]
-    notes: tuple[str, ...]
 
 
 def make_jaw(
@@ -33,10 +19,10 @@ def make_jaw(
     unit: str | None = None,
     body: int | None = None,
     width: float | None = None,
-    wishes: Wishes,
+    overrides: Overrides,
     picture: Path | None = None,
-) -> MadeJaw:
-    """Read a finger and write the jaw file that describes it.
+) -> tuple[list[Path], list[str]]:
+    """Read a finger and write the jaw file that describes it; return what was written, and what was found and guessed.
 
     Args:
         file: the finger, see `read_section`.
@@ -46,7 +32,7 @@ def make_jaw(
         unit: of the file; None to guess it.
         body: which one of several bodies, from 1.
         width: along y [m]; needed for drawings.
-        wishes: what is known better than the guesses.
+        overrides: what is stated in place of the guesses.
         picture: the PNG file; None for one beside the jaw file.
 
     Raises:
@@ -58,7 +44,7 @@ def make_jaw(
     if width is None:
         raise JawFileError(f"{file.name}: a drawing has no width; give it in metres: --width 0.025")
     try:
-        finger = recognize(raw.polygon, width, wishes, raw.taper)
+        finger = recognize(raw.polygon, width, overrides, raw.taper)
     except JawFileError as error:
         raise JawFileError(f"{file.name}: {error}") from error
     proposal = propose(finger, name, material)
@@ -72,4 +58,4 @@ def make_jaw(
     notes.append(f"{len(proposal.keypoints)} key points, {proposal.candidates[2]} contact candidates")
     notes.append(f"reference point {proposal.reference_note}")
     notes.append(f"{material}: {spread}, until `finforce calibrate` has measured it (--material)")
-    return MadeJaw(files=(output, section, picture), notes=tuple(notes))
+    return [output, section, picture], notes

@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce_ifea.jaw.cad.proposal import Proposal
-from finforce_ifea.jaw.cad.recognition import RecognizedFinger, find_reach
+from finforce_ifea.jaw.cad.recognition import RecognizedFinger
 from finforce_ifea.jaw.mesh import VolumeMesh
-from finforce_ifea.jaw.section import order_rings
+from finforce_ifea.jaw.section import find_reach
 
-_VIEW, _LIGHT, _PIXELS = np.array([0.75, 1.0, 0.35]), np.array([0.9, 0.5, 0.6]), 900
+_VIEW = {"elev": 16.0, "azim": 53.0}  # [deg], from the side that the camera sees
 _MATERIAL, _HELD, _INNER, _OUTER, _RIB = "#d9dee6", "#8a93a3", "#c0392b", "#2d6cb5", "#3a8f4d"
 
 
@@ -25,15 +25,15 @@ def draw_finger(finger: RecognizedFinger, proposal: Proposal, mesh: VolumeMesh, 
     """
     from matplotlib.figure import Figure
 
-    size = np.array([np.ptp(np.array(finger.polygon.exterior.coords)[:, 0]), finger.length])
+    size = np.array([np.ptp(finger.rings[0][:, 0]), finger.length])
     figure = Figure(figsize=(13.0, 9.0), layout="constrained")
     flat = figure.add_subplot(1, 2, 1)
-    solid = figure.add_subplot(1, 2, 2)
+    solid = figure.add_subplot(1, 2, 2, projection="3d", proj_type="ortho")
     _draw_section(flat, finger)
     _draw_walls(flat, finger)
     _draw_points(flat, finger, proposal, size)
     flat.set(xlabel="x / mm, towards the object", ylabel="z / mm, base to tip", aspect="equal")
-    widths = finger.read_width(np.array(finger.polygon.exterior.coords))
+    widths = finger.read_width(finger.rings[0])
     flat.set_title(f"{proposal.name}: {1e3 * size[0]:.1f} x {_say(widths)} x {1e3 * size[1]:.1f} mm")
     flat.legend(loc="upper left", fontsize=8, framealpha=0.9)
     _draw_solid(solid, mesh)
@@ -46,7 +46,7 @@ def _draw_section(axes, finger: RecognizedFinger) -> None:
     from matplotlib.path import Path as Curve
 
     vertices, codes = [], []
-    for ring in order_rings(finger.polygon):
+    for ring in finger.rings:
         vertices.append(1e3 * np.vstack([ring, ring[:1]]))
         codes.append(np.r_[Curve.MOVETO, np.full(len(ring) - 1, Curve.LINETO), Curve.CLOSEPOLY])
     curve = Curve(np.concatenate(vertices), np.concatenate(codes))
@@ -99,7 +99,7 @@ def _draw_points(axes, finger: RecognizedFinger, proposal: Proposal, size: NDArr
     first, step, count = proposal.candidates
     heights = 1e3 * (first + step * np.arange(count))
     axes.plot(
-        [1e3 * find_reach(finger.polygon, 1e-3 * height) for height in heights],
+        1e3 * find_reach(finger.polygon, 1e-3 * heights),
         heights,
         "<",
         color=_INNER,
@@ -112,24 +112,8 @@ def _draw_points(axes, finger: RecognizedFinger, proposal: Proposal, size: NDArr
 
 
 def _draw_solid(axes, mesh: VolumeMesh) -> None:
-    """Draw a mesh as seen from the camera's side, lit from there; parallel rays find what is in front."""
-    import open3d as o3d
-
-    scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(mesh.nodes.astype(np.float32), mesh.surface.astype(np.uint32))
-    view = _VIEW / np.linalg.norm(_VIEW)
-    right = np.cross([0.0, 0.0, 1.0], view)
-    right = right / np.linalg.norm(right)
-    up = np.cross(view, right)
-    flat = np.stack([mesh.nodes @ right, mesh.nodes @ up], axis=1)
-    low, high = flat.min(axis=0) - 1e-3, flat.max(axis=0) + 1e-3
-    step = (high - low).max() / _PIXELS
-    across, along = (np.arange(low[k], high[k], step) for k in (0, 1))
-    starts = across[None, :, None] * right + along[::-1, None, None] * up + 0.5 * view
-    rays = np.concatenate([starts, np.broadcast_to(-view, starts.shape)], axis=2).astype(np.float32)
-    hits = scene.cast_rays(o3d.core.Tensor(np.ascontiguousarray(rays)))
-    normals, seen = hits["primitive_normals"].numpy(), np.isfinite(hits["t_hit"].numpy())
-    light = 0.35 + 0.6 * np.clip(normals @ (_LIGHT / np.linalg.norm(_LIGHT)), 0.0, 1.0)
-    picture = np.where(seen[:, :, None], light[:, :, None] * np.array([0.87, 0.9, 1.0]), 1.0)
-    axes.imshow(picture, extent=1e3 * np.array([low[0], high[0], low[1], high[1]]), interpolation="bilinear")
+    """Draw a mesh as seen from the camera's side."""
+    axes.plot_trisurf(*(1e3 * mesh.nodes.T), triangles=mesh.surface, color=_MATERIAL, linewidth=0.0)
+    axes.view_init(**_VIEW)
+    axes.set_aspect("equal")
     axes.set_axis_off()

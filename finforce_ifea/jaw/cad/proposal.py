@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from finforce_ifea.jaw.cad.recognition import RecognizedFinger
 from finforce_ifea.jaw.jaw_file import MATERIALS
-from finforce_ifea.jaw.section import order_rings
 
 # Key points [m] above the clamp at least; candidates so far from either end of the inner face, and from each other.
 _ABOVE, _AWAY, _STEP = 1e-3, 4e-3, 4e-3
@@ -57,7 +56,7 @@ def propose(finger: RecognizedFinger, name: str, material: str) -> Proposal:
     for band in BANDS:
         for number, rib in enumerate(finger.ribs, start=1):
             x, z = getattr(rib, band)
-            if z > finger.clamped_z + _ABOVE and not _is_held(finger, x, z):
+            if z > finger.clamped_z + _ABOVE and not finger.find_clamped(np.array([[x, z]])).any():
                 places[f"{band}_{number}"] = (x, z)
     top = finger.polygon.intersection(shapely.box(-1.0, finger.length - _TIP, 1.0, 1.0)).centroid
     places["tip"] = (top.x, top.y)
@@ -88,7 +87,8 @@ def _find_middles(
         ends = {"clamp": finger.clamped_z, **ends, "tip": places["tip"][1]}
         for (below, low), (above, high) in pairwise(ends.items()):
             z = 0.5 * (low + high)
-            if not _is_held(finger, x := float(np.interp(z, line[:, 1], line[:, 0])), z):
+            x = float(np.interp(z, line[:, 1], line[:, 0]))
+            if not finger.find_clamped(np.array([[x, z]])).any():
                 found[f"{band}_{below.removeprefix(f'{band}_')}_{above.removeprefix(f'{band}_')}"] = (x, z)
     return found
 
@@ -96,12 +96,6 @@ def _find_middles(
 def _put_on_side(finger: RecognizedFinger, x: float, z: float) -> NDArray:
     """Return a place of the section on the side that the camera sees (3,) [m]."""
     return np.array([x, 0.5 * float(finger.read_width(np.array([x, z]))), z])
-
-
-def _is_held(finger: RecognizedFinger, x: float, z: float) -> bool:
-    """Whether a place is within a circle that a bolt holds."""
-    circles = finger.clamped_circles
-    return bool((np.hypot(circles[:, 0] - x, circles[:, 1] - z) <= circles[:, 2]).any())
 
 
 def _find_face_end(finger: RecognizedFinger) -> float:
@@ -130,7 +124,7 @@ def write_jaw(finger: RecognizedFinger, proposal: Proposal, path: Path, source: 
         source: name of the file that it comes from.
     """
     section = path.with_suffix(".section.json")
-    loops = [np.round(1e3 * ring, 4).tolist() for ring in order_rings(finger.polygon)]
+    loops = [np.round(1e3 * ring, 4).tolist() for ring in finger.rings]
     content = {
         "source": source,
         "unit": "mm",
@@ -139,11 +133,11 @@ def write_jaw(finger: RecognizedFinger, proposal: Proposal, path: Path, source: 
         "loops": loops,
     }
     section.write_text(json.dumps(content) + "\n", encoding="utf-8")
-    path.write_text(describe_jaw(finger, proposal, section.name, source), encoding="utf-8")
+    path.write_text(_describe_jaw(finger, proposal, section.name, source), encoding="utf-8")
     return section
 
 
-def describe_jaw(finger: RecognizedFinger, proposal: Proposal, section: str, source: str) -> str:
+def _describe_jaw(finger: RecognizedFinger, proposal: Proposal, section: str, source: str) -> str:
     """Return the text of a jaw file."""
     material = MATERIALS[proposal.material]
     first, step, count = proposal.candidates

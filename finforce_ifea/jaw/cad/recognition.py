@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from shapely import affinity
 
 from finforce_ifea.errors import JawFileError
-from finforce_ifea.jaw.section import order_rings
+from finforce_ifea.jaw.section import Section, find_reach, order_rings
 
 # A hole is round, thus a bolt's, when its area is this share of the circle's with its outline.
 _ROUND, _ROUND_POINTS = 0.955, 8
@@ -64,52 +64,31 @@ class RecognizedRib:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class RecognizedFinger:
-    """A section in the jaw frame, and its parts.
+class RecognizedFinger(Section):
+    """A section in the jaw frame, its lowest point at z = 0, and its parts.
 
     Attributes:
-        polygon: x towards the object, z from base to tip [m]; its lowest point is at z = 0.
-        width: along y [m], at x = z = 0.
-        taper: (2,) [-], change of the width along x and z.
-        cells: the rooms between bands and ribs (n, 2) each, base to tip.
         bolts: bolt holes (b, 3): x, z, radius [m].
         inner: the band that touches objects.
         outer: the other one.
         ribs: base to tip.
-        clamped_z: everything below is clamped [m].
-        clamped_circles: (c, 3), x, z and radius [m] about bolts farther up.
         face_x: plane of the inner face, x [m].
         face_deviation: how far the inner face leaves its plane [m].
         notes: what was found and guessed, a line each.
     """
 
-    polygon: shapely.Polygon
-    width: float
-    taper: NDArray
-    cells: list[NDArray]
     bolts: NDArray
     inner: Wall
     outer: Wall
     ribs: list[RecognizedRib]
-    clamped_z: float
-    clamped_circles: NDArray
     face_x: float
     face_deviation: float
     notes: list[str] = field(default_factory=list)
 
-    def read_width(self, points: NDArray) -> NDArray:
-        """Return the width (...) [m] at points (..., 2) [m] of the section."""
-        return self.width + points @ self.taper
-
-    @property
-    def length(self) -> float:
-        """From the lowest point to the end of the tip [m]."""
-        return float(self.polygon.bounds[3])
-
 
 @dataclass(frozen=True, kw_only=True)
-class Wishes:
-    """What a user knows better than the guesses.
+class Overrides:
+    """What a user states in place of the guesses.
 
     Attributes:
         flip: base and tip are the other way round.
@@ -124,13 +103,15 @@ class Wishes:
     face_x: float | None = None
 
 
-def recognize(polygon: shapely.Polygon, width: float, wishes: Wishes, taper: NDArray | None = None) -> RecognizedFinger:
+def recognize(
+    polygon: shapely.Polygon, width: float, overrides: Overrides, taper: NDArray | None = None
+) -> RecognizedFinger:
     """Find the parts of a fin-ray finger in its section.
 
     Args:
         polygon: the section [m], anyhow turned.
         width: of the finger [m], where its sides are no parallel planes that at the origin of the section.
-        wishes: what is given.
+        overrides: what is given.
         taper: (2,) [-], change of the width along the section's axes; None for none.
 
     Raises:
@@ -146,18 +127,18 @@ def recognize(polygon: shapely.Polygon, width: float, wishes: Wishes, taper: NDA
             "drawing"
         )
     notes: list[str] = []
-    turned, frame = _turn_upright(polygon, cells, wishes, notes)
+    turned, frame = _turn_upright(polygon, cells, overrides, notes)
     turned = turned.simplify(_CHORD)
     holes = [np.array(ring.coords)[:-1] for ring in turned.interiors]
     bolts = _fit_bolts([hole for hole in holes if _is_round(hole)])
     cells = _order_cells([hole for hole in holes if not _is_round(hole)])
     walls = _measure_walls(turned, cells)
     inner, outer, ribs = walls
-    clamped_z, circles = _propose_clamp(cells, bolts, inner, wishes, notes)
+    clamped_z, circles = _propose_clamp(cells, bolts, inner, overrides, notes)
     face_x, deviation = _measure_face(turned, cells, clamped_z)
     if deviation > _FLAT:
         notes.append(f"inner face curved: it leaves its plane by {1e3 * deviation:.2g} mm")
-    shift = _choose_origin(turned, clamped_z, wishes, face_x)
+    shift = _choose_origin(turned, clamped_z, overrides, face_x)
     move = np.array([shift, 0.0])
     taper = np.zeros(2) if taper is None else frame[:, :2] @ taper
     width -= float(taper @ (frame[:, 2] + move))
@@ -168,10 +149,9 @@ def recognize(polygon: shapely.Polygon, width: float, wishes: Wishes, taper: NDA
         + (f" of {_say_range(2.0 * bolts[:, 2])} mm" if len(bolts) else "")
     )
     return RecognizedFinger(
-        polygon=affinity.translate(turned, shift, 0.0),
+        rings=order_rings(affinity.translate(turned, shift, 0.0)),
         width=width,
         taper=taper,
-        cells=[cell + move for cell in cells],
         bolts=bolts + [shift, 0.0, 0.0],
         inner=Wall(line=inner.line + move, thickness=inner.thickness),
         outer=Wall(line=outer.line + move, thickness=outer.thickness),
@@ -216,7 +196,7 @@ def _order_cells(cells: list[NDArray]) -> list[NDArray]:
 
 
 def _turn_upright(
-    polygon: shapely.Polygon, cells: list[NDArray], wishes: Wishes, notes: list[str]
+    polygon: shapely.Polygon, cells: list[NDArray], overrides: Overrides, notes: list[str]
 ) -> tuple[shapely.Polygon, NDArray]:
     """Return the section with its inner face upright at the largest x, and its lowest point at z = 0.
 
@@ -228,7 +208,7 @@ def _turn_upright(
     narrow = _measure_widths(polygon, direction)
     if narrow[0] < narrow[1]:
         direction, narrow = -direction, narrow[::-1]
-    if wishes.flip:
+    if overrides.flip:
         direction = -direction
     elif narrow[1] > _NARROWER * narrow[0]:
         raise JawFileError(
@@ -252,7 +232,7 @@ def _turn_upright(
         # both are straight: the inner face stands at right angles on the base
         base = _find_base(polygon, direction)
         chosen = min(faces, key=lambda face: abs(face[1] @ base))
-    if wishes.other_face:
+    if overrides.other_face:
         chosen = faces[1] if chosen is faces[0] else faces[0]
     sign, up, deviation = chosen
     outward = sign * np.array([-up[1], up[0]])
@@ -315,17 +295,17 @@ def _find_base(polygon: shapely.Polygon, direction: NDArray) -> NDArray:
     return longest / np.linalg.norm(longest)
 
 
-def _choose_origin(polygon: shapely.Polygon, clamped_z: float, wishes: Wishes, face_x: float) -> float:
+def _choose_origin(polygon: shapely.Polygon, clamped_z: float, overrides: Overrides, face_x: float) -> float:
     """Return by how much [m] the section is moved along x: what the clamp holds is half on either side of x = 0."""
-    if wishes.face_x is not None:
-        return wishes.face_x - face_x
+    if overrides.face_x is not None:
+        return overrides.face_x - face_x
     low_x, _, high_x, high_z = polygon.bounds
     held = polygon.intersection(shapely.box(low_x, -1.0, high_x, max(clamped_z, 0.02 * high_z)))
     return -0.5 * (held.bounds[0] + held.bounds[2])
 
 
 def _propose_clamp(
-    cells: list[NDArray], bolts: NDArray, inner: Wall, wishes: Wishes, notes: list[str]
+    cells: list[NDArray], bolts: NDArray, inner: Wall, overrides: Overrides, notes: list[str]
 ) -> tuple[float, NDArray]:
     """Return the height below which everything is clamped, and circles about bolts farther up (c, 3) [m].
 
@@ -335,9 +315,9 @@ def _propose_clamp(
     base = bolts[bolts[:, 1] <= lowest_top]
     farther = bolts[bolts[:, 1] > lowest_top]
     circles = farther * [1.0, 1.0, _WASHER]
-    if wishes.clamp_z is not None:
-        notes.append(f"clamped below z = {1e3 * wishes.clamp_z:.4g} mm, as given")
-        return wishes.clamp_z, circles[circles[:, 1] > wishes.clamp_z]
+    if overrides.clamp_z is not None:
+        notes.append(f"clamped below z = {1e3 * overrides.clamp_z:.4g} mm, as given")
+        return overrides.clamp_z, circles[circles[:, 1] > overrides.clamp_z]
     if len(base):
         height = float((base[:, 1] + _GRIP * base[:, 2]).max())
         reason = f"a radius of its {len(base)} base bolts above their heads"
@@ -354,18 +334,11 @@ def _measure_face(polygon: shapely.Polygon, cells: list[NDArray], clamped_z: flo
     """Return the plane x [m] of the inner face and how far it leaves that, between the clamp and the last cell [m]."""
     low = max(clamped_z, min(float(cell[:, 1].min()) for cell in cells))
     high = max(float(cell[:, 1].max()) for cell in cells)
-    reach = np.array([find_reach(polygon, z) for z in np.linspace(low, high, 80)[1:-1]])
+    reach = find_reach(polygon, np.linspace(low, high, 80)[1:-1])
     face = float(np.median(reach))
     deviation = float(np.abs(reach - face).max())
     # of a curved face the place that is farthest in front
     return (face if deviation <= _FLAT else float(reach.max())), deviation
-
-
-def find_reach(polygon: shapely.Polygon, z: float) -> float:
-    """Return the largest x of a section at a height [m]."""
-    low_x, _, high_x, _ = polygon.bounds
-    cut = polygon.intersection(shapely.LineString([(low_x - 1.0, z), (high_x + 1.0, z)]))
-    return float(cut.bounds[2]) if not cut.is_empty else 0.0
 
 
 def _measure_walls(polygon: shapely.Polygon, cells: list[NDArray]) -> tuple[Wall, Wall, list[RecognizedRib]]:
