@@ -56,6 +56,8 @@ setup(
         "tqdm",  # progress bars
         "pandas",  # tables of forces over time and of figures, with named columns
         "pyarrow",  # these tables in Parquet files
+        "joblib",  # many recordings at once, in processes of which one that dies costs itself
+        "psutil",  # CPU time and memory of processes; joblib starts a process anew whose memory grows
     ],
     extras_require={
         # ROS 2 Jazzy for machines without it; Python 3.10 to 3.13 on x86_64

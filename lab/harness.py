@@ -19,7 +19,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from finforce_eval.errors import OptionError
-from finforce_eval.evaluation.tables import align_rows
+from finforce_eval.evaluation.tables import markdown_rows
 from finforce_eval.machine import without_nan
 
 
@@ -166,7 +166,13 @@ def format_table(table: pd.DataFrame) -> str:
     texts = [name for name in table if not pd.api.types.is_numeric_dtype(table[name])]
     ordered = table[[*texts, *(name for name in table if name not in texts)]]
     rows = [[_cell(value) for value in row] for row in ordered.itertuples(index=False)]
-    return align_rows(list(ordered), rows, texts=len(texts))
+    widths = [max(map(len, column)) for column in zip(list(ordered), *rows, strict=True)]
+    head, *padded = (
+        [cell.ljust(width) if number < len(texts) else cell.rjust(width)
+         for number, (cell, width) in enumerate(zip(row, widths, strict=True))]
+        for row in (list(ordered), *rows)
+    )  # fmt: skip
+    return "\n".join(markdown_rows(head, padded, len(texts)))
 
 
 def _cell(value: Any) -> str:

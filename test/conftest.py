@@ -13,9 +13,9 @@ settings.load_profile("finforce")
 def nothing_kept_warm():
     """Estimators that the tasks of a process share are a test's own."""
     yield
-    warm = sys.modules.get("finforce_eval.evaluation.warm")
-    if warm is not None:
-        warm.close_warm()
+    setup = sys.modules.get("finforce_eval.evaluation.setup")
+    if setup is not None:
+        setup.forget_setup()
 
 
 @pytest.fixture

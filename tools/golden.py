@@ -48,7 +48,8 @@ def run_tool(*words: str) -> str:
 def freeze_forces(folder: Path, bags: list[str], source: str) -> None:
     """Keep the series of every jaw of some recordings."""
     from finforce_eval.cli.main import parse
-    from finforce_eval.evaluation.setup import evaluate_jaws, make_setup, read_keypoints
+    from finforce_eval.evaluation.forces import evaluate_jaws
+    from finforce_eval.evaluation.setup import make_setup, read_keypoints
 
     for bag in bags:
         calibration = "twin" if source == "images" else "bench"

@@ -1,11 +1,14 @@
-"""A recording with forces beside what it held: the same messages, byte for byte, and new topics between them."""
+"""Recordings with forces next to what they held: the same messages, byte for byte, and new topics between them."""
 
 from __future__ import annotations
 
+import argparse
+import json
 import os
 import shutil
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from tempfile import mkdtemp
 from typing import Any
@@ -15,9 +18,14 @@ from numpy.typing import NDArray
 
 from finforce.errors import FinforceError, one_line
 from finforce.messages import read_stamp
-from finforce_eval.annotation.forces import reasons
 from finforce_eval.errors import RecordingError
-from finforce_eval.recordings.bags import NO_DIGEST, BagReader, open_bag
+from finforce_eval.evaluation.forces import estimate_forces, no_force_reasons
+from finforce_eval.evaluation.gripper import combine_jaws
+from finforce_eval.evaluation.keypoint_source import parse_source
+from finforce_eval.evaluation.setup import share_setup, sides_of
+from finforce_eval.machine import version, without_nan
+from finforce_eval.recordings.bags import NO_DIGEST, BagReader, bag_source, list_files, open_bag
+from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.tracks import Recording
 from finforce_eval.recordings.writer import (
     Entry,
@@ -28,9 +36,67 @@ from finforce_eval.recordings.writer import (
     wrench_message,
 )
 from finforce_eval.table import AXES, ForceSeries
+from finforce_eval.tasks import Task, hash_settings
 
 GRIPPER_FRAME = "gripper_base"
+NOTE = "annotation.json"
 _OK, _WARN = 0, 1
+
+
+def bag_task(name: str, source: Path, target: Path, options: argparse.Namespace, settings: Mapping[str, Any]) -> Task:
+    """Return the task of annotating a bag; nothing of it is read yet but its place.
+
+    `settings` are what `describe_options` says of the options. Where there is no such recording, the task says so.
+    """
+    key = hash_settings(settings, list_files(source))
+    given = {"source": source, "target": target, "options": options, "settings": hash_settings(settings), "key": key}
+    return Task(name=name, key=key, work=annotate_bag, given=given, output=str(target))
+
+
+def annotate_bag(source: Path, target: Path, options: argparse.Namespace, settings: str, key: str) -> dict[str, Any]:
+    """Write a recording with forces and return figures of it; where it is there already, a run was killed after that.
+
+    Args:
+        source: rosbag2 folder, .mcap or .db3 file.
+        target: the new folder.
+        options: of the command `annotate`.
+        settings: hash of them and of the files that they name.
+        key: of the task, which is kept beside what was written.
+
+    Raises:
+        FinforceError: the recording cannot be read, or no forces be found in it.
+        OSError: the folder cannot be written.
+    """
+    with suppress(OSError, ValueError, KeyError, TypeError):
+        note = json.loads((target / NOTE).read_text(encoding="utf-8"))
+        if note["key"] == key:
+            return note["figures"]
+    setup, keypoints = share_setup(settings, options), parse_source(options)
+    recording = read_recording(source, keypoints.pairing, sides_of(options), strict=keypoints.strict)
+    recording = keypoints.apply(replace(recording, name=source.stem))
+    jaws = estimate_forces(recording, setup)
+    messages = ForceMessages(jaws, combine_jaws(jaws))
+    figures = without_nan(_describe(jaws) | {"notes": list(recording.notes)})
+    about = {"key": key, "figures": figures, "settings": dict(setup.about), "version": version()}
+    with new_folder(target) as folder:
+        write_annotated(recording, bag_source(recording.source), messages, folder, side_file=options.side_file)
+        (folder / NOTE).write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
+    return figures
+
+
+def _describe(jaws: Mapping[str, ForceSeries]) -> dict[str, Any]:
+    """Return what is said of the forces in the manifest."""
+    sides = {}
+    for side, forces in jaws.items():
+        words, counts = np.unique(forces.column("status")[~forces.solved], return_counts=True)
+        sides[side] = {
+            "images": len(forces),
+            "answered": int(forces.solved.sum()),
+            "unanswered": dict(zip(words.tolist(), counts.tolist(), strict=True)),
+            "largest_N": float(np.nanmax(forces.magnitude)) if forces.solved.any() else float("nan"),
+        }
+    stamps = np.concatenate([forces.stamps for forces in jaws.values()])
+    return {"jaws": sides, "span_s": round(1e-9 * float(np.ptp(stamps)), 3) if len(stamps) else 0.0}
 
 
 class ForceMessages:
@@ -42,7 +108,7 @@ class ForceMessages:
     """
 
     def __init__(self, jaws: Mapping[str, ForceSeries], grasp: ForceSeries) -> None:
-        self._jaws = {side: _rows(forces, {"reason": reasons(forces)}) for side, forces in jaws.items()}
+        self._jaws = {side: _rows(forces, {"reason": no_force_reasons(forces)}) for side, forces in jaws.items()}
         self._grasp = _rows(grasp)
         self._drawn: dict[str, bool] = {}
         names = ("wrench", "wrench_stddev", "wrench_status", "contact", "markers")
@@ -126,23 +192,17 @@ def write_annotated(
         OSError: the folder cannot be written, or the disk is full.
     """
     with open_bag(source, recording.name) as bag:
-        if not side_file:
-            _refuse_same_topics(bag, forces.topics)
+        same = sorted(bag.types.keys() & forces.topics)
+        if same and not side_file:
+            raise RecordingError(
+                f"{bag.name}: has {', '.join(same)} already; expected a recording without, or --side-file, which "
+                "writes the new messages alone"
+            )
         _write(bag, recording, forces, folder, side_file=side_file)
         if len(forces):
             raise RecordingError(f"{recording.name}: the forces of {len(forces)} images are of none in the bag")
         if source.is_dir() and not side_file:
             _copy_others(source, folder)
-
-
-def _refuse_same_topics(bag: BagReader, topics: Collection[str]) -> None:
-    """Refuse a bag that has a topic which is to be added."""
-    same = sorted(bag.types.keys() & topics)
-    if same:
-        raise RecordingError(
-            f"{bag.name}: has {', '.join(same)} already; expected a recording without, or --side-file, which writes "
-            "the new messages alone"
-        )
 
 
 def _write(bag: BagReader, recording: Recording, forces: ForceMessages, folder: Path, *, side_file: bool) -> None:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from finforce_eval.evaluation.contact_source import ContactChoice, first_touch
-from finforce_eval.evaluation.evaluate import check_keypoint_count
+from finforce_eval.evaluation.forces import check_keypoint_count
 from finforce_eval.evaluation.scoring import match_truth
 from finforce_eval.recordings.tracks import Recording
 from finforce_ifea.identification import CalibrationCase, CalibrationFit, fit_calibration, identify_friction

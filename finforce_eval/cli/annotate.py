@@ -4,32 +4,19 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from shutil import rmtree
 from typing import Any
 
-from finforce_eval.annotation.bag import new_folder
-from finforce_eval.annotation.bag_task import bag_task
-from finforce_eval.annotation.bag_task import ended_before as bag_ended_before
-from finforce_eval.annotation.lerobot.dataset import ended_before as episode_ended_before
-from finforce_eval.annotation.lerobot.dataset import episode_tasks, write_dataset
-from finforce_eval.annotation.lerobot.layout import is_dataset
-from finforce_eval.cli.parser import (
-    add_calibration,
-    add_engine_options,
-    add_jaw_options,
-    add_set,
-    add_source_options,
-    read_engine,
-)
-from finforce_eval.engine.engines import run_tasks
-from finforce_eval.engine.settings import describe_options
-from finforce_eval.engine.tasks import OK, Manifest, choose_shard
+from finforce_eval.annotation.bag import bag_task, new_folder
+from finforce_eval.annotation.dataset import is_dataset
+from finforce_eval.annotation.dataset_forces import episode_tasks, write_dataset
+from finforce_eval.cli.parser import JAWS_CHOICES, add_engine_options, add_run_options, read_engine
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.keypoint_source import IMAGES
+from finforce_eval.evaluation.setup import describe_options, print_notes
 from finforce_eval.recordings.bags import name_recordings
-from finforce_eval.recordings.tracks import JAWS
+from finforce_eval.tasks import OK, Line, Manifest, choose_shard, run_tasks
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -41,17 +28,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     text = "of bags: write the new messages alone, beside the recording instead of a copy of it"
     parser.add_argument("--side-file", action="store_true", help=text)
     text = "jaws that are in the images, where no topic tells; of datasets both by default"
-    parser.add_argument("--jaws", choices=(*JAWS, "both"), help=text)
+    parser.add_argument("--jaws", choices=JAWS_CHOICES, help=text)
     text = "of datasets: the feature with the wrist camera's pictures; without it the only one"
     parser.add_argument("--images", default="", metavar="FEATURE", help=text)
     text = "of datasets: fx fy cx cy [k1 k2 p1 p2 k3] of that camera in pixels, or a JSON or YAML file"
     parser.add_argument("--intrinsics", nargs="+", metavar="NUMBER", help=text)
     text = "of datasets: what the names of the new features begin with (observation)"
     parser.add_argument("--prefix", default="observation", metavar="NAME", help=text)
-    add_jaw_options(parser)
-    add_source_options(parser)
-    add_calibration(parser)
-    add_set(parser)
+    add_run_options(parser)
     add_engine_options(parser)
 
 
@@ -64,8 +48,13 @@ def run(options: argparse.Namespace) -> int:
     datasets = {name: path for name, path in named if is_dataset(path)}
     if datasets:
         _check_dataset_options(options)
+    bags = choose_shard([(name, path) for name, path in named if name not in datasets], options.shard)
+    settings = describe_options(options)
     with manifest.alone():
-        lines = _run_bags([(name, path) for name, path in named if name not in datasets], options, manifest)
+        tasks = [bag_task(name, path, out / name, options, settings) for name, path in bags]
+        lines = run_tasks(tasks, read_engine(options), manifest)
+        for line in lines:
+            _print_outcome(line)
         for name, path in datasets.items():
             lines += _run_dataset(name, path, options, manifest)
     failed = sum(line["status"] != OK for line in lines)
@@ -94,28 +83,16 @@ def _set_unless_given(options: argparse.Namespace, change: str) -> None:
         options.detector = [*options.detector, change]
 
 
-def _run_bags(
-    named: Sequence[tuple[str, Path]], options: argparse.Namespace, manifest: Manifest
-) -> list[dict[str, Any]]:
-    """Annotate bags and say what became of each."""
-    out, settings = Path(options.out), describe_options(options)
-    tasks = [bag_task(name, path, out / name, options, settings) for name, path in choose_shard(named, options.shard)]
-    lines = run_tasks(tasks, read_engine(options), manifest, bag_ended_before)
-    for line in lines:
-        _say(line)
-    return lines
-
-
-def _run_dataset(name: str, path: Path, options: argparse.Namespace, manifest: Manifest) -> list[dict[str, Any]]:
+def _run_dataset(name: str, path: Path, options: argparse.Namespace, manifest: Manifest) -> list[Line]:
     """Annotate the episodes of a dataset, and write it anew once all of them are; say what became of each."""
     out = Path(options.out)
     parts, target = out / f".{name}.parts", out / name
     if target.exists():
         raise OptionError(f"{target}: exists already; a dataset is written to a new folder")
     parts.mkdir(exist_ok=True)
-    lines = run_tasks(episode_tasks(path, parts, options), read_engine(options), manifest, episode_ended_before)
+    lines = run_tasks(episode_tasks(path, parts, options), read_engine(options), manifest)
     for line in lines:
-        _say(line)
+        _print_outcome(line)
     if any(line["status"] != OK for line in lines):
         print(f"{name}: not written: some of its episodes failed", file=sys.stderr)
         return lines
@@ -126,14 +103,13 @@ def _run_dataset(name: str, path: Path, options: argparse.Namespace, manifest: M
     return lines
 
 
-def _say(line: dict[str, Any]) -> None:
+def _print_outcome(line: dict[str, Any]) -> None:
     """Print what became of a recording."""
     name, said = line["name"], line["error"]
     if line["status"] != OK:
         print(said if said.startswith(f"{name}: ") else f"{name}: {said}", file=sys.stderr)
         return
-    for note in line["figures"].get("notes", ()):
-        print(f"note: {name}: {note}", file=sys.stderr)
+    print_notes(name, line["figures"].get("notes", ()))
     words = [
         f"{side} {jaw['answered']} of {jaw['images']} images, {jaw['largest_N'] or 0.0:.2f} N at most"
         for side, jaw in line["figures"].get("jaws", {}).items()

@@ -5,17 +5,16 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from finforce_eval.cli.parser import add_jaw_options, add_set, add_source_options
-from finforce_eval.evaluation.setup import make_setup, read_keypoints, truth_sides
+from finforce_eval.cli.parser import BAG_HELP, add_run_options
+from finforce_eval.evaluation.forces import truth_sides
+from finforce_eval.evaluation.setup import make_setup, read_keypoints
 from finforce_ifea.jaw.calibration import name_mechanics, save_calibration
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
-    parser.add_argument("bags", nargs="+", metavar="BAG", help="rosbag2 folder, .mcap or .db3 file")
-    add_jaw_options(parser)
-    add_source_options(parser)
-    add_set(parser)
+    parser.add_argument("bags", nargs="+", metavar="BAG", help=BAG_HELP)
+    add_run_options(parser, calibration=False)
     parser.add_argument("-o", "--output", required=True, metavar="FILE", help="calibration to be written")
 
 

@@ -8,17 +8,16 @@ from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from tqdm import tqdm
-
 from finforce.errors import MissingDependencyError
 from finforce.messages import read_stamp
 from finforce_eval.cli.extrinsics import read_at_rest
-from finforce_eval.cli.parser import whole_number
+from finforce_eval.cli.parser import add_rest_options
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.at_rest import ROUNDS
 from finforce_eval.evaluation.check import FAULT, check_recording
 from finforce_eval.recordings.images import CAMERA_INFO, COMPRESSED, IMAGE
 from finforce_eval.recordings.writer import Entry, typestore, write_entries
+from finforce_eval.tasks import progress_bar
 from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC, is_compressed
 
 PICTURE = "check.png"
@@ -34,14 +33,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "if there is any, aligned depth"
     )
     parser.add_argument("--topics", nargs="*", metavar="TOPIC", help=text)
-    parser.add_argument("--jaw", default="bench", metavar="FILE", help="jaw file, or a shipped name (bench)")
-    parser.add_argument("--jaws", default="both", choices=("left", "right", "both"), help="in the images (both)")
-    text = "the camera in the gripper: robot, bench, or x,y,z,qx,qy,qz,qw; without it that of the case.json, else robot"
-    parser.add_argument("--extrinsics", metavar="POSE", help=text)
-    text = "change a parameter of the key point detector, as depth=none; repeatable"
-    parser.add_argument("--detector", action="append", default=[], metavar="NAME=VALUE", help=text)
-    text = "how many images at the beginning show the jaws open, still and unloaded (30)"
-    parser.add_argument("--images", type=whole_number(1, 100_000), default=30, metavar="N", help=text)
+    add_rest_options(parser, images=30)
     parser.add_argument("--report", default=".", metavar="DIR", help=f"where {PICTURE} is written (here)")
 
 
@@ -112,7 +104,7 @@ def _check(options: argparse.Namespace) -> int:
     source, recording = read_at_rest(options)
     if not recording.images.has_depth and "depth" not in source.parameters:
         source = replace(source, parameters={**source.parameters, "depth": "none"})
-    with tqdm(total=ROUNDS * len(recording.images), unit="image", disable=None, leave=False) as bar:
+    with progress_bar(ROUNDS * len(recording.images), "image") as bar:
         check = check_recording(recording, source, bar.update)
     for line in check.said:
         print(f"{line.level:<8}{line.text}")

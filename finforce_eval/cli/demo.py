@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import argparse
 import json
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from shutil import rmtree
 from typing import Any
 
+from finforce_eval.annotation.bag import new_folder
 from finforce_eval.cli.parser import CONTACT_HELP
 from finforce_eval.cli.replay import format_replay
+from finforce_eval.cli.twin import RecordingForm, record_scene
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.keypoint_source import IMAGES, KeypointSource
 from finforce_eval.evaluation.setup import make_setup
@@ -18,6 +21,8 @@ from finforce_eval.figures.report import write_report
 from finforce_eval.recordings.recording import DEMO, read_recording
 from finforce_eval.recordings.tracks import Recording
 from finforce_eval.replay.replay import Replay, replay
+from finforce_sim.footage import parse_size
+from finforce_sim.scenarios import build_scenario
 
 CALIBRATION = "bench"
 # the synthetic scene of a run from images, and the calibration of its finger
@@ -87,74 +92,37 @@ def format_summary(result: Replay) -> str:
     if error.rmse_N is not None:
         where = f"of {score.largest:.2f} N at most; {error.n} of {score.frames} images in the record phases answered"
         lines.append(f"Grasp force: {error.rmse_N:.3f} N RMSE, {error.max_error_N:.3f} N largest error, {where}")
-    if sight.pixel_median_px is not None:
-        median, p95 = sight.pixel_median_px, sight.pixel_p95_px
+    if sight["pixel_median_px"] is not None:
+        median, p95 = sight["pixel_median_px"], sight["pixel_p95_px"]
         lines.append(f"Key points: {median:.2f} px off in the median, {p95:.2f} px at the 95th percentile")
-    if delay.n:
-        lines.append(f"Delay: the grasp force shows {delay.median_ms:.0f} ms after its true onset")
-    elif delay.missed:
+    if delay["n"]:
+        lines.append(f"Delay: the grasp force shows {delay['median_ms']:.0f} ms after its true onset")
+    elif delay["missed"]:
         lines.append("Delay: the grasp force did not show within a second of its true onset")
     return "\n".join(lines)
 
 
 def prepare_recording(folder: Path) -> Recording:
-    """Return the recording of the demo's scene in a folder; what is there is used if it is whole and of that scene.
+    """Return the recording of the demo's scene in a folder, rendered unless it is there already.
 
     Raises:
         RecordingError: the folder holds something else than a recording of a synthetic scene.
         FinforceError: the scene cannot be rendered.
     """
-    recording = find_recording(folder)
-    if recording is None:
-        clear_folder(folder)
-        print(f"Rendering the scene {SCENE} into {folder}, once ...", flush=True)
-        _render(folder)
-        recording = read_recording(folder)
-    return replace(recording, name=SCENE)
-
-
-def find_recording(folder: Path) -> Recording | None:
-    """Return the recording in a folder if it is a whole one of the demo's scene, seed and finger, else None."""
-    if not folder.is_dir():
-        return None
-    try:
-        recording = read_recording(folder)
-    except RecordingError:
-        return None
-    # it is written after all images: without it the recording was broken off
-    wanted: dict[str, Any] = {"scene": SCENE, "seed": SEED, "finger": FINGER}
-    is_wanted = all(recording.case.get(name) == value for name, value in wanted.items())
-    return recording if is_wanted and recording.images is not None else None
-
-
-def clear_folder(folder: Path) -> None:
-    """Remove a recording that the demo has made, whole or broken off.
-
-    Raises:
-        RecordingError: the folder holds something else.
-    """
-    if not folder.exists():
-        return
-    if not (_is_synthetic(folder) or {path.name for path in folder.iterdir()} <= {f"{folder.name}.mcap"}):
+    case: dict[str, Any] = {}
+    with suppress(OSError, ValueError, TypeError):
+        case = dict(json.loads((folder / "case.json").read_text(encoding="utf-8")))
+    if folder.exists() and "scene" not in case:
         raise RecordingError(
             f"{folder}: holds something else than a recording of a synthetic scene, expected one or no such folder; "
             "move it away, or give another --report"
         )
-    rmtree(folder)
-
-
-def _is_synthetic(folder: Path) -> bool:
-    """Say whether a folder's `case.json` names a synthetic scene."""
-    try:
-        return "scene" in json.loads((folder / "case.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError, TypeError):
-        return False
-
-
-def _render(folder: Path) -> None:
-    """Render the demo's scene into a new folder, under a progress bar."""
-    from finforce_eval.cli.twin import RecordingForm, record_scene
-    from finforce_sim.footage import parse_size
-    from finforce_sim.scenarios import build_scenario
-
-    record_scene(build_scenario(SCENE), SEED, folder, camera=parse_size(SIZE), form=RecordingForm(), finger=FINGER)
+    if (case.get("scene"), case.get("seed"), case.get("finger")) == (SCENE, SEED, FINGER):
+        with suppress(RecordingError):
+            return replace(read_recording(folder, strict=True), name=SCENE)
+    if folder.exists():
+        rmtree(folder)
+    print(f"Rendering the scene {SCENE} into {folder}, once ...", flush=True)
+    with new_folder(folder) as new:
+        record_scene(build_scenario(SCENE), SEED, new, camera=parse_size(SIZE), form=RecordingForm(), finger=FINGER)
+    return replace(read_recording(folder), name=SCENE)

@@ -8,33 +8,23 @@ from contextlib import ExitStack
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from finforce_eval.cli.parser import (
-    add_calibration,
-    add_engine_options,
-    add_jaw_options,
-    add_set,
-    add_source_options,
-    read_engine,
-)
-from finforce_eval.evaluation.setup import EvaluationSetup, make_setup
-from finforce_eval.evaluation.tables import evaluation_json, format_table
+from finforce_eval.cli.parser import BAG_HELP, add_engine_options, add_run_options, read_engine
+from finforce_eval.evaluate import evaluate_many
+from finforce_eval.evaluation.setup import make_setup
+from finforce_eval.evaluation.tables import evaluation_json, format_tables
 from finforce_eval.machine import write_json
-from finforce_eval.many import ManyEvaluated, evaluate_many
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
-    parser.add_argument("bags", nargs="+", metavar="BAG", help="rosbag2 folder, .mcap or .db3 file")
-    add_jaw_options(parser)
-    add_source_options(parser)
-    add_calibration(parser)
-    add_set(parser)
+    parser.add_argument("bags", nargs="+", metavar="BAG", help=BAG_HELP)
+    add_run_options(parser)
     parser.add_argument("--json", metavar="OUT", help="write the scores as JSON")
     parser.add_argument("--report", metavar="DIR", help="write pictures and a page that shows them")
     text = (
         "write a table of every recording there (Parquet: a row for each image and jaw), and manifest.jsonl, by which "
     )
-    text += "a run that was killed goes on where it was; finforce report shows the tables"
+    text += "a run that was killed goes on where it was; finforce report shows the tables, finforce compare two of them"
     parser.add_argument("--out", metavar="DIR", help=text)
     add_engine_options(parser)
 
@@ -44,20 +34,15 @@ def run(options: argparse.Namespace) -> int:
     setup, engine = make_setup(options), read_engine(options)
     with ExitStack() as stack:
         folder = Path(options.out or stack.enter_context(TemporaryDirectory(prefix="finforce_")))
-        found = evaluate_many(options, engine, folder)
-    for name, error in found.failed.items():
+        evaluation, failed = evaluate_many(options, engine, folder)
+    for name, error in failed.items():
         print(f"failed: {error if name in error else f'{name}: {error}'}", file=sys.stderr)
-    print(format_table(found.evaluation))
-    _write(found, setup, options)
-    return 2 if found.failed else 0
-
-
-def _write(found: ManyEvaluated, setup: EvaluationSetup, options: argparse.Namespace) -> None:
-    """Write what was asked for."""
+    print(format_tables(evaluation))
     if options.json:
-        failed = {"failed": dict(found.failed)} if found.failed else {}
-        write_json(options.json, evaluation_json(found.evaluation, **failed, **setup.about))
+        more = {"failed": failed} if failed else {}
+        write_json(options.json, evaluation_json(evaluation, **more, **setup.about))
     if options.report:
         from finforce_eval.figures.report import write_overview
 
-        print(f"Report: {write_overview(found.evaluation, options.report, about=setup.about)}")
+        print(f"Report: {write_overview(evaluation, options.report, about=setup.about)}")
+    return 2 if failed else 0

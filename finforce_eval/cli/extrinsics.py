@@ -8,16 +8,16 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from finforce.camera import ImageError, decode_picture
 from finforce.transforms import pose_numbers, rotation_between
-from finforce_eval.cli.parser import whole_number
+from finforce_eval.cli.parser import add_rest_options
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.at_rest import ROUNDS, approach, first_images
 from finforce_eval.evaluation.keypoint_source import KeypointSource, build_records, choose_images, parse_source
-from finforce_eval.evaluation.setup import read_recordings
-from finforce_eval.recordings.tracks import JAWS, Recording
+from finforce_eval.evaluation.setup import read_recordings, sides_of
+from finforce_eval.recordings.tracks import Recording
+from finforce_eval.tasks import progress_bar
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints.geometry.extrinsics import Extrinsics, GridCamera, find_grid_camera
 
@@ -30,14 +30,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "the picture shows a table with holes this far apart [m]: find the camera's intrinsics and its place above it"
     )
     parser.add_argument("--grid", type=float, metavar="PITCH", help=text)
-    parser.add_argument("--jaw", default="bench", metavar="FILE", help="jaw file, or a shipped name (bench)")
-    parser.add_argument("--jaws", default="both", choices=("left", "right", "both"), help="in the images (both)")
-    text = "where the camera is about: robot, bench, or x,y,z,qx,qy,qz,qw; without it that of the case.json, else robot"
-    parser.add_argument("--extrinsics", metavar="POSE", help=text)
-    text = "change a parameter of the key point detector, as model=FOLDER; repeatable"
-    parser.add_argument("--detector", action="append", default=[], metavar="NAME=VALUE", help=text)
-    text = "how many images at the beginning show the jaws at rest (45)"
-    parser.add_argument("--images", type=whole_number(1, 100_000), default=45, metavar="N", help=text)
+    add_rest_options(parser, images=45)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -49,7 +42,7 @@ def run(options: argparse.Namespace) -> None:
     start = build_records(source.node_parameters(recording)).parameters
     recording = replace(recording, images=choose_images(recording, start.depth))
     jaws = {side: load_jaw(options.jaw, side) for side in recording.jaws}
-    with tqdm(total=ROUNDS * len(recording.images), unit="image", disable=None, leave=False) as bar:
+    with progress_bar(ROUNDS * len(recording.images), "image") as bar:
         found, _ = approach(recording, source, jaws, start.camera_pose, bar.update)
     print(format_extrinsics(found, start.camera_pose))
 
@@ -64,7 +57,7 @@ def read_at_rest(options: argparse.Namespace) -> tuple[KeypointSource, Recording
     if options.images < 5:
         raise OptionError(f"--images {options.images}: expected at least 5, the mean of which is taken")
     source = parse_source(options)
-    sides = JAWS if options.jaws == "both" else (options.jaws,)
+    sides = sides_of(options)
     (recording,) = read_recordings(options.bags, source.pairing, sides, strict=source.strict)
     recording = first_images(recording, options.images)
     return source, replace(recording, jaws={side: recording.jaws[side] for side in sides})

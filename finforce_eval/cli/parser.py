@@ -8,19 +8,19 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, NoReturn
 
 if TYPE_CHECKING:
-    from finforce_eval.engine.engines import EngineOptions
+    from finforce_eval.tasks import EngineOptions
 
 SOLVERS = ("default", "reduced", "solid", "frame", "plane", "linear", "paper")
 MESHES = ("default", "coarse", "fine")
 UNITS = ("m", "cm", "mm", "inch")
 SOURCES = ("images", "keypoints", "truth")
+JAWS_CHOICES = ("left", "right", "both")
+BAG_HELP = "rosbag2 folder, .mcap or .db3 file"
 CONTACT_HELP = (
     "contact: estimate, closest or paper, from the object's mesh and pose; fixed:Z_MM, the height of first touch above "
     "the clamped base; fixed:case takes it from the case.json beside each recording; NAME=Z_MM gives it for one "
     "recording and may be repeated. Without it estimate for a recording with mesh and poses, else fixed:case"
 )
-
-
 PICTURES = (".png", ".jpg", ".svg", ".pdf")
 
 
@@ -39,8 +39,8 @@ class Parser(argparse.ArgumentParser):
         self.exit(2, f"{self.prog}: {message} (see {self.prog} --help)\n")
 
 
-def add_jaw_options(parser: argparse.ArgumentParser) -> None:
-    """Add what names the jaw, the solver and the contact."""
+def add_run_options(parser: argparse.ArgumentParser, *, calibration: bool = True, settings: bool = True) -> None:
+    """Add what names jaw, solver, contact and key points and, where they count, calibration and single settings."""
     parser.add_argument("--jaw", default="bench", metavar="FILE", help="jaw file, or a shipped name (bench)")
     parser.add_argument("--solver", default="default", choices=SOLVERS, help="model and objective")
     parser.add_argument("--mesh", default="default", choices=MESHES, help="mesh density")
@@ -48,19 +48,35 @@ def add_jaw_options(parser: argparse.ArgumentParser) -> None:
     mesh = "object mesh (STL, OBJ, PLY, GLB) in its own frame; without it the one that each case.json names"
     parser.add_argument("--object", metavar="MESH", help=mesh)
     parser.add_argument("--object-unit", default="m", choices=UNITS, help="unit of the mesh (m)")
-
-
-def add_source_options(parser: argparse.ArgumentParser) -> None:
-    """Add what names the key points and their detector."""
     text = "key points: images, by the detector; keypoints, as recorded; truth, of a synthetic recording. Without it "
     text += "keypoints where they were recorded, else images"
     parser.add_argument("--from", dest="source", choices=SOURCES, help=text)
+    add_detector_options(parser)
+    text = "refuse a recording that is cut off or damaged; without it, it is read as far as it is good"
+    parser.add_argument("--strict", action="store_true", help=text)
+    if calibration:
+        text = "calibration file, or a shipped name; without it the jaw file's own material"
+        parser.add_argument("--calibration", metavar="FILE", help=text)
+    if settings:
+        text = "change a setting of the estimator, may be repeated; an unknown NAME lists them"
+        parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help=text)
+
+
+def add_detector_options(parser: argparse.ArgumentParser) -> None:
+    """Add what changes the key point detector."""
     text = "change a parameter of the key point detector, as model=FOLDER or detector.gate=0.004; repeatable"
     parser.add_argument("--detector", action="append", default=[], metavar="NAME=VALUE", help=text)
     text = "the camera in the gripper: robot, bench, or x,y,z,qx,qy,qz,qw; without it that of the case.json, else robot"
     parser.add_argument("--extrinsics", metavar="POSE", help=text)
-    text = "refuse a recording that is cut off or damaged; without it, it is read as far as it is good"
-    parser.add_argument("--strict", action="store_true", help=text)
+
+
+def add_rest_options(parser: argparse.ArgumentParser, images: int) -> None:
+    """Add what names jaws at rest in the first images of a recording, so many unless told otherwise."""
+    parser.add_argument("--jaw", default="bench", metavar="FILE", help="jaw file, or a shipped name (bench)")
+    parser.add_argument("--jaws", default="both", choices=JAWS_CHOICES, help="in the images (both)")
+    add_detector_options(parser)
+    text = f"how many images at the beginning show the jaws open, still and unloaded ({images})"
+    parser.add_argument("--images", type=whole_number(1, 100_000), default=images, metavar="N", help=text)
 
 
 def whole_number(least: int, most: int) -> Callable[[str], int]:
@@ -75,21 +91,9 @@ def whole_number(least: int, most: int) -> Callable[[str], int]:
     return read
 
 
-def add_calibration(parser: argparse.ArgumentParser) -> None:
-    """Add what names the calibration."""
-    text = "calibration file, or a shipped name; without it the jaw file's own material"
-    parser.add_argument("--calibration", metavar="FILE", help=text)
-
-
-def add_set(parser: argparse.ArgumentParser) -> None:
-    """Add changes of single settings."""
-    text = "change a setting of the estimator, may be repeated; an unknown NAME lists them"
-    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help=text)
-
-
 def add_engine_options(parser: argparse.ArgumentParser) -> None:
     """Add what says how many recordings are worked at, and where."""
-    from finforce_eval.engine.engines import ENGINES
+    from finforce_eval.tasks import ENGINES
 
     parser.add_argument("--engine", default=ENGINES[0], choices=ENGINES, help="how recordings are worked at")
     text = "recordings at once; without it one for each processor"
@@ -107,6 +111,6 @@ def read_engine(options: argparse.Namespace) -> EngineOptions:
     Raises:
         OptionError: a number is out of its bounds.
     """
-    from finforce_eval.engine.engines import EngineOptions
+    from finforce_eval.tasks import EngineOptions
 
     return EngineOptions(engine=options.engine, workers=options.workers, memory=options.memory, address=options.address)

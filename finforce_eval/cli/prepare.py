@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import argparse
 
-from tqdm import tqdm
-
 from finforce_eval.preparation import COMPILED, prepare
+from finforce_eval.tasks import progress_bar
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -20,7 +19,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Compile and build under a progress bar."""
     count = len(COMPILED) + len(options.jaws)
-    with tqdm(total=count, desc="preparing", unit="part", disable=None, leave=False) as bar:
+    with progress_bar(count, "part", "preparing") as bar:
         for done in prepare(options.jaws, options.calibration):
             bar.update()
             bar.write(done)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from tqdm import tqdm
 
 from finforce.optional import import_trimesh
 from finforce_contact.reconstruction.evidence import GeneratedMesh, ImageEvidence, Reconstruction, collect_evidence
@@ -51,8 +52,14 @@ def run(options: argparse.Namespace) -> None:
     check_options(options)
     evidence, color = read_evidence(options)
     generated = read_generated(options) if options.mesh else None
-    with StageBar() as bar:
-        result = reconstruct(evidence, generated, options.method or "", bar.report)
+    form = "{desc:28s} {percentage:3.0f}%|{bar:30}| {elapsed}"
+    with tqdm(total=1.0, bar_format=form, leave=False, disable=None) as bar:
+
+        def show(stage: str, share: float) -> None:
+            bar.set_description_str(stage, refresh=False)
+            bar.update(share - bar.n)
+
+        result = reconstruct(evidence, generated, options.method or "", show)
     write_result(result, Path(options.output))
     print(describe_result(result))
     print(f"Mesh: {options.output} (metres); pose: {pose_path(Path(options.output))}")
@@ -99,28 +106,6 @@ def read_generated(options: argparse.Namespace) -> GeneratedMesh:
     vertices, triangles = read_mesh(options.mesh)
     affine = read_generated_pose(options.pose)
     return GeneratedMesh(vertices=vertices, triangles=triangles, affine=affine, name=Path(options.mesh).stem)
-
-
-class StageBar:
-    """A progress bar that starts anew with each stage."""
-
-    def __enter__(self) -> StageBar:
-        """Show the bar."""
-        from tqdm import tqdm
-
-        form = "{desc:28s} {percentage:3.0f}%|{bar:30}| {elapsed}"
-        self._bar = tqdm(total=1.0, bar_format=form, leave=False, disable=None)
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        """Take the bar away."""
-        self._bar.close()
-
-    def report(self, stage: str, share: float) -> None:
-        """Show a stage and the share of it that is done."""
-        self._bar.set_description_str(stage, refresh=False)
-        self._bar.n = share
-        self._bar.refresh()
 
 
 def write_result(result: Reconstruction, output: Path) -> None:

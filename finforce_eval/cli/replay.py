@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Mapping
 from dataclasses import asdict
 
-from finforce_eval.cli.parser import add_jaw_options, add_source_options
+from finforce_eval.cli.parser import BAG_HELP, add_run_options
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.keypoint_source import parse_source
-from finforce_eval.evaluation.setup import EvaluationSetup, make_setup
-from finforce_eval.evaluation.tables import evaluation_json, format_table
+from finforce_eval.evaluation.setup import make_setup
+from finforce_eval.evaluation.tables import evaluation_json, format_tables
 from finforce_eval.machine import write_json
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.replay.replay import Playing, Replay, replay
@@ -19,10 +18,11 @@ from finforce_eval.replay.replay import Playing, Replay, replay
 
 def format_replay(result: Replay) -> str:
     """Return the table of the score, with the state of the nodes below."""
-    lines = [format_table(result.evaluation), ""]
+    lines = [format_tables(result.evaluation), ""]
     began = "images" if any(case.has("detector_ms") for case in result.evaluation.results.values()) else "key points"
     lines.append(f"Step times are from {began} out to wrench in, over the middleware and back.")
-    lines.append(f"grasp_wrench: {len(result.grasp)} messages, largest {_largest(result.grasp):.2f} N{_shown(result)}.")
+    largest = max(result.grasp.values(), default=math.nan)
+    lines.append(f"grasp_wrench: {len(result.grasp)} messages, largest {largest:.2f} N{_shown(result)}.")
     for name, state in result.health.items():
         own = " / ".join(state.get(f"callback to published {part} [ms]", "-") for part in ("p50", "p95"))
         lines.append(f"{name}: {state['message']}; refused: {state.get('refused', '-')}; in the node {own} ms")
@@ -32,21 +32,17 @@ def format_replay(result: Replay) -> str:
 def _shown(result: Replay) -> str:
     """Return in words when the grasp force showed."""
     delay = result.grasp_score.delay
-    if not delay.n:
-        return f", missed at {delay.missed} onsets" if delay.missed else ""
-    return f", above 0.1 N {delay.median_ms:.0f} ms (at most {delay.max_ms:.0f} ms) after {delay.n} true onsets"
-
-
-def _largest(values: Mapping[int, float]) -> float:
-    return max(values.values(), default=math.nan)
+    if not delay["n"]:
+        return f", missed at {delay['missed']} onsets" if delay["missed"] else ""
+    return (
+        f", above 0.1 N {delay['median_ms']:.0f} ms (at most {delay['max_ms']:.0f} ms) after {delay['n']} true onsets"
+    )
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add what names the recording and how it is played."""
-    parser.add_argument("bag", metavar="BAG", help="rosbag2 folder, .mcap or .db3 file")
-    add_jaw_options(parser)
-    add_source_options(parser)
-    parser.add_argument("--calibration", metavar="FILE", help="calibration file, or a shipped name")
+    parser.add_argument("bag", metavar="BAG", help=BAG_HELP)
+    add_run_options(parser, settings=False)
     parser.add_argument("--rate", type=float, default=1.0, help="speed; other than 1 on /clock (1)")
     parser.add_argument("--sim-time", action="store_true", help="keep the stamps, give the time on /clock")
     parser.add_argument(
@@ -75,14 +71,9 @@ def run(options: argparse.Namespace) -> None:
     recording = read_recording(options.bag, keypoints.pairing, strict=keypoints.strict)
     result = replay(recording, setup, calibration_file=calibration, playing=playing, keypoints=keypoints)
     print(format_replay(result))
-    _write(result, setup, options)
-
-
-def _write(result: Replay, setup: EvaluationSetup, options: argparse.Namespace) -> None:
-    """Write what was asked for."""
     if options.json:
         score = result.grasp_score
-        grasp = {"grasp": asdict(score.error), "grasp_delay": asdict(score.delay)}
+        grasp = {"grasp": asdict(score.error), "grasp_delay": score.delay}
         write_json(options.json, evaluation_json(result.evaluation, **grasp, **setup.about))
     if options.report:
         from finforce_eval.figures.report import write_report

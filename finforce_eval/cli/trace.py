@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from finforce_eval.cli.parser import add_jaw_options, add_source_options, picture_file
+from finforce_eval.cli.parser import BAG_HELP, add_run_options, picture_file
 from finforce_eval.evaluation.keypoint_source import parse_source
 from finforce_eval.evaluation.setup import make_setup
 from finforce_eval.machine import write_figures
@@ -17,10 +17,8 @@ from finforce_eval.replay.trace import Trace, draw_way, format_trace, read_spans
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add what names the recording, and how the stages run."""
-    parser.add_argument("bag", metavar="BAG", help="rosbag2 folder, .mcap or .db3 file")
-    add_jaw_options(parser)
-    add_source_options(parser)
-    parser.add_argument("--calibration", metavar="FILE", help="calibration file, or a shipped name")
+    parser.add_argument("bag", metavar="BAG", help=BAG_HELP)
+    add_run_options(parser, settings=False)
     parser.add_argument("--apart", action="store_true", help="every stage in a process of its own")
     parser.add_argument("--json", metavar="OUT", help="write the figures as JSON")
     parser.add_argument(
@@ -45,9 +43,9 @@ def run(options: argparse.Namespace) -> None:
             playing=playing,
             source=keypoints,
         ).log
-        sent = {stamp: time for jaw in log.jaws.values() for stamp, time in jaw.sent.items()}
+        sent = {stamp: time for times in log.sent.values() for stamp, time in times.items()}
         trace = Trace(
-            ways=read_spans(Path(folder), log.offset, sent),
+            spans=read_spans(Path(folder), log.offset, sent),
             late={stamp: 1e3 * late for stamp, late in log.grasp_latency.items()},
             images=sorted(sent),
             lost={name: state["refused"] for name, state in log.health.items() if "refused" in state},

@@ -18,7 +18,7 @@ from finforce.optional import import_cv2, import_trimesh
 from finforce.transforms import pose_numbers, quaternion_from_pose
 from finforce_eval.cli.parser import Parser, whole_number
 from finforce_eval.errors import OptionError, RecordingError
-from finforce_eval.evaluation.results import parse_changes
+from finforce_eval.evaluation.keypoint_source import parse_changes
 from finforce_eval.recordings.images import (
     CAMERA_INFO,
     COMPRESSED,

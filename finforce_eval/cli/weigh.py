@@ -6,27 +6,23 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from finforce_eval.calibration.weighing import find_holds, format_weighing, weigh
-from finforce_eval.cli.parser import add_jaw_options, add_set, add_source_options
+from finforce_eval.cli.parser import BAG_HELP, add_run_options
 from finforce_eval.errors import OptionError
-from finforce_eval.evaluation.evaluate import check_keypoint_count, find_forces
+from finforce_eval.evaluation.forces import estimate_forces
 from finforce_eval.evaluation.setup import make_setup, read_keypoints
+from finforce_eval.tasks import progress_bar
 from finforce_ifea.jaw.calibration import Calibration, name_mechanics, save_calibration
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
-    parser.add_argument("bags", nargs=1, metavar="BAG", help="rosbag2 folder, .mcap or .db3 file")
-    add_jaw_options(parser)
-    add_source_options(parser)
+    parser.add_argument("bags", nargs=1, metavar="BAG", help=BAG_HELP)
+    add_run_options(parser)
     parser.add_argument("--side", default="left", choices=("left", "right"), help="the jaw that pressed (left)")
     text = "what the scale showed at the end of each hold, in their order; without it the holds are listed"
     parser.add_argument("--grams", nargs="+", type=float, metavar="G", help=text)
-    text = "calibration that is scaled, a file or a shipped name; without it the jaw file's own material"
-    parser.add_argument("--calibration", metavar="FILE", help=text)
-    add_set(parser)
     parser.add_argument("-o", "--output", metavar="FILE", help="calibration to be written; needs --grams")
 
 
@@ -36,11 +32,9 @@ def run(options: argparse.Namespace) -> None:
         raise OptionError("-o needs --grams: the readings of the scale, one for each hold")
     setup = make_setup(options).side(options.side)
     (recording,) = read_keypoints(options, (options.side,))
-    check_keypoint_count(recording, options.side, setup.jaw)
     stamps = recording.jaw(options.side).keypoints.stamps
-    with tqdm(total=len(stamps), unit="frame", desc=recording.name, disable=None, leave=False) as bar:
-        estimator, source = setup.estimator(), setup.source(recording)
-        forces = find_forces(recording, options.side, setup.jaw, estimator, source, progress=bar.update)
+    with progress_bar(len(stamps), "frame", recording.name) as bar:
+        forces = estimate_forces(recording, setup, [options.side], strict=True, progress=bar.update)[options.side]
     holds = find_holds((stamps - stamps[0]) * 1e-9, np.abs(forces.force[:, 0]))
     if not options.grams:
         for number, hold in enumerate(holds, 1):

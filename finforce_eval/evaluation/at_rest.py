@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from finforce.transforms import pose_numbers
 from finforce_eval.errors import RecordingError
-from finforce_eval.evaluation.keypoint_source import Detector, KeypointSource
+from finforce_eval.evaluation.keypoint_source import KeypointSource
 from finforce_eval.recordings.tracks import Recording
 from finforce_ifea.jaw.jaw import Jaw
+from finforce_keypoints.detector import KeypointDetector
 from finforce_keypoints.geometry.extrinsics import Extrinsics, SeenJaw, find_extrinsics
 
 ROUNDS = 4  # of finding the key points with the place found before
@@ -42,7 +43,7 @@ class RestLook:
 
 
 def look_at_rest(
-    recording: Recording, detector: Detector, jaws: Mapping[str, Jaw], progress: Callable[[int], Any]
+    recording: Recording, detector: KeypointDetector, jaws: Mapping[str, Jaw], progress: Callable[[int], Any]
 ) -> RestLook:
     """Average the pixels of the key points over the images.
 

@@ -87,14 +87,13 @@ def check_recording(
     try:
         found, look = approach(recording, source, jaws, parameters.camera_pose, progress)
     except (RecordingError, KeypointError, ImageError) as error:
-        said.append(Said(FAULT, f"no jaw to rely on: {_trim(error)}"))
+        said.append(Said(FAULT, f"no jaw to rely on: {one_line(error)}"))
         said += _find_reasons(mean, source, recording, parameters.camera_pose)
         return Check(said=said, picture=_draw(mean, jaws, parameters.camera_pose, None, None))
-    said += [
-        Said(OK, f"{side} jaw: {_count(jaw)} of {len(jaw.pixels)} key points seen") for side, jaw in look.jaws.items()
-    ]
-    lines = _judge_place(found, look, recording, parameters.camera_pose)
-    said += lines
+    for side, jaw in look.jaws.items():
+        seen = np.isfinite(jaw.pixels).all(axis=1)
+        said.append(Said(OK, f"{side} jaw: {seen.sum()} of {len(seen)} key points seen"))
+    said += _judge_place(found, look, recording, parameters.camera_pose)
     if found.residual > GOOD_RESIDUAL:
         said += _find_reasons(mean, source, recording, parameters.camera_pose)
     picture = _draw(mean, jaws, parameters.camera_pose, found, look)
@@ -103,30 +102,18 @@ def check_recording(
 
 def judge_picture(color: NDArray) -> list[Said]:
     """Return what speaks against a picture (h, w, 3) uint8, best a mean of many: light, focus, something before it."""
-    cv2 = import_cv2()
-    grey = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    said, level = [], float(grey.mean())
+    grey = import_cv2().cvtColor(color, import_cv2().COLOR_RGB2GRAY).astype(np.float32)
+    said, level, sharpness = [], float(grey.mean()), measure_sharpness(grey)
     if not DARK <= level <= BRIGHT:
-        said.append(
-            Said(WARNING, f"mean brightness {level:.0f} of 255; expected {DARK:g} to {BRIGHT:g}: more or less light")
-        )
-    sharpness = measure_sharpness(grey)
+        text = f"mean brightness {level:.0f} of 255; expected {DARK:g} to {BRIGHT:g}: more or less light"
+        said.append(Said(WARNING, text))
     if sharpness < BLURRED:
-        said.append(
-            Said(FAULT, f"out of focus: fine detail {sharpness:.2f} of coarse; expected {BLURRED:g}: focus the lens")
-        )
-    rows, columns = (np.linspace(0, size, TILES + 1).astype(int) for size in grey.shape)
-    flat = [
-        float(grey[r0:r1, c0:c1].std()) < FLAT
-        for r0, r1 in zip(rows[:-1], rows[1:], strict=True)
-        for c0, c1 in zip(columns[:-1], columns[1:], strict=True)
-    ]
-    if np.mean(flat) > COVERED:
-        said.append(
-            Said(
-                WARNING, f"{100 * np.mean(flat):.0f} % of the picture show nothing at all: is the lens partly covered?"
-            )
-        )
+        text = f"out of focus: fine detail {sharpness:.2f} of coarse; expected {BLURRED:g}: focus the lens"
+        said.append(Said(FAULT, text))
+    tiles = [part for row in np.array_split(grey, TILES) for part in np.array_split(row, TILES, axis=1)]
+    flat = 100.0 * np.mean([part.std() < FLAT for part in tiles])
+    if flat > 100.0 * COVERED:
+        said.append(Said(WARNING, f"{flat:.0f} % of the picture show nothing at all: is the lens partly covered?"))
     return said or [Said(OK, f"brightness {level:.0f} of 255, fine detail {sharpness:.2f} of coarse")]
 
 
@@ -218,14 +205,13 @@ def fit_focal(jaws: Mapping[str, SeenJaw], camera: CameraIntrinsics, found: Extr
 
 def _find_reasons(mean: RgbdImage, source: KeypointSource, recording: Recording, guess: NDArray) -> list[Said]:
     """Return which other reading of picture, extrinsics or jaw file shows the jaws better."""
-    own = _try(mean, source, recording, guess, lambda image, T: (image, T, None))
-    best = max(
-        ((_try(mean, source, recording, guess, change), words) for words, change in _readings(source)),
-        key=lambda entry: entry[0],
-        default=(0.0, ""),
-    )
-    if best[0] > max(own + BETTER, ENOUGH):
-        return [Said(FAULT, f"the jaws show (likelihood {best[0]:.2f} instead of {own:.2f}) if {best[-1]}")]
+    own = _score(mean, source, recording, guess)
+    best, words = own, ""
+    for text, image, pose, jaw_file in _readings(mean, source, guess):
+        likelihood = _score(image, replace(source, jaw_file=jaw_file), recording, pose)
+        best, words = max((best, words), (likelihood, text), key=lambda entry: entry[0])
+    if best > max(own + BETTER, ENOUGH):
+        return [Said(FAULT, f"the jaws show (likelihood {best:.2f} instead of {own:.2f}) if {words}")]
     return [
         Said(
             WARNING,
@@ -235,58 +221,25 @@ def _find_reasons(mean: RgbdImage, source: KeypointSource, recording: Recording,
     ]
 
 
-def _try(mean: RgbdImage, source: KeypointSource, recording: Recording, guess: NDArray, change: Callable) -> float:
-    """Return how likely the jaws are in another reading."""
-    try:
-        image, pose, jaw = change(mean, guess)
-        return _score(image, replace(source, jaw_file=jaw or source.jaw_file), recording, pose)
-    except FinforceError:
-        return 0.0
-
-
-def _readings(source: KeypointSource) -> Iterator[tuple[str, Callable]]:
-    """Yield other readings: in words, and as a change of image and extrinsics."""
-    yield (
-        "the picture is turned upside down: rotate it, or turn T_gripper_camera by 180 degrees",
-        lambda i, T: (
-            _flip(i, rows=True, columns=True),
-            T,
-            None,
-        ),
-    )
-    yield (
-        "the picture is mirrored: switch that off in the camera's driver",
-        lambda i, T: (
-            _flip(i, rows=False, columns=True),
-            T,
-            None,
-        ),
-    )
-    yield (
-        "T_gripper_camera is inverted, the gripper in the camera's frame: give its inverse",
-        lambda i, T: (
-            i,
-            invert_pose(T),
-            None,
-        ),
-    )
-    yield (
-        "T_gripper_camera is of the camera's body (x ahead): give that of its optical frame (z ahead)",
-        lambda i, T: (
-            i,
-            T @ _pose_of(Rotation.from_matrix([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])),
-            None,
-        ),
-    )
-    yield (
+def _readings(image: RgbdImage, source: KeypointSource, T: NDArray) -> Iterator[tuple[str, RgbdImage, NDArray, str]]:
+    """Yield other readings: in words, and the image, the extrinsics and the jaw file by them."""
+    own = source.jaw_file
+    turned, mirrored = _flip(image, rows=True, columns=True), _flip(image, rows=False, columns=True)
+    yield "the picture is turned upside down: rotate it, or turn T_gripper_camera by 180 degrees", turned, T, own
+    yield "the picture is mirrored: switch that off in the camera's driver", mirrored, T, own
+    body = _pose_of(Rotation.from_matrix([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]))
+    poses = {
+        "T_gripper_camera is inverted, the gripper in the camera's frame: give its inverse": invert_pose(T),
+        "T_gripper_camera is of the camera's body (x ahead): give that of its optical frame (z ahead)": T @ body,
         "the camera is on the other side of the gripper: turn T_gripper_camera by half a turn about the gripper's z, "
-        "left and right change places",
-        lambda i, T: (i, HALF_TURN @ T, None),
-    )
-    yield "the quaternion of T_gripper_camera begins with w: give x y z w", lambda i, T: (i, _reorder(T), None)
+        "left and right change places": HALF_TURN @ T,
+        "the quaternion of T_gripper_camera begins with w: give x y z w": _reorder(T),
+    }
+    for words, pose in poses.items():
+        yield words, image, pose, own
     for name in list_shipped_jaws():
-        if name != source.jaw_file and load_jaw(name).model != "frame":
-            yield f"the finger is {name}: give its jaw file", lambda i, T, name=name: (i, T, name)
+        if name != own and load_jaw(name).model != "frame":
+            yield f"the finger is {name}: give its jaw file", image, T, name
 
 
 def _pose_of(rotation: Rotation) -> NDArray:
@@ -313,14 +266,17 @@ def _flip(image: RgbdImage, *, rows: bool, columns: bool) -> RgbdImage:
 
 
 def _score(image: RgbdImage, source: KeypointSource, recording: Recording, pose: NDArray) -> float:
-    """Return the mean likelihood of the key points, the jaws looked for all along the closing axis."""
+    """Return the mean likelihood of the key points, looked for all along the closing axis; 0 where nothing can be."""
     from finforce_keypoints.build import build_pixel_detector
     from finforce_keypoints.parameters import load_jaws
 
-    given = {**source.node_parameters(recording), "T_gripper_camera": [float(number) for number in pose_numbers(pose)]}
-    parameters, settings, dots = build_records(given)
-    pixel_detector = build_pixel_detector(load_jaws(parameters), parameters, settings, dots)
-    found = pixel_detector.detect(image, dict.fromkeys(recording.jaws))
+    given = {**source.node_parameters(recording), "T_gripper_camera": list(pose_numbers(pose))}
+    try:
+        parameters, settings, dots = build_records(given)
+        pixel_detector = build_pixel_detector(load_jaws(parameters), parameters, settings, dots)
+        found = pixel_detector.detect(image, dict.fromkeys(recording.jaws))
+    except FinforceError:
+        return 0.0
     return float(np.mean([found[side].likelihood.mean() if side in found else 0.0 for side in recording.jaws]))
 
 
@@ -351,11 +307,3 @@ def _draw(
         for x, y in jaw.pixels[np.isfinite(jaw.pixels).all(axis=1)]:
             cv2.circle(picture, (round(8 * x), round(8 * y)), 24, SEEN, 1, cv2.LINE_AA, 3)
     return picture
-
-
-def _count(jaw: SeenJaw) -> int:
-    return int(np.isfinite(jaw.pixels).all(axis=1).sum())
-
-
-def _trim(error: Exception) -> str:
-    return one_line(error)

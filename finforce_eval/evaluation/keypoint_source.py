@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from time import perf_counter
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,14 +17,15 @@ from finforce.errors import FinforceError
 from finforce.stamps import NANOSECONDS
 from finforce.transforms import quaternion_from_pose
 from finforce_eval.errors import OptionError, RecordingError
-from finforce_eval.evaluation.results import parse_changes
 from finforce_eval.recordings.images import DEPTH_ENDS, PAIRED, ImageTrack
 from finforce_eval.recordings.tracks import DetectionTrack, JawTrack, KeypointTrack, PoseTrack, Recording
+from finforce_eval.tasks import progress_bar
 from finforce_keypoints.errors import KeypointError
-from finforce_keypoints.images import RgbdImage
 
 if TYPE_CHECKING:
+    from finforce_keypoints.detector import KeypointDetector
     from finforce_keypoints.detectors.dots import DotSettings
+    from finforce_keypoints.geometry.jaw_localizer import JawKeypoints
     from finforce_keypoints.parameters import DetectorParameters, DetectorSettings
 
 SOURCES = IMAGES, KEYPOINTS, TRUTH = ("images", "keypoints", "truth")
@@ -39,6 +39,7 @@ DECIDED = {
     "depth_topic": _BY_ENDS,
     "info_topic": _BY_ENDS,
 }
+_SWITCHES = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
 LIVE = ("max_age", "restart_gap", "diagnostics_period")  # without meaning where no clock runs
 
 
@@ -110,7 +111,7 @@ class KeypointSource:
         jaws = "both" if len(sides) == 2 else sides[0]
         return {"jaws": jaws, "jaw_file": self.jaw_file, **own, **self.parameters}
 
-    def build(self, recording: Recording) -> Detector:
+    def build(self, recording: Recording) -> KeypointDetector:
         """Return a fresh detector for a recording.
 
         Raises:
@@ -132,12 +133,10 @@ class KeypointSource:
         return PAIRED if seconds is None else round(seconds * NANOSECONDS)
 
     def _detect(self, recording: Recording) -> Recording:
-        from tqdm import tqdm
-
         detector, parameters = self.build(recording), build_records(self.node_parameters(recording)).parameters
         images = choose_images(recording, parameters.depth)
         recording = replace(recording, images=replace(images, depth_scale=parameters.depth_scale))
-        with tqdm(total=len(recording.images), unit="image", desc=recording.name, disable=None, leave=False) as bar:
+        with progress_bar(len(recording.images), "image", recording.name) as bar:
             return detect_keypoints(recording, detector, progress=bar.update)
 
 
@@ -250,69 +249,40 @@ def _parse_extrinsics(text: str) -> list[float]:
     return numbers
 
 
-class FoundKeypoints(Protocol):
-    """What is read of the key points that a detector found of one jaw; `finforce_keypoints.JawKeypoints` has it."""
+def parse_changes(option: str, kind: str, texts: Sequence[str], defaults: Mapping[str, Any]) -> dict[str, Any]:
+    """Return `NAME=VALUE` texts as values by name, each of the type of the default that it changes.
 
-    points: NDArray
-    likelihood: NDArray
-    pixels: NDArray
-    valid: NDArray
-    stddev: NDArray
-    T_camera_jaw: NDArray
-    reasons: NDArray
+    Args:
+        option: of the command line, for messages.
+        kind: what a name is the name of, for messages.
+        texts: as they were given.
+        defaults: by name; a list takes its values with commas between.
 
-
-class Detector(Protocol):
-    """Finds the key points of all jaws in one image after the other.
-
-    Attributes:
-        warnings: what is suspicious about a jaw, by side.
+    Raises:
+        OptionError: a name is not known, or a value is not of its type.
     """
-
-    warnings: Mapping[str, str]
-
-    def detect(self, image: RgbdImage) -> Mapping[str, FoundKeypoints]:
-        """Return what was found, by side; a jaw that was not found is absent."""
-
-
-@dataclass(kw_only=True)
-class SideLog:
-    """What a detector said of one jaw, image by image [ns].
-
-    Attributes:
-        found: the key points, where the jaw was found.
-        step_ms: wall time [ms] of every image.
-    """
-
-    found: dict[int, FoundKeypoints] = field(default_factory=dict)
-    step_ms: dict[int, float] = field(default_factory=dict)
+    changes = {}
+    for text in texts:
+        name, _, value = text.partition("=")
+        if name not in defaults:
+            raise OptionError(f"{option} {text}: unknown {kind}; expected one of {', '.join(defaults)}")
+        changes[name] = _parse_value(f"{option} {text}", value, defaults[name])
+    return changes
 
 
-class Reasons:
-    """Why images were refused: texts that differ in their numbers only are one reason."""
-
-    def __init__(self) -> None:
-        """Begin without any."""
-        self._counts: Counter[str] = Counter()
-        self._texts: dict[str, str] = {}
-
-    def count(self, text: str) -> None:
-        """Take a reason; of a kind, the first text is kept."""
-        kind = re.sub(r"[0-9.]+", "#", text)
-        self._counts[kind] += 1
-        self._texts.setdefault(kind, text)
-
-    def commonest(self) -> str:
-        """Return the text of the most frequent reason, "" without any."""
-        return self._texts[self._counts.most_common(1)[0][0]] if self._counts else ""
-
-    def notes(self) -> list[str]:
-        """Return a line for each reason."""
-        return [f"{count} images refused: {self._texts[kind]}" for kind, count in self._counts.items()]
+def _parse_value(given: str, text: str, default: Any) -> Any:
+    """Return a text as a value of the type of a default."""
+    if isinstance(default, tuple | list):
+        kind = type(default[0]) if default else str
+        return [_parse_value(given, part, kind()) for part in text.split(",")]
+    try:
+        return _SWITCHES[text.lower()] if isinstance(default, bool) else type(default)(text)
+    except (KeyError, ValueError):
+        raise OptionError(f"{given}: '{text}' is no {type(default).__name__}") from None
 
 
 def detect_keypoints(
-    recording: Recording, detector: Detector, *, progress: Callable[[int], Any] = lambda images: None
+    recording: Recording, detector: KeypointDetector, *, progress: Callable[[int], Any] = lambda images: None
 ) -> Recording:
     """Return a recording with the key points and jaw poses that a detector finds in its images.
 
@@ -326,28 +296,39 @@ def detect_keypoints(
     Raises:
         RecordingError: an image is damaged, or not one jaw was found in any.
     """
-    images = recording.images
-    logs = {side: SideLog() for side in recording.jaws}
-    reasons = Reasons()
+    images, refused = recording.images, []
+    found: dict[str, dict[int, JawKeypoints]] = {side: {} for side in recording.jaws}
+    step_ms: dict[int, float] = {}
     for stamp, image in images:
         begin = perf_counter()
         try:
-            found = detector.detect(image)
+            seen = detector.detect(image)
         except (KeypointError, ImageError) as error:
-            found = {}
-            reasons.count(str(error))
-        spent = 1e3 * (perf_counter() - begin)
-        for side, log in logs.items():
-            log.step_ms[stamp] = spent
-            if side in found:
-                log.found[stamp] = found[side]
+            seen = {}
+            refused.append(str(error))
+        step_ms[stamp] = 1e3 * (perf_counter() - begin)
+        for side in found.keys() & seen.keys():
+            found[side][stamp] = seen[side]
         progress(1)
+    reasons = count_reasons(refused)
     warnings = [f"{side} jaw: {warning}" for side, warning in detector.warnings.items()]
-    if not any(log.found for log in logs.values()):
-        why = reasons.commonest() or "; ".join(warnings) or "no jaw stands where it could be; another --extrinsics?"
+    if not any(found.values()):
+        commonest = max(reasons, key=reasons.get, default="")
+        why = commonest or "; ".join(warnings) or "no jaw stands where it could be; another --extrinsics?"
         raise RecordingError(f"{recording.name}: no key points in {len(images)} images: {why}")
-    notes = reasons.notes() + warnings
-    return with_detections(replace(recording, notes=(*recording.notes, *notes)), logs)
+    notes = [f"{count} images refused: {text}" for text, count in reasons.items()] + warnings
+    recording = replace(recording, notes=(*recording.notes, *notes))
+    return with_detections(recording, found, dict.fromkeys(found, step_ms))
+
+
+def count_reasons(texts: Iterable[str]) -> dict[str, int]:
+    """Return how often images were refused by reason; of texts that differ in their numbers only, the first counts."""
+    firsts: dict[str, str] = {}
+    counts: dict[str, int] = {}
+    for text in texts:
+        first = firsts.setdefault(re.sub(r"[0-9.]+", "#", text), text)
+        counts[first] = counts.get(first, 0) + 1
+    return counts
 
 
 def awaiting_keypoints(recording: Recording) -> Recording:
@@ -356,25 +337,29 @@ def awaiting_keypoints(recording: Recording) -> Recording:
     return replace(recording, jaws=jaws)
 
 
-def with_detections(recording: Recording, logs: Mapping[str, SideLog]) -> Recording:
+def with_detections(
+    recording: Recording,
+    found: Mapping[str, Mapping[int, JawKeypoints]],
+    step_ms: Mapping[str, Mapping[int, float]],
+) -> Recording:
     """Return a recording whose key points and jaw poses are those that a detector found.
 
     Args:
         recording: with images.
-        logs: by side; a jaw that was never found has no key points in any image.
+        found: by side and stamp [ns]; a jaw that was never found has no key points in any image.
+        step_ms: wall time [ms] of every image, likewise.
     """
-    jaws = {
-        side: _with_detection(track, logs[side], recording.images.stamps, recording.images.frame_id)
-        for side, track in recording.jaws.items()
-        if side in logs
-    }
+    jaws = {side: _with_detection(recording.jaw(side), found[side], step_ms[side], recording.images) for side in found}
     return replace(recording, jaws=jaws)
 
 
-def _with_detection(track: JawTrack, log: SideLog, stamps: NDArray[np.int64], frame_id: str) -> JawTrack:
-    """Return the track of a jaw with its detections at all images (n,) [ns]."""
-    count = next((len(found.points) for found in log.found.values()), track.sight.points.shape[1] if track.sight else 0)
-    seen = [log.found.get(int(stamp)) for stamp in stamps]
+def _with_detection(
+    track: JawTrack, found: Mapping[int, JawKeypoints], step_ms: Mapping[int, float], images: ImageTrack
+) -> JawTrack:
+    """Return the track of a jaw with its detections at all images."""
+    count = next((len(each.points) for each in found.values()), track.sight.points.shape[1] if track.sight else 0)
+    stamps = images.stamps
+    seen = [found.get(stamp) for stamp in stamps.tolist()]
     points, stddev = _rows(seen, "points", (count, 3)), _rows(seen, "stddev", (count, 3))
     accepted = np.nan_to_num(_rows(seen, "valid", (count,))).astype(bool)
     # what is not valid has no coordinates for the solver, as when the cloud comes by topic in single precision
@@ -385,36 +370,33 @@ def _with_detection(track: JawTrack, log: SideLog, stamps: NDArray[np.int64], fr
         likelihood=np.nan_to_num(_rows(seen, "likelihood", (count,))),
         stddev=np.where(np.isfinite(passed), stddev, np.nan),
     )
+    unfound = np.full(count, "")
+    reasons = [unfound if each is None else each.reasons for each in seen]
     detection = DetectionTrack(
         stamps=stamps,
         pixels=_rows(seen, "pixels", (count, 2)),
         points=points,
         accepted=accepted,
-        reasons=np.array([_reasons(found, count) for found in seen]).reshape(-1, count),
-        found=np.array([found is not None for found in seen]),
-        step_ms=np.array([log.step_ms.get(int(stamp), np.nan) for stamp in stamps]),
+        reasons=np.array(reasons, dtype="U16").reshape(-1, count),
+        found=np.array([each is not None for each in seen]),
+        step_ms=np.array([step_ms.get(stamp, np.nan) for stamp in stamps.tolist()]),
     )
-    return replace(track, keypoints=keypoints, pose=_pose_track(log, frame_id), detection=detection)
+    return replace(track, keypoints=keypoints, pose=_pose_track(found, images.frame_id), detection=detection)
 
 
-def _rows(seen: Sequence[FoundKeypoints | None], name: str, shape: tuple[int, ...]) -> NDArray[np.float64]:
+def _rows(seen: Sequence[JawKeypoints | None], name: str, shape: tuple[int, ...]) -> NDArray[np.float64]:
     """Return one attribute of every image (n, *shape), NaN where the jaw was not found."""
     missing = np.full(shape, np.nan)
     rows = [missing if found is None else np.asarray(getattr(found, name), dtype=np.float64) for found in seen]
     return np.array(rows).reshape(-1, *shape)
 
 
-def _reasons(found: FoundKeypoints | None, count: int) -> NDArray[np.str_]:
-    """Return why each key point (count,) was refused, "" where the jaw was not found."""
-    return np.full(count, "", dtype="U16") if found is None else np.asarray(found.reasons, dtype="U16")
-
-
-def _pose_track(log: SideLog, frame_id: str) -> PoseTrack | None:
+def _pose_track(found: Mapping[int, JawKeypoints], frame_id: str) -> PoseTrack | None:
     """Return the poses of a jaw where it was found; None without any."""
-    if not log.found:
+    if not found:
         return None
-    stamps = sorted(log.found)
-    poses = [log.found[stamp].T_camera_jaw for stamp in stamps]
+    stamps = sorted(found)
+    poses = [found[stamp].T_camera_jaw for stamp in stamps]
     return PoseTrack(
         stamps=np.array(stamps, dtype=np.int64),
         position=np.array([pose[:3, 3] for pose in poses]),

@@ -1,52 +1,63 @@
-"""What an offline run needs beside the recordings: jaw, settings, calibration, contact; and the run itself."""
+"""What an offline run needs beside the recordings: jaw, settings, calibration, contact; by the command's options."""
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from functools import partial
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
 
 from finforce.errors import FinforceError
 from finforce_contact.loop import ContactSource
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.contact_source import ContactChoice, build_source, parse_contacts
-from finforce_eval.evaluation.evaluate import Evaluation, check_keypoint_count, evaluate_recording, score_results
-from finforce_eval.evaluation.keypoint_source import parse_source
-from finforce_eval.evaluation.manipulation import with_distances
-from finforce_eval.evaluation.results import parse_changes
-from finforce_eval.machine import version
+from finforce_eval.evaluation.keypoint_source import parse_changes, parse_source
+from finforce_eval.machine import commit, version
 from finforce_eval.recordings.bags import name_recordings
 from finforce_eval.recordings.images import PAIRED
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.tracks import JAWS, Recording
-from finforce_eval.table import ForceSeries
 from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.jaw.calibration import Calibration, load_calibration
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_ifea.settings import EstimatorSettings
 
+# Options that change nothing in the forces of a recording.
+_OUTSIDE = ("bags", "out", "engine", "workers", "memory", "address", "shard", "run", "prefix", "json", "report")
+
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluationSetup:
-    """What an offline run needs beside the recordings."""
+    """What an offline run needs beside the recordings; its estimators are built and compiled once for all of them."""
 
     jaw: Jaw
     settings: EstimatorSettings
     calibration: Calibration | None
     contacts: ContactChoice
     about: Mapping[str, str]
+    _sides: dict[str, EvaluationSetup] = field(default_factory=dict, init=False, repr=False, compare=False)
+    _estimators: dict[bool, JawEstimator] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def side(self, side: str) -> EvaluationSetup:
         """Return the setup of the left or the right jaw; a jaw file describes the left one."""
-        return self if side == self.jaw.side else replace(self, jaw=self.jaw.mirrored())
+        if side == self.jaw.side:
+            return self
+        if side not in self._sides:
+            self._sides[side] = replace(self, jaw=self.jaw.mirrored())
+        return self._sides[side]
 
     def estimator(self, held: bool = False) -> JawEstimator:
-        """Return a fresh estimator that has nothing left to compile; `held` where both jaws hold an object."""
+        """Return the estimator of this jaw, which forgets what it has seen; `held` where both jaws hold an object."""
+        if held in self._estimators:
+            self._estimators[held].forget()
+            return self._estimators[held]
         settings = self.settings.resolve_held(both=held)
         estimator = JawEstimator(self.jaw, settings=settings, calibration=self.calibration)
         estimator.warm_up()
+        self._estimators[held] = estimator
         return estimator
 
     @property
@@ -58,50 +69,6 @@ class EvaluationSetup:
         """Return a fresh contact source for this jaw of a recording."""
         jaw = self.calibration.apply(self.jaw) if self.calibration else self.jaw
         return build_source(self.contacts, recording, jaw, self.density)
-
-
-def read_recordings(
-    paths: Sequence[str], pairing: int = PAIRED, sides: Sequence[str] = (), *, strict: bool = False
-) -> list[Recording]:
-    """Read recordings and give each a name of its own.
-
-    Args:
-        paths: of the recordings.
-        pairing: greatest distance between the stamps of a colour and a depth image that belong together [ns].
-        sides: jaws that are in the images, whether or not a topic tells of them.
-        strict: refuse recordings that are damaged.
-
-    Raises:
-        RecordingError: one of them cannot be read.
-        OptionError: one was given twice.
-    """
-    recordings = []
-    for name, path in name_recordings(paths, "/"):
-        recording = replace(read_recording(path, pairing, sides, strict=strict), name=name)
-        for note in recording.notes:
-            print(f"note: {recording.name}: {note}", file=sys.stderr)
-        recordings.append(recording)
-    return recordings
-
-
-def read_keypoints(options: argparse.Namespace, sides: Sequence[str] = ()) -> list[Recording]:
-    """Read the recordings with the key points that were asked for.
-
-    Args:
-        options: of the command line.
-        sides: jaws that are in the images, whether or not a topic tells of them.
-
-    Raises:
-        FinforceError: one of them cannot be read, or has no such key points.
-    """
-    source = parse_source(options)
-    recordings = []
-    for read in read_recordings(options.bags, source.pairing, sides, strict=source.strict):
-        recording = source.apply(read)
-        for note in recording.notes[len(read.notes) :]:
-            print(f"note: {recording.name}: {note}", file=sys.stderr)
-        recordings.append(recording)
-    return recordings
 
 
 def make_setup(options: argparse.Namespace) -> EvaluationSetup:
@@ -132,6 +99,30 @@ def make_setup(options: argparse.Namespace) -> EvaluationSetup:
     return EvaluationSetup(jaw=jaw, settings=settings, calibration=calibration, contacts=contacts, about=about)
 
 
+_last: dict[str, EvaluationSetup] = {}
+
+
+def share_setup(key: str, options: argparse.Namespace) -> EvaluationSetup:
+    """Return the setup that the tasks of one process share: that of the call before, where its key was the same.
+
+    Args:
+        key: hash of the options and of the files that they name.
+        options: of the command line.
+
+    Raises:
+        FinforceError: jaw, calibration or settings cannot be used.
+    """
+    if key not in _last:
+        _last.clear()
+        _last[key] = make_setup(options)
+    return _last[key]
+
+
+def forget_setup() -> None:
+    """Forget the setup of the call before."""
+    _last.clear()
+
+
 def parse_settings(solver: str, mesh: str, changes: Sequence[str]) -> EstimatorSettings:
     """Return the settings of the estimator with `NAME=VALUE` changes.
 
@@ -145,64 +136,74 @@ def parse_settings(solver: str, mesh: str, changes: Sequence[str]) -> EstimatorS
         raise OptionError(f"settings: {error}") from error
 
 
-def evaluate_all(recordings: Sequence[Recording], setup: EvaluationSetup) -> Evaluation:
-    """Evaluate every jaw with ground truth of every recording.
-
-    Raises:
-        FinforceError: one of them cannot be evaluated.
-    """
-    results = [result for recording in recordings for result in evaluate_jaws(recording, setup)]
-    return score_results(results, recordings)
+def describe_options(options: argparse.Namespace) -> dict[str, Any]:
+    """Return all options that forces depend on, hashes of the files that they name, version and commit."""
+    chosen = {name: value for name, value in vars(options).items() if name not in _OUTSIDE}
+    words = [str(word) for value in chosen.values() for word in (value if isinstance(value, list) else [value])]
+    return chosen | {"files": hash_files(words), "version": version(), "commit": commit()}
 
 
-def evaluate_jaws(
-    recording: Recording,
-    setup: EvaluationSetup,
-    build: Callable[[str, bool], JawEstimator] | None = None,
-    *,
-    shown: bool = True,
-) -> tuple[ForceSeries, ...]:
-    """Evaluate every jaw with ground truth of a recording.
+def hash_files(words: Iterable[str]) -> dict[str, str]:
+    """Return hashes of the files that are among some options' words."""
+    return {word: sha256(Path(word).read_bytes()).hexdigest() for word in words if _is_file(word)}
+
+
+def _is_file(word: str) -> bool:
+    """Say whether an option's word names a file."""
+    try:
+        return bool(word) and Path(word).is_file()
+    except (OSError, ValueError):
+        return False
+
+
+def sides_of(options: argparse.Namespace) -> tuple[str, ...]:
+    """Return the jaws that images show, none where the option does not say."""
+    return {None: (), "both": JAWS}.get(options.jaws, (options.jaws,))
+
+
+def read_recordings(
+    paths: Sequence[str], pairing: int = PAIRED, sides: Sequence[str] = (), *, strict: bool = False
+) -> list[Recording]:
+    """Read recordings and give each a name of its own.
 
     Args:
-        recording: with key points and truth.
-        setup: jaw, settings, calibration and contact.
-        build: gives an estimator of a side that knows nothing yet, and whether both jaws hold; new ones without.
-        shown: under a progress bar.
+        paths: of the recordings.
+        pairing: greatest distance between the stamps of a colour and a depth image that belong together [ns].
+        sides: jaws that are in the images, whether or not a topic tells of them.
+        strict: refuse recordings that are damaged.
 
     Raises:
-        FinforceError: it cannot be evaluated.
+        RecordingError: one of them cannot be read.
+        OptionError: one was given twice.
     """
-    from tqdm import tqdm
-
-    sides = truth_sides(recording)
-    for side in sides:
-        check_keypoint_count(recording, side, setup.jaw)
-    both, results = len(sides) == len(JAWS), []
-    frames = sum(len(recording.jaw(side).keypoints.stamps) for side in sides)
-    hidden = None if shown else True
-    with tqdm(total=frames, unit="frame", desc=recording.name, disable=hidden, leave=False) as bar:
-        for side in sides:
-            own = setup.side(side)
-            result = evaluate_recording(
-                recording,
-                own.jaw,
-                own.source(recording),
-                side=side,
-                factory=partial(build, side, both) if build else partial(own.estimator, both),
-                progress=bar.update,
-            )
-            results.append(result.renamed(f"{recording.name}/{side}") if both else result)
-    return tuple(with_distances(dict(zip(sides, results, strict=True)), recording).values() if both else results)
+    recordings = []
+    for name, path in name_recordings(paths, "/"):
+        recording = replace(read_recording(path, pairing, sides, strict=strict), name=name)
+        print_notes(recording.name, recording.notes)
+        recordings.append(recording)
+    return recordings
 
 
-def truth_sides(recording: Recording) -> list[str]:
-    """Return the jaws of a recording that have ground truth.
+def print_notes(name: str, notes: Iterable[str]) -> None:
+    """Print what is to be said of a recording."""
+    for note in notes:
+        print(f"note: {name}: {note}", file=sys.stderr)
+
+
+def read_keypoints(options: argparse.Namespace, sides: Sequence[str] = ()) -> list[Recording]:
+    """Read the recordings with the key points that were asked for.
+
+    Args:
+        options: of the command line.
+        sides: jaws that are in the images, whether or not a topic tells of them.
 
     Raises:
-        RecordingError: there is none.
+        FinforceError: one of them cannot be read, or has no such key points.
     """
-    sides = [side for side, track in recording.jaws.items() if track.truth is not None]
-    if not sides:
-        recording.truth(next(iter(recording.jaws)))
-    return sides
+    source = parse_source(options)
+    recordings = []
+    for read in read_recordings(options.bags, source.pairing, sides, strict=source.strict):
+        recording = source.apply(read)
+        print_notes(recording.name, recording.notes[len(read.notes) :])
+        recordings.append(recording)
+    return recordings

@@ -3,72 +3,69 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
+from itertools import groupby
 from typing import Any
 
 from finforce_eval.evaluation.comparison import error_blocks
-from finforce_eval.evaluation.evaluate import Evaluation
-from finforce_eval.evaluation.manipulation import format_manipulation
-from finforce_eval.evaluation.scoring import CaseScore, Spread, Stats
+from finforce_eval.evaluation.scoring import PHASES, CaseScore, Evaluation, Stats
 from finforce_eval.table import ForceSeries
 
-PHASES = ("all", "load", "unload")
-HEADER = ("RMSE/N", "NRMSD/%", "max/N")
+_CONTACT = (
+    "Contact: distance along the undeformed surface between the true pressure centre and the contact that the "
+    "solver was given (given) and that it found (solved), above 0.2 N; onset: frames from 0.02 N of true force to "
+    "the `touching` that stays, one per loading cycle, negative is early; false: share of the frames without true "
+    "force that were said to touch; ms: a step of the contact estimator alone."
+)
+_MAGNITUDE = ("rmse_N", "nrmsd_pct", "max_error_N", "bias_N")  # not scored of a net force
+_DISTANCES = ("median_mm", "p95_mm", "max_mm")
+_SIGHT = (
+    "Key points: distance in the image, over the points that were visible, and in the jaw frame, over those that were "
+    "accepted; hidden+: hidden points that were accepted; visible-: visible points that were lost; detector: from "
+    "image to key points of all jaws. Force: from 0.02 N of true force to an estimate above 0.1 N, computed; "
+    "rise: what the true force takes from the one to the other."
+)
 
 
-def format_number(value: float | None, digits: int = 2) -> str:
-    """Return a number, or a dash for none."""
-    return "-" if value is None else f"{value:.{digits}f}"
+@dataclass(frozen=True, kw_only=True)
+class ScoreTable:
+    """One row per case and one for all.
 
+    Attributes:
+        head: group, short and full name of each column.
+        rows: cells.
+        meaning: of the columns.
+        words: columns of words at the beginning.
+    """
 
-def _format_spread(spread: Spread) -> str:
-    """Return mean and standard deviation over the cycles."""
-    mean = format_number(spread.mean)
-    return mean if spread.std is None else f"{mean}±{spread.std:.2f}"
+    head: Sequence[tuple[str, str, str]]
+    rows: Sequence[Sequence[str]]
+    meaning: str = ""
+    words: int = 1
 
+    @property
+    def names(self) -> list[str]:
+        """Full names of the columns."""
+        return [name for _, _, name in self.head]
 
-def score_cells(score: CaseScore, phase: str) -> list[str]:
-    """Return RMSE, NRMSD (mean ± standard deviation over the cycles) and maximum error of a phase."""
-    cycles = score.cycles[phase]
-    stats: Stats = getattr(score, phase)
-    return [
-        _format_spread(cycles.rmse_N),
-        _format_spread(cycles.nrmsd_pct),
-        format_number(stats.max_error_N),
-    ]
+    def terminal(self, *, has_total: bool = False) -> list[str]:
+        """Return the lines for a terminal; `has_total` with a rule before the last row."""
+        head = [short for _, short, _ in self.head]
+        widths = [max(map(len, column)) for column in zip(head, *self.rows, strict=True)]
+        titles = []
+        for group, members in groupby(zip(self.head, widths, strict=True), key=lambda entry: entry[0][0]):
+            inner = [width for _, width in members]
+            titles.append(f" {group} ".center(sum(inner) + 2 * (len(inner) - 1), "-" if group else " "))
+        lines = [_join(row, widths) for row in (head, *self.rows)]
+        rule = "-" * len(lines[0])
+        lines[1:1] = [rule]
+        if has_total:
+            lines[-1:-1] = [rule]
+        return ["  ".join(titles).rstrip(), *lines]
 
-
-def table_head() -> list[str]:
-    """Return the names of the columns of `table_rows`."""
-    return ["case", *(f"{phase}: {name}" for phase in PHASES for name in HEADER), "bias/N", "solved/%"]
-
-
-def table_rows(evaluation: Evaluation) -> list[list[str]]:
-    """Return one row per case and one for all: name, three numbers for each phase, bias, solved frames."""
-    rows = []
-    for name, score in [*evaluation.scores.items(), ("all", evaluation.total)]:
-        solved = 100.0 * (1.0 - score.record_skipped / max(score.record_frames, 1))
-        cells = [cell for phase in PHASES for cell in score_cells(score, phase)]
-        rows.append([name, *cells, f"{format_number(score.all.bias_N)}", f"{solved:.1f}"])
-    return rows
-
-
-def format_table(evaluation: Evaluation) -> str:
-    """Return the table for a terminal, with a line of summary below."""
-    head = ["case", *HEADER * len(PHASES), "bias/N", "solved/%"]
-    rows = table_rows(evaluation)
-    widths = [max(len(row[i]) for row in [head, *rows]) for i in range(len(head))]
-    groups = [sum(widths[1 + 3 * k : 4 + 3 * k]) + 4 for k in range(len(PHASES))]
-    titles = (f" {phase} ".center(width, "-") for phase, width in zip(PHASES, groups, strict=True))
-    lines = [" " * widths[0] + "  " + "  ".join(titles), _join(head, widths)]
-    rule = "-" * len(lines[1])
-    lines += [rule, *(_join(row, widths) for row in rows[:-1]), rule, _join(rows[-1], widths)]
-    contact = format_contact_table(evaluation)
-    below = ["", contact, *contact_lines()] if contact else []
-    net = format_manipulation(evaluation.manipulation)
-    below += ["", *net] if net else []
-    below += format_sight(evaluation)
-    return "\n".join([*lines, "", *summary_lines(evaluation), *below])
+    def markdown(self) -> list[str]:
+        """Return the lines in Markdown."""
+        return markdown_rows(self.names, self.rows, self.words)
 
 
 def _join(cells: Sequence[str], widths: Sequence[int]) -> str:
@@ -77,100 +74,156 @@ def _join(cells: Sequence[str], widths: Sequence[int]) -> str:
     return "  ".join([cells[0].ljust(widths[0]), *rest])
 
 
-CONTACT_HEADER = (
-    "contact", "given: median/mm", "p95/mm", "max/mm", "solved: median/mm", "p95/mm", "max/mm",
-    "onset: median", "earliest", "latest", "missed", "false touches/%", "p50/ms", "p99/ms",
-)  # fmt: skip
+def markdown_rows(head: Sequence[str], rows: Sequence[Sequence[str]], words: int = 1) -> list[str]:
+    """Return the lines of a table whose first `words` columns are words, the others numbers, to the right."""
+    rule = "|---" * words + "|---:" * (len(head) - words) + "|"
+    first, *rest = ("| " + " | ".join(row) + " |" for row in (head, *rows))
+    return [first, rule, *rest]
 
 
-def contact_rows(evaluation: Evaluation) -> list[list[str]]:
-    """Return one row per case and one for all: where the contact came from, place, onset and time; none without any."""
+def _score_rows(evaluation: Evaluation) -> list[tuple[str, CaseScore]]:
+    """Return the scores by the name of the row."""
+    return [*evaluation.scores.items(), ("all", evaluation.total)]
+
+
+def _number(value: float | None, digits: int = 2) -> str:
+    """Return a number, or a dash for none."""
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def _numbers(values: Sequence[float | None], digits: int = 2) -> list[str]:
+    return [_number(value, digits) for value in values]
+
+
+def score_table(evaluation: Evaluation) -> ScoreTable:
+    """Return RMSE, NRMSD (mean ± standard deviation over the cycles) and maximum error of each phase, and bias."""
+    head = [("", "case", "case")]
+    head += [(phase, name, f"{phase}: {name}") for phase in PHASES for name in ("RMSE/N", "NRMSD/%", "max/N")]
     rows = []
-    for name, score in [*evaluation.scores.items(), ("all", evaluation.total)]:
-        result = evaluation.results.get(name)
-        source = "" if result is None else _contact_source(result)
-        places = [
-            format_number(value)
-            for place in (score.place, score.solved_place)
-            for value in (place.median_mm, place.p95_mm, place.max_mm)
-        ]
+    for name, score in _score_rows(evaluation):
+        cells = [name]
+        for phase in PHASES:
+            cells += [_spread(score.cycles[phase][number]) for number in ("rmse_N", "nrmsd_pct")]
+            cells.append(_number(getattr(score, phase).max_error_N))
+        solved = 100.0 * (1.0 - score.record_skipped / max(score.record_frames, 1))
+        rows.append([*cells, _number(score.all.bias_N), f"{solved:.1f}"])
+    return ScoreTable(head=[*head, ("", "bias/N", "bias/N"), ("", "solved/%", "solved/%")], rows=rows)
+
+
+def _spread(spread: dict[str, float | None]) -> str:
+    """Return mean and standard deviation over the cycles."""
+    mean = _number(spread["mean"])
+    return mean if spread["std"] is None else f"{mean}±{spread['std']:.2f}"
+
+
+def contact_table(evaluation: Evaluation) -> ScoreTable:
+    """Return where the contact came from, location, onset and time; no row where nobody says."""
+    head = [("", "", "case"), ("", "contact", "contact")]
+    for group in ("given", "solved"):
+        head += [(f"{group}/mm", "median", f"{group}: median/mm"), (f"{group}/mm", "p95", "p95/mm")]
+        head.append((f"{group}/mm", "max", "max/mm"))
+    onset = {"median": "onset: median", "first": "earliest", "last": "latest", "missed": "missed"}
+    head += [("onset/frames", short, name) for short, name in (onset | {"false/%": "false touches/%"}).items()]
+    head += [("ms", "p50", "p50/ms"), ("ms", "p99", "p99/ms")]
+    rows = []
+    for name, score in _score_rows(evaluation):
+        place = [part[number] for part in (score.place, score.solved_place) for number in _DISTANCES]
         onset = score.onset
-        frames = [format_number(v, 0) for v in (onset.median_frames, onset.earliest_frames, onset.max_frames)]
-        missed = str(onset.missed) if onset.n + onset.missed else "-"
-        false = format_number(onset.false_pct, 1)
-        times = [format_number(score.contact_ms.p50), format_number(score.contact_ms.p99)]
-        rows.append([name, source, *places, *frames, missed, false, *times])
-    return rows if any(map(_contact_source, evaluation.results.values())) else []
+        frames = _numbers([onset[f"{which}_frames"] for which in ("median", "earliest", "max")], 0)
+        missed = str(onset["missed"]) if onset["n"] + onset["missed"] else "-"
+        times = _numbers([score.contact_ms["p50"], score.contact_ms["p99"]])
+        source = _contact_source(evaluation.results.get(name))
+        rows.append([name, source, *_numbers(place), *frames, missed, _number(onset["false_pct"], 1), *times])
+    known = any(map(_contact_source, evaluation.results.values()))
+    return ScoreTable(head=head, rows=rows if known else [], meaning=_CONTACT, words=2)
 
 
-def format_contact_table(evaluation: Evaluation) -> str:
-    """Return the contact's rows for a terminal, empty without any."""
-    rows = contact_rows(evaluation)
-    if not rows:
-        return ""
-    head = ["", "contact", "median", "p95", "max", "median", "p95", "max", "median", "first", "last", "missed",
-            "false/%", "p50", "p99"]  # fmt: skip
-    widths = [max(len(row[i]) for row in [head, *rows]) for i in range(len(head))]
-    groups = (("", 0, 2), ("given/mm", 2, 5), ("solved/mm", 5, 8), ("onset/frames", 8, 13), ("ms", 13, 15))
-    titles = [f" {t} ".center(sum(widths[a:b]) + 2 * (b - a - 1), "-" if t else " ") for t, a, b in groups]
-    lines = ["  ".join(titles), _join(head, widths)]
-    return "\n".join([*lines, "-" * len(lines[1]), *(_join(row, widths) for row in rows)])
+def sight_table(evaluation: Evaluation) -> ScoreTable:
+    """Return how well key points were seen, and how late the force shows; no row where no detector ran."""
+    head = [("", "", "case")]
+    for group, short in (("pixels/px", "px"), ("points/mm", "mm")):
+        head += [(group, "median", f"{group.split('/')[0]}: median/{short}"), (group, "p95", f"p95/{short}")]
+    head += [("share/%", "hidden+", "hidden accepted/%"), ("share/%", "visible-", "visible lost/%")]
+    head += [("detector/ms", "p50", "detector: p50/ms"), ("detector/ms", "p95", "p95/ms")]
+    after = {"median": "force shows after/ms", "max": "largest/ms", "missed": "missed", "rise": "true rise/ms"}
+    head += [("force shows after/ms", short, name) for short, name in after.items()]
+    rows = []
+    for name, score in _score_rows(evaluation):
+        sight, delay = score.sight, score.delay
+        exact = [sight[number] for number in ("pixel_median_px", "pixel_p95_px", "point_median_mm", "point_p95_mm")]
+        shares = [sight["hidden_accepted_pct"], sight["visible_lost_pct"]]
+        shares += [score.detector_ms["p50"], score.detector_ms["p95"]]
+        missed = str(delay["missed"]) if delay["n"] + delay["missed"] else "-"
+        shown = [*_numbers([delay["median_ms"], delay["max_ms"]], 0), missed, _number(delay["rise_ms"], 0)]
+        rows.append([name, *_numbers(exact), *_numbers(shares, 1), *shown])
+    known = any(result.has("detector_ms") for result in evaluation.results.values())
+    return ScoreTable(head=head, rows=rows if known else [], meaning=_SIGHT)
 
 
-def contact_lines() -> list[str]:
-    """Return what the numbers of the contact mean."""
-    return [
-        "Contact: distance along the undeformed surface between the true pressure centre and the contact that the "
-        "solver was given (given) and that it found (solved), above 0.2 N; onset: frames from 0.02 N of true force to "
-        "the `touching` that stays, one per loading cycle, negative is early; false: share of the frames without true "
-        "force that were said to touch; ms: a step of the contact estimator alone."
-    ]
+def format_tables(evaluation: Evaluation) -> str:
+    """Return all tables for a terminal, with a line of summary below the first."""
+    lines = [*score_table(evaluation).terminal(has_total=True), "", *summary_lines(evaluation)]
+    contact, sight = contact_table(evaluation), sight_table(evaluation)
+    if contact.rows:
+        lines += ["", *contact.terminal(), contact.meaning]
+    if evaluation.manipulation:
+        lines += ["", *format_manipulation(evaluation.manipulation)]
+    if sight.rows:
+        lines += ["", *sight.terminal(), sight.meaning]
+    return "\n".join(lines)
+
+
+def markdown_tables(evaluation: Evaluation) -> list[str]:
+    """Return the lines of all tables in Markdown, with what they mean."""
+    lines = [*score_table(evaluation).markdown(), "", *summary_lines(evaluation)]
+    for table in (contact_table(evaluation), sight_table(evaluation)):
+        if table.rows:
+            lines += ["", *table.markdown(), "", table.meaning]
+    return lines
 
 
 def summary_lines(evaluation: Evaluation) -> list[str]:
     """Return what the table's numbers mean, and the times."""
     total = evaluation.total
-    step = total.step_ms
     rmse = {name: score.all.rmse_N for name, score in evaluation.scores.items()}
     worst = max(rmse, key=lambda name: rmse[name] or 0.0)
+    times = ", ".join(f"{name} {_number(value)}" for name, value in total.step_ms.items())
     return [
         f"Mean RMSE of {len(rmse)} case{'s' if rmse.keys() - {worst} else ''}: "
-        f"{format_number(total.mean_rmse_N, 3)} N, worst {format_number(rmse[worst], 3)} N ({worst}). "
-        f"RMSE and NRMSD: mean ± standard deviation over the cycles, {total.cycles['all'].n} in all; "
+        f"{_number(total.mean_rmse_N, 3)} N, worst {_number(rmse[worst], 3)} N ({worst}). "
+        f"RMSE and NRMSD: mean ± standard deviation over the cycles, {total.cycles['all']['n']} in all; "
         f"NRMSD: over the force range {evaluation.span:.2f} N.",
         f"{total.frames} frames, {total.solved} solved, {total.skipped} skipped; in the record phases "
-        f"{total.record_frames - total.record_skipped} of {total.record_frames} solved. "
-        f"Step: p50 {format_number(step.p50)}, p95 {format_number(step.p95)}, "
-        f"p99 {format_number(step.p99)}, max {format_number(step.max)} ms.",
-        *vector_lines(total.all),
+        f"{total.record_frames - total.record_skipped} of {total.record_frames} solved. Step: {times} ms.",
+        *_vector_lines(total.all),
     ]
 
 
-def vector_lines(stats: Stats) -> list[str]:
+def _vector_lines(stats: Stats) -> list[str]:
     """Return what is known of the force as a vector; nothing where the truth is a magnitude."""
     if stats.axis_rmse_N is None:
         return []
-    line = f"As a vector: RMSE {format_number(stats.vector_rmse_N)} N, x/y/z {_per_axis(stats.axis_rmse_N, 2)} N"
+    axes = "/".join(_numbers(stats.axis_rmse_N))
+    line = f"As a vector: RMSE {_number(stats.vector_rmse_N)} N, x/y/z {axes} N"
     if stats.within_3_sigma_pct is not None:
-        line += f", within three stated deviations x/y/z {_per_axis(stats.within_3_sigma_pct, 1)} %"
+        shares = "/".join(_numbers(stats.within_3_sigma_pct, 1))
+        line += f", within three stated deviations x/y/z {shares} %"
     return [f"{line}."]
 
 
-def _per_axis(values: Sequence[float], digits: int) -> str:
-    return "/".join(format_number(value, digits) for value in values)
-
-
-def markdown_table(evaluation: Evaluation) -> str:
-    """Return the table in Markdown."""
-    return "\n".join(markdown_rows(table_head(), table_rows(evaluation)))
-
-
-def markdown_contact_table(evaluation: Evaluation) -> list[str]:
-    """Return the contact's table in Markdown and what it means; no line without any."""
-    rows = contact_rows(evaluation)
-    if not rows:
-        return []
-    return ["", *markdown_rows(["case", *CONTACT_HEADER], rows, texts=2), "", *contact_lines()]
+def format_manipulation(scores: dict[str, Stats]) -> list[str]:
+    """Return a line per recording with two jaws; none without any."""
+    lines = []
+    for name, score in scores.items():
+        if score.vector_rmse_N is None:
+            lines.append(f"{name}: no net force: never were both jaws answered")
+            continue
+        turn = "" if score.torque_rmse_Nm is None else f", torque by {1e3 * score.torque_rmse_Nm:.1f} N mm"
+        lines.append(
+            f"{name}: net force on the gripper off by {score.vector_rmse_N:.3f} N (x, y, z: "
+            f"{' '.join(_numbers(score.axis_rmse_N))}){turn}, {score.answered_pct:.1f} % answered"
+        )
+    return lines
 
 
 def evaluation_json(evaluation: Evaluation, **about: Any) -> dict[str, Any]:
@@ -180,96 +233,20 @@ def evaluation_json(evaluation: Evaluation, **about: Any) -> dict[str, Any]:
         evaluation: the scores.
         about: what else stands at the top: jaw, solver, contact, ...
     """
-    cases = {
-        name: asdict(score) | _contact_name(evaluation, name) | {"seconds": error_blocks(evaluation.results[name])}
-        for name, score in evaluation.scores.items()
+    cases = {}
+    for name, score in evaluation.scores.items():
+        result = evaluation.results[name]
+        source = _contact_source(result)
+        cases[name] = asdict(score) | ({"contact": source} if source else {}) | {"seconds": error_blocks(result)}
+    net = {
+        name: {number: value for number, value in asdict(score).items() if number not in _MAGNITUDE}
+        for name, score in evaluation.manipulation.items()
     }
-    net = {name: asdict(score) for name, score in evaluation.manipulation.items()}
-    both = {"manipulation": net} if net else {}
-    return {"cases": cases, "all": asdict(evaluation.total), **both, "force_range_N": evaluation.span, **about}
+    top = {"manipulation": net} if net else {}
+    return {"cases": cases, "all": asdict(evaluation.total), **top, "force_range_N": evaluation.span, **about}
 
 
-def _contact_name(evaluation: Evaluation, name: str) -> dict[str, str]:
-    """Return where the contact of a case came from."""
-    source = _contact_source(evaluation.results[name])
-    return {"contact": source} if source else {}
-
-
-def _contact_source(result: ForceSeries) -> str:
+def _contact_source(result: ForceSeries | None) -> str:
     """Return what gave the contact of a case, "" where nobody says."""
-    return str(result.column("contact_source")[0]) if result.has("contact_source") and len(result) else ""
-
-
-SIGHT_HEADER = (
-    "pixels: median/px", "p95/px", "points: median/mm", "p95/mm", "hidden accepted/%", "visible lost/%",
-    "detector: p50/ms", "p95/ms", "force shows after/ms", "largest/ms", "missed", "true rise/ms",
-)  # fmt: skip
-SHORT = ("median", "p95", "median", "p95", "hidden+", "visible-", "p50", "p95", "median", "max", "missed", "rise")
-GROUPS = (("", 0, 1), ("pixels/px", 1, 3), ("points/mm", 3, 5), ("share/%", 5, 7), ("detector/ms", 7, 9),
-          ("force shows after/ms", 9, 13))  # fmt: skip
-MEANING = (
-    "Key points: distance in the image, over the points that were visible, and in the jaw frame, over those that were "
-    "accepted; hidden+: hidden points that were accepted; visible-: visible points that were lost; detector: from "
-    "image to key points of all jaws. Force: from 0.02 N of true force to an estimate above 0.1 N, computed; "
-    "rise: what the true force takes from the one to the other."
-)
-
-
-def sight_rows(evaluation: Evaluation) -> list[list[str]]:
-    """Return one row per case and one for all; none where no detector ran."""
-    if not any(result.has("detector_ms") for result in evaluation.results.values()):
-        return []
-    return [[name, *_cells(score)] for name, score in [*evaluation.scores.items(), ("all", evaluation.total)]]
-
-
-def _cells(score: CaseScore) -> list[str]:
-    sight, delay = score.sight, score.delay
-    exact = (sight.pixel_median_px, sight.pixel_p95_px, sight.point_median_mm, sight.point_p95_mm)
-    shares = (sight.hidden_accepted_pct, sight.visible_lost_pct, score.detector_ms.p50, score.detector_ms.p95)
-    shown = [_number(value, 0) for value in (delay.median_ms, delay.max_ms)]
-    missed = str(delay.missed) if delay.n + delay.missed else "-"
-    numbers = [*(_number(value, 2) for value in exact), *(_number(value, 1) for value in shares)]
-    return [*numbers, *shown, missed, _number(delay.rise_ms, 0)]
-
-
-def _number(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
-
-
-def format_sight(evaluation: Evaluation) -> list[str]:
-    """Return the lines for a terminal; none where no detector ran."""
-    rows = sight_rows(evaluation)
-    if not rows:
-        return []
-    table = [["", *SHORT], *rows]
-    widths = [max(len(row[i]) for row in table) for i in range(len(table[0]))]
-    titles = [f" {t} ".center(sum(widths[a:b]) + 2 * (b - a - 1), "-" if t else " ") for t, a, b in GROUPS]
-    lines = [_join(row, widths) for row in table]
-    return ["", "  ".join(titles), lines[0], "-" * len(lines[0]), *lines[1:], MEANING]
-
-
-def markdown_sight(evaluation: Evaluation) -> list[str]:
-    """Return the table in Markdown and what it means; no line where no detector ran."""
-    rows = sight_rows(evaluation)
-    if not rows:
-        return []
-    return ["", *markdown_rows(["case", *SIGHT_HEADER], rows), "", MEANING]
-
-
-def markdown_rows(head: Sequence[str], rows: Sequence[Sequence[str]], texts: int = 1) -> list[str]:
-    """Return the lines of a table whose first `texts` columns are words, the others numbers, to the right."""
-    rule = "|---" * texts + "|---:" * (len(head) - texts) + "|"
-    first, *rest = ("| " + " | ".join(row) + " |" for row in (head, *rows))
-    return [first, rule, *rest]
-
-
-def align_rows(head: Sequence[str], rows: Sequence[Sequence[str]], texts: int = 1) -> str:
-    """Returns a table whose columns are as wide as their widest cell; the first `texts` columns are words."""
-    cells = [list(head), *(list(row) for row in rows)]
-    widths = [max(len(row[column]) for row in cells) for column in range(len(head))]
-    padded = [
-        [cell.ljust(width) if column < texts else cell.rjust(width)
-         for column, (cell, width) in enumerate(zip(row, widths, strict=True))]
-        for row in cells
-    ]  # fmt: skip
-    return "\n".join(markdown_rows(padded[0], padded[1:], texts))
+    is_known = result is not None and result.has("contact_source") and len(result)
+    return str(result.column("contact_source")[0]) if is_known else ""

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_eval.evaluation.results import compare_detection
+from finforce_eval.evaluation.scoring import compare_detection
 from finforce_eval.figures.figures import BLUE, GREEN, GREY, ORANGE, new_figure, style_axes
 from finforce_eval.recordings.tracks import DetectionTrack, JawTrack, Recording
 from finforce_eval.table import ForceSeries

@@ -6,15 +6,8 @@ import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from finforce_eval.evaluation.evaluate import Evaluation
-from finforce_eval.evaluation.tables import (
-    markdown_contact_table,
-    markdown_sight,
-    markdown_table,
-    summary_lines,
-    table_head,
-    table_rows,
-)
+from finforce_eval.evaluation.scoring import Evaluation
+from finforce_eval.evaluation.tables import markdown_tables, score_table
 from finforce_eval.figures.html_report import write_html
 from finforce_eval.recordings.tracks import Recording
 from finforce_eval.table import ForceSeries
@@ -134,24 +127,14 @@ def write_page(evaluation: Evaluation, path: Path, *, about: Mapping[str, str], 
     Raises:
         OSError: it cannot be written.
     """
-    return write_html(
-        list(evaluation.results.values()),
-        path,
-        title=title,
-        about=about,
-        columns=table_head(),
-        rows=table_rows(evaluation),
-    )
+    table, results = score_table(evaluation), list(evaluation.results.values())
+    return write_html(results, path, title=title, about=about, columns=table.names, rows=table.rows)
 
 
 def _overview(evaluation: Evaluation) -> list[str]:
     """Return the table and the pictures of all cases together."""
     return [
-        markdown_table(evaluation),
-        "",
-        *summary_lines(evaluation),
-        *markdown_contact_table(evaluation),
-        *markdown_sight(evaluation),
+        *markdown_tables(evaluation),
         "",
         "Errors are norm of the estimate minus norm of the measured force, over the record phases.",
         "",

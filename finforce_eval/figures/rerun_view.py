@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from finforce.optional import import_cv2, import_library
 from finforce.stamps import NANOSECONDS
-from finforce_eval.annotation.forces import Shape
+from finforce_eval.evaluation.forces import Estimator
 from finforce_eval.recordings.tracks import JawTrack, Recording
 from finforce_eval.table import ForceSeries
 from finforce_ifea.messages import ARROW, CONTACT, CONTACT_DIAMETER, FORCE, NEWTONS_PER_METRE
@@ -78,17 +78,17 @@ class RerunView:
             points = self._rr.Points2D(found.pixels[row][seen], colors=colours, radii=2.5)
             self._stream.log(f"camera/{side}", points)
 
-    def show_shape(self, shape: Shape) -> None:
-        """Send how a jaw bends."""
-        self._at(shape.stamp)
-        normals = _vertex_normals(shape.vertices, shape.triangles)
+    def show_shape(self, side: str, stamp: int, estimator: Estimator) -> None:
+        """Send how a jaw bends in an image [ns], as its estimator has found it."""
+        self._at(stamp)
+        vertices, triangles = np.array(estimator.surface()), np.asarray(estimator.surface_triangles)
         mesh = self._rr.Mesh3D(
-            vertex_positions=shape.vertices.astype(np.float32),
-            triangle_indices=shape.triangles,
-            vertex_normals=normals,
+            vertex_positions=vertices.astype(np.float32),
+            triangle_indices=triangles,
+            vertex_normals=_vertex_normals(vertices, triangles),
             albedo_factor=(150, 170, 190),
         )
-        self._stream.log(f"jaws/{shape.side}/surface", mesh)
+        self._stream.log(f"jaws/{side}/surface", mesh)
 
     def show_poses(self, recording: Recording) -> None:
         """Send where the jaws are in the camera's frame, as far as that is known."""

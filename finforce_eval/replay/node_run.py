@@ -1,28 +1,23 @@
-"""The real nodes while a stream is played: their answers, CPU time and memory."""
+"""The real nodes while messages are played to them: their answers, CPU time and memory."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from os import getpid
 from time import monotonic, time_ns
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
+
+import psutil
 
 from finforce.errors import MissingDependencyError
 from finforce.ros.transport import free_domain
 from finforce.systems.processes import PIPELINE, executables_of
 from finforce_eval.replay.live import ReplayLog
-from finforce_eval.replay.playback import RawMessage
-from finforce_eval.replay.processes import (
-    CpuMeter,
-    ProcessError,
-    ProcessGroup,
-    busy_seconds,
-    resident_bytes,
-)
-from finforce_eval.replay.synthetic_stream import SyntheticStream
+from finforce_eval.replay.playback import Playback, RawMessage
+from finforce_eval.replay.processes import ProcessError, ProcessGroup, begin_shares, end_shares, resident_bytes
+from finforce_eval.tasks import progress_bar
 from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 
 if TYPE_CHECKING:
@@ -31,8 +26,9 @@ if TYPE_CHECKING:
 
 PATIENCE = 180.0  # [s]; a first start compiles the element loops
 PLAYER = "player"
+OBJECT_TOPIC = "/object_pose"
 QUIET = 25.0  # [% of a core] that everything else may take; above it latencies are those of a busy machine
-LINGER = 1.0  # [s]; the last answers may still be on their way when the last message has left
+LINGER = 0.5  # [s]; the last answers may still be on their way when the last message has left
 
 
 def describe_load(others: Iterable[float]) -> str:
@@ -43,15 +39,6 @@ def describe_load(others: Iterable[float]) -> str:
     return (
         f"THE MACHINE WAS BUSY: everything else took up to {largest:.0f} % of a core; repeat it when nothing else runs."
     )
-
-
-class Runnable(Protocol):
-    """What a `ProcessGroup` starts."""
-
-    label: str
-
-    def command(self) -> list[str]:
-        """Return the command line."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,10 +70,10 @@ def awaited_topics(processes: Sequence[Process], sides: Sequence[str]) -> list[s
     if not (sees and composed):
         kinds = ("keypoints", "jaw_pose") if localizes else ("keypoints",)
         topics += [f"/{side}/{kind}" for side in sides for kind in kinds]
-    return topics
+    return [*topics, OBJECT_TOPIC] if localizes else topics
 
 
-def await_listeners(player: PlayerNode, nodes: ProcessGroup, topics: Collection[str]) -> None:
+def _await_listeners(player: PlayerNode, nodes: ProcessGroup, topics: Collection[str]) -> None:
     """Wait until somebody beside the player listens to each of the topics.
 
     Raises:
@@ -102,25 +89,31 @@ def await_listeners(player: PlayerNode, nodes: ProcessGroup, topics: Collection[
 
 
 def run_nodes(
-    processes: Sequence[Runnable],
-    stream: SyntheticStream,
+    processes: Sequence[Process],
+    messages: Playback,
     sides: Sequence[str],
     awaited: Collection[str] = (),
     *,
     heard: Sequence[str] | None = None,
     detector: bool = False,
     watch: Callable[[Mapping[str, int], RawMessage], Any] = lambda pids, message: None,
+    rate: float = 1.0,
+    has_clock: bool = False,
+    environment: Mapping[str, str] | None = None,
 ) -> NodeRun:
-    """Play a stream to processes in real time, stamps shifted to now; nothing outlives the call.
+    """Play messages to processes in real time; nothing outlives the call.
 
     Args:
         processes: to be started, and ended.
-        stream: what is played.
+        messages: what is played.
         sides: jaws that are played.
-        awaited: topics that somebody has to listen to before the stream begins; without any those of our own nodes.
+        awaited: topics that somebody has to listen to before it begins; without any those of our own nodes.
         heard: jaws whose own results are heard beside the grasp force, which makes them work for it; all without.
         detector: whether the results of a key point detector are heard, too.
         watch: called with the process ids, by label, before each message leaves.
+        rate: speed.
+        has_clock: keep the stamps, and give the time on /clock; else stamps are shifted to now.
+        environment: variables of the processes; without ROS_DOMAIN_ID they have a domain by chance.
 
     Raises:
         ProcessError: a process cannot be started, ended early, or does not listen.
@@ -130,76 +123,40 @@ def run_nodes(
         from finforce_eval.replay.node import open_player
     except ImportError as error:
         raise MissingDependencyError(f"running nodes needs ROS 2: pip install 'finforce[ros]' ({error})") from error
-    domain, log = free_domain(), ReplayLog(tuple(sides))
+    log = ReplayLog(tuple(sides))
+    environment = dict(environment or {})
+    domain = environment.setdefault("ROS_DOMAIN_ID", str(free_domain()))
     with ExitStack() as stack:
-        player = stack.enter_context(open_player(domain))
-        nodes = stack.enter_context(ProcessGroup(processes, {"ROS_DOMAIN_ID": str(domain)}))
-        player.offer(stream)
+        player = stack.enter_context(open_player(int(domain)))
+        nodes = stack.enter_context(ProcessGroup(processes, environment))
+        player.offer(messages)
         player.listen(sides if heard is None else heard, log, detector=detector)
 
-        await_listeners(player, nodes, awaited or awaited_topics(processes, sides))
+        _await_listeners(player, nodes, awaited or awaited_topics(processes, sides))
         player.spin_until(monotonic() + LINGER)
-        pids = nodes.pids
-        meter = CpuMeter({**pids, PLAYER: getpid()})
-        offset = time_ns() - stream.begin
-        log.begin(offset)
-        busy = busy_seconds()
-        meter.sample()
+        bar = stack.enter_context(progress_bar(len(messages), "msg", "replay"))
+        offset = None if has_clock else time_ns() - messages.begin
+        log.offset, pids = offset or 0, nodes.pids
+        began, meters = monotonic(), begin_shares({**pids, PLAYER: getpid()})
+        psutil.cpu_percent()
 
         def note(message: RawMessage) -> None:
+            nodes.check()
             watch(pids, message)
             log.take_sent(message.topic, message.stamp, monotonic())
+            bar.update()
 
-        player.play(stream, offset=offset, sent=note)
-        meter.sample()
-        busy = busy_seconds() - busy
+        player.play(messages, rate=rate, offset=offset, sent=note)
+        busy, shares, seconds = psutil.cpu_percent() * psutil.cpu_count(), end_shares(meters), monotonic() - began
         memory = {name: resident_bytes(pid) for name, pid in pids.items()}
         log.end()
         player.spin_until(monotonic() + LINGER)
         nodes.check()
-    shares = meter.shares()
     return NodeRun(
         log=log,
         cpu={name: shares[name] for name in pids},
         memory=memory,
         player=shares[PLAYER],
-        others=max(0.0, 100.0 * busy / meter.elapsed - sum(shares.values())),
-        seconds=meter.elapsed,
+        others=max(0.0, busy - sum(shares.values())),
+        seconds=seconds,
     )
-
-
-LISTENER = """
-import sys
-from importlib import import_module
-import rclpy
-from rclpy.qos import QoSProfile, ReliabilityPolicy
-rclpy.init(args=sys.argv)
-node = rclpy.create_node("listener")
-quality = QoSProfile(depth=5, reliability=ReliabilityPolicy.RELIABLE)
-for entry in sys.argv[1:sys.argv.index("--ros-args")]:
-    topic, kind = entry.split("=")
-    package, _, name = kind.split("/")
-    node.create_subscription(getattr(import_module(package + ".msg"), name), topic, lambda message: None, quality)
-try:
-    rclpy.spin(node)
-except (KeyboardInterrupt, rclpy.executors.ExternalShutdownException):
-    pass
-"""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Listener:
-    """A process that hears topics and does nothing: what receiving them costs by itself.
-
-    Attributes:
-        label: name of the node.
-        topics: type by topic.
-    """
-
-    label: str
-    topics: Mapping[str, str]
-
-    def command(self) -> list[str]:
-        """Return the command line."""
-        topics = [f"{topic}={kind}" for topic, kind in self.topics.items()]
-        return [sys.executable, "-c", LISTENER, *topics, "--ros-args", "-r", f"__node:={self.label}"]

@@ -7,36 +7,27 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from time import monotonic, time_ns
 from typing import Any, NamedTuple
 
-from tqdm import tqdm
-
-from finforce.errors import MissingDependencyError
 from finforce.ros.tracing import FOLDER
-from finforce.ros.transport import free_domain
 from finforce.skipping import IDLE
-from finforce.systems.processes import Process, ReplayOptions, compose, executables_of, replay_processes
+from finforce.systems.processes import Process, ReplayOptions, compose, replay_processes
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.contact_source import FIXED, ContactChoice
-from finforce_eval.evaluation.evaluate import Evaluation, check_keypoint_count, score_results
-from finforce_eval.evaluation.keypoint_source import IMAGES, TRUTH, KeypointSource, awaiting_keypoints, with_detections
-from finforce_eval.evaluation.manipulation import with_distances
-from finforce_eval.evaluation.scoring import GraspScore, score_grasp
-from finforce_eval.evaluation.setup import EvaluationSetup, truth_sides
+from finforce_eval.evaluation.forces import check_keypoint_count, truth_sides
+from finforce_eval.evaluation.gripper import with_distances
+from finforce_eval.evaluation.keypoint_source import IMAGES, TRUTH, KeypointSource, awaiting_keypoints
+from finforce_eval.evaluation.scoring import Evaluation, GraspScore, score_grasp, score_results
+from finforce_eval.evaluation.setup import EvaluationSetup
 from finforce_eval.recordings.objects import find_mesh, require_mesh
 from finforce_eval.recordings.tracks import JAWS, Recording
 from finforce_eval.recordings.writer import write_recording
-from finforce_eval.replay.live import ReplayLog, live_result
-from finforce_eval.replay.node_run import await_listeners, awaited_topics
-from finforce_eval.replay.playback import Playback, RawMessage, read_playback
-from finforce_eval.replay.processes import ProcessGroup
-from finforce_eval.replay.synthetic_stream import OBJECT_TOPIC
-from finforce_eval.table import ForceSeries
+from finforce_eval.replay.live import ReplayLog, live_result, with_heard_keypoints
+from finforce_eval.replay.node_run import run_nodes
+from finforce_eval.replay.playback import read_playback
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 
-LINGER = 0.3  # s; the last answers may still be on their way when the last message has left
 RESULTS = ("wrench", "wrench_stddev", "surface", "markers", "contact", "object_outline")
 
 
@@ -114,8 +105,8 @@ def replay(
         recording, setup, calibration_file=calibration_file, playing=playing or Playing(), source=keypoints
     )
     recording, log = played.recording, played.log
-    if log.detections and played.from_images:
-        recording = with_detections(recording, {side: found.side_log() for side, found in log.detections.items()})
+    if played.from_images:
+        recording = with_heard_keypoints(recording, log)
     evaluation = _score(recording, setup, log)
     return Replay(
         evaluation=evaluation,
@@ -150,9 +141,19 @@ def play_to_nodes(
         messages = read_playback(recording.source, without=_results_of(sides) | _unplayed(sides, from_images))
         options = _graph_options(recording, setup, calibration_file, playing)
         processes = replay_processes(replace(options, images=from_images, composed=False), Path())
-        processes, log = _for_scores(processes, recording, keypoints), ReplayLog(sides)
-        _run(compose(processes) if playing.composed else processes, messages, log, playing)
-    return Played(recording, log, from_images)
+        processes = _for_scores(processes, recording, keypoints)
+        environment = {} if playing.domain is None else {"ROS_DOMAIN_ID": str(playing.domain)}
+        run = run_nodes(
+            compose(processes) if playing.composed else processes,
+            messages,
+            sides,
+            heard=() if playing.trace else sides,
+            detector=from_images,
+            rate=playing.rate,
+            has_clock=playing.has_clock,
+            environment=environment | ({FOLDER: playing.trace} if playing.trace else {}),
+        )
+    return Played(recording, run.log, from_images)
 
 
 def _choose_keypoints(recording: Recording, jaw: Jaw, keypoints: KeypointSource, stack: ExitStack) -> Recording:
@@ -238,55 +239,20 @@ def _contact_options(recording: Recording, choice: ContactChoice) -> dict[str, A
     return {"contact": mode, "object_mesh": str(mesh), "object_mesh_unit": choice.object_unit}
 
 
-def _run(processes: Sequence[Process], messages: Playback, log: ReplayLog, playing: Playing) -> None:
-    """Start the nodes, wait until they listen, play, and end them."""
-    try:
-        from finforce_eval.replay.node import open_player
-    except ImportError as error:
-        raise MissingDependencyError(f"replay needs ROS 2: pip install 'finforce[ros]' ({error})") from error
-    domain = free_domain() if playing.domain is None else playing.domain
-    awaited, names = awaited_topics(processes, tuple(log.jaws)), executables_of(processes)
-    detects = "keypoint_detector" in names
-    if "contact_estimator" in names:
-        awaited.append(OBJECT_TOPIC)
-    with ExitStack() as stack:
-        player = stack.enter_context(open_player(domain))
-        environment = {"ROS_DOMAIN_ID": str(domain), **({FOLDER: playing.trace} if playing.trace else {})}
-        nodes = stack.enter_context(ProcessGroup(processes, environment))
-        player.offer(messages)
-        player.listen(() if playing.trace else log.jaws, log, detector=detects)
-
-        await_listeners(player, nodes, awaited)
-        player.spin_until(monotonic() + LINGER)
-        bar = stack.enter_context(tqdm(total=len(messages), unit="msg", desc="replay", disable=None))
-        offset = None if playing.has_clock else time_ns() - messages.begin
-        log.begin(offset or 0)
-
-        def sent(message: RawMessage) -> None:
-            nodes.check()
-            log.take_sent(message.topic, message.stamp, monotonic())
-            bar.update()
-
-        player.play(messages, rate=playing.rate, offset=offset, sent=sent)
-        log.end()
-        player.spin_until(monotonic() + LINGER)
-        nodes.check()
-
-
 def _score(recording: Recording, setup: EvaluationSetup, log: ReplayLog) -> Evaluation:
     """Score the wrenches of every jaw with ground truth.
 
     Raises:
         RecordingError: there are none.
     """
-    results: list[ForceSeries] = []
+    results = []
     sides = truth_sides(recording)
     for side in sides:
-        if not log.jaws[side].force:
+        if not any("force" in row for row in log.rows[side].values()):
             raise RecordingError(f"{recording.name}: no wrench came on {side}/wrench: {_words(log, side)}")
         estimator = setup.side(side).estimator()
         threshold = setup.settings.likelihood_threshold
-        result = live_result(recording, side, log.jaws[side], likelihood_threshold=threshold, estimator=estimator)
+        result = live_result(recording, side, log, likelihood_threshold=threshold, estimator=estimator)
         results.append(result if len(sides) == 1 else result.renamed(f"{recording.name}/{side}"))
     if len(sides) == len(JAWS):
         results = list(with_distances(dict(zip(sides, results, strict=True)), recording).values())

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from finforce.errors import FinforceError
 
-GRASP = "grasp_wrench"
 WAY = "image out to grasp force in"
 PERCENTS = (50, 95, 99)
 OTHER_WORK = ("/diagnostics", "/clock", "/camera/camera/color/camera_info")
@@ -22,70 +22,50 @@ class TraceError(FinforceError, ValueError):
     """Nothing was noted, or nothing that belongs to an image."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Span:
-    """One callback.
-
-    Attributes:
-        node: that was called back.
-        topic: of the message.
-        begin: after the image had left [ms].
-        end: after the image had left [ms].
-        own: time in which it did not wait for another stage that it had called [ms].
-    """
-
-    node: str
-    topic: str
-    begin: float
-    end: float
-    own: float
-
-    @property
-    def stage(self) -> str:
-        """Node and topic in a few words."""
-        return f"{self.node}: {self.topic.lstrip('/').removeprefix('camera/camera/')}"
-
-
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Trace:
     """The ways of the images of a recording.
 
     Attributes:
-        ways: stamp of an image [ns] -> its callbacks, in their order.
+        spans: see `read_spans`.
         late: stamp -> from the image's leaving to the grasp force's arrival [ms]; of answered images.
         images: stamps of all images.
         lost: reason -> how many images no grasp force came of, as the nodes say.
     """
 
-    ways: Mapping[int, Sequence[Span]]
+    spans: pd.DataFrame
     late: Mapping[int, float]
     images: Sequence[int]
     lost: Mapping[str, str]
 
 
-def read_spans(folder: Path, offset: int, sent: Mapping[int, float]) -> dict[int, list[Span]]:
-    """Return what processes have noted of images.
+def read_spans(folder: Path, offset: int, sent: Mapping[int, float]) -> pd.DataFrame:
+    """Return what processes have noted of images, a row for each callback in the order of their beginnings.
 
     Args:
         folder: of their files.
         offset: by which stamps were later than they were recorded [ns].
         sent: when each image left, by its recorded stamp [s, monotonic].
 
+    Returns:
+        `image`, its recorded stamp [ns]; `stage`, node and topic in a few words; `begin` and `end` after the image had
+        left [ms]; `own` time in which the callback did not wait for another stage that it had called [ms].
+
     Raises:
         TraceError: there is nothing.
     """
-    ways: dict[int, list[Span]] = {}
+    rows = []
     for path in sorted(folder.glob("*.json")):
         noted = json.loads(path.read_text(encoding="utf-8"))
         owned = _own_times([(begin, end) for *_, begin, end in noted])
         for (node, topic, stamp, begin, end), own in zip(noted, owned, strict=True):
             left = sent.get(stamp - offset)
             if left is not None and topic not in OTHER_WORK:
-                times = {"begin": 1e-6 * begin - 1e3 * left, "end": 1e-6 * end - 1e3 * left, "own": 1e-6 * own}
-                ways.setdefault(stamp - offset, []).append(Span(node=node, topic=topic, **times))
-    if not ways:
+                stage = f"{node}: {topic.lstrip('/').removeprefix('camera/camera/')}"
+                rows.append((stamp - offset, stage, 1e-6 * begin - 1e3 * left, 1e-6 * end - 1e3 * left, 1e-6 * own))
+    if not rows:
         raise TraceError("no stage has noted anything of an image; expected at least one image to be answered")
-    return {stamp: sorted(spans, key=lambda span: span.begin) for stamp, spans in sorted(ways.items())}
+    return pd.DataFrame(rows, columns=["image", "stage", "begin", "end", "own"]).sort_values(["image", "begin"])
 
 
 def _own_times(spans: Sequence[tuple[int, int]]) -> list[int]:
@@ -105,17 +85,9 @@ def _own_times(spans: Sequence[tuple[int, int]]) -> list[int]:
 
 def stage_figures(trace: Trace) -> dict[str, dict[str, Any]]:
     """Return by stage how often it was at work, for how long itself, and when it began [ms], and the whole way."""
-    stages: dict[str, list[Span]] = {}
-    for spans in trace.ways.values():
-        for span in spans:
-            stages.setdefault(span.stage, []).append(span)
     found = {
-        name: {
-            "n": len(spans),
-            "own_ms": _percentiles([span.own for span in spans]),
-            "begin_ms": _percentiles([span.begin for span in spans]),
-        }
-        for name, spans in stages.items()
+        stage: {"n": len(rows), "own_ms": _percentiles(rows["own"]), "begin_ms": _percentiles(rows["begin"])}
+        for stage, rows in trace.spans.groupby("stage", sort=False)
     }
     ordered = dict(sorted(found.items(), key=lambda entry: entry[1]["begin_ms"][0]))
     late = list(trace.late.values())
@@ -123,18 +95,17 @@ def stage_figures(trace: Trace) -> dict[str, dict[str, Any]]:
 
 
 def _percentiles(values: Sequence[float]) -> list[float]:
-    return [float(value) for value in np.percentile(values, PERCENTS)] if values else [float("nan")] * len(PERCENTS)
+    return np.percentile(values, PERCENTS).tolist() if len(values) else [float("nan")] * len(PERCENTS)
 
 
 def format_trace(trace: Trace) -> str:
     """Return a table of the stages in Markdown, and what was lost."""
     lines = ["| stage | images | begins at p50/ms | takes p50/ms | p95 | p99 |", "|---|---:|---:|---:|---:|---:|"]
     for name, figures in stage_figures(trace).items():
-        begin, own = figures["begin_ms"][0], figures["own_ms"]
-        lines.append(f"| {name} | {figures['n']} | {begin:.2f} | " + " | ".join(f"{value:.2f}" for value in own) + " |")
-    answered = len(trace.late)
-    lines.append("")
-    lines.append(f"{answered} of {len(trace.images)} images answered. Where the others went, by the nodes themselves:")
+        times = " | ".join(f"{value:.2f}" for value in (figures["begin_ms"][0], *figures["own_ms"]))
+        lines.append(f"| {name} | {figures['n']} | {times} |")
+    lines += ["", f"{len(trace.late)} of {len(trace.images)} images answered. Where the others went, by the nodes "
+              "themselves:"]  # fmt: skip
     return "\n".join([*lines, *(f"- {name}: {why}" for name, why in trace.lost.items())])
 
 
@@ -144,7 +115,8 @@ def median_image(trace: Trace) -> int:
     Raises:
         TraceError: none was answered.
     """
-    known = sorted((late, stamp) for stamp, late in trace.late.items() if stamp in trace.ways)
+    noted = set(trace.spans["image"])
+    known = sorted((late, stamp) for stamp, late in trace.late.items() if stamp in noted)
     if not known:
         raise TraceError("no image was answered; expected one at least")
     return known[len(known) // 2][1]
@@ -155,18 +127,19 @@ def draw_way(trace: Trace, path: Path | str) -> None:
     from finforce_eval.figures.figures import BLACK, BLUE, GREY, ORANGE, new_figure, style_axes
 
     stamp = median_image(trace)
-    spans = trace.ways[stamp]
-    figure = new_figure(10.0, 1.6 + 0.28 * len(spans) + 1.8)
-    way, all_of_them = figure.subplots(2, 1, height_ratios=[0.28 * len(spans) + 0.6, 1.6])
-    for row, span in enumerate(spans):
-        way.barh(row, span.end - span.begin, left=span.begin, height=0.7, color=BLUE, alpha=0.85)
-        way.text(span.end + 0.1, row, f"{span.own:.2f} ms", va="center", fontsize=7, color=BLACK)
-    way.set_yticks(range(len(spans)), [span.stage for span in spans], fontsize=7)
+    spans = trace.spans[trace.spans["image"] == stamp]
+    height = 0.28 * len(spans)
+    figure = new_figure(10.0, height + 3.4)
+    way, all_of_them = figure.subplots(2, 1, height_ratios=[height + 0.6, 1.6])
+    way.barh(range(len(spans)), spans["end"] - spans["begin"], left=spans["begin"], height=0.7, color=BLUE, alpha=0.85)
+    for row, (end, own) in enumerate(zip(spans["end"], spans["own"], strict=True)):
+        way.text(end + 0.1, row, f"{own:.2f} ms", va="center", fontsize=7, color=BLACK)
+    way.set_yticks(range(len(spans)), spans["stage"], fontsize=7)
     way.invert_yaxis()
     way.axvline(trace.late[stamp], color=ORANGE, linewidth=1.2)
     way.text(trace.late[stamp], -0.9, "grasp force", color=ORANGE, ha="center", fontsize=8)
     way.set_xlabel("after the image left [ms]; beside each bar what the stage itself took")
-    way.set_xlim(left=0.0, right=1.15 * max(trace.late[stamp], max(span.end for span in spans)))
+    way.set_xlim(left=0.0, right=1.15 * max(trace.late[stamp], spans["end"].max()))
     late = np.array(list(trace.late.values()))
     all_of_them.hist(late, bins=np.linspace(0.0, max(40.0, float(late.max())), 80), color=GREY)
     for percent in PERCENTS:

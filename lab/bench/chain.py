@@ -36,7 +36,7 @@ from finforce_eval.replay.live import ReplayLog
 from finforce_eval.replay.node_run import NodeRun, describe_load, run_nodes
 from finforce_eval.replay.playback import RawMessage
 from finforce_eval.replay.processes import resident_bytes
-from finforce_eval.replay.synthetic_stream import SyntheticStream, stream_images, stream_keypoints
+from lab.bench.streams import SyntheticStream, stream_images, stream_keypoints
 from lab.harness import Figures, Tradeoff, percentiles
 from lab.scenes import GRASP, GRASP_FAST, find_scene
 
@@ -140,7 +140,7 @@ def measure_long(minutes: float) -> Figures:
 
 def divide_grasps(log: ReplayLog, truth: TrueGrasp, stream: SyntheticStream) -> pd.DataFrame:
     """Return images, answers and mean error of each grasp after the tare, beside the truth of the first one."""
-    sent = np.array(sorted(log.jaws[SIDES[0]].sent))
+    sent = np.array(sorted(log.sent[SIDES[0]]))
     sent = sent[sent >= sent[0] + TARE * NANOSECONDS]
     number = (sent - stream.messages[0].stamp) // stream.period
     force = np.array([log.grasp.get(int(stamp), np.nan) for stamp in sent])
@@ -198,7 +198,7 @@ def true_grasp(recording: Recording) -> TrueGrasp:
 def describe_run(source: str, setup: str, rate: int, run: NodeRun, truth: TrueGrasp) -> dict[str, Any]:
     """Return the row of a run; counts are of images after the tare."""
     log = run.log
-    sent = np.array(sorted(log.jaws[SIDES[0]].sent))
+    sent = np.array(sorted(log.sent[SIDES[0]]))
     counted = {int(stamp) for stamp in sent if stamp >= sent[0] + TARE * NANOSECONDS}
     answered = np.array(sorted(counted & log.grasp.keys()))
     error = np.array([log.grasp[int(stamp)] for stamp in answered]) - truth.at(answered)

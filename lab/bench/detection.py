@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from time import perf_counter, process_time
 from typing import Any
@@ -18,13 +18,15 @@ from numpy.typing import NDArray
 
 from finforce.camera import ImageError, project
 from finforce.transforms import pose_from_quaternion
-from finforce_eval.evaluation.keypoint_source import Detector, KeypointSource, SideLog, build_records, with_detections
-from finforce_eval.evaluation.results import compare_detection, detection_stats
+from finforce_eval.evaluation.keypoint_source import KeypointSource, build_records, with_detections
+from finforce_eval.evaluation.scoring import compare_detection, detection_stats
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.tracks import JawTrack, Recording
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_keypoints.build import build_detector
+from finforce_keypoints.detector import KeypointDetector
 from finforce_keypoints.errors import KeypointError
+from finforce_keypoints.geometry.jaw_localizer import JawKeypoints
 from finforce_keypoints.images import RgbdImage
 from finforce_keypoints.parameters import load_jaws
 from lab.harness import Figures, Tradeoff, percentiles
@@ -67,8 +69,9 @@ class _DetectionRun:
     """A way on one recording: its detector, and what it found of each jaw."""
 
     way: Way
-    detector: Detector
-    logs: dict[str, SideLog]
+    detector: KeypointDetector
+    found: dict[str, dict[int, JawKeypoints]]
+    step_ms: dict[int, float] = field(default_factory=dict)
     seconds: list[float] = field(default_factory=list)
     cpu: list[float] = field(default_factory=list)
 
@@ -77,15 +80,14 @@ class _DetectionRun:
         begin, used = perf_counter(), process_time()
         if self.way.searches:
             self.detector.reset()
-        found: Mapping[str, Any] = {}
+        seen: Mapping[str, JawKeypoints] = {}
         with suppress(KeypointError, ImageError):
-            found = self.detector.detect(image)
+            seen = self.detector.detect(image)
         self.seconds.append(perf_counter() - begin)
         self.cpu.append(process_time() - used)
-        for side, log in self.logs.items():
-            log.step_ms[stamp] = 1e3 * self.seconds[-1]
-            if side in found:
-                log.found[stamp] = found[side]
+        self.step_ms[stamp] = 1e3 * self.seconds[-1]
+        for side in self.found.keys() & seen.keys():
+            self.found[side][stamp] = seen[side]
 
 
 def measure(quick: bool) -> Figures:
@@ -119,7 +121,7 @@ def measure_ways(ways: Sequence[Way], scenes: Sequence[TwinScene], count: int | 
             # the first image compiles, and finds the jaws
             seconds[run.way.name] += run.seconds[1:]
             cpu[run.way.name] += run.cpu[1:]
-            detected = with_detections(recording, run.logs)
+            detected = with_detections(recording, run.found, dict.fromkeys(run.found, run.step_ms))
             series[run.way.name] += [
                 compare_detection(track.detection, track.sight) for track in detected.jaws.values()
             ]
@@ -129,7 +131,7 @@ def measure_ways(ways: Sequence[Way], scenes: Sequence[TwinScene], count: int | 
             **percentiles(spent),
             "CPU p50/ms": 1e3 * float(np.median(cpu[name])),
             "CPU mean/ms": 1e3 * float(np.mean(cpu[name])),
-            **sight_columns(asdict(detection_stats(series[name]))),
+            **sight_columns(detection_stats(series[name])),
         }
         for name, spent in seconds.items()
     ]
@@ -150,7 +152,7 @@ def measure_ways(ways: Sequence[Way], scenes: Sequence[TwinScene], count: int | 
 
 
 def sight_columns(stats: Mapping[str, float | None]) -> dict[str, float]:
-    """Return the fields of `DetectionStats`, how well key points were seen, as columns of a table."""
+    """Return the numbers of `detection_stats`, how well key points were seen, as columns of a table."""
     found = {name: np.nan if value is None else value for name, value in stats.items()}
     return {
         "pixel error median/px": found["pixel_median_px"],
@@ -183,7 +185,7 @@ def _begin(way: Way, recording: Recording) -> _DetectionRun:
     records = build_records(KeypointSource(parameters=way.parameters).node_parameters(recording))
     detector = build_detector(load_jaws(records.parameters), *records, rests=way.rests)
     detector.warm_up()
-    return _DetectionRun(way=way, detector=detector, logs={side: SideLog() for side in recording.jaws})
+    return _DetectionRun(way=way, detector=detector, found={side: {} for side in recording.jaws})
 
 
 def time_product(size: int = 512) -> float:

@@ -12,13 +12,14 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
-from finforce_eval.evaluation.results import Delay, delay_stats, force_delays
+from finforce_eval.evaluation.scoring import delay_stats, force_delays
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.replay.live import ReplayLog
 from finforce_eval.replay.node_run import describe_load, run_nodes
-from finforce_eval.replay.synthetic_stream import stream_images
 from lab.bench.chain import SIDES, TARE, TrueGrasp, chain_processes, true_grasp
+from lab.bench.streams import stream_images
 from lab.harness import Figures
 from lab.scenes import EVERY_RATE, TwinScene, find_scene
 
@@ -55,41 +56,41 @@ def measure(quick: bool) -> Figures:
     rows, loads = [], []
     for closing in CLOSINGS:
         for rate, phases in ((30, PHASES), (90, (0,) * len(PHASES))):
-            delays: list[Delay] = []
+            delays: list[NDArray] = []
             for grasp in range(1 if quick else GRASPS):
                 found, load = _play(closing.changes(grasp), rate, phases)
-                delays += found
+                delays.append(found)
                 loads.append(load)
             stats = delay_stats(delays)
             rows.append(
                 {
                     "closing/mm/s": 1e3 * closing.speed,
                     "Hz": rate,
-                    "onsets": stats.n,
-                    "missed": stats.missed,
-                    "shows after: median/ms": stats.median_ms or np.nan,
-                    "largest/ms": stats.max_ms or np.nan,
-                    "rise of the true force/ms": stats.rise_ms or np.nan,
+                    "onsets": stats["n"],
+                    "missed": stats["missed"],
+                    "shows after: median/ms": stats["median_ms"] or np.nan,
+                    "largest/ms": stats["max_ms"] or np.nan,
+                    "rise of the true force/ms": stats["rise_ms"] or np.nan,
                 }
             )
     return Figures(tables={"onset": pd.DataFrame(rows)}, notes=[describe_load(loads)])
 
 
-def _play(changes: Mapping[str, float], rate: int, phases: Sequence[int]) -> tuple[list[Delay], float]:
+def _play(changes: Mapping[str, float], rate: int, phases: Sequence[int]) -> tuple[NDArray, float]:
     """Play a grasp at a rate [Hz], once from each phase of the images; return delays and other load [% of a core]."""
     path = find_scene(TwinScene(scenario="grasp_cylinder", seed=101, changes=SHORT | changes, slots=EVERY_RATE))
     recording = read_recording(path)
-    truth, delays, load = true_grasp(recording), [], 0.0
+    truth, delays, load = true_grasp(recording), np.zeros((0, 2)), 0.0
     for phase in phases:
         stream = stream_images(path, rate, phase=phase)
         run = run_nodes(chain_processes(recording, images=True), stream, SIDES, heard=())
-        delays, load = delays + find_delays(run.log, truth), max(load, run.others)
+        delays, load = np.vstack((delays, find_delays(run.log, truth))), max(load, run.others)
     return delays, load
 
 
-def find_delays(log: ReplayLog, truth: TrueGrasp) -> list[Delay]:
+def find_delays(log: ReplayLog, truth: TrueGrasp) -> NDArray:
     """Return the delay after each onset in a run."""
-    sent = np.array(sorted(log.jaws[SIDES[0]].sent))
+    sent = np.array(sorted(log.sent[SIDES[0]]))
     stamps = sent[sent >= sent[0] + int(0.5e9 * TARE)]
     estimate = np.array([log.grasp.get(int(stamp), np.nan) for stamp in stamps])
     lag = np.array([log.grasp_latency.get(int(stamp), np.nan) for stamp in stamps])

@@ -19,9 +19,9 @@ from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.tracks import PhaseTrack
 from finforce_eval.replay.node_run import describe_load, run_nodes
 from finforce_eval.replay.playback import RawMessage
-from finforce_eval.replay.processes import CpuMeter
-from finforce_eval.replay.synthetic_stream import stream_images
+from finforce_eval.replay.processes import begin_shares, end_shares
 from lab.bench.chain import SIDES, chain_processes
+from lab.bench.streams import stream_images
 from lab.harness import Figures
 from lab.scenes import TwinScene, find_scene
 
@@ -88,7 +88,7 @@ class SceneMeter:
     spans: Mapping[str, tuple[int, int]]
     shares: dict[str, Mapping[str, float]] = field(default_factory=dict)
     _scene: str = ""
-    _meter: Any = None
+    _processes: Mapping[str, Any] = field(default_factory=dict)
 
     def note(self, pids: Mapping[str, int], message: RawMessage) -> None:
         """Note that a message leaves."""
@@ -96,10 +96,8 @@ class SceneMeter:
         if scene == self._scene:
             return
         if self._scene:
-            self._meter.sample()
-            self.shares[self._scene] = self._meter.shares()
-        self._scene, self._meter = scene, CpuMeter(pids)
-        self._meter.sample()
+            self.shares[self._scene] = end_shares(self._processes)
+        self._scene, self._processes = scene, begin_shares(pids)
 
 
 def arrange(rows: pd.DataFrame) -> pd.DataFrame:

@@ -13,10 +13,9 @@ from typing import Any
 import pandas as pd
 
 from finforce.errors import FinforceError
-from finforce_eval.engine.engines import EngineOptions, run_tasks
-from finforce_eval.engine.tasks import OK, Manifest, Task, choose_shard
 from finforce_eval.figures.figures import new_figure, style_axes
 from finforce_eval.machine import commit, version, write_figures
+from finforce_eval.tasks import OK, EngineOptions, Manifest, Task, choose_shard, run_tasks
 from lab.experiments.runs import Case, RunOptions
 from lab.harness import Figures, format_figures
 

@@ -12,10 +12,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from finforce_eval.evaluation.evaluate import Evaluation
-from finforce_eval.evaluation.results import ONSET, force_delays
-from finforce_eval.evaluation.scoring import rms
-from finforce_eval.evaluation.setup import evaluate_all
+from finforce_eval.evaluate import evaluate_all
+from finforce_eval.evaluation.scoring import ONSET_FORCE, Evaluation, force_delays, rms
 from finforce_eval.figures.figures import BLACK, BLUE, GREEN, ORANGE
 from lab.experiments.experiment import Experiment, average, draw_panels, tabulate
 from lab.experiments.runs import Case, RunOptions, build_setup, keep_poses
@@ -57,7 +55,8 @@ def join_jaws(evaluation: Evaluation, name: str) -> pd.DataFrame:
 def find_phases(grasp: pd.DataFrame) -> dict[str, NDArray]:
     """Return which images (n,) belong to the whole grasp, to loading, holding and letting go, by the true force."""
     truth = grasp.truth.to_numpy()
-    held, largest, places = np.nan_to_num(truth) > ONSET, float(np.nanmax(truth, initial=0.0)), np.arange(len(truth))
+    held, largest = np.nan_to_num(truth) > ONSET_FORCE, float(np.nanmax(truth, initial=0.0))
+    places = np.arange(len(truth))
     high, kept = np.flatnonzero(truth >= RISEN * largest), np.flatnonzero(truth >= FALLEN * largest)
     first, last = (int(high[0]), int(kept[-1])) if high.size else (0, 0)
     load, release = held & (places <= first), held & (places > last)
@@ -81,7 +80,7 @@ def score_grasp(grasp: pd.DataFrame) -> dict[str, Any]:
         "max_error_N": float(np.abs(error[known]).max(initial=0.0)),
         "answered_pct": 100.0 * float(known.sum() / max(held.sum(), 1)),
         "within_3_sigma_pct": 100.0 * float(within.mean()) if known.any() else float("nan"),
-        "delay_ms": [1e3 * one.shown for one in delays],
+        "delay_ms": (1e3 * delays[:, 0]).tolist(),
     }
 
 
@@ -168,7 +167,7 @@ def draw_grasps(figures: Mapping[str, Mapping[str, Any]]) -> Any:
         for row in figures.values():
             if title == f"{row['object']}, {row['place']}":
                 grasp = pd.DataFrame(row["drawn"])
-                seconds = grasp.seconds - grasp.seconds[grasp.truth > ONSET].min()
+                seconds = grasp.seconds - grasp.seconds[grasp.truth > ONSET_FORCE].min()
                 axes.plot(seconds, grasp.found, color=COLOURS[row["level"]], linewidth=1.2)
                 axes.plot(seconds, grasp.truth, color=BLACK, linewidth=0.9, dashes=(4, 2))
         axes.set_xlim(left=-1.0)

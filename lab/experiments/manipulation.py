@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.gripper_frames import SIDES
-from finforce_eval.evaluation.manipulation import join_net
-from finforce_eval.evaluation.scoring import rms
-from finforce_eval.evaluation.setup import EvaluationSetup, evaluate_all
+from finforce_eval.evaluate import evaluate_all
+from finforce_eval.evaluation.scoring import join_net, rms
+from finforce_eval.evaluation.setup import EvaluationSetup
 from finforce_eval.figures.figures import BLACK, BLUE, new_figure
 from finforce_eval.recordings.tracks import Recording
 from finforce_eval.table import ForceSeries

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from finforce.optional import import_cv2
 from finforce_eval.errors import OptionError, RecordingError
+from finforce_eval.evaluate import evaluate_all
 from finforce_eval.evaluation.scoring import rms
-from finforce_eval.evaluation.setup import evaluate_all
 from finforce_eval.figures.figures import BLACK, BLUE, ORANGE
 from finforce_eval.recordings.images import StampedImage
 from finforce_keypoints.networks.network import open_session

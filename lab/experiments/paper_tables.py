@@ -11,10 +11,10 @@ import numpy as np
 import pandas as pd
 
 from finforce_eval.errors import RecordingError
+from finforce_eval.evaluate import evaluate_all
 from finforce_eval.evaluation.contact_source import ContactChoice
-from finforce_eval.evaluation.evaluate import Evaluation
-from finforce_eval.evaluation.results import ONSET
-from finforce_eval.evaluation.setup import EvaluationSetup, evaluate_all
+from finforce_eval.evaluation.scoring import ONSET_FORCE, Evaluation
+from finforce_eval.evaluation.setup import EvaluationSetup
 from finforce_eval.recordings.tracks import Recording
 from lab.experiments.experiment import Experiment
 from lab.experiments.runs import Case, RunOptions, build_setup
@@ -94,24 +94,24 @@ def score_contact(recording: Recording, setup: EvaluationSetup) -> dict[str, Any
     except RecordingError as error:
         return {"rmse_N": float("nan"), "solved_pct": 0.0, "reason": str(error)}
     score = evaluation.total
-    cycles = {phase: score.cycles[phase].rmse_N for phase in ("all", "load", "unload")}
+    cycles = {phase: score.cycles[phase]["rmse_N"] for phase in ("all", "load", "unload")}
     return {
         "rmse_N": score.all.rmse_N,
-        "std_N": cycles["all"].std,
-        "load_N": cycles["load"].mean,
-        "unload_N": cycles["unload"].mean,
-        "nrmsd_pct": score.cycles["all"].nrmsd_pct.mean,
+        "std_N": cycles["all"]["std"],
+        "load_N": cycles["load"]["mean"],
+        "unload_N": cycles["unload"]["mean"],
+        "nrmsd_pct": score.cycles["all"]["nrmsd_pct"]["mean"],
         "bias_N": score.all.bias_N,
         "solved_pct": _share_solved(evaluation),
-        "place_median_mm": score.place.median_mm,
-        "place_p95_mm": score.place.p95_mm,
+        "place_median_mm": score.place["median_mm"],
+        "place_p95_mm": score.place["p95_mm"],
     }
 
 
 def _share_solved(evaluation: Evaluation) -> float:
     """Return the share of the scored images with a true force that was answered [%]."""
     loaded = [
-        (result.scored & (result.true_magnitude > ONSET), result.solved) for result in evaluation.results.values()
+        (result.scored & (result.true_magnitude > ONSET_FORCE), result.solved) for result in evaluation.results.values()
     ]
     answered = sum(int((rows & solved).sum()) for rows, solved in loaded)
     return 100.0 * answered / max(sum(int(rows.sum()) for rows, _ in loaded), 1)

@@ -20,8 +20,8 @@ from finforce_contact.mesh.views import MeshView
 from finforce_contact.pose.symmetry import Symmetry, read_symmetry
 from finforce_contact.pose.tracker import PoseTracker
 from finforce_eval.errors import RecordingError
+from finforce_eval.evaluate import evaluate_all
 from finforce_eval.evaluation.contact_source import ContactChoice
-from finforce_eval.evaluation.setup import evaluate_all
 from finforce_eval.recordings.objects import require_mesh
 from finforce_eval.recordings.tracks import PoseTrack, Recording
 from finforce_keypoints.images import RgbdImage
@@ -109,7 +109,7 @@ def run(options: RunOptions, case: Case, folder: Path) -> dict[str, Any]:
         for way, (seen, delay) in ways.items():
             setup = build_setup(case.settings, ContactChoice(mode="estimate", pose_delay=delay))
             evaluation = evaluate_all([seen], setup)
-            places = [score.solved_place.median_mm for score in evaluation.scores.values()]
+            places = [score.solved_place["median_mm"] for score in evaluation.scores.values()]
             known = [place for place in places if place is not None]
             score = score_grasp(join_jaws(evaluation, recording.name))
             found[way] = {**score, "place_median_mm": max(known) if known else float("nan")}

@@ -12,11 +12,10 @@ from typing import Any
 from numpy.typing import NDArray
 
 from finforce.gripper_frames import SIDES
-from finforce_eval.engine.settings import hash_files
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.contact_source import ContactChoice
 from finforce_eval.evaluation.keypoint_source import KeypointSource
-from finforce_eval.evaluation.setup import EvaluationSetup
+from finforce_eval.evaluation.setup import EvaluationSetup, hash_files
 from finforce_eval.recordings.bags import bag_source
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.tracks import Recording

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from finforce_eval.engine.engines import EngineOptions, run_tasks
-from finforce_eval.engine.tasks import OK, Manifest, Task
+from finforce_eval.tasks import OK, EngineOptions, Manifest, Task, run_tasks
 from lab.training.commands import DatasetError
 
 MARGIN = 28  # px of padding all round, room for shifting and turning a picture

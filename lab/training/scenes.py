@@ -21,8 +21,7 @@ from scipy.spatial.transform import Rotation
 from finforce.camera import CameraIntrinsics, project
 from finforce.optional import import_cv2
 from finforce_eval.cli.parser import add_engine_options, read_engine, whole_number
-from finforce_eval.engine.engines import EngineOptions
-from finforce_eval.engine.tasks import Task, choose_shard
+from finforce_eval.tasks import EngineOptions, Task, choose_shard
 from finforce_keypoints.geometry.side_picture import PlaneGrid
 from finforce_keypoints.geometry.template import MARK_RADIUS, SideShape, draw_template, fit_grid
 from finforce_sim.objects import OBJECT_NAMES, build_object

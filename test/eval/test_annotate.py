@@ -15,13 +15,11 @@ from rosbags.typesys import Stores, get_typestore
 
 from finforce_eval.annotation import bag as annotated_bag
 from finforce_eval.cli.main import main
-from finforce_eval.engine import engines
-from finforce_eval.engine.engines import EngineOptions, run_tasks
-from finforce_eval.engine.tasks import Manifest, Task, choose_shard
-from finforce_eval.evaluation.evaluate import evaluate_recording
+from finforce_eval.evaluation.forces import evaluate_recording
 from finforce_eval.evaluation.setup import make_setup
 from finforce_eval.recordings.recording import DEMO, read_recording
 from finforce_eval.recordings.writer import write_recording
+from finforce_eval.tasks import EngineOptions, Manifest, Task, choose_shard, run_tasks
 
 TYPES = get_typestore(Stores.ROS2_JAZZY)
 SECONDS = 6
@@ -89,7 +87,7 @@ def test_types_and_qualities_of_the_topics_are_kept(source, annotated):
 def test_forces_are_those_of_evaluate_and_what_has_none_is_nan_with_its_reason(source, annotated, tmp_path):
     recording = read_recording(source)
     setup = make_setup(options_of(source))
-    expected = evaluate_recording(recording, setup.jaw, setup.source(recording), factory=setup.estimator)
+    expected = evaluate_recording(recording, setup.jaw, setup.source(recording), setup.estimator())
     forces = decoded(annotated, "/left/wrench")
     found = np.array([[f.wrench.force.x, f.wrench.force.y, f.wrench.force.z] for f in forces])
     np.testing.assert_array_equal(found, expected.force)
@@ -295,17 +293,6 @@ def test_a_run_that_is_killed_again_and_again_loses_nothing_and_does_nothing_twi
     for bag, name in zip(bags, names, strict=True):
         topics = {topic for topic, *_ in messages(bag)}
         assert [entry for entry in messages(out / name) if entry[0] in topics] == messages(bag)
-
-
-def count_letters(word):
-    return {"letters": len(word)}
-
-
-def test_processes_give_way_to_others_and_nothing_waits_for_ever(tmp_path, monkeypatch):
-    monkeypatch.setattr(engines, "_TASKS_PER_PROCESS", 3)
-    tasks = [Task(name=f"t{n}", key="k", work=count_letters, given={"word": n * "x"}) for n in range(14)]
-    lines = run_tasks(tasks, EngineOptions(engine="processes", workers=2), Manifest(tmp_path))
-    assert [line["figures"]["letters"] for line in lines] == list(range(14))
 
 
 @pytest.mark.parametrize("words", [["--workers", "-1"], ["--memory", "nan"], ["--memory=-1"], ["--memory", "inf"]])

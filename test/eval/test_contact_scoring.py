@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from test_scoring import make_result
 
-from finforce_eval.evaluation.scoring import given_distance, onset_delays, onset_stats, place_stats, solved_distance
+from finforce_eval.evaluation.scoring import distances, given_distance, onset_delays, onset_stats, solved_distance
 
 
 def contact_result(truth, *, touching=None, given=None, place=None, cycle=None, pressure=0.040):
@@ -30,19 +30,19 @@ def test_places_are_compared_where_something_presses():
         [0.0, 0.1, 0.3, 1.0, 1.0], given=[0.0, 0.0, 0.041, 0.037, np.nan], place=[0.0, 0.0, 0.04, 0.042, 0.04]
     )
     np.testing.assert_allclose(given_distance(result), [np.nan, np.nan, 1e-3, 3e-3, np.nan])
-    stats = place_stats(given_distance(result))
-    assert (stats.n, stats.median_mm, stats.max_mm) == (2, pytest.approx(2.0), pytest.approx(3.0))
-    assert stats.p95_mm == pytest.approx(2.9)
-    assert place_stats(solved_distance(result)).median_mm == pytest.approx(0.0)
-    assert place_stats(solved_distance(result)).n == 3
+    stats = distances([given_distance(result)])
+    assert (stats["n"], stats["median_mm"], stats["max_mm"]) == (2, pytest.approx(2.0), pytest.approx(3.0))
+    assert stats["p95_mm"] == pytest.approx(2.9)
+    assert distances([solved_distance(result)])["median_mm"] == pytest.approx(0.0)
+    assert distances([solved_distance(result)])["n"] == 3
 
 
 def test_result_without_contact_has_no_place_and_no_onset():
     result = make_result(truth=[1.0], force=[1.0])
-    assert place_stats(given_distance(result)).n == 0
-    assert place_stats(solved_distance(result)).median_mm is None
+    assert distances([given_distance(result)])["n"] == 0
+    assert distances([solved_distance(result)])["median_mm"] is None
     assert onset_delays(result) == []
-    assert onset_stats([result]).median_frames is None
+    assert onset_stats([result])["median_frames"] is None
 
 
 FORCE = [0, 0, 0, 0.01, 0.03, 1, 1, 0, 0]
@@ -71,13 +71,13 @@ def test_cycles_are_counted_apart_and_what_lingers_from_the_last_one_is_no_touch
     result = contact_result(FORCE * 2, touching=touching, cycle=[0] * 9 + [1] * 9)
     assert onset_delays(result) == [1, 2]
     stats = onset_stats([result, contact_result(FORCE, touching=[0] * 9)])
-    assert (stats.n, stats.missed) == (2, 1)
-    assert (stats.median_frames, stats.earliest_frames, stats.max_frames) == (1.5, 1, 2)
+    assert (stats["n"], stats["missed"]) == (2, 1)
+    assert (stats["median_frames"], stats["earliest_frames"], stats["max_frames"]) == (1.5, 1, 2)
 
 
 def test_touches_without_true_force_are_false():
     result = contact_result(FORCE, touching=[1, 0, 0, 0, 0, 1, 1, 1, 0])
-    assert onset_stats([result]).false_pct == pytest.approx(100 * 2 / 6)
+    assert onset_stats([result])["false_pct"] == pytest.approx(100 * 2 / 6)
 
 
 def test_touch_that_is_never_let_go_is_early_by_the_whole_pause():

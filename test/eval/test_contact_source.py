@@ -10,7 +10,7 @@ from finforce.errors import PoseError
 from finforce_contact.loop import ForceLoop
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.contact_source import RecordedContact
-from finforce_eval.evaluation.evaluate import evaluate_recording
+from finforce_eval.evaluation.forces import evaluate_recording
 from finforce_eval.recordings.objects import ObjectTrack, track_object
 
 
@@ -27,7 +27,7 @@ def run(track, *, lost=(), touching=lambda update: True):
     solver, fake = FakeEstimator(forces), FakeContactEstimator(touching)
     jaw = FakeJaw(keypoints=np.zeros((4, 3)))
     source = RecordedContact(fake, track)
-    result = evaluate_recording(recording, jaw, source, factory=lambda: solver)
+    result = evaluate_recording(recording, jaw, source, solver)
     return result, solver, fake
 
 
@@ -117,7 +117,7 @@ def test_pose_that_the_estimator_refuses_is_named():
     source = RecordedContact(Strict(), track_object(recording, "left"))
     jaw = FakeJaw(keypoints=np.zeros((4, 3)))
     with pytest.raises(RecordingError, match=r"case: object pose at 1000.000 s: the camera at \[.*\] is inside"):
-        evaluate_recording(recording, jaw, source, factory=lambda: FakeEstimator([]))
+        evaluate_recording(recording, jaw, source, FakeEstimator([]))
 
 
 def test_a_pose_of_the_image_itself_is_used_with_it_whatever_the_date():

@@ -14,9 +14,9 @@ from finforce_contact.loop import GivenContact
 from finforce_eval.cli import demo
 from finforce_eval.cli.twin import write_footage
 from finforce_eval.errors import RecordingError
-from finforce_eval.evaluation.evaluate import evaluate_recording, score_results
+from finforce_eval.evaluation.forces import evaluate_recording
 from finforce_eval.evaluation.keypoint_source import detect_keypoints
-from finforce_eval.evaluation.scoring import score_grasp
+from finforce_eval.evaluation.scoring import score_grasp, score_results
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.replay.replay import Replay
 
@@ -56,10 +56,8 @@ def test_a_recording_of_something_else_is_rendered_anew(folder, rendered, change
     assert len(rendered) == 2 and json.loads((folder / "case.json").read_text()) == case
 
 
-@pytest.mark.parametrize("missing", [("case.json", "metadata.yaml", "object.stl", "preview.jpg"), ("metadata.yaml",)])
-def test_a_recording_that_was_broken_off_is_rendered_anew(folder, rendered, missing):
-    for name in missing:
-        (folder / name).unlink()
+def test_a_damaged_recording_is_rendered_anew(folder, rendered):
+    (folder / "metadata.yaml").unlink()
     bag = folder / "recording.mcap"
     bag.write_bytes(bag.read_bytes()[:5000])
     assert len(demo.prepare_recording(folder).images) == 12 and len(rendered) == 2
@@ -95,7 +93,7 @@ def test_the_grasp_force_is_scored_against_the_smaller_true_force(played):
     assert score.error.rmse_N == pytest.approx(0.03) and score.error.n == 40
     assert score.largest == pytest.approx(2.0) and score.frames == 40
     # 0.02 N a fifth of a period after image 19; 0.13 N with image 20, 0.8 periods later, and 50 ms on the way
-    assert score.delay.n == 1 and score.delay.median_ms == pytest.approx(0.8e3 / 30 + 50, abs=0.1)
+    assert score.delay["n"] == 1 and score.delay["median_ms"] == pytest.approx(0.8e3 / 30 + 50, abs=0.1)
     left = played.jaws["left"]
     weaker = replace(left, truth=replace(left.truth, force=0.5 * left.truth.force))
     both = replace(played, jaws={"left": left, "right": weaker})
@@ -106,13 +104,13 @@ def test_without_the_truth_of_a_jaw_nothing_is_said_of_the_grasp(played):
     left = played.jaws["left"]
     both = replace(played, jaws={"left": left, "right": replace(left, truth=None)})
     score = score_grasp(both, *grasp_of(played, 0.0))
-    assert score.error.rmse_N is None and not score.delay.n
+    assert score.error.rmse_N is None and not score.delay["n"]
 
 
 def replay_of(recording):
     forces = recording.truth("left").force
     jaw = FakeJaw(keypoints=np.zeros((4, 3)))
-    result = evaluate_recording(recording, jaw, GivenContact(None), factory=lambda: FakeEstimator(forces))
+    result = evaluate_recording(recording, jaw, GivenContact(None), FakeEstimator(forces))
     grasp, lag = grasp_of(recording, 0.03)
     return Replay(
         evaluation=score_results([result], [recording]),

@@ -11,7 +11,7 @@ from finforce_eval.cli.main import main
 from finforce_eval.cli.twin import write_footage
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.keypoint_source import KeypointSource, awaiting_keypoints, detect_keypoints, parse_source
-from finforce_eval.evaluation.results import compare_detection, detection_stats
+from finforce_eval.evaluation.scoring import compare_detection, detection_stats
 from finforce_eval.evaluation.setup import make_setup
 from finforce_eval.recordings.objects import track_object
 from finforce_eval.recordings.recording import read_recording
@@ -110,23 +110,23 @@ def test_scores_count_what_they_say(recording):
     found, _ = detect(recording, accepted=(True, True, False, True))
     track = found.jaws["left"]
     stats = detection_stats([compare_detection(track.detection, track.sight)])
-    assert (stats.n_visible, stats.n_hidden) == (36, 12)
-    assert stats.pixel_median_px == pytest.approx(1.0, abs=1e-4)  # of 0.6 and 0.8, in single precision
-    assert stats.point_median_mm == pytest.approx(0.3, abs=1e-4)
-    assert stats.hidden_accepted_pct == 100.0  # the fourth point is hidden and accepted
-    assert stats.visible_lost_pct == pytest.approx(100 / 3)  # the third is visible and is not
+    assert (stats["n_visible"], stats["n_hidden"]) == (36, 12)
+    assert stats["pixel_median_px"] == pytest.approx(1.0, abs=1e-4)  # of 0.6 and 0.8, in single precision
+    assert stats["point_median_mm"] == pytest.approx(0.3, abs=1e-4)
+    assert stats["hidden_accepted_pct"] == 100.0  # the fourth point is hidden and accepted
+    assert stats["visible_lost_pct"] == pytest.approx(100 / 3)  # the third is visible and is not
 
 
 def test_a_jaw_that_is_not_found_has_lost_all_its_points(recording):
     found, _ = detect(recording, lost=(0, 1, 2), accepted=(True,) * 3 + (False,))
     track = found.jaws["left"]
     stats = detection_stats([compare_detection(track.detection, track.sight)])
-    assert stats.visible_lost_pct == pytest.approx(25.0) and stats.hidden_accepted_pct == 0.0
+    assert stats["visible_lost_pct"] == pytest.approx(25.0) and stats["hidden_accepted_pct"] == 0.0
 
 
 def test_no_detection_has_no_numbers():
     stats = detection_stats([])
-    assert stats.n_visible == 0 and stats.pixel_median_px is None and stats.visible_lost_pct is None
+    assert stats["n_visible"] == 0 and stats["pixel_median_px"] is None and stats["visible_lost_pct"] is None
 
 
 def test_true_key_points_are_those_the_camera_could_see(recording):

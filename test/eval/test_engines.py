@@ -6,10 +6,9 @@ import pytest
 from test_experiments import Counting
 
 from finforce_eval.cli.main import main
-from finforce_eval.engine.engines import EngineOptions
-from finforce_eval.engine.tasks import Task
 from finforce_eval.recordings.recording import DEMO, read_recording
 from finforce_eval.recordings.writer import write_recording
+from finforce_eval.tasks import EngineOptions, Task
 from lab.training.commands import DatasetError
 from lab.training.pictures import make_all
 

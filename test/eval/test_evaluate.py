@@ -10,8 +10,9 @@ from finforce.errors import FinforceError, ObservationError
 from finforce_contact.loop import GivenContact
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.contact_source import RecordedContact, parse_contacts
-from finforce_eval.evaluation.evaluate import evaluate_recording, score_results
-from finforce_eval.evaluation.tables import evaluation_json, format_table, markdown_contact_table, markdown_table
+from finforce_eval.evaluation.forces import evaluate_recording
+from finforce_eval.evaluation.scoring import score_results
+from finforce_eval.evaluation.tables import contact_table, evaluation_json, format_tables, score_table
 from finforce_eval.recordings.objects import track_object
 from finforce_eval.recordings.tracks import DetectionTruth, JawTrack
 from finforce_ifea.observation import Contact
@@ -26,7 +27,7 @@ def truth_of(recording):
 def run(recording, forces, **options):
     estimator = FakeEstimator(forces)
     jaw = FakeJaw(keypoints=np.zeros((4, 3)))
-    result = evaluate_recording(recording, jaw, GivenContact(CONTACT), factory=lambda: estimator, **options)
+    result = evaluate_recording(recording, jaw, GivenContact(CONTACT), estimator, **options)
     return result, estimator
 
 
@@ -165,7 +166,7 @@ def test_frame_that_the_estimator_refuses_is_named():
             raise ObservationError("odd")
 
     with pytest.raises(ObservationError, match="case: frame 0: odd"):
-        evaluate_recording(make_recording(), FakeJaw(), GivenContact(CONTACT), factory=lambda: Refusing([]))
+        evaluate_recording(make_recording(), FakeJaw(), GivenContact(CONTACT), Refusing([]))
 
 
 def test_two_cases_of_one_name_are_refused():
@@ -216,20 +217,20 @@ def test_tables_have_a_row_per_case_and_one_for_all():
     first, second = make_recording("first"), make_recording("second")
     results = [run(recording, truth_of(recording) * 1.1)[0] for recording in (first, second)]
     evaluation = score_results(results, [first, second])
-    lines = format_table(evaluation).splitlines()
+    lines = format_tables(evaluation).splitlines()
     assert [line.split()[0] for line in lines if line[:1].isalpha()][:4] == ["case", "first", "second", "all"]
     assert max(map(len, lines[:6])) <= 130
-    rows = [line for line in markdown_table(evaluation).splitlines() if line.startswith("| ")]
+    rows = [line for line in score_table(evaluation).markdown() if line.startswith("| ")]
     assert {line.count("|") for line in rows} == {13}
-    score = evaluation.scores["first"]
-    assert f"{score.cycles['load'].rmse_N.mean:.2f}±{score.cycles['load'].rmse_N.std:.2f}" in rows[1]
+    spread = evaluation.scores["first"].cycles["load"]["rmse_N"]
+    assert f"{spread['mean']:.2f}±{spread['std']:.2f}" in rows[1]
 
 
 def estimated(recording, gain=1.0):
     source = RecordedContact(FakeContactEstimator(), track_object(recording, "left"))
     estimator = FakeEstimator(truth_of(recording) * gain)
     jaw = FakeJaw(keypoints=np.zeros((4, 3)))
-    return evaluate_recording(recording, jaw, source, factory=lambda: estimator)
+    return evaluate_recording(recording, jaw, source, estimator)
 
 
 def test_json_says_how_well_the_contact_was_known():
@@ -248,13 +249,13 @@ def test_json_says_how_well_the_contact_was_known():
 def test_contact_table_has_a_row_per_case_and_one_for_all():
     first, second = make_recording("first"), make_recording("second")
     evaluation = score_results([estimated(first), run(second, truth_of(second))[0]], [first, second])
-    lines = format_table(evaluation).splitlines()
+    lines = format_tables(evaluation).splitlines()
     begin = next(index for index, line in enumerate(lines) if "given/mm" in line)
     assert [line.split()[0] for line in lines[begin + 3 : begin + 6]] == ["first", "second", "all"]
     assert lines[begin + 3].split()[1:4] == ["estimate", "40.00", "40.00"]
     assert lines[begin + 4].split()[1:3] == ["given", "2.00"]
     assert lines[begin + 4].split()[-6:] == ["-"] * 6
-    table = [line for line in markdown_contact_table(evaluation) if line.startswith("|")]
+    table = contact_table(evaluation).markdown()
     assert len({line.count("|") for line in table}) == 1
 
 
@@ -262,7 +263,7 @@ def test_table_of_a_case_without_counted_frames_has_dashes():
     recording = make_recording()
     result, _ = run(recording, truth_of(recording))
     nothing = result.with_columns(true_force=np.full_like(result.true_force, np.nan), step_ms=np.nan)
-    text = format_table(score_results([nothing], [recording]))
+    text = format_tables(score_results([nothing], [recording]))
     assert "worst - N (case)" in text
     assert "p50 -" in text
 

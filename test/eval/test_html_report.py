@@ -12,10 +12,11 @@ from eval_fakes import FakeEstimator, FakeJaw, make_recording
 from finforce_contact.loop import GivenContact
 from finforce_eval.cli.main import main
 from finforce_eval.errors import RecordingError
-from finforce_eval.evaluation.evaluate import evaluate_recording, score_results, true_range
+from finforce_eval.evaluate import read_evaluations
+from finforce_eval.evaluation.forces import evaluate_recording
+from finforce_eval.evaluation.scoring import score_results, true_range
 from finforce_eval.figures.html_report import write_html
 from finforce_eval.figures.report import write_page
-from finforce_eval.many import read_evaluations
 from finforce_eval.recordings.writer import write_recording
 from finforce_eval.table import ForceSeries, read_table, write_table
 
@@ -150,7 +151,7 @@ def evaluated(name="pressed"):
     forces = recording.jaws["left"].truth.force * 1.1
     jaw, source = FakeJaw(), GivenContact(None)
     jaw = replace(jaw, keypoints=recording.jaws["left"].keypoints.points[0])
-    return recording, evaluate_recording(recording, jaw, source, factory=lambda: FakeEstimator(forces))
+    return recording, evaluate_recording(recording, jaw, source, FakeEstimator(forces))
 
 
 def test_the_page_of_an_evaluation_has_its_scores(browser, tmp_path):

@@ -11,8 +11,9 @@ from rgbd_fakes import CAMERA, FakeDetector, FakeGripper, make_footage
 from finforce_contact.loop import GivenContact
 from finforce_eval.cli.twin import write_footage
 from finforce_eval.errors import RecordingError
-from finforce_eval.evaluation.evaluate import evaluate_recording, score_results
+from finforce_eval.evaluation.forces import evaluate_recording
 from finforce_eval.evaluation.keypoint_source import detect_keypoints
+from finforce_eval.evaluation.scoring import score_results
 from finforce_eval.figures.report import write_report
 from finforce_eval.recordings.images import ImageTrack
 from finforce_eval.recordings.recording import read_recording
@@ -47,7 +48,7 @@ def recording(tmp_path_factory):
 def result(recording):
     jaw, forces = FakeJaw(keypoints=np.zeros((4, 3))), list(recording.truth("left").force)
     forces[0] = None
-    return evaluate_recording(recording, jaw, GivenContact(None), factory=lambda: FakeEstimator(forces))
+    return evaluate_recording(recording, jaw, GivenContact(None), FakeEstimator(forces))
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import pytest
 
 from finforce.camera import ImageError
 from finforce.messages import color_from_image
-from finforce_eval.evaluation.keypoint_source import Reasons
+from finforce_eval.evaluation.keypoint_source import count_reasons
 from finforce_eval.recordings.images import compress_depth, depth_from_message, encode_color
 
 DEPTH = np.random.default_rng(1).integers(100, 200, (48, 64), dtype=np.uint16)
@@ -67,13 +67,9 @@ def test_inverse_depths_of_float_images_are_not_taken_for_millimetres():
 
 
 def test_reasons_that_differ_in_numbers_are_one_note():
-    reasons = Reasons()
-    assert reasons.commonest() == "" and reasons.notes() == []
-    for number in range(6, 100):
-        reasons.count(f"frozen camera: {number} identical pictures")
-    reasons.count("black image: 3 of 255")
-    assert reasons.notes() == [
-        "94 images refused: frozen camera: 6 identical pictures",
-        "1 images refused: black image: 3 of 255",
-    ]
-    assert reasons.commonest() == "frozen camera: 6 identical pictures"
+    texts = [f"frozen camera: {number} identical pictures" for number in range(6, 100)]
+    assert count_reasons([*texts, "black image: 3 of 255"]) == {
+        "frozen camera: 6 identical pictures": 94,
+        "black image: 3 of 255": 1,
+    }
+    assert count_reasons([]) == {}

@@ -8,13 +8,9 @@ from test_scoring import make_result
 
 from finforce.gripper_frames import ROBOT_CAMERA, jaw_in_camera
 from finforce.transforms import quaternion_from_pose
-from finforce_eval.evaluation.manipulation import (
-    format_manipulation,
-    join_net,
-    score_manipulation,
-    score_net,
-    with_distances,
-)
+from finforce_eval.evaluation.gripper import with_distances
+from finforce_eval.evaluation.scoring import join_net, score_manipulation, score_net
+from finforce_eval.evaluation.tables import format_manipulation
 from finforce_eval.recordings.tracks import PoseTrack
 
 

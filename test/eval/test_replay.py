@@ -22,7 +22,7 @@ from finforce_eval.evaluation.setup import make_setup
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.writer import write_recording
 from finforce_eval.replay import replay as replaying
-from finforce_eval.replay.live import JawLog, ReplayLog, live_result, point_of_application
+from finforce_eval.replay.live import ReplayLog, live_result, point_of_application
 from finforce_eval.replay.node import open_player
 
 SHIPPED = Path(replaying.__file__).parents[1] / "data" / "bench_cyl25_middle"
@@ -150,10 +150,10 @@ class FakeEstimator:
 def test_the_time_series_has_a_gap_where_no_wrench_came():
     recording = read_recording(SHIPPED)
     stamps = recording.jaws["left"].keypoints.stamps
-    log = JawLog()
-    for stamp in stamps[::2]:
-        log.force[int(stamp)], log.torque[int(stamp)] = np.array([-2.0, 0, 0]), np.array([0.0, -0.08, 0])
-        log.stddev[int(stamp)], log.latency[int(stamp)] = np.array([0.1, 0.5, 0.5]), 0.002
+    log = ReplayLog(("left",))
+    for stamp in stamps[::2].tolist():
+        found = {"force": np.array([-2.0, 0, 0]), "torque": np.array([0.0, -0.08, 0])}
+        log.rows["left"][stamp] = found | {"force_stddev": np.array([0.1, 0.5, 0.5]), "step_ms": 2.0}
     result = live_result(recording, "left", log, likelihood_threshold=0.6, estimator=FakeEstimator())
     assert result.solved[::2].all() and not result.solved[1::2].any()
     np.testing.assert_allclose(result.column("magnitude_stddev")[::2], 0.1)

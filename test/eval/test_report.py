@@ -9,7 +9,8 @@ import pytest
 from eval_fakes import BOX, BOX_TRIANGLES, FakeEstimator, FakeJaw, drawn_hues, make_recording
 
 from finforce_contact.loop import GivenContact
-from finforce_eval.evaluation.evaluate import evaluate_recording, score_results
+from finforce_eval.evaluation.forces import evaluate_recording
+from finforce_eval.evaluation.scoring import score_results
 from finforce_eval.figures.report import write_report
 
 pytest.importorskip("matplotlib")
@@ -21,7 +22,7 @@ def evaluate(name, *, gain=1.1, phases=True, lost=()):
     for index in lost:
         forces[index] = None
     jaw = FakeJaw(keypoints=np.zeros((4, 3)))
-    return evaluate_recording(recording, jaw, GivenContact(None), factory=lambda: FakeEstimator(forces)), recording
+    return evaluate_recording(recording, jaw, GivenContact(None), FakeEstimator(forces)), recording
 
 
 @pytest.mark.parametrize("phases", [False, True])

@@ -44,17 +44,18 @@ def ways(tmp_path):
 
 
 def make_trace(ways):
-    return Trace(ways=ways, late={10: 9.5, 20: 4.0, 40: 30.0}, images=[10, 20, 30, 40], lost={"left jaw": "1 late"})
+    return Trace(spans=ways, late={10: 9.5, 20: 4.0, 40: 30.0}, images=[10, 20, 30, 40], lost={"left jaw": "1 late"})
 
 
 def test_spans_are_those_of_images_that_left_and_begin_with_them(ways):
-    assert sorted(ways) == [10, 20]
-    assert [span.node for span in ways[10]] == ["detector", "solver", "other"]
-    assert [span.begin for span in ways[10]] == pytest.approx([1.0, 3.0, 7.0])
+    assert ways["image"].tolist() == [10, 10, 10, 20]
+    first = ways[ways["image"] == 10]
+    assert [stage.split(":")[0] for stage in first["stage"]] == ["detector", "solver", "other"]
+    assert first["begin"].tolist() == pytest.approx([1.0, 3.0, 7.0])
 
 
 def test_what_a_stage_called_is_not_its_own_time_and_another_process_is_none_of_it(ways):
-    assert [span.own for span in ways[10]] == pytest.approx([4.0, 3.0, 2.0])
+    assert ways["own"].tolist()[:3] == pytest.approx([4.0, 3.0, 2.0])
 
 
 def test_figures_come_in_the_order_of_the_way_with_the_whole_of_it_last(ways):
@@ -71,7 +72,7 @@ def test_the_image_in_the_middle_is_one_that_was_noted(ways, tmp_path):
     draw_way(make_trace(ways), tmp_path / "way.png")
     assert drawn_hues(tmp_path / "way.png") >= 2
     with pytest.raises(TraceError, match="no image was answered"):
-        median_image(Trace(ways=ways, late={}, images=[10], lost={}))
+        median_image(Trace(spans=ways, late={}, images=[10], lost={}))
 
 
 def test_a_folder_without_anything_of_an_image_is_said(tmp_path):

@@ -12,9 +12,10 @@ from finforce_contact.loop import GivenContact
 from finforce_eval.cli import twin as twin_commands
 from finforce_eval.cli.main import main
 from finforce_eval.cli.twin import write_footage
-from finforce_eval.evaluation.evaluate import evaluate_recording, score_results
+from finforce_eval.evaluation.forces import evaluate_recording
 from finforce_eval.evaluation.keypoint_source import detect_keypoints
-from finforce_eval.evaluation.tables import evaluation_json, format_sight, format_table, markdown_sight
+from finforce_eval.evaluation.scoring import score_results
+from finforce_eval.evaluation.tables import evaluation_json, format_tables, sight_table
 from finforce_eval.recordings.recording import read_recording
 from finforce_sim.scenarios import SCENARIOS
 
@@ -120,7 +121,7 @@ def evaluation(tmp_path_factory):
     found = detect_keypoints(recording, FakeDetector(recording))
     late = np.vstack((np.zeros((1, 3)), recording.truth("left").force[:-1]))
     jaw = FakeJaw(keypoints=np.zeros((4, 3)))
-    result = evaluate_recording(found, jaw, GivenContact(None), factory=lambda: FakeEstimator(late))
+    result = evaluate_recording(found, jaw, GivenContact(None), FakeEstimator(late))
     return score_results([result], [found])
 
 
@@ -137,10 +138,10 @@ def test_scores_of_key_points_and_of_the_onset_are_in_the_json(evaluation):
 
 
 def test_the_table_shows_them_and_says_what_they_are(evaluation):
-    lines = format_sight(evaluation)
+    lines = format_tables(evaluation).splitlines()
     assert lines[-2].startswith("all") and "33.3" in lines[-2] and "1.00" in lines[-2]
-    assert "pixels/px" in format_table(evaluation) and "hidden+" in format_table(evaluation)
-    table = [line for line in markdown_sight(evaluation) if line.startswith("|")]
+    assert any("pixels/px" in line for line in lines) and any("hidden+" in line for line in lines)
+    table = sight_table(evaluation).markdown()
     assert len({line.count("|") for line in table}) == 1 and len(table) == 4
 
 
@@ -153,12 +154,12 @@ def test_the_detector_of_two_jaws_is_timed_once(tmp_path):
             found,
             FakeJaw(keypoints=np.zeros((4, 3)), side=side),
             GivenContact(None),
-            side=side,
-            factory=lambda: FakeEstimator([np.zeros(3)] * 12),
+            FakeEstimator([np.zeros(3)] * 12),
+            side,
         )
         for side in ("left", "right")
     ]
     np.testing.assert_array_equal(results[0].column("detector_ms"), results[1].column("detector_ms"))
-    assert score_results(results[:1], [found]).total.detector_ms.p50 == float(
+    assert score_results(results[:1], [found]).total.detector_ms["p50"] == float(
         np.median(results[0].column("detector_ms"))
     )

@@ -6,8 +6,8 @@ import pytest
 pytest.importorskip("rerun")
 chunk = pytest.importorskip("rerun.chunk")
 
-from finforce_eval.annotation.forces import estimate_forces  # noqa: E402
 from finforce_eval.cli.main import main, parse  # noqa: E402
+from finforce_eval.evaluation.forces import estimate_forces  # noqa: E402
 from finforce_eval.evaluation.setup import make_setup  # noqa: E402
 from finforce_eval.recordings.recording import read_recording  # noqa: E402
 from lab.scenes import GRASP, find_scene  # noqa: E402
@@ -54,8 +54,12 @@ def test_jaws_bend_and_forces_are_those_that_were_found(scene):
     from finforce_eval.evaluation.setup import read_keypoints
 
     (recording,) = read_keypoints(options)
-    shapes = []
-    forces = estimate_forces(recording, make_setup(options), watch=shapes.append)
+    shapes = {"left": [], "right": []}
+
+    def watch(side, stamp, estimator):
+        shapes[side].append(np.array(estimator.surface()))
+
+    forces = estimate_forces(recording, make_setup(options), watch=watch)
     for side in ("left", "right"):
         times, values = column(rows[f"/forces/{side}"], "scalars")
         expected = np.linalg.norm(forces[side].force, axis=1)
@@ -63,9 +67,8 @@ def test_jaws_bend_and_forces_are_those_that_were_found(scene):
         np.testing.assert_allclose([value[0] for value in values], expected)
         assert np.isnan(expected[:40]).all() and np.nanmax(expected) > 2.0
         _, meshes = column(rows[f"/jaws/{side}/surface"], "vertex_positions")
-        own = [shape for shape in shapes if shape.side == side]
-        assert len(meshes) == len(own)
-        np.testing.assert_allclose(meshes[-40], own[-40].vertices, atol=1e-7)
+        assert len(meshes) == len(shapes[side])
+        np.testing.assert_allclose(meshes[-40], shapes[side][-40], atol=1e-7)
         moved = np.abs(np.asarray(meshes[100]) - np.asarray(meshes[10])).max()
         assert moved > 1e-3
 

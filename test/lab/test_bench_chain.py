@@ -33,9 +33,7 @@ def run(truth):
     log = ReplayLog(("left", "right"))
     for index, stamp in enumerate(truth.stamps.tolist()):
         for side in ("left", "right"):
-            log.jaws[side].sent[stamp] = 0.0
-            log.jaws[side].force[stamp] = np.zeros(3)
-            log.detections[side].clouds[stamp] = None
+            log.sent[side][stamp] = 0.0
         log.grasp[stamp], log.grasp_latency[stamp] = 0.1 * index + 0.2, 0.03
     return NodeRun(
         log=log, cpu={"solver": 12.0, "other": 3.0}, memory={"solver": 3e8}, player=5.0, others=1.0, seconds=4.0
@@ -97,7 +95,7 @@ def test_losses_and_errors_belong_to_their_grasps(truth):
     stream = SimpleNamespace(messages=[first], period=COUNT * PERIOD)
     log, lost = ReplayLog(("left", "right")), {COUNT + 1, COUNT + 2, 2 * COUNT}
     for index in range(4 * COUNT):
-        log.jaws["left"].sent[stamp_of(index)] = 0.0
+        log.sent["left"][stamp_of(index)] = 0.0
         if index not in lost:
             log.grasp[stamp_of(index)] = 0.1 * (index % COUNT) + 0.1 * (index // COUNT)
     grasps = divide_grasps(log, truth, stream)

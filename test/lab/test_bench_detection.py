@@ -39,7 +39,7 @@ def detectors(monkeypatch, bag):
 
     def begin(way, recording):
         made[way.name] = Watched(recording, lost=range(0, 12, 2) if way.name == "blind" else ())
-        return bench._DetectionRun(way=way, detector=made[way.name], logs={"left": bench.SideLog()})
+        return bench._DetectionRun(way=way, detector=made[way.name], found={"left": {}})
 
     monkeypatch.setattr(bench, "_begin", begin)
     monkeypatch.setattr(bench, "find_scene", lambda scene: bag)

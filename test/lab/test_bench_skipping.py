@@ -27,24 +27,14 @@ def test_idling_approach_and_holding_are_measured_once_they_have_begun():
 def test_cpu_time_is_read_where_a_scene_begins_and_ends(monkeypatch):
     made = []
 
-    class Meter:
-        def __init__(self, pids):
-            made.append(self)
-            self.samples = 0
-
-        def sample(self):
-            self.samples += 1
-
-        def shares(self):
-            return {"node": 10.0 * len(made)}
-
-    monkeypatch.setattr(skipping, "CpuMeter", Meter)
+    monkeypatch.setattr(skipping, "begin_shares", lambda pids: made.append("begin") or pids)
+    monkeypatch.setattr(skipping, "end_shares", lambda processes: made.append("end") or {"node": 10.0 * len(made)})
     meter = SceneMeter(spans={"idle": (10, 20), "grasp": (30, 40)})
     for time in (0, 12, 15, 22, 31, 39, 45):
         meter.note({"node": 1}, RawMessage(time, "/camera", "Image", b"", False))
     assert list(meter.shares) == ["idle", "grasp"]
-    # a meter for what is before, in each scene, between and after them
-    assert [one.samples for one in made] == [2, 1, 2, 1]
+    # what is before, between and after the scenes begins, and is not asked for
+    assert made == ["begin", "end", "begin", "begin", "end", "begin"]
 
 
 def test_the_table_sets_a_node_with_the_rules_beside_the_same_without():

@@ -13,7 +13,6 @@ from eval_fakes import FakeContactEstimator, make_recording
 
 from finforce.errors import FinforceError
 from finforce_eval.cli.main import main
-from finforce_eval.engine.tasks import Manifest
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.contact_source import RecordedContact
 from finforce_eval.machine import describe_sources
@@ -22,6 +21,7 @@ from finforce_eval.recordings.objects import ObjectTrack
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.writer import write_recording
 from finforce_eval.table import ForceSeries
+from finforce_eval.tasks import Manifest
 from finforce_ifea.grasp_force import R_GRIPPER_JAW
 from lab.experiments import grasp_world
 from lab.experiments.chip import CHIP

@@ -8,9 +8,9 @@ from rgbd_fakes import FakeGripper
 from scipy.spatial.transform import Rotation
 
 from finforce_eval.replay import synthetic_stream
-from finforce_eval.replay.synthetic_stream import FINE_RATE, slot_of
 from finforce_sim.footage import START
 from lab import scenes
+from lab.bench.streams import FINE_RATE, slot_of
 from lab.scenes import EVERY_RATE, GRASP, SmoothGripper, find_scene
 
 

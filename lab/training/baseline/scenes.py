@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from finforce.errors import FinforceError
 from finforce_eval.cli.parser import add_engine_options, read_engine, whole_number
-from finforce_eval.engine.engines import EngineOptions
-from finforce_eval.engine.tasks import Task, choose_shard
+from finforce_eval.tasks import EngineOptions, Task, choose_shard
 from finforce_sim.footage import FINGER, parse_size, set_stage
 from finforce_sim.gripper import TwinGripper
 from finforce_sim.photographer import Photographer

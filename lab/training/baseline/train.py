@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from finforce.optional import import_library
 from finforce.settings import setting
-from finforce_eval.evaluation.results import ONSET
-from finforce_eval.evaluation.scoring import rms
+from finforce_eval.evaluation.scoring import ONSET_FORCE, rms
 from lab.experiments.network import HEIGHT, KIND, LAYOUT, SHOWN, WIDTH
 from lab.training.baseline.scenes import GraspFilm, load_films
 from lab.training.commands import PURPOSE, RecipeError, add_settings, import_torch, one_line_errors, settings_from
@@ -196,7 +195,7 @@ class BaselineTraining(Training):
             errors.append(self.network.judge(windows).cpu().numpy() - film.force[SHOWN - 1 :])
             true.append(film.force[SHOWN - 1 :])
         error, force = np.concatenate(errors), np.concatenate(true)
-        return {"rmse_N": rms(error), "held_N": rms(error[force > ONSET])}
+        return {"rmse_N": rms(error), "held_N": rms(error[force > ONSET_FORCE])}
 
     def train(self, films: Sequence[GraspFilm], held_out: Sequence[GraspFilm], folder: Path) -> None:
         """Train on some grasps and be judged by others; write the network's file at last; see `train`."""

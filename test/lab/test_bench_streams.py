@@ -12,7 +12,10 @@ from finforce_eval.cli.twin import write_footage
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.images import IMAGE
 from finforce_eval.replay.playback import RawMessage
-from finforce_eval.replay.synthetic_stream import (
+from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
+from finforce_sim.footage import Footage
+from finforce_sim.photographer import SceneSetting
+from lab.bench.streams import (
     FINE_RATE,
     OBJECT_TOPIC,
     START,
@@ -21,9 +24,6 @@ from finforce_eval.replay.synthetic_stream import (
     stream_keypoints,
     thin_messages,
 )
-from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
-from finforce_sim.footage import Footage
-from finforce_sim.photographer import SceneSetting
 from lab.scenes import EVERY_RATE, SmoothGripper
 
 

@@ -15,10 +15,9 @@ from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.keypoint_source import TRUTH, KeypointSource
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.writer import write_recording
+from finforce_eval.replay.node_run import OBJECT_TOPIC
 from finforce_eval.replay.playback import Playback, RawMessage, read_playback
 from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
-
-OBJECT_TOPIC = "/object_pose"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -1,1 +1,0 @@
-"""Many recordings, one task each: one after the other, in processes, or on a Ray cluster."""

@@ -1,0 +1,332 @@
+"""The forces on the jaws of a recording, image after image, as rows of the table of forces."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce.errors import ObservationError
+from finforce_contact.loop import ContactSource, ForceLoop
+from finforce_eval.errors import RecordingError
+from finforce_eval.evaluation.gripper import with_distances
+from finforce_eval.evaluation.places import InnerSurface, true_lines
+from finforce_eval.evaluation.scoring import compare_detection, match_samples, match_truth
+from finforce_eval.recordings.tracks import JAWS, Recording
+from finforce_eval.table import AXES, ForceSeries, Snapshot
+from finforce_eval.tasks import progress_bar
+from finforce_ifea.observation import Contact, Observation
+
+if TYPE_CHECKING:
+    from finforce_eval.evaluation.setup import EvaluationSetup
+
+_VECTORS = ("force", "torque", "force_stddev", "torque_stddev", "contact_location", "contact_point")
+_NUMBERS = ("magnitude_stddev", "residual", "step_ms", "contact_ms", "contact_height", "true_height")
+_POINTS = ("points_x", "points_y", "points_z", "points_weight", "points_touching")
+
+
+class Estimator(Protocol):
+    """What is asked of an estimator; `JawEstimator` satisfies it."""
+
+    surface_triangles: NDArray[np.integer]
+
+    def update(self, observation: Observation, contact: Contact | None) -> Any:
+        """Return the Solution for one observation."""
+
+    def surface(self) -> NDArray[np.float64]:
+        """Return the deformed vertices (n, 3) [m]."""
+
+
+def evaluate_jaws(recording: Recording, setup: EvaluationSetup) -> list[ForceSeries]:
+    """Return the forces on every jaw with ground truth of a recording, under a progress bar.
+
+    Raises:
+        RecordingError: no ground truth, another number of key points than the jaw's, or not one frame solved.
+        FinforceError: the contact cannot be known, or the estimator refuses a frame.
+    """
+    sides = truth_sides(recording)
+    frames = sum(len(recording.jaw(side).keypoints.stamps) for side in sides)
+    with progress_bar(frames, "frame", recording.name) as bar:
+        found = estimate_forces(recording, setup, sides, strict=True, progress=bar.update)
+    results = [each.renamed(f"{recording.name}/{side}") if len(sides) > 1 else each for side, each in found.items()]
+    for result in results:
+        check_solved(result, recording)
+    return results
+
+
+def truth_sides(recording: Recording) -> list[str]:
+    """Return the jaws of a recording that have ground truth.
+
+    Raises:
+        RecordingError: there is none.
+    """
+    sides = [side for side, track in recording.jaws.items() if track.truth is not None]
+    if not sides:
+        recording.truth(next(iter(recording.jaws)))
+    return sides
+
+
+def estimate_forces(
+    recording: Recording,
+    setup: EvaluationSetup,
+    sides: Collection[str] = (),
+    *,
+    strict: bool = False,
+    progress: Callable[[int], Any] = lambda images: None,
+    watch: Callable[[str, int, Estimator], Any] | None = None,
+) -> dict[str, ForceSeries]:
+    """Return the forces on some jaws of a recording that has key points, and the distance of two.
+
+    Args:
+        recording: with key points, recorded or found.
+        setup: jaw, settings, calibration and contact.
+        sides: of the jaws; all without.
+        strict: an image that is refused ends the run, else it has no force and says why.
+        progress: called with the number of images done since its last call.
+        watch: called with side, stamp [ns] and estimator after every image.
+
+    Raises:
+        FinforceError: the key points are another jaw's, or the contact cannot be known.
+    """
+    sides = sides or list(recording.jaws)
+    for side in sides:
+        check_keypoint_count(recording, side, setup.jaw)
+    both, found = len(sides) == len(JAWS), {}
+    for side in sides:
+        own = setup.side(side)
+        estimator, source = own.estimator(both), own.source(recording)
+        found[side] = find_forces(
+            recording, own.jaw, source, estimator, side, strict=strict, progress=progress, watch=watch
+        )
+    return with_distances(found, recording) if both else found
+
+
+def check_keypoint_count(recording: Recording, side: str, jaw: Any) -> None:
+    """Refuse a recording of another jaw.
+
+    Raises:
+        RecordingError: the numbers of key points differ.
+    """
+    track, expected = recording.jaw(side), len(jaw.keypoint_names)
+    counts = {f"key points in /{side}/keypoints": track.keypoints.count}
+    if track.sight is not None:  # beside points that were found with that jaw in the images
+        counts[f"true key points of the {side} jaw"] = track.sight.points.shape[1]
+    for what, count in counts.items():
+        if count != expected:
+            raise RecordingError(
+                f"{recording.name}: {count} {what}; the jaw '{jaw.name}' has {expected} (another --jaw?)"
+            )
+
+
+def evaluate_recording(
+    recording: Recording, jaw: Any, source: ContactSource, estimator: Estimator, side: str = "left"
+) -> ForceSeries:
+    """Return the forces on one jaw of a recording with ground truth; see `find_forces`.
+
+    Raises:
+        RecordingError: no ground truth, another number of key points than the jaw's, or not one frame solved.
+        ObservationError: the estimator refuses a frame.
+    """
+    recording.truth(side)
+    check_keypoint_count(recording, side, jaw)
+    result = find_forces(recording, jaw, source, estimator, side)
+    check_solved(result, recording)
+    return result
+
+
+def check_solved(result: ForceSeries, recording: Recording) -> None:
+    """Refuse a recording of which nothing can be said.
+
+    Raises:
+        RecordingError: no frame that is to be scored was solved, and why.
+    """
+    if not result.scored.any():
+        raise RecordingError(f"{result.name}: {_why_unscored(result, recording)}")
+    if not result.counted.any():
+        if (result.scored & result.solved).any():
+            raise RecordingError(f"{result.name}: no ground truth at the stamps of the key points")
+        words, counts = np.unique(result.column("status")[result.scored], return_counts=True)
+        statuses = ", ".join(f"{count} {word}" for word, count in zip(words, counts, strict=True))
+        message = result.column("message")[~result.solved][-1]
+        reason = f" ({statuses}): {message}" if message else f" ({statuses})"
+        raise RecordingError(f"{result.name}: none of the frames to be scored was solved{reason}")
+
+
+def _why_unscored(result: ForceSeries, recording: Recording) -> str:
+    """Return why no frame of a recording is to be scored."""
+    count, phases = len(result), recording.phases
+    if not count:
+        return "there are no frames to be scored: no image has key points"
+    none = f"none of the {count} frames is to be scored: "
+    if phases is not None and not (phases.stage == "record").any():
+        return f"{none}/bench/phase names no 'record' phase; expected one, or no /bench/phase: then all are scored"
+    return f"{none}its 'record' phases lie at none of their stamps (two clocks?)"
+
+
+def find_forces(
+    recording: Recording,
+    jaw: Any,
+    source: ContactSource,
+    estimator: Estimator,
+    side: str = "left",
+    *,
+    strict: bool = True,
+    progress: Callable[[int], Any] = lambda steps: None,
+    watch: Callable[[str, int, Estimator], Any] | None = None,
+) -> ForceSeries:
+    """Return the force on one jaw in every image that has key points, and where it was measured, the true one.
+
+    Deterministic: the same recording gives the same estimates.
+
+    Args:
+        recording: with key points.
+        jaw: the jaw of that side.
+        source: where the contact of each image comes from; a fresh one.
+        estimator: one that knows of no recording.
+        side: "left" or "right".
+        strict: an image that is refused ends the run, else it has no force and says why.
+        progress: called with the number of images done since its last call.
+        watch: called with side, stamp [ns] and estimator after every image.
+
+    Raises:
+        RecordingError: a pose or an image is refused.
+        ObservationError: the estimator refuses an image.
+    """
+    track = recording.jaw(side).keypoints
+    stamps, phases = track.stamps, recording.phases_at(track.stamps)
+    run, rows = _JawRun(recording, side, jaw, ForceLoop(source, estimator)), []
+    for index, stamp in enumerate(stamps.tolist()):
+        try:
+            rows.append(run.step(index))
+        except (ObservationError, RecordingError) as error:
+            if strict:
+                frame = f"frame {index}: " if isinstance(error, ObservationError) else ""
+                raise type(error)(f"{recording.name}: {frame}{error}") from error
+            rows.append(run.row("refused", str(error)))
+        if watch is not None:
+            watch(side, stamp, estimator)
+        progress(1)
+    columns = {name: np.array([row[name] for row in rows]) for name in (*_VECTORS, *_NUMBERS)}
+    columns |= {name: [row[name] for row in rows] for name in (*_POINTS, "used")}
+    columns |= {name: np.array([row[name] for row in rows], str) for name in ("status", "message", "contact_status")}
+    if source.estimate is not None:
+        columns["touching"] = np.array([row["touching"] for row in rows], dtype=bool)
+    else:
+        del columns["contact_ms"]
+    columns |= {"cycle": phases.cycle, "direction": phases.direction, "scored": phases.scored}
+    columns |= truth_columns(recording, side) | sight_columns(recording, side) | {"contact_source": source.name}
+    if "detector_ms" in columns:
+        columns["latency_ms"] = columns["step_ms"] + columns["detector_ms"]
+    return ForceSeries.build(recording.name, side, stamps, **columns).with_snapshot(run.snapshot)
+
+
+class _JawRun:
+    """The images of one jaw through the loop of contact and force.
+
+    Args:
+        recording: with key points.
+        side: "left" or "right".
+        jaw: the jaw of that side.
+        loop: a fresh one.
+
+    Attributes:
+        snapshot: the jaw under the largest force so far of an image that is scored.
+    """
+
+    def __init__(self, recording: Recording, side: str, jaw: Any, loop: ForceLoop) -> None:
+        self._jaw, self._loop, self._track = jaw, loop, recording.jaw(side).keypoints
+        self._scored = recording.phases_at(self._track.stamps).scored
+        self._surface0 = np.array(loop.force.surface())
+        self._lines = None
+        if recording.jaw(side).truth is not None:
+            self._face = InnerSurface(self._surface0, jaw.face)
+            self._lines = true_lines(recording, side, self._track.stamps, self._face.face_x)
+        self.snapshot: Snapshot | None = None
+
+    def step(self, index: int) -> dict[str, Any]:
+        """Return what the loop makes of image `index`.
+
+        Raises:
+            ObservationError: the estimator refuses it.
+            RecordingError: the contact estimator refuses a pose.
+        """
+        loop = self._loop
+        solution = loop.update(self._track.observation(index))
+        row = self.row(solution.status, "" if solution.trusted else solution.message)
+        row |= {"step_ms": loop.force_ms, "contact_ms": loop.contact_ms}
+        row |= {"used": solution.keypoints_used, "residual": solution.residual}
+        if loop.contact.estimate is not None:
+            row |= {"touching": bool(loop.contact.estimate.touching), "contact_status": loop.contact.estimate.status}
+        if self._lines is not None:
+            line = self._lines.points[index], self._lines.directions[index]
+            row["true_height"] = self._face.cut(loop.force.surface(), *line)
+        if solution.trusted:
+            row |= {name: getattr(solution, name) for name in (*_VECTORS, "magnitude_stddev")}
+            if self._scored[index]:
+                self._keep_largest(index, solution)
+        return row
+
+    def row(self, status: str, message: str) -> dict[str, Any]:
+        """Return a row without a force, with the contact as it was given to the solver, if there was any."""
+        row = dict.fromkeys(_NUMBERS, np.nan) | dict.fromkeys(_POINTS) | dict.fromkeys(_VECTORS, np.full(3, np.nan))
+        row |= {"used": np.zeros(self._track.count, dtype=bool), "touching": False, "contact_status": ""}
+        contact = self._loop.given
+        if contact is not None:
+            points = np.asarray(contact.points, dtype=np.float64)
+            row |= {f"points_{axis}": points[:, number] for number, axis in enumerate(AXES)}
+            row |= {"points_weight": np.asarray(contact.weights, np.float64), "points_touching": bool(contact.touching)}
+            if len(points):
+                row["contact_height"] = np.average(points[:, 2], weights=contact.weights)
+        return row | {"status": status, "message": message}
+
+    def _keep_largest(self, index: int, solution: Any) -> None:
+        """Keep jaw and object as they are now where the force is the largest so far."""
+        largest = 0.0 if self.snapshot is None else float(np.linalg.norm(self.snapshot.force))
+        # two per cent: the surface is copied now and then, not on every image of a rising force
+        if float(np.linalg.norm(solution.force)) <= 1.02 * largest:
+            return
+        contact, estimator = self._loop.given, self._loop.force
+        known = contact is not None and contact.outline is not None
+        self.snapshot = Snapshot(
+            stamp=int(self._track.stamps[index]),
+            surface0=self._surface0,
+            surface=np.array(estimator.surface()),
+            triangles=np.asarray(estimator.surface_triangles),
+            keypoints0=np.asarray(self._jaw.keypoints),
+            keypoints=self._track.points[index],
+            used=np.array(solution.keypoints_used),
+            contact_point=np.array(solution.contact_point),
+            force=np.array(solution.force),
+            outline=contact.outline.placed() if known else (),
+        )
+
+
+def truth_columns(recording: Recording, side: str) -> dict[str, Any]:
+    """Return the measured wrenches at the stamps of the key points, none without any."""
+    truth, stamps = recording.jaw(side).truth, recording.jaw(side).keypoints.stamps
+    if truth is None:
+        return {}
+    return {
+        "true_force": match_truth(truth, stamps),
+        "true_torque": match_samples(truth.stamps, truth.torque, stamps),
+    }
+
+
+def sight_columns(recording: Recording, side: str) -> dict[str, Any]:
+    """Return how the key points were seen, where they were found in images."""
+    track = recording.jaw(side)
+    if track.detection is None:
+        return {}
+    columns: dict[str, Any] = {"detector_ms": track.detection.step_ms}
+    if track.sight is not None:
+        errors = compare_detection(track.detection, track.sight).set_index("stamp")
+        columns |= dict(errors.reindex(track.keypoints.stamps).items())
+    return columns
+
+
+def no_force_reasons(forces: ForceSeries) -> list[str]:
+    """Return for each image why it has no force, "" where it has one."""
+    columns = zip(forces.solved, forces.column("message"), forces.column("status"), strict=True)
+    return ["" if solved else str(message or status) for solved, message, status in columns]

@@ -1,0 +1,100 @@
+"""Both jaws of a recording as one gripper: grasp force, net force and torque (Eq. 3 of the paper)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from finforce.gripper_frames import SIDES
+from finforce.transforms import pose_from_quaternion
+from finforce_eval.recordings.tracks import Recording
+from finforce_eval.table import ForceSeries
+from finforce_ifea.grasp_force import JawDistance, Wrench, combine_wrenches, single_jaw_grasp
+
+_SAME = 0.2  # [s] within which a jaw's pose is still that of an image
+
+
+def with_distances(jaws: Mapping[str, ForceSeries], recording: Recording) -> dict[str, ForceSeries]:
+    """Return the series of both jaws with the distance between them, as it was seen and as it was."""
+    return {
+        side: series.with_columns(
+            jaw_distance=find_distances(recording, series.stamps),
+            true_jaw_distance=find_distances(recording, series.stamps, true=True),
+        )
+        for side, series in jaws.items()
+    }
+
+
+def combine_jaws(jaws: Mapping[str, ForceSeries]) -> ForceSeries:
+    """Return what the gripper feels, in its frame, in every image of one of its jaws.
+
+    Args:
+        jaws: by side; both, or the only one. Where both have distances, see `with_distances`, torques are known.
+
+    Returns:
+        Net force and torque about the gripper's origin, their truth, and the grasp force; NaN where a jaw has none.
+    """
+    stamps = np.unique(np.concatenate([each.stamps for each in jaws.values()]))
+    first = next(iter(jaws.values()))
+    jaws = {
+        side: ForceSeries(each.table.set_index("stamp").reindex(stamps).reset_index()) for side, each in jaws.items()
+    }
+    found, true = _combine(jaws, ""), _combine(jaws, "true_")
+    return ForceSeries.build(
+        first.name.removesuffix(f"/{first.side}"),
+        "gripper",
+        stamps,
+        force=found["manipulation"],
+        torque=found["torque"],
+        grasp_force=found["grasp"][:, 0],
+        true_force=true["manipulation"],
+        true_torque=true["torque"],
+        # the jaws' frames are turned about z by half a turn: their axes are those of the gripper
+        force_stddev=np.sqrt(np.sum([each.column("force_stddev") ** 2 for each in jaws.values()], axis=0)),
+        scored=np.all([each.table["scored"].fillna(False).astype(bool) for each in jaws.values()], axis=0),
+    )
+
+
+def _combine(jaws: Mapping[str, ForceSeries], prefix: str) -> dict[str, NDArray]:
+    """Return grasp, net force and torque (n, 3) of the columns with a prefix, NaN where a jaw has no force."""
+    wrenches = [
+        zip(*(each.column(f"{prefix}{name}") for name in ("force", "torque")), strict=True) for each in jaws.values()
+    ]
+    distances = (
+        pd.DataFrame([each.column(f"{prefix}jaw_distance").astype(float) for each in jaws.values()]).bfill().iloc[0]
+    )
+    out = {name: np.full((len(distances), 3), np.nan) for name in ("grasp", "manipulation", "torque")}
+    for row, (distance, *pairs) in enumerate(zip(distances, *wrenches, strict=True)):
+        each = {side: Wrench(*pair) for side, pair in zip(jaws, pairs, strict=True)}
+        if not all(np.isfinite(wrench.force).all() for wrench in each.values()):
+            continue
+        if len(each) == 2:
+            grasp = combine_wrenches(each["left"], each["right"], None if np.isnan(distance) else float(distance))
+        else:
+            grasp = single_jaw_grasp(next(iter(each.values())), next(iter(each)))
+        out["grasp"][row], out["manipulation"][row] = grasp.grasp, grasp.manipulation
+        if grasp.torque is not None:
+            out["torque"][row] = grasp.torque
+    return out
+
+
+def find_distances(recording: Recording | None, stamps: NDArray, *, true: bool = False) -> list[float | None]:
+    """Return the distance between the jaws in images (n,) [ns], as it was seen or as it was; None where unknown."""
+    distance, tracks = JawDistance(_SAME), {}
+    for side in SIDES if recording is not None else ():
+        jaw = recording.jaw(side)
+        track = (jaw.true_pose or jaw.pose) if true else (jaw.pose or jaw.true_pose)
+        if track is None:
+            break
+        poses = zip(track.position, track.quaternion, strict=True)
+        tracks[side] = dict(zip(track.stamps.tolist(), (pose_from_quaternion(*pose) for pose in poses), strict=True))
+    found: list[float | None] = []
+    for stamp in stamps.tolist():
+        for side, poses in tracks.items():
+            if stamp in poses:
+                distance.take(side, stamp, poses[stamp])
+        found.append(distance.at(stamp))
+    return found
