@@ -56,7 +56,7 @@ def test_outline_of_a_box_from_the_side_is_its_rectangle():
 
 def test_matplotlib_is_loaded_only_for_a_report():
     code = (
-        "import sys; from finforce_eval.evaluation import evaluate; from finforce_eval.figures import report; "
-        "assert report and evaluate and 'matplotlib' not in sys.modules"
+        "import sys; from finforce_eval.evaluation import forces; from finforce_eval.figures import report; "
+        "assert report and forces and 'matplotlib' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
