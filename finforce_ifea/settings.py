@@ -72,5 +72,5 @@ class EstimatorSettings:
         check_bounds(self, ObservationError)
 
     def resolve_held(self, *, both: bool) -> "EstimatorSettings":
-        """Return settings in which `held` is no longer `auto`; `both` where another jaw presses the same object."""
-        return self if self.held != "auto" else replace(self, held="yes" if both else "no")
+        """Return settings in which `held` is `auto` only where `both` jaws press the same object."""
+        return replace(self, held="no") if self.held == "auto" and not both else self

@@ -373,7 +373,7 @@ _DEPTH_SHARE = 1e-3
 
 
 @njit(**_OPTIONS)
-def _find_averaged_spread(point, count):
+def find_averaged_spread(point, count):
     """Return the entries 00, 11 and 01 of the covariance of a key point's averaged residual [m^2]."""
     share = 1.0 / max(count, 1.0)
     noise = point.noise
@@ -388,7 +388,7 @@ def _compute_posterior(points, average, offset, prior_variance, information):
         mean = average[k]
         if mean.count <= 0.5:
             continue
-        s00, s11, s01 = _find_averaged_spread(points[k], mean.count)
+        s00, s11, s01 = find_averaged_spread(points[k], mean.count)
         det = s00 * s11 - s01 * s01
         for i in range(3):
             a = (s11 * mean.modes[0, i] - s01 * mean.modes[1, i]) / det
@@ -539,7 +539,7 @@ def _measure_misfit(points, average):
     for k in range(len(points)):
         if average[k].count <= 0.5:
             continue
-        s00, s11, s01 = _find_averaged_spread(points[k], average[k].count)
+        s00, s11, s01 = find_averaged_spread(points[k], average[k].count)
         m0, m1 = average[k].residual[0], average[k].residual[1]
         total += (s11 * m0 * m0 - 2.0 * s01 * m0 * m1 + s00 * m1 * m1) / (s00 * s11 - s01 * s01)
         freedom += 2.0

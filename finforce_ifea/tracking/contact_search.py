@@ -50,6 +50,7 @@ class ContactSearch:
 
     Attributes:
         points: key points of the last image (K,), see `KEYPOINT`.
+        average: of their residuals (K,), see `AVERAGE`.
         state: of the contact in the last image in which it was found, see `CONTACT_STATE`.
         expectation: of the object, see `EXPECTATION`.
         q: unknowns of the jaw (size,).
@@ -61,7 +62,7 @@ class ContactSearch:
         self.points = np.zeros(count, KEYPOINT)
         self.state, self._found = blank_contact_state(), blank_contact_state()
         self._forecast = np.zeros((), FORECAST)
-        self._average, self._extended = np.zeros(count, AVERAGE), np.zeros(count, AVERAGE)
+        self.average, self._extended = np.zeros(count, AVERAGE), np.zeros(count, AVERAGE)
         self.expectation = np.zeros((), EXPECTATION)
         self.expectation["gate"] = settings.gate
 
@@ -72,7 +73,7 @@ class ContactSearch:
         self.state["x"][DEPTH] = contact.find_touch(self.state["x"])
         self.state["spread"] = _FIRST_SPREAD
         self.resume(contact.begin(mean[1]))
-        self._average[:] = np.zeros((), AVERAGE)
+        self.average[:] = np.zeros((), AVERAGE)
 
     def resume(self, q: NDArray) -> None:
         """Continue from another shape of the jaw (size,), whose motions are not known yet."""
@@ -81,12 +82,16 @@ class ContactSearch:
     def forget(self, mean: NDArray) -> None:
         """Expect an object of any shape and height about the mean (2,) again."""
         self.state["x"][1:] = mean
-        self._average[:] = np.zeros((), AVERAGE)
+        self.average[:] = np.zeros((), AVERAGE)
 
     def lead(self, change: NDArray, kept: float) -> None:
         """Take shape and height along by a change (2,), and keep a share of the averaged residuals."""
         self.state["x"][1:] += change
-        self._average["count"] *= kept
+        self.average["count"] *= kept
+
+    def change_traction(self, change: float) -> None:
+        """Take averaged residuals to another traction ratio of the next image."""
+        self.average["residual"] -= self.points["modes"][:, :, 3] * change
 
     def find(self, contact: RigidContact, traction: Traction, probe: Any, dt: float, *, is_sudden: bool) -> bool:
         """Find the contact in the image of `points`; False, all as it was, where too few key points agree.
@@ -123,7 +128,7 @@ class ContactSearch:
                 in_vain = in_vain + 1 if abs(jump) > far - _LEAST_APPROACH else 0
                 far = abs(jump)
                 continue
-            update_state(self.points, self._average, self._extended, forecast, expectation, found)
+            update_state(self.points, self.average, self._extended, forecast, expectation, found)
             updated = True
             aim = _bound_step(found, x, share, expectation)
             # between two corners of an object the linearisation changes its mind: meet in the middle
@@ -137,7 +142,7 @@ class ContactSearch:
         if not updated or not pressed.touches:
             return False
         self.q, self._modes = q, pressed.modes[:, :3]
-        self._average, self._extended = self._extended, self._average
+        self.average, self._extended = self._extended, self.average
         self.state, self._found = found, self.state
         found["x"], found["x_model"], found["depth"] = x, x_model, depth
         self._conclude(pressed, moved)

@@ -26,6 +26,7 @@ from finforce_ifea.tracking.contact_state import (
 )
 from finforce_ifea.tracking.friction import SMOOTH, Coefficient, FrictionEstimate, SlipHistory, leave_play
 from finforce_ifea.tracking.held_weight import LARGEST_RATIO, HeldWeight, project_response
+from finforce_ifea.tracking.hold import HoldHypotheses
 from finforce_ifea.tracking.influence import explain_offsets, measure_influence
 from finforce_ifea.tracking.lateral_load import LateralLoad, Torsion
 
@@ -96,6 +97,7 @@ class ContactTracker:
         self.roughness = FrictionEstimate(settings, smooth)
         self._lateral = LateralLoad(torsion, len(keypoints), UNSEEN_TRACTION * settings.friction)
         self._held = HeldWeight(self._lateral.half_width)
+        self._hold = HoldHypotheses()
         self.reset()
 
     def reset(self, height: float | None = None) -> None:
@@ -172,6 +174,7 @@ class ContactTracker:
         self._led = self._mean.copy()
         self.slips.reset()
         self._held.reset()
+        self._hold.reset()
         self._lateral.reset()
         self._released, self._jumped, self._slides = 0, False, False
 
@@ -208,8 +211,9 @@ class ContactTracker:
         self._released = self._released + 1 if state["depth"] < TOUCH_DEPTH else 0
         if self._released >= _IMAGES_RELEASED:  # the next object may be any again, and nothing hangs on the jaw yet
             self._forget_contact()
-            if self.settings.held == "yes":
+            if self.settings.held != "no":
                 self._held.reset()
+                self._hold.reset()
                 self._traction = FRICTIONLESS
         if held is not None and state["converged"] and state["depth"] >= LOADED_DEPTH and not self._jumped:
             self._follow_traction(noise.gain, dt, gravity)
@@ -249,14 +253,23 @@ class ContactTracker:
         return self._outline is self._contact.indenter
 
     def _follow_traction(self, gain: NDArray, dt: float, gravity: NDArray | None) -> None:
-        """Follow the traction of an object that is held; that of one that slides is left to `learn`."""
-        if self.settings.held != "yes":
-            self._slides = True
+        """Follow the traction of an object that only the jaws hold, or may; friction is left to `learn`."""
+        held, search, prior = self.settings.held, self._search, self._search.expectation["variance"]
+        self._slides = held != "yes"
+        if held == "no":
             return
         response = tuple(project_response(each, gain) for each in (self._lateral.by_force, self._lateral.by_moment))
-        search, prior = self._search, self._search.expectation["variance"]
         wanted = self._held.update(search.points, search.state, response, prior, dt, gravity)
-        self._traction = constant_traction(min(max(wanted, -LARGEST_RATIO), LARGEST_RATIO))
+        if held == "auto":
+            normal = max(hypot(search.state["pressing"][0], search.state["pressing"][2]), _LEAST_NORMAL)
+            expected = Coefficient(wanted, self._find_held_stddev(normal)), self._find_friction()
+            wanted = self._hold.update(search.points, search.average, search.state, prior, expected, dt)
+        self._set_traction(min(max(wanted, -LARGEST_RATIO), LARGEST_RATIO))
+
+    def _set_traction(self, ratio: float) -> None:
+        """Press the next image's jaw with another traction ratio."""
+        self._search.change_traction(ratio - self._traction.ratio)
+        self._traction = constant_traction(ratio)
 
     def learn(self) -> None:
         """Learn what the last image tells of friction, which its force did not wait for."""
@@ -267,9 +280,10 @@ class ContactTracker:
         before, known = self.slips.mobilised, self.roughness.coefficient.mean
         self._fidelities[0].contact.set_indenter(self._contact.indenter)
         expected = np.r_[state["x_model"][DEPTH], mean]
-        mobilised = self.slips.follow(self.give_shape(), expected, sqrt(state["depth_variance"]), known)
+        self.slips.follow(self.give_shape(), expected, sqrt(state["depth_variance"]), known)
         self.roughness.update(self._search.points, state, mean, self._search.expectation["variance"], before)
-        self._traction = constant_traction(self.roughness.coefficient.mean * mobilised)
+        if self.settings.held == "no":
+            self._set_traction(self._find_friction().mean)
 
     def resume(self, q: NDArray) -> None:
         """Start anew from the shape (size,) that another tracker has found."""
@@ -341,23 +355,35 @@ class ContactTracker:
     def _find_lateral(self, normal: float) -> NDArray:
         """Return what acts laterally, see `LateralLoad`; what a lifted object may do there is uncertainty."""
         load, held = self._lateral.load.copy(), self._held
-        if self.settings.held == "yes" and held.lateral_stddev < np.inf:
+        if self.settings.held != "no" and held.lateral_stddev < np.inf:
             load[2] += held.lateral
             load[3] = hypot(load[3], held.lateral_stddev / max(normal, _LEAST_NORMAL))
         return load
 
     def _find_leak(self, state: ContactState, normal: float) -> float:
-        """Return by how much a held object's force [N] along the finger changes that along x [-]."""
-        if self.settings.held != "yes" or normal < _LEAST_NORMAL:
+        """Return by how much a force [N] along the finger that is not known of changes that along x [-]."""
+        if self.settings.held == "no" or normal < _LEAST_NORMAL:
             return 0.0
-        return float(state["by_traction"][0] / normal - state["force_modes"][0, DEPTH] * self._held.leverage)
+        leverage = self._held.leverage if self.settings.held == "yes" else self._hold.leverage / normal
+        return float(state["by_traction"][0] / normal - state["force_modes"][0, DEPTH] * leverage)
 
     def _find_traction(self, normal: float) -> float:
         """Return the standard deviation of the traction ratio of a force [N] along the finger [-]."""
-        if self.settings.held == "yes":
-            return sqrt(min(self._held.stddev / max(normal, _LEAST_NORMAL), _WEIGHT) ** 2 + _TRACTION**2)
-        found = self.roughness.coefficient
-        return sqrt((found.stddev * self.slips.mobilised) ** 2 + (_UNFOLLOWED * found.mean) ** 2 + _TRACTION**2)
+        if self.settings.held == "no":
+            return self._find_friction().stddev
+        if self.settings.held == "auto" and self._hold.ratio.stddev < np.inf:
+            return self._hold.ratio.stddev
+        return self._find_held_stddev(max(normal, _LEAST_NORMAL))
+
+    def _find_held_stddev(self, normal: float) -> float:
+        """Return the standard deviation of the traction ratio of what only the jaws hold, by a force [N]."""
+        return sqrt(min(self._held.stddev / normal, _WEIGHT) ** 2 + _TRACTION**2)
+
+    def _find_friction(self) -> Coefficient:
+        """Return the traction ratio of what something else holds, too."""
+        found, mobilised = self.roughness.coefficient, self.slips.mobilised
+        variance = (found.stddev * mobilised) ** 2 + (_UNFOLLOWED * found.mean) ** 2 + _TRACTION**2
+        return Coefficient(found.mean * mobilised, sqrt(variance))
 
 
 def _attach(contact: RigidContact, keypoints: NDArray) -> _Fidelity:

@@ -1,0 +1,134 @@
+"""Whether the jaws alone hold an object, or something else holds it, too.
+
+The two hypotheses expect different traction on a jaw's face. What only the jaws hold does not move along the finger:
+friction balances the inclination of the bent faces, but for the object's weight. What a bench, a table or a hand holds
+as well is pushed along the finger by the inclined face, and friction follows from its motion on it. The key points
+tell the traction ratio r themselves, the better the deeper the jaw is pressed: with the averaged residuals m_k, their
+derivatives J_k by depth, shape, height and r, and the covariances S_k,
+
+    minimise  sum_k (m_k - J_k y)^T S_k^-1 (m_k - J_k y) + prior of shape and height
+
+for y. The ratio that this asks for, and its variance, is the evidence. Each hypothesis has a mean and a variance of r;
+its share follows by Bayes' rule. Errors of the averages are those of successive images, too, so evidence is not added
+up: the clearest of a grasp counts, and fades slowly.
+"""
+
+from math import exp, inf, log, sqrt
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from finforce.elimination import eliminate
+from finforce_ifea.tracking.contact_filter import find_averaged_spread
+from finforce_ifea.tracking.contact_state import ContactState
+from finforce_ifea.tracking.friction import Coefficient
+
+_OPTIONS = {"cache": True, "error_model": "numpy"}
+# Probability that only the jaws hold an object of which nothing is known.
+_HELD = 0.5
+# Errors of the mechanics that look like traction, as a standard deviation of the ratio.
+_RATIO_ERROR = 0.08
+# Time after which a hold that was recognised is asked about again [s], and log odds that are certainty.
+_FADES, _CERTAIN = 20.0, 12.0
+
+
+class HoldHypotheses:
+    """Weighs both hypotheses for one object.
+
+    Attributes:
+        held: probability that only the jaws hold the object.
+        ratio: expected traction ratio and its standard deviation.
+        leverage: depth that a unit of the ratio is taken for [m].
+    """
+
+    def __init__(self) -> None:
+        """Start with an object of which nothing is known."""
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the grasp."""
+        self._clearest = 0.0
+        self.held, self.leverage = _HELD, 0.0
+        self.ratio = Coefficient(0.0, inf)
+
+    def update(
+        self,
+        points: NDArray,
+        average: NDArray,
+        state: ContactState,
+        variance: NDArray,
+        expected: tuple[Coefficient, Coefficient],
+        dt: float,
+    ) -> float:
+        """Take one image; return the expected traction ratio.
+
+        Args:
+            points: key points of the image, see `KEYPOINT`.
+            average: of their residuals, see `AVERAGE`.
+            state: of the contact.
+            variance: of expected shape and height (2,).
+            expected: traction ratio of what the jaws alone hold, and of what something else holds, too.
+            dt: time since the last image [s].
+        """
+        asked, spread, self.leverage = measure_traction(points, average, variance)
+        spread = spread * max(1.0, float(state["misfit"]) ** 2) + _RATIO_ERROR**2
+        seen = float(state["traction_ratio"]) + asked
+        evidence, fitted = 0.0, []
+        for sign, each in zip((1.0, -1.0), expected, strict=True):
+            own = each.stddev**2
+            both = own + spread
+            evidence += sign * -0.5 * ((seen - each.mean) ** 2 / both + log(both))
+            fitted.append(((each.mean * spread + seen * own) / both, own * spread / both))
+        evidence = min(max(evidence, -_CERTAIN), _CERTAIN)
+        self._clearest *= exp(-dt / _FADES)
+        if abs(evidence) > abs(self._clearest):
+            self._clearest = evidence
+        self.held = 1.0 / (1.0 + exp(-self._clearest) * (1.0 - _HELD) / _HELD)
+        (one, first), (two, second) = fitted
+        mean = self.held * one + (1.0 - self.held) * two
+        between = self.held * (1.0 - self.held) * (one - two) ** 2
+        self.ratio = Coefficient(mean, sqrt(self.held * first + (1.0 - self.held) * second + between))
+        return mean
+
+
+@njit(**_OPTIONS)
+def measure_traction(points, average, variance):
+    """Return the change of the traction ratio that averaged residuals ask for, its variance, and its depth [m].
+
+    Args:
+        points: (K,), see `KEYPOINT`.
+        average: of their residuals (K,), see `AVERAGE`.
+        variance: prior of shape and height (2,).
+    """
+    A, b, row = np.zeros((4, 4)), np.zeros(4), np.empty((2, 4))
+    for k in range(len(points)):
+        point, mean = points[k], average[k]
+        if mean.count <= 0.5:
+            continue
+        s00, s11, s01 = find_averaged_spread(point, mean.count)
+        det = s00 * s11 - s01 * s01
+        for a in range(2):
+            row[a, 3] = point.modes[a, 3]
+            for i in range(3):
+                row[a, i] = mean.modes[a, i]
+        for i in range(4):
+            q0 = (s11 * row[0, i] - s01 * row[1, i]) / det
+            q1 = (s00 * row[1, i] - s01 * row[0, i]) / det
+            b[i] += q0 * mean.residual[0] + q1 * mean.residual[1]
+            for j in range(4):
+                A[i, j] += q0 * row[0, j] + q1 * row[1, j]
+    leverage = A[0, 3] / A[0, 0] if A[0, 0] > 0.0 else 0.0
+    for i in range(2):
+        A[i + 1, i + 1] += 1.0 / variance[i]
+    known, others = np.empty((3, 2)), A[:3, :3].copy()
+    for i in range(3):
+        known[i, 0], known[i, 1] = b[i], A[i, 3]
+    eliminate(others, known)
+    information, asked = A[3, 3], b[3]
+    for i in range(3):
+        information -= A[3, i] * known[i, 1]
+        asked -= A[3, i] * known[i, 0]
+    if not information > 1e-9:
+        return 0.0, 1e9, leverage
+    return asked / information, 1.0 / information, leverage
