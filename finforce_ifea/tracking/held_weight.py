@@ -11,12 +11,17 @@ residual is remembered from when the hold began, and the change since then is ex
     does not roll with either,
 
 where T and S rise or fall steadily over the images that are averaged. Where gravity's direction is known, T and S are
-expected as it points: its share along the finger and across, plus what little acts from outside. Once a
-change of T or S is beyond chance the object is lifted, and every change counts until the hold ends. Where the jaws move
-on far, or the object slides, the memory begins anew, and T and S are what they were.
+expected as it points: its share along the finger and across, plus what little acts from outside. Whether the object
+is lifted at all is a hypothesis: the change counts by its probability p, where
+
+    p / (1 - p) = p0 N(0; 0, P) / N(0; m, C) / (1 - p0)
+
+for T and S with the expected covariance P and the estimate m with covariance C (Savage and Dickey). Once it is certain,
+every change counts until the hold ends. Where the jaws move on far, or the object slides, the memory begins anew, and T
+and S are what they were.
 """
 
-from math import hypot
+from math import exp, hypot, log, sqrt
 
 import numpy as np
 from numba import njit
@@ -48,8 +53,10 @@ _PRESSURE_ARM = 0.5
 LARGEST_RATIO = 0.9
 # [N m], keeps the moment's variance above zero where the finger's width is unknown.
 _LEAST_MOMENT = 1e-6
-# The errors of so many successive images count for one. A change of so many standard deviations is no chance.
-_ALIKE, _SURE = 1.5, 3.0
+# The errors of so many successive images count for one.
+_ALIKE = 1.5
+# Probability that a held object is lifted in an image, and that with which it is from then on.
+_LIFTED, _CERTAIN = 0.02, 0.999
 # Fewer points than these say nothing.
 _FEWEST = 6
 # What changes: shape, height, T, S, M, and the speeds of T and S.
@@ -82,7 +89,7 @@ class HeldWeight:
         """Start to remember."""
         self._images, self._x = 0, np.zeros(3)
         self._forget_changes()
-        self._before, self._changed, self._led = (self.force, self.lateral), False, np.zeros(2)
+        self._before, self._lifted, self._led = np.array([self.force, self.lateral]), False, np.zeros(2)
 
     def _forget_changes(self) -> None:
         self._information, self._vector = np.zeros((_UNKNOWN, _UNKNOWN)), np.zeros(_UNKNOWN)
@@ -154,12 +161,23 @@ class HeldWeight:
         spread = np.linalg.inv(self._information / _ALIKE + expected)
         asked = self._vector / _ALIKE
         asked[:2] += self._led / settles[:2]
-        changes, stddev = (spread @ asked)[_T : _S + 1], np.sqrt(np.diag(spread))[_T : _S + 1]
-        self._changed |= bool((np.abs(changes) > _SURE * stddev).any())
-        self.stddev = float(stddev[0])
-        if self._changed:
-            self.force, self.lateral = float(self._before[0] + changes[0]), float(self._before[1] + changes[1])
-            self.lateral_stddev = float(stddev[1])
+        changes, covariance = (spread @ asked)[_T : _S + 1], spread[_T : _S + 1, _T : _S + 1]
+        prior_covariance = np.linalg.inv(expected[_T : _S + 1, _T : _S + 1])
+        share = 1.0 if self._lifted else _find_share(changes, covariance, prior_covariance)
+        self._lifted = share > _CERTAIN
+        self.force, self.lateral = (float(value) for value in self._before + share * changes)
+        variance = np.diag(covariance)
+        between = share * (1.0 - share) * changes**2
+        self.stddev = sqrt(float(variance[0] + between[0]))
+        if share > _LIFTED:
+            self.lateral_stddev = sqrt(float(share * variance[1] + between[1]))
+
+
+def _find_share(changes: NDArray, covariance: NDArray, expected: NDArray) -> float:
+    """Return the probability that T and S (2,) have changed, for their covariance and the one before it was seen."""
+    squared = changes @ np.linalg.solve(covariance, changes)
+    odds = 0.5 * squared + 0.5 * log(np.linalg.det(covariance) / np.linalg.det(expected))
+    return 1.0 / (1.0 + (1.0 - _LIFTED) / _LIFTED * exp(-min(odds, 50.0)))
 
 
 def find_upright_ratio(force: NDArray, ratio: float) -> float:
