@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from finforce_eval.cli.parser import picture_file
+from finforce_eval.evaluate import read_evaluations
 from finforce_eval.evaluation.comparison import (
     BETTER,
     SAME,
@@ -20,6 +22,7 @@ from finforce_eval.evaluation.comparison import (
     read_evaluation,
     total_change,
 )
+from finforce_eval.evaluation.tables import evaluation_json
 from finforce_eval.machine import without_nan, write_json
 
 WORSE_FOUND = 1
@@ -27,8 +30,8 @@ WORSE_FOUND = 1
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
-    parser.add_argument("before", metavar="A.json", help="what finforce evaluate --json wrote")
-    parser.add_argument("after", metavar="B.json", help="the same of other settings, fingers or versions")
+    parser.add_argument("before", metavar="A", help="what finforce evaluate --json wrote, or the folder of its --out")
+    parser.add_argument("after", metavar="B", help="the same of other settings, fingers or versions")
     parser.add_argument("--json", metavar="OUT", help="write the changes as JSON")
     parser.add_argument(
         "--figure", type=picture_file, metavar="PNG", help="draw the error of each recording before and after"
@@ -38,7 +41,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Compare two evaluations: print the table, write JSON and picture."""
-    before, after = (read_evaluation(path) for path in (options.before, options.after))
+    before, after = (_read(Path(path)) for path in (options.before, options.after))
     changes = compare_evaluations(before, after)
     for name, (old, new) in differing_settings(before, after).items():
         print(f"{name}: {old} -> {new}")
@@ -53,6 +56,19 @@ def run(options: argparse.Namespace) -> int:
         draw_comparison(changes, names).savefig(options.figure)
         print(f"Picture: {options.figure}")
     return WORSE_FOUND if options.strict and any(change.verdict == WORSE for change in changes) else 0
+
+
+def _read(path: Path) -> Mapping[str, Any]:
+    """Return what `evaluate --json` writes, from such a file or from a folder of tables.
+
+    Raises:
+        FinforceError: it is neither.
+    """
+    tables = sorted(path.glob("*.parquet"))
+    if not tables:
+        return read_evaluation(path)
+    evaluation, about = read_evaluations(tables)
+    return without_nan(evaluation_json(evaluation, **about))
 
 
 def format_changes(changes: Sequence[Change]) -> str:

@@ -4,9 +4,16 @@ import json
 
 import numpy as np
 import pytest
+from eval_fakes import FakeEstimator, FakeJaw, make_recording
 
+from finforce_contact.loop import GivenContact
 from finforce_eval.cli.main import main
 from finforce_eval.evaluation.comparison import compare_evaluations, total_change
+from finforce_eval.evaluation.forces import evaluate_recording
+from finforce_eval.evaluation.scoring import score_results, true_range
+from finforce_eval.evaluation.tables import evaluation_json
+from finforce_eval.machine import write_json
+from finforce_eval.table import write_table
 
 
 def evaluation(squares, *, skipped=0, name="a", **about):
@@ -110,3 +117,16 @@ def test_another_file_is_refused(text, files, tmp_path, capsys):
     other.write_text(text)
     assert main(["compare", files[0], str(other)]) == 2
     assert "expected what finforce evaluate --json writes" in capsys.readouterr().err
+
+
+def test_the_tables_of_an_evaluation_say_what_its_json_says(tmp_path, capsys):
+    recording = make_recording("pressed")
+    estimator = FakeEstimator(1.1 * recording.truth("left").force)
+    result = evaluate_recording(recording, FakeJaw(keypoints=np.zeros((4, 3))), GivenContact(None), estimator)
+    (tmp_path / "out").mkdir()
+    about = {"about": {"jaw": "fake"}, "true_range_N": true_range(recording)}
+    write_table(tmp_path / "out" / "pressed.parquet", [result], about)
+    write_json(tmp_path / "scores.json", evaluation_json(score_results([result], [recording]), jaw="fake"))
+    assert main(["compare", str(tmp_path / "out"), str(tmp_path / "scores.json"), "--strict"]) == 0
+    said = capsys.readouterr().out
+    assert "1 the same, 0 unsure or in one file only" in said and "->" not in said
