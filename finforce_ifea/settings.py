@@ -41,8 +41,8 @@ class EstimatorSettings:
     )
     held: str = setting(
         "auto",
-        "whether the jaws alone hold the object, so that friction balances the inclination of their faces; auto: yes "
-        "where there are both, else no",
+        "whether only the jaws hold the object, so that friction balances the inclination of their faces; auto: "
+        "weighed by what the key points show if there are two jaws, else no",
         choices=("auto", "yes", "no"),
     )
     tare_frames: int = setting(45, "unloaded images before the first force", "images", 5, 10000)

@@ -263,13 +263,13 @@ def test_rate_and_latency_are_in_the_diagnostics(probe):
     [
         ({}, "no"),
         ({"completes_grasp": True}, "no"),
-        ({"peer": "right"}, "yes"),
-        ({"paired": True}, "yes"),
+        ({"peer": "right"}, "auto"),
+        ({"paired": True}, "auto"),
         ({"paired": True, "estimator.held": "no"}, "no"),
         ({"estimator.held": "yes"}, "yes"),
     ],
 )
-def test_two_jaws_hold_what_they_press_unless_told_otherwise(probe, parameters, held):
+def test_two_jaws_may_hold_what_they_press_alone_unless_told_otherwise(probe, parameters, held):
     given = {"contact_height": 0.04, **parameters}
     overrides = [Parameter(name, value=value) for name, value in given.items()]
     asked = []
