@@ -290,7 +290,7 @@ class JawEstimator:
     def _solution(self, state: ContactState, used: NDArray) -> Solution:
         """Return the force that belongs to a contact, and how good it is."""
         error = hypot(self._force_error, state["location_error"], _EXTRAPOLATED * state["extrapolation"])
-        sliding = self.settings.friction if self.settings.held == "no" else 0.0
+        sliding = 0.0 if self.settings.may_be_held else self.settings.friction
         vectors, dt = np.empty((7, 3)), self._pass_time()
         magnitude, stddev = compute_force(state, self._relaxation.packed, dt, error, sliding, vectors)
         force, torque, force_stddev, torque_stddev, point, location, normal = vectors

@@ -66,7 +66,7 @@ class IfeaSolverNode(Node):
         self.skips = Skips(SOLVER, parameters.skip_off)
         jaw = load_parameter_jaw(parameters)
         self.contacts = build_contact_feed(jaw, parameters)
-        self.gravity = GravityFeed(parameters) if settings.held != "no" else None
+        self.gravity = GravityFeed(parameters) if settings.may_be_held else None
         ros.warn_first_start(self)
         with self._announce_wait(jaw.name):
             self.estimator = build(jaw, parameters, settings)

@@ -41,9 +41,9 @@ class EstimatorSettings:
     )
     held: str = setting(
         "auto",
-        "whether only the jaws hold the object, so that friction balances the inclination of their faces; auto: "
-        "weighed by what the key points show if there are two jaws, else no",
-        choices=("auto", "yes", "no"),
+        "whether only the jaws hold the object, so that friction balances the inclination of their faces; either: "
+        "weighed by what the key points show; auto: either if there are two jaws, else no",
+        choices=("auto", "yes", "no", "either"),
     )
     tare_frames: int = setting(45, "unloaded images before the first force", "images", 5, 10000)
     automatic_tare: bool = setting(True, "automatic tare at the start while nothing presses")
@@ -72,5 +72,10 @@ class EstimatorSettings:
         check_bounds(self, ObservationError)
 
     def resolve_held(self, *, both: bool) -> "EstimatorSettings":
-        """Return settings in which `held` is `auto` only where `both` jaws press the same object."""
-        return replace(self, held="no") if self.held == "auto" and not both else self
+        """Return settings in which `held` is no longer `auto`; `both` where another jaw presses the same object."""
+        return self if self.held != "auto" else replace(self, held="either" if both else "no")
+
+    @property
+    def may_be_held(self) -> bool:
+        """Whether only the jaws hold the object, as far as that is known."""
+        return self.held in ("yes", "either")

@@ -89,10 +89,6 @@ class ContactSearch:
         self.state["x"][1:] += change
         self.average["count"] *= kept
 
-    def change_traction(self, change: float) -> None:
-        """Take averaged residuals to another traction ratio of the next image."""
-        self.average["residual"] -= self.points["modes"][:, :, 3] * change
-
     def find(self, contact: RigidContact, traction: Traction, probe: Any, dt: float, *, is_sudden: bool) -> bool:
         """Find the contact in the image of `points`; False, all as it was, where too few key points agree.
 

@@ -211,7 +211,7 @@ class ContactTracker:
         self._released = self._released + 1 if state["depth"] < TOUCH_DEPTH else 0
         if self._released >= _IMAGES_RELEASED:  # the next object may be any again, and nothing hangs on the jaw yet
             self._forget_contact()
-            if self.settings.held != "no":
+            if self.settings.may_be_held:
                 self._held.reset()
                 self._hold.reset()
                 self._traction = FRICTIONLESS
@@ -254,22 +254,17 @@ class ContactTracker:
 
     def _follow_traction(self, gain: NDArray, dt: float, gravity: NDArray | None) -> None:
         """Follow the traction of an object that only the jaws hold, or may; friction is left to `learn`."""
-        held, search, prior = self.settings.held, self._search, self._search.expectation["variance"]
-        self._slides = held != "yes"
-        if held == "no":
+        search, prior = self._search, self._search.expectation["variance"]
+        self._slides = self.settings.held != "yes"
+        if not self.settings.may_be_held:
             return
         response = tuple(project_response(each, gain) for each in (self._lateral.by_force, self._lateral.by_moment))
         wanted = self._held.update(search.points, search.state, response, prior, dt, gravity)
-        if held == "auto":
+        if self.settings.held == "either":
             normal = max(hypot(search.state["pressing"][0], search.state["pressing"][2]), _LEAST_NORMAL)
             expected = Coefficient(wanted, self._find_held_stddev(normal)), self._find_friction()
             wanted = self._hold.update(search.points, search.average, search.state, prior, expected, dt)
-        self._set_traction(min(max(wanted, -LARGEST_RATIO), LARGEST_RATIO))
-
-    def _set_traction(self, ratio: float) -> None:
-        """Press the next image's jaw with another traction ratio."""
-        self._search.change_traction(ratio - self._traction.ratio)
-        self._traction = constant_traction(ratio)
+        self._traction = constant_traction(min(max(wanted, -LARGEST_RATIO), LARGEST_RATIO))
 
     def learn(self) -> None:
         """Learn what the last image tells of friction, which its force did not wait for."""
@@ -282,8 +277,8 @@ class ContactTracker:
         expected = np.r_[state["x_model"][DEPTH], mean]
         self.slips.follow(self.give_shape(), expected, sqrt(state["depth_variance"]), known)
         self.roughness.update(self._search.points, state, mean, self._search.expectation["variance"], before)
-        if self.settings.held == "no":
-            self._set_traction(self._find_friction().mean)
+        if not self.settings.may_be_held:
+            self._traction = constant_traction(self._find_friction().mean)
 
     def resume(self, q: NDArray) -> None:
         """Start anew from the shape (size,) that another tracker has found."""
@@ -355,23 +350,23 @@ class ContactTracker:
     def _find_lateral(self, normal: float) -> NDArray:
         """Return what acts laterally, see `LateralLoad`; what a lifted object may do there is uncertainty."""
         load, held = self._lateral.load.copy(), self._held
-        if self.settings.held != "no" and held.lateral_stddev < np.inf:
+        if self.settings.may_be_held and held.lateral_stddev < np.inf:
             load[2] += held.lateral
             load[3] = hypot(load[3], held.lateral_stddev / max(normal, _LEAST_NORMAL))
         return load
 
     def _find_leak(self, state: ContactState, normal: float) -> float:
         """Return by how much a force [N] along the finger that is not known of changes that along x [-]."""
-        if self.settings.held == "no" or normal < _LEAST_NORMAL:
+        if not self.settings.may_be_held or normal < _LEAST_NORMAL:
             return 0.0
         leverage = self._held.leverage if self.settings.held == "yes" else self._hold.leverage / normal
         return float(state["by_traction"][0] / normal - state["force_modes"][0, DEPTH] * leverage)
 
     def _find_traction(self, normal: float) -> float:
         """Return the standard deviation of the traction ratio of a force [N] along the finger [-]."""
-        if self.settings.held == "no":
+        if not self.settings.may_be_held:
             return self._find_friction().stddev
-        if self.settings.held == "auto" and self._hold.ratio.stddev < np.inf:
+        if self.settings.held == "either" and self._hold.ratio.stddev < np.inf:
             return self._hold.ratio.stddev
         return self._find_held_stddev(max(normal, _LEAST_NORMAL))
 

@@ -263,8 +263,8 @@ def test_rate_and_latency_are_in_the_diagnostics(probe):
     [
         ({}, "no"),
         ({"completes_grasp": True}, "no"),
-        ({"peer": "right"}, "auto"),
-        ({"paired": True}, "auto"),
+        ({"peer": "right"}, "either"),
+        ({"paired": True}, "either"),
         ({"paired": True, "estimator.held": "no"}, "no"),
         ({"estimator.held": "yes"}, "yes"),
     ],
