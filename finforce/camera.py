@@ -311,10 +311,11 @@ def decode_color(data: NDArray | bytes, encoding: str, layout: ImageLayout | Non
     return np.ascontiguousarray(image)
 
 
+_SENT = ("JPEG", "PNG")  # formats of a compressed image
 LARGEST_PICTURE = 50_000_000  # px, of a picture that is unpacked: no camera here makes more
 
 
-def open_picture(data: bytes, what: str, formats: tuple[str, ...] | None = ("JPEG", "PNG")) -> Any:
+def open_picture(data: bytes, what: str, formats: tuple[str, ...] | None = _SENT) -> Any:
     """Return a picture of Pillow, unpacked; of any format that Pillow reads where `formats` is None.
 
     Raises:
@@ -342,6 +343,8 @@ def open_picture(data: bytes, what: str, formats: tuple[str, ...] | None = ("JPE
     return picture
 
 
-def decode_picture(data: NDArray | bytes, what: str) -> NDArray[np.uint8]:
-    """Return the colours (h, w, 3), red green blue, of a jpeg or png; raises ImageError as `open_picture` does."""
-    return np.array(open_picture(bytes(data), what).convert("RGB"))
+def decode_picture(data: NDArray | bytes, what: str, formats: tuple[str, ...] | None = _SENT) -> NDArray[np.uint8]:
+    """Return the colours (h, w, 3), red green blue, of a picture; formats and errors are those of `open_picture`."""
+    picture = open_picture(bytes(data), what, formats)
+    # a camera's pictures come as they are wanted: converting one anyway would copy it
+    return np.asarray(picture if picture.mode == "RGB" else picture.convert("RGB"))

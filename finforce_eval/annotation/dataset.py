@@ -19,10 +19,10 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from finforce.camera import MILLIMETRE, CameraIntrinsics, ImageError
+from finforce.camera import MILLIMETRE, CameraIntrinsics, ImageError, decode_picture
 from finforce.errors import one_line
 from finforce.files import FileError, parse_json, read_json, read_text
-from finforce.optional import import_cv2, import_library
+from finforce.optional import import_library
 from finforce.stamps import NANOSECONDS
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.recordings.images import StampedImage
@@ -278,13 +278,16 @@ class EpisodeImages:
 
     def _read_column(self) -> Iterator[NDArray[np.uint8]]:
         """Yield the pictures that stand in the episode's rows."""
-        cv2, rows = import_cv2(), rows_of(read_parquet(self.episode.data), self.episode, self.name)
+        rows = rows_of(read_parquet(self.episode.data), self.episode, self.name)
         for number, cell in enumerate(rows[self.feature]):
             stored: Any = cell.as_py()
-            data = stored.get("bytes") if isinstance(stored, dict) else stored
-            picture = None
-            if isinstance(data, bytes) and data:
-                picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-            if picture is None:
-                raise RecordingError(f"{self.name}: frame {number} of {self.feature} is no picture")
-            yield cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+            data, what = stored, f"{self.name}: frame {number} of {self.feature}"
+            if isinstance(stored, dict):
+                data = stored.get("bytes")
+            if not isinstance(data, bytes):
+                raise RecordingError(f"{what} is no picture")
+            try:
+                picture = decode_picture(data, what, formats=None)
+            except ImageError as error:
+                raise RecordingError(str(error)) from error
+            yield picture
