@@ -373,7 +373,7 @@ _DEPTH_SHARE = 1e-3
 
 
 @njit(**_OPTIONS)
-def find_averaged_spread(point, count):
+def _find_averaged_spread(point, count):
     """Return the entries 00, 11 and 01 of the covariance of a key point's averaged residual [m^2]."""
     share = 1.0 / max(count, 1.0)
     noise = point.noise
@@ -381,21 +381,37 @@ def find_averaged_spread(point, count):
 
 
 @njit(**_OPTIONS)
-def _compute_posterior(points, average, offset, prior_variance, information):
-    """Return Hessian and gradient of the log posterior of the state for averaged residuals."""
-    hessian, gradient = np.zeros((3, 3)), np.zeros(3)
+def sum_averages(points, average):
+    """Return what averaged residuals tell of depth, shape, height and traction ratio: normal equations (4, 4), (4,).
+
+    Args:
+        points: (K,), see `KEYPOINT`.
+        average: of their residuals (K,), see `AVERAGE`.
+    """
+    normal, right, row = np.zeros((4, 4)), np.zeros(4), np.empty((2, 4))
     for k in range(len(points)):
         mean = average[k]
         if mean.count <= 0.5:
             continue
-        s00, s11, s01 = find_averaged_spread(points[k], mean.count)
+        s00, s11, s01 = _find_averaged_spread(points[k], mean.count)
         det = s00 * s11 - s01 * s01
-        for i in range(3):
-            a = (s11 * mean.modes[0, i] - s01 * mean.modes[1, i]) / det
-            b = (s00 * mean.modes[1, i] - s01 * mean.modes[0, i]) / det
-            gradient[i] += a * mean.residual[0] + b * mean.residual[1]
-            for j in range(3):
-                hessian[i, j] += a * mean.modes[0, j] + b * mean.modes[1, j]
+        for axis in range(2):
+            row[axis, :3] = mean.modes[axis]
+            row[axis, 3] = points[k].modes[axis, 3]
+        for i in range(4):
+            a = (s11 * row[0, i] - s01 * row[1, i]) / det
+            b = (s00 * row[1, i] - s01 * row[0, i]) / det
+            right[i] += a * mean.residual[0] + b * mean.residual[1]
+            for j in range(4):
+                normal[i, j] += a * row[0, j] + b * row[1, j]
+    return normal, right
+
+
+@njit(**_OPTIONS)
+def _compute_posterior(points, average, offset, prior_variance, information):
+    """Return Hessian and gradient of the log posterior of the state for averaged residuals."""
+    normal, right = sum_averages(points, average)
+    hessian, gradient = normal[:3, :3].copy(), right[:3].copy()
     for i in range(2):
         # far from its mean the prior lets go (Cauchy), for an object may touch first elsewhere than was stated
         variance = prior_variance[i] + (offset[i] / _PRIOR_REACH) ** 2
@@ -539,7 +555,7 @@ def _measure_misfit(points, average):
     for k in range(len(points)):
         if average[k].count <= 0.5:
             continue
-        s00, s11, s01 = find_averaged_spread(points[k], average[k].count)
+        s00, s11, s01 = _find_averaged_spread(points[k], average[k].count)
         m0, m1 = average[k].residual[0], average[k].residual[1]
         total += (s11 * m0 * m0 - 2.0 * s01 * m0 * m1 + s00 * m1 * m1) / (s00 * s11 - s01 * s01)
         freedom += 2.0

@@ -20,7 +20,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from finforce.elimination import eliminate
-from finforce_ifea.tracking.contact_filter import find_averaged_spread
+from finforce_ifea.tracking.contact_filter import sum_averages
 from finforce_ifea.tracking.contact_state import ContactState
 from finforce_ifea.tracking.friction import Coefficient
 
@@ -101,7 +101,7 @@ def measure_traction(points, average, variance):
         average: of their residuals (K,), see `AVERAGE`.
         variance: prior of shape and height (2,).
     """
-    A, b = _add_up(points, average)
+    A, b = sum_averages(points, average)
     leverage = A[0, 3] / A[0, 0] if A[0, 0] > 0.0 else 0.0
     for i in range(2):
         A[i + 1, i + 1] += 1.0 / variance[i]
@@ -116,25 +116,3 @@ def measure_traction(points, average, variance):
     if not information > 1e-9:
         return 0.0, 1e9, leverage
     return asked / information, 1.0 / information, leverage
-
-
-@njit(**_OPTIONS)
-def _add_up(points, average):
-    """Return the normal equations (4, 4) and (4,) of depth, shape, height and traction ratio."""
-    A, b, row = np.zeros((4, 4)), np.zeros(4), np.empty((2, 4))
-    for k in range(len(points)):
-        point, mean = points[k], average[k]
-        if mean.count <= 0.5:
-            continue
-        s00, s11, s01 = find_averaged_spread(point, mean.count)
-        det = s00 * s11 - s01 * s01
-        for a in range(2):
-            row[a, :3] = mean.modes[a]
-            row[a, 3] = point.modes[a, 3]
-        for i in range(4):
-            q0 = (s11 * row[0, i] - s01 * row[1, i]) / det
-            q1 = (s00 * row[1, i] - s01 * row[0, i]) / det
-            b[i] += q0 * mean.residual[0] + q1 * mean.residual[1]
-            for j in range(4):
-                A[i, j] += q0 * row[0, j] + q1 * row[1, j]
-    return A, b
