@@ -120,22 +120,6 @@ def check_keypoint_count(recording: Recording, side: str, jaw: Any) -> None:
             )
 
 
-def evaluate_recording(
-    recording: Recording, jaw: Any, source: ContactSource, estimator: Estimator, side: str = "left"
-) -> ForceSeries:
-    """Return the forces on one jaw of a recording with ground truth; see `find_forces`.
-
-    Raises:
-        RecordingError: no ground truth, another number of key points than the jaw's, or not one frame solved.
-        ObservationError: the estimator refuses a frame.
-    """
-    recording.truth(side)
-    check_keypoint_count(recording, side, jaw)
-    result = find_forces(recording, jaw, source, estimator, side)
-    check_solved(result, recording)
-    return result
-
-
 def check_solved(result: ForceSeries, recording: Recording) -> None:
     """Refuse a recording of which nothing can be said.
 

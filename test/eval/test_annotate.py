@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from eval_fakes import evaluate_recording
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
 from finforce_eval.annotation import bag as annotated_bag
 from finforce_eval.cli.main import main
-from finforce_eval.evaluation.forces import evaluate_recording
 from finforce_eval.evaluation.setup import make_setup
 from finforce_eval.recordings.recording import DEMO, read_recording
 from finforce_eval.recordings.writer import write_recording

@@ -4,12 +4,11 @@ import json
 
 import numpy as np
 import pytest
-from eval_fakes import FakeEstimator, FakeJaw, make_recording
+from eval_fakes import FakeEstimator, FakeJaw, evaluate_recording, make_recording
 
 from finforce_contact.loop import GivenContact
 from finforce_eval.cli.main import main
 from finforce_eval.evaluation.comparison import compare_evaluations, total_change
-from finforce_eval.evaluation.forces import evaluate_recording
 from finforce_eval.evaluation.scoring import score_results, true_range
 from finforce_eval.evaluation.tables import evaluation_json
 from finforce_eval.machine import write_json

@@ -4,13 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from eval_fakes import PERIOD, START, FakeContactEstimator, FakeEstimator, FakeJaw, make_recording
+from eval_fakes import PERIOD, START, FakeContactEstimator, FakeEstimator, FakeJaw, evaluate_recording, make_recording
 
 from finforce.errors import PoseError
 from finforce_contact.loop import ForceLoop
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.contact_source import RecordedContact
-from finforce_eval.evaluation.forces import evaluate_recording
 from finforce_eval.recordings.objects import ObjectTrack, track_object
 
 

@@ -7,14 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from eval_fakes import FakeEstimator, FakeJaw
+from eval_fakes import FakeEstimator, FakeJaw, evaluate_recording
 from rgbd_fakes import FakeDetector, FakeGripper, make_footage
 
 from finforce_contact.loop import GivenContact
 from finforce_eval.cli import demo
 from finforce_eval.cli.twin import write_footage
 from finforce_eval.errors import RecordingError
-from finforce_eval.evaluation.forces import evaluate_recording
 from finforce_eval.evaluation.keypoint_source import detect_keypoints
 from finforce_eval.evaluation.scoring import score_grasp, score_results
 from finforce_eval.recordings.recording import read_recording

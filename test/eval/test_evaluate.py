@@ -4,13 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from eval_fakes import PERIOD, START, FakeContactEstimator, FakeEstimator, FakeJaw, make_recording
+from eval_fakes import PERIOD, START, FakeContactEstimator, FakeEstimator, FakeJaw, evaluate_recording, make_recording
 
 from finforce.errors import FinforceError, ObservationError
 from finforce_contact.loop import GivenContact
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.contact_source import RecordedContact, parse_contacts
-from finforce_eval.evaluation.forces import evaluate_recording
 from finforce_eval.evaluation.scoring import score_results
 from finforce_eval.evaluation.tables import contact_table, evaluation_json, format_tables, score_table
 from finforce_eval.recordings.objects import track_object

@@ -7,13 +7,12 @@ import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
 import pytest
-from eval_fakes import FakeEstimator, FakeJaw, make_recording
+from eval_fakes import FakeEstimator, FakeJaw, evaluate_recording, make_recording
 
 from finforce_contact.loop import GivenContact
 from finforce_eval.cli.main import main
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluate import read_evaluations
-from finforce_eval.evaluation.forces import evaluate_recording
 from finforce_eval.evaluation.scoring import score_results, true_range
 from finforce_eval.figures.html_report import write_html
 from finforce_eval.figures.report import write_page

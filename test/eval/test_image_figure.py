@@ -5,13 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from eval_fakes import FakeEstimator, FakeJaw, make_recording
+from eval_fakes import FakeEstimator, FakeJaw, evaluate_recording, make_recording
 from rgbd_fakes import CAMERA, FakeDetector, FakeGripper, make_footage
 
 from finforce_contact.loop import GivenContact
 from finforce_eval.cli.twin import write_footage
 from finforce_eval.errors import RecordingError
-from finforce_eval.evaluation.forces import evaluate_recording
 from finforce_eval.evaluation.keypoint_source import detect_keypoints
 from finforce_eval.evaluation.scoring import score_results
 from finforce_eval.figures.report import write_report

@@ -6,10 +6,9 @@ import sys
 
 import numpy as np
 import pytest
-from eval_fakes import BOX, BOX_TRIANGLES, FakeEstimator, FakeJaw, drawn_hues, make_recording
+from eval_fakes import BOX, BOX_TRIANGLES, FakeEstimator, FakeJaw, drawn_hues, evaluate_recording, make_recording
 
 from finforce_contact.loop import GivenContact
-from finforce_eval.evaluation.forces import evaluate_recording
 from finforce_eval.evaluation.scoring import score_results
 from finforce_eval.figures.report import write_report
 

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from eval_fakes import FakeEstimator, FakeJaw
+from eval_fakes import FakeEstimator, FakeJaw, evaluate_recording
 from PIL import Image
 from rgbd_fakes import FakeDetector, FakeGripper, make_footage
 
@@ -12,7 +12,6 @@ from finforce_contact.loop import GivenContact
 from finforce_eval.cli import twin as twin_commands
 from finforce_eval.cli.main import main
 from finforce_eval.cli.twin import write_footage
-from finforce_eval.evaluation.forces import evaluate_recording
 from finforce_eval.evaluation.keypoint_source import detect_keypoints
 from finforce_eval.evaluation.scoring import score_results
 from finforce_eval.evaluation.tables import evaluation_json, format_tables, sight_table
