@@ -19,7 +19,7 @@ from finforce_contact.localization.outline_localizer import (
     OutlineLocalizer,
     build_inner_face,
 )
-from finforce_contact.localization.section import Section, SectionKeeper, count_inside
+from finforce_contact.localization.section import ObjectSection, SectionKeeper, count_inside
 from finforce_contact.localization.touch import (
     SURELY_BENT,
     Slip,
@@ -337,7 +337,7 @@ class ContactEstimator:
         height = self._slips.follow(self._located.patch.mean)
         self._face = face_at(scene.line, self.face.heights, height)
 
-    def _outline(self, pose: FilteredPose, section: Section) -> ObjectOutline | None:
+    def _outline(self, pose: FilteredPose, section: ObjectSection) -> ObjectOutline | None:
         """Return the outline for the solver, with the errors of the pose that no average removes."""
         if self.settings.mode != "estimate":
             return None

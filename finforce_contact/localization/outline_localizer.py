@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from finforce_contact.localization.section import Section, compute_gaps, distances_to
+from finforce_contact.localization.section import ObjectSection, compute_gaps, distances_to
 from finforce_ifea.errors import MeshError
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_ifea.jaw.mesh import VolumeMesh
@@ -273,7 +273,7 @@ class ContactScene:
     """
 
     T: NDArray
-    section: Section
+    section: ObjectSection
     surface: NDArray
     line: NDArray
     wrench: tuple[NDArray, NDArray] | None = None

@@ -269,7 +269,7 @@ def _check_placement(R_jaw_object: ArrayLike, half_width: float, centre_y: float
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Section:
+class ObjectSection:
     """An object's outline and where it is.
 
     Attributes:
@@ -331,7 +331,7 @@ class SectionKeeper:
         self._R: NDArray | None = None
         self.cuts = 0
 
-    def at(self, T: NDArray) -> Section:
+    def at(self, T: NDArray) -> ObjectSection:
         """Return the outline at T_jaw_object (4, 4)."""
         tilt = 0.0
         if self._R is None:
@@ -341,7 +341,7 @@ class SectionKeeper:
             if swing > _RECUT_ANGLE or abs(T[1, 3] - self._y) > _RECUT_SHIFT:
                 self._cut(T)
                 tilt = 0.0
-        return Section(
+        return ObjectSection(
             polygons=self._polygons, origin=T[0:3:2, 3].copy(), tilt=tilt, cut_edges=self._edges, across=self._across
         )
 

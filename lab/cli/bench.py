@@ -11,7 +11,7 @@ from finforce.errors import FinforceError
 from finforce_eval.cli.parser import picture_file
 from finforce_eval.errors import OptionError
 from finforce_eval.machine import describe_machine, write_figures
-from lab.harness import PARTS, Part, draw_tradeoff, figures_json, format_figures, select_parts
+from lab.harness import PARTS, BenchPart, draw_tradeoff, figures_json, format_figures, select_parts
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -47,7 +47,7 @@ def run(options: argparse.Namespace) -> None:
     print(f"\n{machine['processor']}, {machine['cores']} cores, Python {machine['python']}, {machine['commit']}")
 
 
-def _run_part(part: Part, quick: bool, given: dict[str, Any], picture: Path | None) -> dict[str, Any]:
+def _run_part(part: BenchPart, quick: bool, given: dict[str, Any], picture: Path | None) -> dict[str, Any]:
     """Measure one part, print and draw it; return it as plain values."""
     print(f"\n{part.title}\n")
     begin = perf_counter()

@@ -21,7 +21,7 @@ from finforce_eval.recordings.recording import read_recording
 from finforce_eval.replay.processes import resident_bytes
 from finforce_ifea.jaw.jaw import load_jaw
 from lab import harness
-from lab.harness import PARTS, Figures, Part, Tradeoff, percentiles, select_parts, time_calls
+from lab.harness import PARTS, BenchPart, Figures, Tradeoff, percentiles, select_parts, time_calls
 
 ROOT = Path(__file__).parents[2]
 
@@ -57,7 +57,7 @@ def two_parts(monkeypatch):
 
         module = SimpleNamespace(measure=measure_folder if takes_folder else measure)
         monkeypatch.setitem(sys.modules, f"lab.bench.{name}", module)
-        return Part(name=name, title=f"Title of {name}", **options)
+        return BenchPart(name=name, title=f"Title of {name}", **options)
 
     parts = (make("first", takes_folder=True, usual=True), make("second", usual=True), make("third"))
     monkeypatch.setattr(harness, "PARTS", parts)
