@@ -443,13 +443,13 @@ def _ending_with_context() -> Iterator[None]:
     """End the process as soon as a signal has shut the context down, within the `with` block.
 
     A node that is being built may compile for a minute; it has nothing yet that wants an end of its own, and what it
-    keeps in caches is written whole or not at all.
+    keeps in caches is written whole or not at all. A start that failed shuts the context down, too, after the block.
     """
     built = Event()
 
     def watch() -> None:
         while not built.wait(_GLANCE):
-            if not rclpy.ok():
+            if not rclpy.ok() and not built.is_set():
                 sys.stdout.flush()
                 sys.stderr.flush()
                 os._exit(0)

@@ -56,3 +56,32 @@ def test_without_ros_a_node_says_how_to_get_it():
     )
     assert done.returncode == 2
     assert "pip install 'finforce[ros]'" in done.stderr and len(done.stderr.splitlines()) == 1
+
+
+LATE_WATCH = """
+import rclpy, sys, threading, time
+from finforce.ros.node import run_nodes
+
+ok, shut_down = rclpy.ok, rclpy.try_shutdown
+
+
+def answer_late():
+    while threading.current_thread().name == "context" and ok():
+        time.sleep(0.01)
+    return ok()
+
+
+def build():
+    time.sleep(0.5)
+    raise RuntimeError("cannot be started")
+
+
+rclpy.ok, rclpy.try_shutdown = answer_late, lambda: (shut_down(), time.sleep(0.5))
+sys.exit(run_nodes("node", build, []))
+"""
+
+
+def test_a_failed_start_is_told_though_its_context_ends_while_somebody_looks_at_it():
+    done = subprocess.run([sys.executable, "-c", LATE_WATCH], capture_output=True, text=True, timeout=START_PATIENCE)
+    assert done.returncode == 1
+    assert done.stderr.strip().splitlines()[-1] == "RuntimeError: cannot be started"
