@@ -99,15 +99,11 @@ class BenchPart:
 
 PARTS = (
     BenchPart(name="solvers", title="Run time against force error of the solver tiers", usual=True),
-    BenchPart(name="localization", title="Run time against error of the contact's location", usual=True),
     BenchPart(name="detection", title="Run time against pixel error of the key points", usual=True),
     BenchPart(name="chain", title="Latency against force error of the whole chain", usual=True),
     BenchPart(name="start", title="From a node's start until it is ready, and its memory"),
-    BenchPart(name="onset", title="From the onset of a force until it shows"),
-    BenchPart(name="skipping", title="CPU time of each node in three scenes, with the skip rules and without"),
     BenchPart(name="mechanics", title="Mechanics against an independent program, and the shipped fingers"),
     BenchPart(name="images", title="From images to forces on unseen scenes, beside true key points"),
-    BenchPart(name="pose_tracking", title="Errors, losses and time of the object tracker on rendered sequences"),
     BenchPart(name="reconstruction", title="Reconstructed meshes: distance from the true ones"),
     BenchPart(name="driver_faults", title="Random faults between the gripper driver and an emulated gripper"),
     BenchPart(name="grasp_faults", title="Grasps by force in which something goes wrong"),

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_ifea.observation import Contact, ObjectOutline, Observation
-from finforce_ifea.settings import EstimatorSettings
 
 TRUTH = Path(__file__).parents[1] / "data" / "pressed_bench.npz"
 YOUNG_MODULUS, POISSON_RATIO = 30e6, 0.45
@@ -25,8 +24,6 @@ LEVELS = (0.002, 0.004, 0.006, 0.008, 0.010)
 PERIOD = 1.0 / 30.0
 REST_FRAMES, HOLD_FRAMES, SCORED_FRAMES = 60, 45, 30
 SPEED = 2e-3
-DIAMETERS, _FEWEST_DEPTHS = (0.015, 0.025, 0.035), 2
-_HARDEST = 12.0  # [N]
 # Corners of the polygon that stands for a cylinder.
 _CORNERS = 96
 # Constant errors of a tracked object's origin [m] and turn [rad], as the contact estimator expects them.
@@ -103,53 +100,6 @@ def bench_finger() -> Jaw:
     return replace(jaw, material=replace(jaw.material, young_modulus=YOUNG_MODULUS, poisson_ratio=POISSON_RATIO))
 
 
-def press_cases(jaw: Jaw, diameters: Sequence[float] = DIAMETERS) -> tuple[BenchCase, ...]:
-    """Return presses of any finger by its own solid model, of a section on the coarse mesh.
-
-    The cylinders of the bench meet the same shares of the finger's candidates as there, and a shorter finger is
-    pressed as much less, a stiff one to about twelve newtons, and one that buckles before as deep as it bears.
-
-    Args:
-        jaw: the finger.
-        diameters: of the cylinders [m].
-
-    Raises:
-        FinforceError: No solid describes the jaw.
-    """
-    from finforce_ifea.mechanics import build_mechanics
-    from lab.forward_press import RigidCylinder, follow_points, press_jaw
-
-    mesh = "default" if jaw.section is None else "coarse"
-    mechanics = build_mechanics(jaw, EstimatorSettings(solver="solid", mesh=mesh))
-    model, surface = mechanics.model, mechanics.contact.surface
-    heights, bench = jaw.candidates[:, 2], load_jaw("bench").candidates[:, 2]
-    size = float(np.ptp(heights) / np.ptp(bench))
-    levels = min(size, 1.0) * np.array(LEVELS)
-    cases = []
-    for name, height in HEIGHTS.items():
-        there = float(heights.min() + size * (height - bench.min()))
-        for diameter in diameters:
-            rigid = RigidCylinder(radius=0.5 * diameter)
-            first = press_jaw(model, surface, jaw.inner_face_x, rigid, there, levels[:1])[0]
-            depths = levels * min(1.0, _HARDEST / float(np.linalg.norm(first.force)) * levels[0] / levels[-1])
-            states = press_jaw(model, surface, jaw.inner_face_x, rigid, there, depths, partial=True)
-            if len(states) < _FEWEST_DEPTHS:
-                continue
-            places = follow_points(model, jaw.keypoints, states)
-            cases.append(
-                BenchCase(
-                    name=f"Ø{1e3 * diameter:.0f} {name}",
-                    height_name=name,
-                    height=there,
-                    radius=rigid.radius,
-                    depth=depths[: len(states)],
-                    moved=places[1:] - places[0],
-                    force=np.stack([state.force for state in states]),
-                )
-            )
-    return tuple(cases)
-
-
 def record_press(case: BenchCase, jaw: Jaw, camera: NoisyCamera | None = None, seed: int = 0) -> ReplayedPress:
     """Return a press to all levels at 2 mm/s, each held for 1.5 s, after two seconds at rest.
 
@@ -163,7 +113,7 @@ def record_press(case: BenchCase, jaw: Jaw, camera: NoisyCamera | None = None, s
     """
     from scipy.interpolate import PchipInterpolator  # megabytes that a process measuring its memory need not have
 
-    motion = _build_motion(case.depth)
+    motion = _build_motion()
     depth = motion.depth
     grid = np.r_[0.0, case.depth]
     shapes = np.concatenate([np.zeros((1, *jaw.keypoints.shape)), case.moved])
@@ -198,12 +148,10 @@ class _PressMotion:
     ends: NDArray
 
 
-def _build_motion(depths: NDArray) -> _PressMotion:
-    """Return rest, then ramps to those of the levels that were pressed, to the last depths of others, and holds."""
-    known = np.isin(np.round(LEVELS, 9), np.round(depths, 9))
-    levels = np.array(LEVELS)[known] if known.all() else depths[-len(LEVELS) :]
+def _build_motion() -> _PressMotion:
+    """Return rest, then ramps to the levels, and holds."""
     parts, ends = [np.zeros(REST_FRAMES)], []
-    for level in levels:
+    for level in LEVELS:
         steps = max(round((level - parts[-1][-1]) / SPEED / PERIOD), 1)
         parts += [np.linspace(parts[-1][-1], level, steps + 1)[1:], np.full(HOLD_FRAMES, level)]
         ends.append(sum(map(len, parts)) - 1)

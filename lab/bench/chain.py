@@ -1,10 +1,11 @@
 """Latency against force error of the whole chain at 30, 60 and 90 Hz, through the real nodes.
 
 A rendered grasp is played from images, and from its true key points, to all stages in one process and to each in its
-own; once more while something else takes one processor. Who listens hears the grasp force alone, as a controller does,
-and every image is to be answered. Latency is from the image's leaving to the arrival of the grasp force. The error is
-counted twice: at the image's own time, and "now": what is known at any time, the newest force that has arrived, against
-the truth at that time.
+own; once more while something else takes one processor, and with the skip rules on. Who listens hears the grasp force
+alone, as a controller does, and without the rules every image is to be answered. Latency is from the image's leaving to
+the arrival of the grasp force. The error is counted twice: at the image's own time, and "now": what is known at any
+time, the newest force that has arrived, against the truth at that time. A force sets in where the true grasp force
+crosses 0.02 N, and shows when a grasp force above 0.1 N has arrived.
 
 For some minutes, the same grasp is played again and again from images to all stages in one process: growth of memory,
 lost images, and drift of the force.
@@ -28,7 +29,7 @@ from finforce.stamps import NANOSECONDS
 from finforce.systems.processes import Process, ReplayOptions, compose, replay_processes
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.keypoint_source import KeypointSource
-from finforce_eval.evaluation.scoring import match_truth, rms
+from finforce_eval.evaluation.scoring import delay_stats, force_delays, match_truth, rms
 from finforce_eval.recordings.objects import require_mesh
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.tracks import Recording
@@ -42,7 +43,7 @@ from lab.scenes import GRASP, GRASP_FAST, find_scene
 
 RATES = (30, 60, 90)  # [Hz]
 IMAGES, KEYPOINTS = "images", "key points"
-TOGETHER, APART, BUSY = "one process", "four processes", "one, a core taken"
+TOGETHER, APART, BUSY, SKIPPING = "one process", "four processes", "one, a core taken", "one, skipping"
 BURN = "while True: pass"
 TARE = 1.8  # [s] from the first image, in which the solvers take their tare and give no force
 SETTLED = 8  # grasps until memory is taken, and the fingers' material has bent as often as it remembers
@@ -84,8 +85,8 @@ def measure(quick: bool, minutes: float = 0.0) -> Figures:
     truth, rows = true_grasp(recording), []
     for rate in RATES[:1] if quick else RATES:
         for source, stream in ((IMAGES, stream_images(scene, rate)), (KEYPOINTS, stream_keypoints(scene, rate))):
-            busy = (BUSY,) if source == IMAGES and rate == RATES[0] else ()
-            for setup in (TOGETHER, APART, *busy):
+            more = (BUSY, SKIPPING) if source == IMAGES and rate == RATES[0] else ()
+            for setup in (TOGETHER, APART, *more):
                 rows.append(describe_run(source, setup, rate, _run(source, setup, stream, recording), truth))
     table = pd.DataFrame(rows).sort_values(["chain from", "stages in", "Hz"])
     return Figures(
@@ -151,7 +152,8 @@ def divide_grasps(log: ReplayLog, truth: TrueGrasp, stream: SyntheticStream) -> 
 
 def _run(source: str, setup: str, stream: SyntheticStream, recording: Recording) -> NodeRun:
     """Play a stream to the stages and return what came of it."""
-    processes = chain_processes(recording, images=source == IMAGES, off=(IDLE,), composed=setup != APART)
+    off = () if setup == SKIPPING else (IDLE,)
+    processes = chain_processes(recording, images=source == IMAGES, off=off, composed=setup != APART)
     other = subprocess.Popen([sys.executable, "-c", BURN]) if setup == BUSY else None
     try:
         return run_nodes(processes, stream, SIDES, heard=())
@@ -211,10 +213,21 @@ def describe_run(source: str, setup: str, rate: int, run: NodeRun, truth: TrueGr
         **percentiles([log.grasp_latency[int(stamp)] for stamp in answered], "latency"),
         "error/N": rms(error),
         "error now/N": rms(error_now(log, truth, sent)),
+        "shows after/ms": delay_stats([find_delays(log, truth)])["median_ms"] or np.nan,
         "nodes/% of a core": sum(run.cpu.values()),
         "memory/MB": sum(run.memory.values()) / 1e6,
         "other load/%": run.others,
     }
+
+
+def find_delays(log: ReplayLog, truth: TrueGrasp) -> NDArray:
+    """Return the delay after each onset in a run, see `force_delays`."""
+    sent = np.array(sorted(log.sent[SIDES[0]]))
+    stamps = sent[sent >= sent[0] + 0.5 * TARE * NANOSECONDS]
+    estimate, lag = (
+        np.array([told.get(int(stamp), np.nan) for stamp in stamps]) for told in (log.grasp, log.grasp_latency)
+    )
+    return force_delays(1e-9 * (stamps - stamps[0]), truth.at(stamps), estimate, lag)
 
 
 def error_now(log: ReplayLog, truth: TrueGrasp, sent: NDArray[np.int64]) -> NDArray:

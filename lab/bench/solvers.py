@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from gc import collect, disable, enable
 from time import perf_counter, thread_time
 from typing import Any
@@ -18,16 +18,7 @@ from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.fem.solid import SolidModel
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_ifea.settings import SOLVERS, EstimatorSettings
-from lab.bench.cases import (
-    DIAMETERS,
-    BenchCase,
-    NoisyCamera,
-    ReplayedPress,
-    bench_finger,
-    load_cases,
-    press_cases,
-    record_press,
-)
+from lab.bench.cases import NoisyCamera, ReplayedPress, bench_finger, load_cases, record_press
 from lab.harness import Figures, Tradeoff, percentiles, time_calls
 
 SEED = 1
@@ -78,36 +69,23 @@ TIERS = (
 )
 
 
-def list_tiers(*, slow: bool = True, section: bool = False) -> tuple[Tier, ...]:
-    """Return the tiers, with one for each solver that the list does not name.
-
-    Args:
-        slow: include those that take long.
-        section: of a finger that is given by its section, not by a drawing.
-    """
-    listed, foreign = {tier.solver for tier in TIERS} | {"default"}, ("frame", "paper") if section else ("plane",)
-    others = tuple(Tier(name=name, solver=name) for name in SOLVERS if name not in listed)
-    every = [tier for tier in TIERS + others if tier.solver not in foreign]
-    if section:  # ten thousand unknowns and more, a second for a step: the smallest of the solids alone
-        every = [tier for tier in every if tier.solver != "solid" or tier.mesh == "coarse"]
-        every = [replace(tier, slow=tier.solver in ("solid", "plane")) for tier in every]
-    return tuple(tier for tier in every if slow or not tier.slow)
+def list_tiers(*, slow: bool = True) -> tuple[Tier, ...]:
+    """Return the tiers, those that take long too if `slow`, with one for each solver that the list does not name."""
+    named = {tier.solver for tier in TIERS} | {"default", "plane"}  # the plane is for fingers without a drawing
+    others = tuple(Tier(name=name, solver=name) for name in SOLVERS if name not in named)
+    return tuple(tier for tier in TIERS + others if slow or not tier.slow)
 
 
-def measure(quick: bool, jaw: str = "bench") -> Figures:
+def measure(quick: bool) -> Figures:
     """Return times and errors of every tier.
 
     Args:
         quick: three cases instead of nine, and no slow tier.
-        jaw: finger; another one than that of the bench is pressed by its own solid model.
-
-    Raises:
-        FinforceError: the jaw cannot be used.
     """
     from tqdm import tqdm
 
-    finger = bench_finger() if jaw == "bench" else load_jaw(jaw)
-    tiers, cases = list_tiers(slow=not quick, section=finger.section is not None), find_cases(jaw, finger, quick)
+    finger, tiers = bench_finger(), list_tiers(slow=not quick)
+    cases = [case for case in load_cases() if case.name.startswith("Ø25") or not quick]
     presses = {
         "noise-free": [record_press(case, finger) for case in cases],
         "noisy": [record_press(case, finger, NoisyCamera(), SEED) for case in cases],
@@ -145,22 +123,6 @@ def measure(quick: bool, jaw: str = "bench") -> Figures:
         ),
         more={"quoted": {"sofa": SOFA, "paper": PAPER}},
     )
-
-
-def find_cases(name: str, jaw: Jaw, quick: bool) -> Sequence[BenchCase]:
-    """Return the presses of a jaw: those of an independent program for the bench's, else of its own solid model.
-
-    Raises:
-        FinforceError: no solid describes the jaw, or it bears no press.
-    """
-    if name == "bench":
-        return [case for case in load_cases() if case.name.startswith("Ø25") or not quick]
-    if jaw.drawing is not None and not jaw.drawing.is_solid:
-        raise FinforceError(f"--jaw {name}: only the frame describes it, expected a finger with a solid model")
-    cases = press_cases(jaw, DIAMETERS[1:2] if quick else DIAMETERS)
-    if not cases:
-        raise FinforceError(f"--jaw {name}: none of the presses finds an equilibrium")
-    return cases
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -56,20 +56,18 @@ class SyntheticStream:
                 yield message._replace(time=message.time + shift, data=data)
 
 
-def stream_images(source: Path, rate: int, *, poses: bool = True, phase: int = 0) -> SyntheticStream:
-    """Return what a camera sees at a rate [Hz], with the object's poses at 10 Hz unless they are left out.
+def stream_images(source: Path, rate: int) -> SyntheticStream:
+    """Return what a camera sees at a rate [Hz], with the object's poses at 10 Hz.
 
     Args:
         source: the scene.
         rate: of the images [Hz].
-        poses: whether the object's are played.
-        phase: slot of 1/180 s of the first image.
 
     Raises:
         RecordingError: the scene has no images at this rate.
     """
-    topics = {COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC, *([OBJECT_TOPIC] if poses else [])}
-    return thin_messages(read_playback(source), topics, rate, phase)
+    topics = {COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC, OBJECT_TOPIC}
+    return thin_messages(read_playback(source), topics, rate)
 
 
 def stream_keypoints(source: Path, rate: int) -> SyntheticStream:
@@ -85,8 +83,8 @@ def stream_keypoints(source: Path, rate: int) -> SyntheticStream:
         return thin_messages(read_playback(plain), topics | {OBJECT_TOPIC}, rate)
 
 
-def thin_messages(messages: Playback, topics: set[str], rate: int, phase: int = 0) -> SyntheticStream:
-    """Return the messages of some topics at a rate [Hz], the images from a slot of 1/180 s on."""
+def thin_messages(messages: Playback, topics: set[str], rate: int) -> SyntheticStream:
+    """Return the messages of some topics at a rate [Hz]."""
     if FINE_RATE % rate:
         raise RecordingError(f"rate {rate} Hz: expected a divisor of {FINE_RATE} Hz")
     step = FINE_RATE // rate
@@ -94,11 +92,7 @@ def thin_messages(messages: Playback, topics: set[str], rate: int, phase: int = 
         message
         for message in messages
         if message.topic in topics
-        and (
-            slot_of(message.stamp) % POSE_SLOTS == 0
-            if message.topic == OBJECT_TOPIC
-            else (slot_of(message.stamp) - phase) % step == 0
-        )
+        and slot_of(message.stamp) % (POSE_SLOTS if message.topic == OBJECT_TOPIC else step) == 0
     ]
     images = {slot_of(message.stamp) // step for message in kept if message.topic != OBJECT_TOPIC}
     if not images or len(images) <= max(images):

@@ -18,10 +18,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
     text = "folder in which the part images keeps its recordings (a cache)"
     parser.add_argument("folder", nargs="?", metavar="FOLDER", help=text)
-    text = "jaw file or shipped jaw of the parts solvers and images; of the latter several, separated by commas"
+    text = "jaw files or shipped jaws of the part images, separated by commas"
     parser.add_argument("--jaw", metavar="NAME", help=text)
     parser.add_argument("--minutes", type=float, metavar="N", help="for which the part chain repeats one grasp")
-    text = "repetitions of each case of the parts images, pose_tracking and reconstruction; faults or grasps of others"
+    text = "repetitions of each case of the parts images and reconstruction; faults or grasps of others"
     parser.add_argument("--count", type=int, metavar="N", help=text)
     parser.add_argument("--model", metavar="FOLDER", help="network of the part images, in place of the shipped one")
     text = f"parts to measure: {', '.join(part.name for part in PARTS)}; without it those of `make bench`"
@@ -37,7 +37,7 @@ def run(options: argparse.Namespace) -> None:
     given = {name: getattr(options, name) for name in ("folder", "jaw", "minutes", "count", "model")}
     given = {name: value for name, value in given.items() if value is not None}
     machine, content = describe_machine(), {}
-    for number, part in enumerate(select_parts(options.parts or ("solvers" if given else None))):
+    for number, part in enumerate(select_parts(options.parts)):
         picture = Path(options.figure) if options.figure else None
         if picture and number:
             picture = picture.with_stem(f"{picture.stem}_{part.name}")

@@ -43,8 +43,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--calibration", metavar="FILE", help=text)
     parser.add_argument("--seed", type=int, default=100, help="of the first scene (100)")
     parser.add_argument("--size", metavar="WxH", help="of the twin's images (640x480; 320x240 with --quick)")
-    text = "end-to-end network of lab.training.baseline (the shipped one)"
-    parser.add_argument("--network", default="", metavar="FILE", help=text)
     parser.add_argument("--keep", action="store_true", help="keep the twin's recordings, some 20 MB a grasp")
     add_engine_options(parser)
 
@@ -70,7 +68,6 @@ def read_options(options: argparse.Namespace) -> RunOptions:
         size=options.size or (QUICK_SIZE if options.quick else RunOptions.size),
         keep=options.keep,
         quick=options.quick,
-        network=options.network,
     )
 
 

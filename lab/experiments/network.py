@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
-from functools import cache, cached_property
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +14,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from finforce.optional import import_cv2
-from finforce_eval.errors import OptionError, RecordingError
+from finforce_eval.errors import RecordingError
 from finforce_eval.evaluate import evaluate_all
 from finforce_eval.evaluation.scoring import rms
 from finforce_eval.figures.figures import BLACK, BLUE, ORANGE
@@ -30,9 +28,7 @@ from lab.harness import Figures
 
 SHOWN = 10  # images that the network is given at a time
 HEIGHT, WIDTH = 120, 160  # [px] of its images
-KIND = "force_from_images"
-LAYOUT = (("images",), ("force",))
-SHIPPED = Path(__file__).parents[1] / "data" / "force_network" / "force_network.onnx"
+FILE = Path(__file__).parents[1] / "data" / "force_network" / "force_network.onnx"
 GRASP = {"settle": 0.2, "record": 0.6, "clearance": 0.003, "closing_speed": 0.004}
 FIRM, SOFT, SLIGHT = 0.006, 0.004, 0.0015  # [m] of each jaw beyond first touch
 SEEN, OBJECT, PLACE, LIGHT = "as trained", "another object", "another place", "dim light"
@@ -65,39 +61,11 @@ def reduce_image(color: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 class ForceNetwork:
-    """An end-to-end network that `lab.training.baseline` has written.
+    """The end-to-end network; see the card beside its file."""
 
-    Args:
-        path: of the ONNX file.
-
-    Raises:
-        OptionError: it is another kind of network.
-        ModelError: it cannot be loaded.
-        MissingDependencyError: onnxruntime is not installed.
-    """
-
-    def __init__(self, path: str | Path = SHIPPED) -> None:
-        self.path = Path(path)
-        self._session = open_session(self.path, 1)
-        text = self._session.get_modelmeta().custom_metadata_map.get(METADATA, "")
-        try:
-            self.about = json.loads(text)
-            is_known = self.about["kind"] == KIND
-        except (ValueError, TypeError, KeyError, RecursionError):
-            is_known = False
-        inputs, outputs = (tuple(self._session.get_inputs()), tuple(self._session.get_outputs()))
-        names = (tuple(item.name for item in inputs), tuple(item.name for item in outputs))
-        shape = list(inputs[0].shape)[1:]
-        if not is_known or names != LAYOUT or shape != [SHOWN, HEIGHT, WIDTH, 3]:
-            raise OptionError(
-                f"{path}: got a network of {', '.join(names[0])} {shape} to {', '.join(names[1])} with metadata "
-                f"{text[:120]!r}, expected one of lab.training.baseline.train"
-            )
-
-    @cached_property
-    def sha256(self) -> str:
-        """The SHA-256 of the file."""
-        return hashlib.sha256(self.path.read_bytes()).hexdigest()
+    def __init__(self) -> None:
+        self._session = open_session(FILE, 1)
+        self.about = json.loads(self._session.get_modelmeta().custom_metadata_map[METADATA])
 
     def predict(self, images: NDArray[np.uint8]) -> NDArray:
         """Return the grasp force (b,) [N] in the last of each row of images (b, 10, 120, 160, 3)."""
@@ -115,23 +83,22 @@ class ForceNetwork:
 
 
 @cache
-def load_network(path: str) -> ForceNetwork:
-    """Return the network of a file; the shipped one for an empty path."""
-    return ForceNetwork(path or SHIPPED)
+def load_network() -> ForceNetwork:
+    """Return the network."""
+    return ForceNetwork()
 
 
 def list_cases(options: RunOptions) -> Sequence[Case]:
     """Return the grasps."""
-    used = {"network": load_network(options.network).sha256}
     if options.bags:
         read = options.read_bags()
         blind = [case.settings["bag"] for case, recording in read if recording.images is None]
         if blind:
             raise RecordingError(f"{blind[0]}: this experiment needs colour images, which are not in it")
-        return [replace(case, settings={**case.settings, **used}) for case, _ in read]
+        return [case for case, _ in read]
     times = QUICK_GRASP if options.quick else GRASP
     return [
-        options.scene_case(name, scene, times | changes, number, words={"group": group}, **used)
+        options.scene_case(name, scene, times | changes, number, words={"group": group})
         for number, (group, name, scene, changes) in enumerate(GRASPS)
         if name in QUICK or not options.quick
     ]
@@ -140,7 +107,7 @@ def list_cases(options: RunOptions) -> Sequence[Case]:
 def run(options: RunOptions, case: Case, folder: Path) -> dict[str, Any]:
     """Return the errors of both on one grasp."""
     with options.open_case(case, folder) as recording:
-        stamps, forces = load_network(options.network).follow(recording.images.colors_alone())
+        stamps, forces = load_network().follow(recording.images.colors_alone())
         grasp = join_jaws(evaluate_all([recording], build_setup(case.settings)), recording.name)
     grasp["network"] = grasp.stamp.map(dict(zip(stamps.tolist(), forces.tolist(), strict=True)))
     held = grasp[find_phases(grasp)["all"] & grasp.network.notna()]
@@ -167,7 +134,7 @@ def find(options: RunOptions, figures: Mapping[str, Mapping[str, Any]], folder: 
     groups["network : finforce"] = groups["network/N"] / groups["finforce/N"]
     note = (
         "Mean over the grasps of each one's RMSE of min(|F_left|, |F_right|) while the true force is above 0.02 N; "
-        f"NRMSD of each grasp's own range. The network: {load_network(options.network).about}."
+        f"NRMSD of each grasp's own range. The network: {load_network().about}."
     )
     each = grasps[["case", *GRASP_COLUMNS]].rename(columns={"case": "grasp", **GRASP_COLUMNS})
     return Figures(

@@ -54,7 +54,6 @@ class RunOptions:
         size: of the twin's images, WIDTHxHEIGHT.
         keep: keep the twin's recordings when they have been scored.
         quick: few and small cases.
-        network: file of the end-to-end network; empty for the shipped one.
     """
 
     bags: Sequence[str] = ()
@@ -65,7 +64,6 @@ class RunOptions:
     size: str = "640x480"
     keep: bool = False
     quick: bool = False
-    network: str = ""
 
     @property
     def shared(self) -> dict[str, Any]:

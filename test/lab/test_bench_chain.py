@@ -9,7 +9,17 @@ from finforce.stamps import NANOSECONDS
 from finforce_eval.errors import OptionError
 from finforce_eval.replay.live import ReplayLog
 from finforce_eval.replay.node_run import NodeRun
-from lab.bench.chain import IMAGES, TOGETHER, TrueGrasp, describe_run, divide_grasps, error_now, measure
+from lab.bench.chain import (
+    IMAGES,
+    TOGETHER,
+    TrueGrasp,
+    describe_run,
+    divide_grasps,
+    error_now,
+    find_delays,
+    measure,
+)
+from lab.bench.streams import START
 
 FIRST = 10**12
 PERIOD = NANOSECONDS // 10
@@ -108,3 +118,24 @@ def test_losses_and_errors_belong_to_their_grasps(truth):
 def test_a_time_that_is_none_is_refused(minutes):
     with pytest.raises(OptionError, match="--minutes .*expected a duration above zero"):
         measure(False, minutes=minutes)
+
+
+@pytest.mark.parametrize("phase", [0.0, 0.3, 0.9])
+@pytest.mark.parametrize("late", [0, 2])
+def test_a_force_shows_with_the_first_image_beyond_a_tenth_of_a_newton_and_its_latency(phase, late):
+    """The force sets in after 2 s, and grows by 1 N in each tenth of a second."""
+    rate, latency, begin = 30, 0.02, 2.0
+    stamps = START + ((np.arange(90) + phase) * NANOSECONDS / rate).astype(np.int64)
+    times = 1e-9 * (stamps - START)
+    fine = np.linspace(0.0, 3.0, 30_001)
+    truth = TrueGrasp(stamps=START + (fine * 1e9).astype(np.int64), force=np.maximum(0.0, 10.0 * (fine - begin)))
+    log = ReplayLog(("left", "right"))
+    for index, stamp in enumerate(stamps.tolist()):
+        log.sent["left"][stamp] = 0.0
+        log.grasp[stamp] = float(truth.at(stamps)[max(0, index - late)])
+        log.grasp_latency[stamp] = latency
+    ((delay, _),) = find_delays(log, truth)
+    shown = times[np.flatnonzero(truth.at(stamps) > 0.1)[0] + late]
+    # the onset is told between two images, along a line that begins with the one before the force
+    assert delay == pytest.approx(shown + latency - begin, abs=1.0 / rate)
+    assert delay >= latency + late / rate

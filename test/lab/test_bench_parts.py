@@ -1,13 +1,10 @@
-"""Claims about what further parts of the benchmark count: mechanics, tracked poses, meshes, faults."""
-
-from types import SimpleNamespace
+"""Claims about what further parts of the benchmark count: mechanics, meshes, faults."""
 
 import numpy as np
 import pandas as pd
 import pytest
-from scipy.spatial.transform import Rotation
 
-from lab.bench import driver_faults, grasp_faults, images, mechanics, pose_tracking, reconstruction
+from lab.bench import driver_faults, grasp_faults, images, mechanics, reconstruction
 from lab.bench.cases import load_cases
 from lab.harness import format_figures
 
@@ -38,26 +35,6 @@ def test_a_shipped_finger_is_described():
     row = mechanics.describe_finger("bench")
     assert row["size/mm"] == "28.0 x 20.0 x 80.0"
     assert row["at half/N/mm"] == pytest.approx(0.29, abs=0.01)  # docs/fingers.md
-
-
-@pytest.mark.parametrize(("name", "counts"), [("cylinder", False), ("asymmetric", True)])
-def test_a_turn_about_the_axis_is_an_error_of_what_is_not_round(name, counts):
-    frame, T = SimpleNamespace(T_camera_object=np.eye(4)), np.eye(4)
-    T[:3, :3] = Rotation.from_rotvec([0.0, 0.0, 0.3]).as_matrix()
-    T[0, 3] = 0.002
-    off = pose_tracking.compute_deviation(name, frame, T, None)
-    assert off.translation == pytest.approx(0.002)
-    # the arc cosine near one is exact to the root of the precision
-    assert off.rotation == pytest.approx(0.3 if counts else 0.0, abs=1e-7)
-
-
-def test_images_without_a_pose_are_counted_as_lost_and_in_no_error():
-    about = {"object": "cube", "image": "424x240", "hidden": 0.0, "speed/m/s": 0.1, "recovered": 0.5}
-    seen = {"translation/mm": 1.0, "rotation/deg": 2.0, "spin/deg": 0.0, "sure": True, "CPU/ms": 5.0, "lost": 0}
-    table = pose_tracking.summarise(pd.DataFrame([{**about, **seen}, {**about, "lost": 1}]))
-    assert table["object"].tolist() == ["cube", "all"]
-    row = table.iloc[0]
-    assert (row["n"], row["lost"], row["recovered"], row["translation p95/mm"], row["sure/%"]) == (1, 1, 1, 1.0, 100.0)
 
 
 def test_a_method_that_gave_up_is_in_no_distance():

@@ -85,7 +85,7 @@ def test_peer_is_compared_on_this_machine_and_on_its_own():
 
 def test_tier_that_does_not_exist_is_noted_and_the_others_are_measured(monkeypatch):
     tiers = (Tier(name="nothing", solver="nothing"), Tier(name="frame", solver="frame", contact="outline"))
-    monkeypatch.setattr(bench, "list_tiers", lambda slow, section: tiers)
+    monkeypatch.setattr(bench, "list_tiers", lambda slow: tiers)
     monkeypatch.setattr(bench, "load_cases", lambda: (CASES["Ø25 middle"],))
     figures = bench.measure(True)
     assert set(figures.tables["tiers"]["tier"]) == {"frame"}

@@ -419,18 +419,6 @@ def test_the_end_to_end_network_needs_ten_images():
     assert network.predict(last[None]) == pytest.approx(forces[-1:], abs=1e-5)
 
 
-def test_another_network_than_an_end_to_end_one_is_refused(tmp_path, capsys):
-    pytest.importorskip("onnxruntime", reason="the network runs on onnxruntime: pip install onnxruntime")
-    other = Path(__file__).parents[2] / "finforce_keypoints" / "models" / "side_plane" / "coarse.onnx"
-    report = ["--report", str(tmp_path)]
-    assert main(["experiment", "network", "--quick", "--network", str(other), *report]) == 2
-    words = capsys.readouterr().err
-    assert "coarse.onnx: got a network of" in words
-    assert "expected one of lab.training.baseline.train" in words
-    assert main(["experiment", "network", "--quick", "--network", str(tmp_path / "none.onnx"), *report]) == 2
-    assert "none.onnx" in capsys.readouterr().err
-
-
 def test_both_methods_are_compared_by_what_the_network_has_seen(tmp_path):
     series = {"seconds": [0.0, 1.0], "truth": [0.0, 2.0], "found": [0.0, 2.1], "network": [None, 1.0]}
     row = {"peak_N": 2.0, "span_N": 2.0, "network_bias_N": 0.0, "answered_pct": 100.0, "drawn": series}
