@@ -140,7 +140,8 @@ class ForceSeries:
 
     def at(self, rows: NDArray) -> ForceSeries:
         """Return some rows, by a mask (n,) or their numbers."""
-        return ForceSeries(self.table[rows] if rows.dtype == bool else self.table.iloc[rows], self.snapshot)
+        chosen = self.table[rows] if rows.dtype == bool else self.table.iloc[rows]
+        return ForceSeries(chosen.reset_index(drop=True), self.snapshot)
 
     def renamed(self, name: str) -> ForceSeries:
         """Return the rows under another name of the case."""

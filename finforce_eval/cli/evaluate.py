@@ -19,6 +19,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
     parser.add_argument("bags", nargs="+", metavar="BAG", help=BAG_HELP)
     add_run_options(parser)
+    text = "leave out the images that the live chain would leave out: nothing moved, or the object is out of reach"
+    parser.add_argument("--as-live", action="store_true", help=text)
     parser.add_argument("--json", metavar="OUT", help="write the scores as JSON")
     parser.add_argument("--report", metavar="DIR", help="write pictures and a page that shows them")
     text = (

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from finforce.errors import PoseError
-from finforce.stamps import SECOND
+from finforce.stamps import SECOND, Idling
 from finforce_contact.loop import ContactLoop, ContactSource, GivenContact
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.scoring import ONSET_FORCE
@@ -30,10 +30,14 @@ class RecordedContact(ContactLoop):
         track: the object's poses in the jaw frame.
         delay: after which a pose arrives [ns].
         name: for reports.
+        idling: passes images over as the contact estimator's node does; None for none.
     """
 
-    def __init__(self, estimator: Any, track: ObjectTrack, delay: int = 0, name: str = "estimate") -> None:
+    def __init__(
+        self, estimator: Any, track: ObjectTrack, delay: int = 0, name: str = "estimate", idling: Idling | None = None
+    ) -> None:
         super().__init__(estimator)
+        self._idling = idling
         self.name, self._track, self._next = name, track, 0
         self._arrivals = track.stamps + delay
 
@@ -46,7 +50,13 @@ class RecordedContact(ContactLoop):
         while self._next < len(self._arrivals) and self._arrivals[self._next] <= stamp + ROUNDING:
             self._take_recorded(self._next)
             self._next += 1
-        return super().contact_at(stamp)
+        if self._idling is None:
+            return super().contact_at(stamp)
+        if self._idling.passes(stamp):
+            return self.last.estimate.contact
+        contact = super().contact_at(stamp)
+        self._idling.note(stamp, self.is_idle)
+        return contact
 
     def _take_recorded(self, index: int) -> None:
         """Give one pose to the estimator."""
@@ -62,7 +72,9 @@ class RecordedContact(ContactLoop):
 LEAST_POSES = 3
 
 
-def build_source(choice: ContactChoice, recording: Recording, jaw: Jaw, mesh: str = "default") -> ContactSource:
+def build_source(
+    choice: ContactChoice, recording: Recording, jaw: Jaw, mesh: str = "default", *, as_live: bool = False
+) -> ContactSource:
     """Return a fresh contact source for one jaw of a recording.
 
     Args:
@@ -70,6 +82,7 @@ def build_source(choice: ContactChoice, recording: Recording, jaw: Jaw, mesh: st
         recording: it tells height, or mesh and poses.
         jaw: the jaw of that side, as calibrated.
         mesh: mesh density of the solver, whose surface the contact estimator gets.
+        as_live: whether images are passed over as by the contact estimator's node.
 
     Raises:
         FinforceError: height, mesh or poses are missing or cannot be used.
@@ -79,7 +92,8 @@ def build_source(choice: ContactChoice, recording: Recording, jaw: Jaw, mesh: st
         height = choice.height(recording)
         return GivenContact(Contact.fixed(jaw, height), f"fixed:{1e3 * height:g}")
     estimator = build_estimator(choice, mode, recording, jaw, mesh)
-    return RecordedContact(estimator, track_object(recording, jaw.side), choice.pose_delay, name=mode)
+    track, idling = track_object(recording, jaw.side), Idling() if as_live else None
+    return RecordedContact(estimator, track, choice.pose_delay, mode, idling)
 
 
 def build_estimator(choice: ContactChoice, mode: str, recording: Recording, jaw: Jaw, mesh: str = "default") -> Any:

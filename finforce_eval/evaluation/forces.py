@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.errors import ObservationError
+from finforce.stamps import Idling
 from finforce_contact.loop import ContactSource, ForceLoop
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.gripper import with_distances
@@ -28,9 +29,15 @@ _POINTS = ("points_x", "points_y", "points_z", "points_weight", "points_touching
 
 
 class Estimator(Protocol):
-    """What is asked of an estimator; `JawEstimator` satisfies it."""
+    """What is asked of an estimator; `JawEstimator` satisfies it.
+
+    Attributes:
+        surface_triangles: (t, 3) vertex indices.
+        is_idle: whether the jaw was at rest in the last image, its object out of reach.
+    """
 
     surface_triangles: NDArray[np.integer]
+    is_idle: bool
 
     def update(self, observation: Observation, contact: Contact | None) -> Any:
         """Return the Solution for one observation."""
@@ -98,7 +105,15 @@ def estimate_forces(
         own = setup.side(side)
         estimator, source = own.estimator(both), own.source(recording)
         found[side] = find_forces(
-            recording, own.jaw, source, estimator, side, strict=strict, progress=progress, watch=watch
+            recording,
+            own.jaw,
+            source,
+            estimator,
+            side,
+            strict=strict,
+            as_live=setup.as_live,
+            progress=progress,
+            watch=watch,
         )
     return with_distances(found, recording) if both else found
 
@@ -157,6 +172,7 @@ def find_forces(
     side: str = "left",
     *,
     strict: bool = True,
+    as_live: bool = False,
     progress: Callable[[int], Any] = lambda steps: None,
     watch: Callable[[str, int, Estimator], Any] | None = None,
 ) -> ForceSeries:
@@ -171,6 +187,7 @@ def find_forces(
         estimator: one that knows of no recording.
         side: "left" or "right".
         strict: an image that is refused ends the run, else it has no force and says why.
+        as_live: whether the images that the solver's node passes over are left out.
         progress: called with the number of images done since its last call.
         watch: called with side, stamp [ns] and estimator after every image.
 
@@ -181,7 +198,14 @@ def find_forces(
     track = recording.jaw(side).keypoints
     stamps, phases = track.stamps, recording.phases_at(track.stamps)
     run, rows = _JawRun(recording, side, jaw, ForceLoop(source, estimator)), []
+    idling, answered = Idling(), np.ones(len(stamps), dtype=bool)
     for index, stamp in enumerate(stamps.tolist()):
+        progress(1)
+        if idling.passes(stamp):
+            source.contact_at(stamp)  # its node has rules of its own
+            answered[index] = False
+            rows.append(run.row("", ""))
+            continue
         try:
             rows.append(run.step(index))
         except (ObservationError, RecordingError) as error:
@@ -189,9 +213,10 @@ def find_forces(
                 frame = f"frame {index}: " if isinstance(error, ObservationError) else ""
                 raise type(error)(f"{recording.name}: {frame}{error}") from error
             rows.append(run.row("refused", str(error)))
+        else:
+            idling.note(stamp, as_live and estimator.is_idle)
         if watch is not None:
             watch(side, stamp, estimator)
-        progress(1)
     columns = {name: np.array([row[name] for row in rows]) for name in (*_VECTORS, *_NUMBERS)}
     columns |= {name: [row[name] for row in rows] for name in (*_POINTS, "used")}
     columns |= {name: np.array([row[name] for row in rows], str) for name in ("status", "message", "contact_status")}
@@ -203,7 +228,8 @@ def find_forces(
     columns |= truth_columns(recording, side) | sight_columns(recording, side) | {"contact_source": source.name}
     if "detector_ms" in columns:
         columns["latency_ms"] = columns["step_ms"] + columns["detector_ms"]
-    return ForceSeries.build(recording.name, side, stamps, **columns).with_snapshot(run.snapshot)
+    series = ForceSeries.build(recording.name, side, stamps, **columns).with_snapshot(run.snapshot)
+    return series.at(answered) if as_live else series
 
 
 class _JawRun:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from time import perf_counter
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from finforce.camera import ImageError
 from finforce.errors import FinforceError
-from finforce.stamps import NANOSECONDS
+from finforce.stamps import NANOSECONDS, Idling
 from finforce.transforms import quaternion_from_pose
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.recordings.images import DEPTH_ENDS, PAIRED, ImageTrack
@@ -60,12 +60,14 @@ class KeypointSource:
         jaw_file: of the jaws.
         parameters: parameters of the detector node that differ from its defaults, by their ROS names.
         strict: refuse recordings that are damaged.
+        as_live: leave out the images that the detector's node leaves out.
     """
 
     source: str = ""
     jaw_file: str = "bench"
     parameters: Mapping[str, Any] = field(default_factory=dict)
     strict: bool = False
+    as_live: bool = False
 
     def source_of(self, recording: Recording) -> str:
         """Return "images", "keypoints" or "truth" for a recording.
@@ -124,7 +126,7 @@ class KeypointSource:
         if live is not None:
             raise OptionError(f"--detector {live}: means nothing offline; leave it out, or use finforce replay")
         parameters, settings, dots = build_records(self.node_parameters(recording))
-        return build_detector(load_jaws(parameters), parameters, settings, dots)
+        return build_detector(load_jaws(parameters), parameters, settings, dots, self.as_live)
 
     @property
     def pairing(self) -> int:
@@ -137,7 +139,7 @@ class KeypointSource:
         images = choose_images(recording, parameters.depth)
         recording = replace(recording, images=replace(images, depth_scale=parameters.depth_scale))
         with progress_bar(len(recording.images), "image", recording.name) as bar:
-            return detect_keypoints(recording, detector, progress=bar.update)
+            return detect_keypoints(recording, detector, as_live=self.as_live, progress=bar.update)
 
 
 def choose_images(recording: Recording, depth: str) -> ImageTrack:
@@ -210,8 +212,8 @@ def parse_source(options: argparse.Namespace) -> KeypointSource:
         parameters = _parse_parameters(changes)
     if extrinsics:
         parameters["T_gripper_camera"] = _parse_extrinsics(extrinsics)
-    strict = bool(getattr(options, "strict", False))
-    return KeypointSource(source=source, jaw_file=options.jaw, parameters=parameters, strict=strict)
+    switches = {name: bool(getattr(options, name, False)) for name in ("strict", "as_live")}
+    return KeypointSource(source=source, jaw_file=options.jaw, parameters=parameters, **switches)
 
 
 def _parse_parameters(texts: Sequence[str]) -> dict[str, Any]:
@@ -282,7 +284,11 @@ def _parse_value(given: str, text: str, default: Any) -> Any:
 
 
 def detect_keypoints(
-    recording: Recording, detector: KeypointDetector, *, progress: Callable[[int], Any] = lambda images: None
+    recording: Recording,
+    detector: KeypointDetector,
+    *,
+    as_live: bool = False,
+    progress: Callable[[int], Any] = lambda images: None,
 ) -> Recording:
     """Return a recording with the key points and jaw poses that a detector finds in its images.
 
@@ -291,6 +297,7 @@ def detect_keypoints(
     Args:
         recording: with images.
         detector: a fresh one, of the recording's jaws.
+        as_live: whether the images that the detector's node leaves out have no row.
         progress: called with the number of images done since its last call.
 
     Raises:
@@ -299,6 +306,7 @@ def detect_keypoints(
     images, refused = recording.images, []
     found: dict[str, dict[int, JawKeypoints]] = {side: {} for side in recording.jaws}
     step_ms: dict[int, float] = {}
+    idling, passed = Idling(), set()
     for stamp, image in images:
         begin = perf_counter()
         try:
@@ -306,6 +314,12 @@ def detect_keypoints(
         except (KeypointError, ImageError) as error:
             seen = {}
             refused.append(str(error))
+        else:
+            is_still = as_live and detector.was_still
+            if is_still and idling.passes(stamp):
+                passed.add(stamp)
+            else:
+                idling.note(stamp, is_still)
         step_ms[stamp] = 1e3 * (perf_counter() - begin)
         for side in found.keys() & seen.keys():
             found[side][stamp] = seen[side]
@@ -318,7 +332,7 @@ def detect_keypoints(
         raise RecordingError(f"{recording.name}: no key points in {len(images)} images: {why}")
     notes = [f"{count} images refused: {text}" for text, count in reasons.items()] + warnings
     recording = replace(recording, notes=(*recording.notes, *notes))
-    return with_detections(recording, found, dict.fromkeys(found, step_ms))
+    return with_detections(recording, found, dict.fromkeys(found, step_ms), passed)
 
 
 def count_reasons(texts: Iterable[str]) -> dict[str, int]:
@@ -341,6 +355,7 @@ def with_detections(
     recording: Recording,
     found: Mapping[str, Mapping[int, JawKeypoints]],
     step_ms: Mapping[str, Mapping[int, float]],
+    passed: Collection[int] = (),
 ) -> Recording:
     """Return a recording whose key points and jaw poses are those that a detector found.
 
@@ -348,17 +363,26 @@ def with_detections(
         recording: with images.
         found: by side and stamp [ns]; a jaw that was never found has no key points in any image.
         step_ms: wall time [ms] of every image, likewise.
+        passed: stamps [ns] of images that are left out.
     """
-    jaws = {side: _with_detection(recording.jaw(side), found[side], step_ms[side], recording.images) for side in found}
+    images = recording.images
+    stamps = images.stamps[~np.isin(images.stamps, list(passed))]
+    jaws = {
+        side: _with_detection(recording.jaw(side), found[side], step_ms[side], stamps, images.frame_id)
+        for side in found
+    }
     return replace(recording, jaws=jaws)
 
 
 def _with_detection(
-    track: JawTrack, found: Mapping[int, JawKeypoints], step_ms: Mapping[int, float], images: ImageTrack
+    track: JawTrack,
+    found: Mapping[int, JawKeypoints],
+    step_ms: Mapping[int, float],
+    stamps: NDArray[np.int64],
+    frame_id: str,
 ) -> JawTrack:
-    """Return the track of a jaw with its detections at all images."""
+    """Return the track of a jaw with its detections at some images (n,) [ns]."""
     count = next((len(each.points) for each in found.values()), track.sight.points.shape[1] if track.sight else 0)
-    stamps = images.stamps
     seen = [found.get(stamp) for stamp in stamps.tolist()]
     points, stddev = _rows(seen, "points", (count, 3)), _rows(seen, "stddev", (count, 3))
     accepted = np.nan_to_num(_rows(seen, "valid", (count,))).astype(bool)
@@ -381,7 +405,7 @@ def _with_detection(
         found=np.array([each is not None for each in seen]),
         step_ms=np.array([step_ms.get(stamp, np.nan) for stamp in stamps.tolist()]),
     )
-    return replace(track, keypoints=keypoints, pose=_pose_track(found, images.frame_id), detection=detection)
+    return replace(track, keypoints=keypoints, pose=_pose_track(found, stamps, frame_id), detection=detection)
 
 
 def _rows(seen: Sequence[JawKeypoints | None], name: str, shape: tuple[int, ...]) -> NDArray[np.float64]:
@@ -391,11 +415,11 @@ def _rows(seen: Sequence[JawKeypoints | None], name: str, shape: tuple[int, ...]
     return np.array(rows).reshape(-1, *shape)
 
 
-def _pose_track(found: Mapping[int, JawKeypoints], frame_id: str) -> PoseTrack | None:
+def _pose_track(found: Mapping[int, JawKeypoints], images: NDArray[np.int64], frame_id: str) -> PoseTrack | None:
     """Return the poses of a jaw where it was found; None without any."""
-    if not found:
+    stamps = [stamp for stamp in images.tolist() if stamp in found]
+    if not stamps:
         return None
-    stamps = sorted(found)
     poses = [found[stamp].T_camera_jaw for stamp in stamps]
     return PoseTrack(
         stamps=np.array(stamps, dtype=np.int64),

@@ -25,6 +25,7 @@ FREE = 5  # images without true force before an onset counts as one
 WAITED = 1.0  # [s] after which a force that did not show is missed
 WATCHED = 30  # frames after the true begin, by which a touch has to be there to stay
 PHASES = ("all", "load", "unload")
+OFF = 0.3  # [N] along an axis, from which on an image is counted as off
 _NOTHING = 1e-3  # [N] along an axis, which needs no standard deviation
 Numbers = dict[str, Any]
 
@@ -43,6 +44,9 @@ class Stats:
         axis_rmse_N: root mean square difference along x, y and z of the jaw [N].
         within_3_sigma_pct: share of the frames in which the difference along x, y and z is within three of the stated
             standard deviations, or 1 mN [%].
+        sharpness: root mean square of the stated standard deviation along x, y and z over that of the difference: below
+            1 too small, far above 1 says nothing; None along an axis without differences.
+        n_off: frames in which the difference along an axis is more than 0.3 N.
         answered_pct: share of the frames that were to be answered [%].
         torque_rmse_Nm: root mean square length of the difference of the torques about the jaw's origin [N m].
         torque_pct: the same over the root mean square of the true torque [%].
@@ -56,6 +60,8 @@ class Stats:
     vector_rmse_N: float | None = None
     axis_rmse_N: tuple[float, float, float] | None = None
     within_3_sigma_pct: tuple[float, float, float] | None = None
+    sharpness: tuple[float | None, float | None, float | None] | None = None
+    n_off: int | None = None
     answered_pct: float | None = None
     torque_rmse_Nm: float | None = None
     torque_pct: float | None = None
@@ -74,6 +80,7 @@ class CaseScore:
         all: errors over the record phases.
         load: of them, on the way in.
         unload: of them, on the way out.
+        moving: errors over all other images with a truth, as on ramps; of none without phases.
         step_ms: time per step, `p50`, `p95`, `p99` and `max`.
         cycles: "all", "load", "unload" -> number `n` of loading cycles, `mean` and sample standard deviation `std` of
             `rmse_N` and `nrmsd_pct` over them.
@@ -95,6 +102,7 @@ class CaseScore:
     all: Stats
     load: Stats
     unload: Stats
+    moving: Stats
     step_ms: Numbers
     cycles: Mapping[str, Numbers]
     mean_rmse_N: float | None
@@ -171,13 +179,15 @@ def score_case(cases: Sequence[ForceSeries], span: float) -> CaseScore:
     solved = sum(int(case.solved.sum()) for case in cases)
     # one pass of the detector finds both jaws: its times count once for each recording
     detector = {case.column("detector_ms").tobytes(): case.column("detector_ms") for case in cases}
+    rows = {phase: [case.scored & _is_phase(case, phase) for case in cases] for phase in PHASES}
+    rows["moving"] = [~case.scored & np.isfinite(case.true_magnitude) for case in cases]
     return CaseScore(
         frames=frames,
         solved=solved,
         skipped=frames - solved,
         record_frames=sum(int(case.scored.sum()) for case in cases),
         record_skipped=sum(int((case.scored & ~case.solved).sum()) for case in cases),
-        **{phase: _score_phase(cases, phase, span) for phase in PHASES},
+        **{name: _score_rows(cases, asked, span) for name, asked in rows.items()},
         step_ms=_times(case.column("step_ms") for case in cases),
         cycles={phase: _cycle_stats(cases, phase, span) for phase in PHASES},
         mean_rmse_N=_spread([compute_stats(case.error[case.counted], span).rmse_N for case in cases])["mean"],
@@ -191,12 +201,12 @@ def score_case(cases: Sequence[ForceSeries], span: float) -> CaseScore:
     )
 
 
-def _score_phase(cases: Sequence[ForceSeries], phase: str, span: float) -> Stats:
-    """Return the errors over the record phases, all of them or those on the way in or out."""
-    chosen = [case.counted & _is_phase(case, phase) for case in cases]
+def _score_rows(cases: Sequence[ForceSeries], asked: Sequence[NDArray[np.bool_]], span: float) -> Stats:
+    """Return the errors over some rows of the cases, which were to be answered."""
+    chosen = [rows & np.isfinite(case.error) for case, rows in zip(cases, asked, strict=True)]
     stats = compute_stats(np.concatenate([case.error[rows] for case, rows in zip(cases, chosen, strict=True)]), span)
-    asked = np.concatenate([case.solved[case.scored & _is_phase(case, phase)] for case in cases])
-    found: Numbers = {"answered_pct": _share(asked)}
+    answered = np.concatenate([case.solved[rows] for case, rows in zip(cases, asked, strict=True)])
+    found: Numbers = {"answered_pct": _share(answered)}
     force, truth, stated = (_join(cases, chosen, name) for name in ("force", "true_force", "force_stddev"))
     # a truth that is along x throughout is a magnitude that was written there, and says nothing of the vector
     if any(np.nan_to_num(case.true_force[:, 1:]).any() for case in cases) and len(force):
@@ -269,17 +279,20 @@ def compare_torques(found: NDArray[np.float64], true: NDArray[np.float64]) -> di
 
 
 def compare_vectors(differences: NDArray[np.float64], stated: NDArray[np.float64] | None) -> Numbers:
-    """Return `vector_rmse_N`, `axis_rmse_N` and, where deviations are stated, `within_3_sigma_pct` of `Stats`.
+    """Return what `Stats` has of forces as vectors: of the deviations only where they are stated.
 
     Args:
         differences: (n, 3) [N], at least one.
         stated: standard deviations (n, 3) [N]; None where none is known.
     """
-    axes = np.sqrt((differences**2).mean(axis=0))
-    found: Numbers = {"vector_rmse_N": float(np.linalg.norm(axes)), "axis_rmse_N": tuple(axes.tolist())}
+    axes = np.sqrt((differences**2).mean(axis=0)).tolist()
+    found: Numbers = {"vector_rmse_N": float(np.linalg.norm(axes)), "axis_rmse_N": tuple(axes)}
+    found["n_off"] = int((np.abs(differences) > OFF).any(axis=1).sum())
     if stated is not None:
         within = np.abs(differences) <= np.maximum(3.0 * stated, _NOTHING)
         found["within_3_sigma_pct"] = tuple((100.0 * within.mean(axis=0)).tolist())
+        widths = np.sqrt((stated**2).mean(axis=0)).tolist()
+        found["sharpness"] = tuple(w / e if e > 0.0 else None for w, e in zip(widths, axes, strict=True))
     return found
 
 

@@ -31,13 +31,17 @@ _OUTSIDE = ("bags", "out", "engine", "workers", "memory", "address", "shard", "r
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluationSetup:
-    """What an offline run needs beside the recordings; its estimators are built and compiled once for all of them."""
+    """What an offline run needs beside the recordings; its estimators are built and compiled once for all of them.
+
+    With `as_live` the images are left out that the nodes of contact and force leave out.
+    """
 
     jaw: Jaw
     settings: EstimatorSettings
     calibration: Calibration | None
     contacts: ContactChoice
     about: Mapping[str, str]
+    as_live: bool = False
     _sides: dict[str, EvaluationSetup] = field(default_factory=dict, init=False, repr=False, compare=False)
     _estimators: dict[bool, JawEstimator] = field(default_factory=dict, init=False, repr=False, compare=False)
 
@@ -68,7 +72,7 @@ class EvaluationSetup:
     def source(self, recording: Recording) -> ContactSource:
         """Return a fresh contact source for this jaw of a recording."""
         jaw = self.calibration.apply(self.jaw) if self.calibration else self.jaw
-        return build_source(self.contacts, recording, jaw, self.density)
+        return build_source(self.contacts, recording, jaw, self.density, as_live=self.as_live)
 
 
 def make_setup(options: argparse.Namespace) -> EvaluationSetup:
@@ -86,6 +90,7 @@ def make_setup(options: argparse.Namespace) -> EvaluationSetup:
     changes = getattr(options, "set", [])
     settings = parse_settings(options.solver, options.mesh, changes)
     calibration = load_calibration(options.calibration) if options.calibration else None
+    as_live = getattr(options, "as_live", False)
     about = {
         "jaw": jaw.name,
         "solver": options.solver,
@@ -94,9 +99,12 @@ def make_setup(options: argparse.Namespace) -> EvaluationSetup:
         "contact": ", ".join(options.contact) or "estimate where mesh and poses are known, else fixed:case",
         "settings": ", ".join(changes) or "as they come",
         "calibration": options.calibration or "none",
+        "images": "those that the live chain answers" if as_live else "all",
         "version": version(),
     }
-    return EvaluationSetup(jaw=jaw, settings=settings, calibration=calibration, contacts=contacts, about=about)
+    return EvaluationSetup(
+        jaw=jaw, settings=settings, calibration=calibration, contacts=contacts, about=about, as_live=as_live
+    )
 
 
 _last: dict[str, EvaluationSetup] = {}

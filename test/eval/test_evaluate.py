@@ -192,11 +192,13 @@ STATS = {
     "vector_rmse_N",
     "axis_rmse_N",
     "within_3_sigma_pct",
+    "sharpness",
+    "n_off",
     "answered_pct",
     "torque_rmse_Nm",
     "torque_pct",
 }
-CASE = {"frames", "solved", "skipped", "all", "load", "unload", "step_ms"}
+CASE = {"frames", "solved", "skipped", "all", "load", "unload", "moving", "step_ms"}
 
 
 def test_json_has_the_agreed_keys():
@@ -208,7 +210,7 @@ def test_json_has_the_agreed_keys():
     for case in (content["cases"]["pressed"], content["all"]):
         assert case.keys() >= CASE
         assert case["step_ms"].keys() == {"p50", "p95", "p99", "max"}
-        for phase in ("all", "load", "unload"):
+        for phase in ("all", "load", "unload", "moving"):
             assert case[phase].keys() == STATS
 
 

@@ -179,9 +179,37 @@ def test_the_force_is_compared_as_a_vector_axis_by_axis():
     assert stats.within_3_sigma_pct == pytest.approx((100.0, 100.0, 50.0))
 
 
+def test_sharpness_is_the_stated_deviation_over_the_error_axis_by_axis():
+    sharpness = score_case([vectors()], span=1.0).all.sharpness
+    assert sharpness == pytest.approx((0.2 / 0.3, None, 0.1 / np.sqrt(0.08)))
+    wider = score_case([vectors(force_stddev=np.full((2, 3), 0.9))], span=1.0).all.sharpness
+    assert wider[0] == pytest.approx(3.0)
+
+
+def test_images_off_by_more_than_three_tenths_of_a_newton_along_an_axis_are_counted():
+    truth = vectors().true_force
+    for error, count in ([0.31, 0.0, 0.0], 2), ([0.0, 0.0, -0.31], 2), ([0.2, 0.2, 0.2], 0):
+        assert score_case([vectors(force=truth + error)], span=1.0).all.n_off == count
+
+
+def test_images_outside_the_record_phases_are_scored_by_themselves():
+    truth = np.array([[-1.0, 0.0, 0.5]] * 4)
+    force = truth + np.array([[0.1, 0, 0], [0.4, 0, -0.3], [np.nan] * 3, [0.0, 0, 0.6]])
+    columns = {"true_force": truth, "force": force, "force_stddev": np.full((4, 3), 0.2)}
+    scored = np.array([True, False, False, False])
+    score = score_case([vectors().at(np.array([0, 0, 0, 0])).with_columns(scored=scored, **columns)], span=1.0)
+    assert (score.all.n, score.moving.n) == (1, 2)
+    assert score.moving.answered_pct == pytest.approx(200 / 3)
+    assert score.moving.vector_rmse_N == pytest.approx(np.sqrt((0.25 + 0.36) / 2))
+    assert score.moving.axis_rmse_N == pytest.approx((np.sqrt(0.08), 0.0, np.sqrt(0.225)))
+    assert (score.all.n_off, score.moving.n_off) == (0, 2)
+    unmeasured = vectors().with_columns(scored=np.zeros(2, bool), true_force=np.full((2, 3), np.nan))
+    assert score_case([unmeasured], span=1.0).moving.n == 0
+
+
 def test_without_stated_deviations_nothing_is_said_of_them():
     stats = score_case([vectors(force_stddev=None)], span=1.0).all
-    assert stats.within_3_sigma_pct is None and stats.vector_rmse_N is not None
+    assert stats.within_3_sigma_pct is stats.sharpness is None and stats.vector_rmse_N is not None
 
 
 def test_a_truth_that_is_a_magnitude_along_x_says_nothing_of_the_vector():
