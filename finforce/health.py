@@ -1,9 +1,9 @@
-"""How a node is doing: rates, latencies, refusals and the level that follows."""
+"""How a node is doing: rates, latencies, rejections, skipped work and the level that follows."""
 
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from time import monotonic
@@ -12,6 +12,9 @@ import numpy as np
 
 from finforce.errors import FinforceError
 from finforce.stamps import StaleError
+
+RULES = UNHEARD, IDLE, STILL = ("nobody subscribes", "idle image", "nothing moved")  # by which work is skipped
+ALL = "all"
 
 
 class Level(IntEnum):
@@ -143,3 +146,37 @@ def _percentile(seconds: Sequence[float], percent: float) -> str:
 def _counts(counter: Counter[str]) -> str:
     """Return counts as text, the most frequent first."""
     return ", ".join(f"{count} {reason}" for reason, count in counter.most_common() if count) or "none"
+
+
+class SkippingError(FinforceError):
+    """A rule that is to be switched off does not exist."""
+
+
+class Skips:
+    """Work that a scene does not need: which rules may be applied, and how often each was.
+
+    Args:
+        off: names of rules that are not to be applied; "all" for none of them.
+
+    Raises:
+        SkippingError: a name in `off` is no rule.
+    """
+
+    def __init__(self, off: Collection[str] = ()) -> None:
+        unknown = sorted(set(off) - {*RULES, ALL, ""})
+        if unknown:
+            raise SkippingError(f"skip_off: there is no rule {unknown[0]!r}; expected {', '.join(RULES)} or {ALL}")
+        self._off = frozenset(RULES if ALL in off else off)
+        self._counts: Counter[str] = Counter()
+
+    def allows(self, rule: str) -> bool:
+        """Say whether a rule may be applied."""
+        return rule not in self._off
+
+    def count(self, rule: str, times: int = 1) -> None:
+        """Note that a rule has saved its work."""
+        self._counts[rule] += times
+
+    def describe(self) -> dict[str, str]:
+        """Return, for the diagnostics, how often each rule saved its work, or that it is off."""
+        return {f"skipped: {rule}": str(self._counts[rule]) if self.allows(rule) else "off" for rule in RULES}

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.errors import ObservationError, PoseError
-from finforce.skipping import CONTACT, STILL, Skips
+from finforce.health import STILL, Skips
 from finforce.transforms import check_pose, invert_pose
 from finforce_contact.localization.outline_localizer import (
     ClosestLocalizer,
@@ -126,7 +126,7 @@ class ContactEstimator:
         self._samples = np.unique(np.linspace(0, len(self.face.mesh.nodes) - 1, _JAW_SAMPLES).astype(int))
         self._poses, self._belief = PoseFilter(self.settings), TouchBelief()
         self._slips = SlipWatch(self.settings)
-        self._stillness, self.skips = StillnessWatch(), skips or Skips(CONTACT)
+        self._stillness, self.skips = StillnessWatch(), skips or Skips()
         self.set_object(mesh)
 
     @property

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from time import perf_counter
 from typing import Any
@@ -13,14 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
-from rclpy.node import Node
 
-from finforce.errors import FinforceError
-from finforce.health import Health, Level, Outcome, Report
+from finforce.health import IDLE, Health, Level, Outcome, Report, Skips
 from finforce.messages import stamp_of
 from finforce.ros import node as ros
 from finforce.settings import refresh_record
-from finforce.skipping import CONTACT, IDLE, Skips
 from finforce.stamps import SECOND, Idling, StampGate
 from finforce.transforms import pose_numbers
 from finforce_contact.estimator import ContactEstimate
@@ -33,26 +29,25 @@ from finforce_contact.session import ContactSession, detections_type
 from finforce_ifea.messages import columns_from_outline
 
 CAMERA = "/camera/camera"
-WAITING = ros.QoSProfile(depth=20, reliability=ros.ReliabilityPolicy.BEST_EFFORT)  # a tenth of a second, and more
 
 
 class ContactOutputs:
     """The publishers of a contact estimator node.
 
     Args:
-        qos: makes publishers and watches them.
+        stage: makes publishers and watches them.
         parameters: which jaws, and whether the object's poses are found here.
         skips: whether what nobody subscribes to is left out.
     """
 
-    def __init__(self, qos: ros.QosWatch, parameters: ContactParameters, skips: Skips) -> None:
+    def __init__(self, stage: ros.Stage, parameters: ContactParameters, skips: Skips) -> None:
         cloud, sides = ros.PointCloud2, parameters.sides
         self._frame, self._skips = parameters.camera_frame, skips
-        self.contact = {side: qos.publisher(cloud, f"{side}/contact", ros.RESULT) for side in sides}
-        self.outline = {side: qos.publisher(cloud, f"{side}/object_outline", ros.RESULT) for side in sides}
-        self.slip = {side: qos.publisher(ros.TwistStamped, f"{side}/slip", ros.RESULT) for side in sides}
+        self.contact = {side: stage.publisher(cloud, f"{side}/contact", ros.RESULT) for side in sides}
+        self.outline = {side: stage.publisher(cloud, f"{side}/object_outline", ros.RESULT) for side in sides}
+        self.slip = {side: stage.publisher(ros.TwistStamped, f"{side}/slip", ros.RESULT) for side in sides}
         self._slip_told = dict.fromkeys(sides, -math.inf)
-        self.pose = qos.publisher(ros.PoseStamped, "object_pose", ros.RESULT) if parameters.tracks else None
+        self.pose = stage.publisher(ros.PoseStamped, "object_pose", ros.RESULT) if parameters.tracks else None
 
     def send_contact(self, side: str, timed: TimedEstimate) -> None:
         """Send outline and contact of an image; no rows say that there is none."""
@@ -92,32 +87,34 @@ def contact_columns(estimate: ContactEstimate) -> dict[str, NDArray]:
     }
 
 
-class ContactEstimatorNode(Node):
+class ContactEstimatorNode(ros.ImageNode):
     """Says where the object touches the jaws, image by image; lives on without an object.
 
     Args:
-        stage: what the node is in a process of several.
+        pipeline: of a process of several nodes.
         options: of `rclpy.node.Node`.
 
     Raises:
         FinforceError: a parameter or the jaw cannot be used.
     """
 
-    def __init__(self, stage: ros.Stage | None = None, **options: Any) -> None:
+    answer = "contact"
+
+    def __init__(self, pipeline: ros.Pipeline | None = None, **options: Any) -> None:
         super().__init__("contact_estimator", **options)
         self.parameters = parameters = ros.declare_record(self, ContactParameters)
         contact = ros.declare_record(self, ContactSettings, "contact")
         tracker = ros.declare_record(self, TrackerSettings, "tracker")
         ros.name_unknown_parameters(self)
         self.sides, age = parameters.sides, parameters.max_age
-        self.skips = Skips(CONTACT, parameters.skip_off)
-        ros.warn_first_start(self)
+        self.skips = Skips(parameters.skip_off)
+        ros.warn_first_start()
         self.session = ContactSession(parameters, contact, tracker, self.skips)
         self.gates = {side: StampGate(max_age=age, restart_gap=parameters.restart_gap) for side in self.sides}
         self.health = {side: Health(source=f"{side}/jaw_pose", stale_after=age) for side in self.sides}
-        self.qos = ros.QosWatch(self, stage)
-        self.out = ContactOutputs(self.qos, parameters, self.skips)
-        with self._refusals(self.sides):
+        self.stage = ros.Stage(self, pipeline)
+        self.out = ContactOutputs(self.stage, parameters, self.skips)
+        with self.rejections():
             self.get_logger().info(self.session.load_mesh(parameters))
         self._serve()
         self.idling = {side: Idling() for side in self.sides}
@@ -128,12 +125,12 @@ class ContactEstimatorNode(Node):
         """Offer services, whose long work holds up nothing else, and diagnostics."""
         session, period = self.session, self.parameters.diagnostics_period
         one_by_one = MutuallyExclusiveCallbackGroup()
-        ros.serve_trigger(self.qos, "~/load_mesh", lambda: session.load_mesh(self._refreshed()), one_by_one)
-        ros.serve_trigger(self.qos, "~/reconstruct", lambda: session.reconstruct(self._refreshed()), one_by_one)
-        ros.serve_trigger(self.qos, "~/reset", session.reset)
+        ros.serve_trigger(self.stage, "~/load_mesh", lambda: session.load_mesh(self._refreshed()), one_by_one)
+        ros.serve_trigger(self.stage, "~/reconstruct", lambda: session.reconstruct(self._refreshed()), one_by_one)
+        ros.serve_trigger(self.stage, "~/reset", session.reset)
         for side in self.sides:
             report = partial(self._report, side)
-            ros.publish_diagnostics(self, self.qos, f"finforce: {side} contact", period, report)
+            ros.publish_diagnostics(self.stage, f"finforce: {side} contact", period, report)
 
     def _subscribe(self) -> None:
         """Subscribe to all that the parameters ask for.
@@ -141,34 +138,34 @@ class ContactEstimatorNode(Node):
         Raises:
             MissingDependencyError: a message type is not installed.
         """
-        qos, session, source = self.qos, self.session, self.parameters.pose_source
+        stage, session, source = self.stage, self.session, self.parameters.pose_source
         self.objects = None
         if self.parameters.tracks:
             self._subscribe_camera()
         elif source == "topic":
-            self.objects = qos.subscription(ros.PoseStamped, "object_pose", self._on_object, ros.SENSOR)
+            self.objects = stage.subscription(ros.PoseStamped, "object_pose", self._on_object, ros.SENSOR)
         else:
-            self.objects = qos.subscription(detections_type(), "object_detections", self._on_object, ros.SENSOR)
+            self.objects = stage.subscription(detections_type(), "object_detections", self._on_object, ros.SENSOR)
         for side in self.sides:
             for kind, name, take in (
                 (ros.WrenchStamped, "wrench", session.take_wrench),
                 (ros.PointCloud2, "surface", session.take_surface),
             ):
                 keep = partial(self._on_solver, side, take)
-                qos.subscription(kind, f"{side}/{name}", keep, ros.SENSOR)
+                stage.subscription(kind, f"{side}/{name}", keep, ros.SENSOR)
             find = partial(self._on_jaw_pose, side)
-            qos.subscription(ros.PoseStamped, f"{side}/jaw_pose", find, WAITING, can_wait=True)
+            stage.subscription(ros.PoseStamped, f"{side}/jaw_pose", find, ros.BUFFERED, can_wait=True)
 
     def _subscribe_camera(self) -> None:
         """Subscribe to the images in which the object is found; they wait for each other."""
         camera, group = self.session.camera, MutuallyExclusiveCallbackGroup()
         info, take_info = f"{CAMERA}/color/camera_info", partial(self._on_image, camera.take_camera)
-        self.qos.subscription(ros.CameraInfo, info, take_info, ros.SENSOR, callback_group=group)
+        self.stage.subscription(ros.CameraInfo, info, take_info, ros.SENSOR, callback_group=group)
         for topic, take in (
             ("object_mask", camera.take_mask),
             (f"{CAMERA}/aligned_depth_to_color/image_raw", camera.take_depth),
         ):
-            ros.LargeSubscription(self.qos, ros.Image, topic, partial(self._on_image, take), callback_group=group)
+            self.stage.large_subscription(ros.Image, topic, partial(self._on_image, take), callback_group=group)
 
     def _refreshed(self) -> ContactParameters:
         """Return the parameters with the present values of those that may be set at run time."""
@@ -179,14 +176,14 @@ class ContactEstimatorNode(Node):
         began, stamp = perf_counter(), stamp_of(pose)
         self.health[side].arrive()
         # poses of the object that came while the image was looked at
-        for message in ros.take_waiting(self.objects):
+        for message in self.objects.take_waiting() if self.objects else ():
             self._on_object(message)
-        with self._refusals((side,)):
+        with self.rejections(side):
             if self.idling[side].passes(stamp):
                 self.skips.count(IDLE)
                 self.session.pass_over(side, pose)
                 return
-            if self.gates[side].enter(stamp, self._now()):
+            if self.gates[side].enter(stamp, self.now()):
                 self.session.restart(side)
                 self.get_logger().warning("the stamps went back: a new recording; poses and contacts are forgotten")
             self.idling[side].end()
@@ -196,25 +193,25 @@ class ContactEstimatorNode(Node):
     def _on_solver(self, side: str, take: Callable[[str, Any], list[TimedEstimate]], message: Any) -> None:
         """Keep what a jaw's solver says, and find the contact of an image that has no jaw pose of its own."""
         began = perf_counter()
-        with self._refusals((side,)):
+        with self.rejections(side):
             self._check_ahead(message)
             self._send(side, began, take(side, message))
 
     def _on_object(self, message: Any) -> None:
         """Use the object's pose that another node has found."""
-        with self._refusals(self.sides):
+        with self.rejections():
             self._check_ahead(message)
             self._hand_on(self.session.read_pose(message))
 
     async def _on_image(self, take: Callable[[Any], StampedPose | None], image: Any) -> None:
         """Use the object's pose, if one is found with an image, while other callbacks go on."""
-        with self._refusals(self.sides):
+        with self.rejections():
             self._check_ahead(image)
             self._hand_on(await ros.run_aside(self, partial(take, image)))
 
     def _check_ahead(self, message: Any) -> None:
         """Refuse a stamp ahead of the clock before anything is kept that all later stamps would be behind."""
-        now = self._now()
+        now = self.now()
         self.gates[self.sides[0]].check_age(max(stamp_of(message), now), now)
 
     def _hand_on(self, found: StampedPose | None) -> None:
@@ -222,44 +219,27 @@ class ContactEstimatorNode(Node):
         began = perf_counter()
         if found is None:
             return
-        self.gates[self.sides[0]].check_age(found.stamp, self._now())
+        self.gates[self.sides[0]].check_age(found.stamp, self.now())
         self.out.send_pose(found)
         for side in self.sides:
-            with self._refusals((side,)):
+            with self.rejections(side):
                 self._send(side, began, self.session.take_object_pose(side, found))
 
     def _send(self, side: str, began: float, estimates: Iterable[TimedEstimate]) -> None:
         """Publish contacts that are still fresh; an object whose pose is not known gives none."""
         for timed in estimates:
-            self.gates[side].check_age(timed.stamp, self._now())
+            self.gates[side].check_age(timed.stamp, self.now())
             outcome = outcome_of_estimate(timed.estimate)
             if timed.estimate.status == "no_pose":
-                self._refuse(outcome, (side,))
+                self.reject(outcome, side)
                 continue
             self.out.send_contact(side, timed)
-            age = (self._now() - timed.stamp) / ros.NANOSECONDS
-            self.health[side].publish(outcome, latency=perf_counter() - began, age=age)
-
-    @contextmanager
-    def _refusals(self, sides: Iterable[str]) -> Iterator[None]:
-        """Survive what is wrong with a message, and say it."""
-        try:
-            yield
-        except FinforceError as error:
-            self._refuse(Outcome.of_error(error), sides)
-
-    def _refuse(self, outcome: Outcome, sides: Iterable[str]) -> None:
-        self.get_logger().warning(f"no contact: {outcome.text}", throttle_duration_sec=2.0)
-        for side in sides:
-            self.health[side].refuse(outcome)
+            self.confirm(side, timed.stamp, outcome, began)
 
     def _report(self, side: str, alarms: list[Outcome]) -> Report:
         """Return how one jaw's contact is doing."""
         values = describe(self.session, side) | self.skips.describe()
         return self.health[side].report([*alarms, *object_alarms(self.session)], values)
-
-    def _now(self) -> int:
-        return self.get_clock().now().nanoseconds
 
 
 LEVELS = {"touching": Level.OK, "apart": Level.OK}  # any other status: WARN

@@ -173,9 +173,9 @@ class GripperDriverNode(Node):
         told = [f"{side} {what}" for side in JAWS for what in ("stddev", "slip")]
         self.times = MessageTimes(self.gripper.clock, ("force", *JAWS, *told), **gate)
         self.health = GripperHealth(source=parameters.port, stale_after=parameters.max_age)
-        self.qos = ros.QosWatch(self)
-        self.joints = None if self.is_other else self.qos.publisher(JointState, "joint_states", ros.RESULT)
-        self.grasp_state = self.qos.publisher(ros.DiagnosticStatus, "~/grasp_state", ros.LATCHED)
+        self.stage = ros.Stage(self)
+        self.joints = None if self.is_other else self.stage.publisher(JointState, "joint_states", ros.RESULT)
+        self.grasp_state = self.stage.publisher(ros.DiagnosticStatus, "~/grasp_state", ros.LATCHED)
         self.seen: ForceSample | None = None
         self.stale_after = grasp.stale_after
         self.arrived: deque[GripperState] = deque(maxlen=100)
@@ -190,14 +190,14 @@ class GripperDriverNode(Node):
         """Offer services, whose waiting holds up nothing else, and diagnostics."""
         tasks = self.tasks
         for name in ("estop", "stop"):
-            ros.serve_trigger(self.qos, f"~/{name}", getattr(tasks, name))
+            ros.serve_trigger(self.stage, f"~/{name}", getattr(tasks, name))
         for name in ("calibrate", "clear_errors", "grasp", "grasp_without_vision", "release"):
             # what waits for an earlier call would move the jaws after a stop
-            ros.serve_trigger(self.qos, f"~/{name}", getattr(tasks, name), ReentrantCallbackGroup())
-        ros.serve_switch(self.qos, "~/activate", tasks.activate)
+            ros.serve_trigger(self.stage, f"~/{name}", getattr(tasks, name), ReentrantCallbackGroup())
+        ros.serve_switch(self.stage, "~/activate", tasks.activate)
         offered = [] if self.is_other else ACTIONS
         self.actions = [action for action in map(self._offer_action, offered) if action is not None]
-        ros.publish_diagnostics(self, self.qos, "finforce: gripper", self.parameters.diagnostics_period, self._report)
+        ros.publish_diagnostics(self.stage, "finforce: gripper", self.parameters.diagnostics_period, self._report)
 
     def _offer_action(self, name: str) -> ActionServer | None:
         """Offer a standard action, if it is installed; a newer goal ends an older one."""
@@ -229,14 +229,14 @@ class GripperDriverNode(Node):
 
     def _subscribe(self) -> None:
         """Create the subscriptions; a node that has them is ready."""
-        self.qos.subscription(JointState, "~/command", self._on_command, ros.RESULT)
-        self.qos.subscription(JointState, "~/grasp_goal", self._on_goal, ros.RESULT)
-        self.qos.subscription(WrenchStamped, "grasp_wrench", self._on_wrench, ros.SENSOR)
+        self.stage.subscription(JointState, "~/command", self._on_command, ros.RESULT)
+        self.stage.subscription(JointState, "~/grasp_goal", self._on_goal, ros.RESULT)
+        self.stage.subscription(WrenchStamped, "grasp_wrench", self._on_wrench, ros.SENSOR)
         for side in JAWS:
-            self.qos.subscription(PointCloud2, f"{side}/contact", partial(self._on_contact, side), ros.SENSOR)
-            self.qos.subscription(TwistStamped, f"{side}/slip", partial(self._on_slip, side), ros.RESULT)
+            self.stage.subscription(PointCloud2, f"{side}/contact", partial(self._on_contact, side), ros.SENSOR)
+            self.stage.subscription(TwistStamped, f"{side}/slip", partial(self._on_slip, side), ros.RESULT)
             stddev = f"{side}/wrench_stddev"
-            self.qos.subscription(WrenchStamped, stddev, partial(self._on_stddev, side), ros.RESULT)
+            self.stage.subscription(WrenchStamped, stddev, partial(self._on_stddev, side), ros.RESULT)
 
     def _take_state(self, state: GripperState) -> None:
         """Keep a state, in the gripper's thread, until the node's own thread has time for it."""

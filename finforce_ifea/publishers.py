@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from finforce.health import Level, Outcome
+from finforce.health import Level, Outcome, Skips
 from finforce.ros import node as ros
 from finforce.ros.messages import points_marker
-from finforce.skipping import Skips
 from finforce_ifea.grasp_force import Grasp
 from finforce_ifea.messages import ARROW, CONTACT, CONTACT_DIAMETER, FORCE, NEWTONS_PER_METRE
 from finforce_ifea.parameters import NodeParameters
@@ -24,21 +23,21 @@ class SolverOutputs:
     """The publishers of a solver node.
 
     Args:
-        qos: makes publishers and watches them.
+        stage: makes publishers and watches them.
         parameters: which jaw, and whether the forces on the gripper are completed here.
         skips: whether what nobody subscribes to is left out.
     """
 
-    def __init__(self, qos: ros.QosWatch, parameters: NodeParameters, skips: Skips) -> None:
+    def __init__(self, stage: ros.Stage, parameters: NodeParameters, skips: Skips) -> None:
         side = parameters.jaw_name
         self._parameters, self._skips = parameters, skips
-        self.wrench = qos.publisher(ros.WrenchStamped, f"{side}/wrench", ros.RESULT)
-        self.stddev = qos.publisher(ros.WrenchStamped, f"{side}/wrench_stddev", ros.RESULT)
-        self.surface = qos.publisher(ros.PointCloud2, f"{side}/surface", ros.RESULT)
-        self.markers = qos.publisher(ros.MarkerArray, f"{side}/markers", ros.RESULT)
+        self.wrench = stage.publisher(ros.WrenchStamped, f"{side}/wrench", ros.RESULT)
+        self.stddev = stage.publisher(ros.WrenchStamped, f"{side}/wrench_stddev", ros.RESULT)
+        self.surface = stage.publisher(ros.PointCloud2, f"{side}/surface", ros.RESULT)
+        self.markers = stage.publisher(ros.MarkerArray, f"{side}/markers", ros.RESULT)
         if parameters.peer or parameters.completes_grasp:
-            self.grasp = qos.publisher(ros.WrenchStamped, "grasp_wrench", ros.RESULT)
-            self.manipulation = qos.publisher(ros.WrenchStamped, "manipulation_wrench", ros.RESULT)
+            self.grasp = stage.publisher(ros.WrenchStamped, "grasp_wrench", ros.RESULT)
+            self.manipulation = stage.publisher(ros.WrenchStamped, "manipulation_wrench", ros.RESULT)
         self._markers_sent = -float("inf")
 
     def send_wrench(self, header: Any, solution: Solution) -> None:

@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from time import monotonic, perf_counter
 from typing import TYPE_CHECKING, Any
 
 from numpy.typing import NDArray
 from rcl_interfaces.msg import ParameterDescriptor
-from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-from finforce.errors import FinforceError
-from finforce.health import Health, Outcome, Report
+from finforce.health import IDLE, STILL, UNHEARD, Health, Outcome, Report, Skips
 from finforce.processors import bind_caller
 from finforce.ros import node as ros
-from finforce.skipping import IDLE, STILL, UNHEARD, Skips
 from finforce.stamps import Idling, StampGate
 from finforce_keypoints.build import build_detector
 from finforce_keypoints.camera_feed import RgbdFeed
@@ -27,7 +23,6 @@ from finforce_keypoints.diagnostics import describe, outcome_of_keypoints, repor
 from finforce_keypoints.images import ImagePair
 from finforce_keypoints.parameters import (
     NO_DEPTH,
-    RULES,
     DetectorParameters,
     DetectorSettings,
     is_compressed,
@@ -40,20 +35,25 @@ if TYPE_CHECKING:
     from finforce_keypoints.geometry.jaw_localizer import JawKeypoints
 
 
-class KeypointDetectorNode(Node):
+class KeypointDetectorNode(ros.ImageNode):
     """Finds the key points of the jaws, image by image; publishes nothing of an image that it does not trust.
 
     Args:
         build: makes the detector, as `build_detector`.
-        stage: what the node is in a process of several.
+        pipeline: of a process of several nodes.
         options: of `rclpy.node.Node`.
 
     Raises:
         FinforceError: a parameter, a jaw or the network cannot be used.
     """
 
+    answer = "key points"
+
     def __init__(
-        self, build: Callable[..., KeypointDetector] = build_detector, stage: ros.Stage | None = None, **options: Any
+        self,
+        build: Callable[..., KeypointDetector] = build_detector,
+        pipeline: ros.Pipeline | None = None,
+        **options: Any,
     ) -> None:
         super().__init__("keypoint_detector", **options)
         self.parameters = parameters = ros.declare_record(self, DetectorParameters)
@@ -64,8 +64,8 @@ class KeypointDetectorNode(Node):
         said = ParameterDescriptor(description="Names of the rows of the key point clouds", read_only=True)
         self.declare_parameter("keypoint_names", list(names), said, ignore_override=True)
         ros.name_unknown_parameters(self)
-        self.skips = Skips(RULES, parameters.skip_off)
-        ros.warn_first_start(self)
+        self.skips = Skips(parameters.skip_off)
+        ros.warn_first_start()
         self.detector = build(jaws, parameters, settings, dots, self.skips.allows(STILL))
         self.feed = RgbdFeed(parameters)
         self.gate = StampGate(max_age=parameters.max_age, restart_gap=parameters.restart_gap)
@@ -73,8 +73,8 @@ class KeypointDetectorNode(Node):
         self.health = {side: Health(source=source, stale_after=age) for side in parameters.sides}
         self.found: Mapping[str, JawKeypoints] = {}
         self.rested, self.idling = float("-inf"), Idling()
-        self.qos = ros.QosWatch(self, stage)
-        self.out = DetectorOutputs(self.qos, parameters, names, self.detector)
+        self.stage = ros.Stage(self, pipeline)
+        self.out = DetectorOutputs(self.stage, parameters, names, self.detector)
         self.detector.warm_up()  # before images come: those that came meanwhile would be lost
         self._serve()
         self._subscribe()
@@ -82,24 +82,24 @@ class KeypointDetectorNode(Node):
 
     def _serve(self) -> None:
         """Offer services and diagnostics."""
-        ros.serve_trigger(self.qos, "~/reset", lambda: self._restart("reset by service"))
+        ros.serve_trigger(self.stage, "~/reset", lambda: self._restart("reset by service"))
         for side in self.parameters.sides:
             report, period = partial(self._report, side), self.parameters.diagnostics_period
-            ros.publish_diagnostics(self, self.qos, f"finforce: {side} key points", period, report)
+            ros.publish_diagnostics(self.stage, f"finforce: {side} key points", period, report)
 
     def _subscribe(self) -> None:
         """Create the subscriptions."""
         parameters = self.parameters
-        self.qos.subscription(CameraInfo, parameters.info_topic, self._on_info, ros.SENSOR)
+        self.stage.subscription(CameraInfo, parameters.info_topic, self._on_info, ros.SENSOR)
         if parameters.depth != NO_DEPTH:
-            ros.LargeSubscription(self.qos, Image, parameters.depth_topic, self._on_depth)
+            self.stage.large_subscription(Image, parameters.depth_topic, self._on_depth)
         for topic in parameters.color_topics:
             kind = CompressedImage if is_compressed(topic) else Image
-            ros.LargeSubscription(self.qos, kind, topic, partial(self._on_color, topic))
+            self.stage.large_subscription(kind, topic, partial(self._on_color, topic))
 
     def _on_info(self, message: CameraInfo) -> None:
         """Keep the camera's intrinsics."""
-        with self._refusals():
+        with self.rejections():
             self.feed.take_info(message)
 
     def _on_color(self, topic: str, message: Any) -> None:
@@ -112,12 +112,12 @@ class KeypointDetectorNode(Node):
             self.rested = monotonic()
             self.skips.count(UNHEARD)
             return
-        with self._refusals():
+        with self.rejections():
             self._answer(self.feed.take_color(topic, message))
 
     def _on_depth(self, message: Image) -> None:
         """Take a depth image."""
-        with self._refusals():
+        with self.rejections():
             self._answer(self.feed.take_depth(message))
 
     def _answer(self, pair: ImagePair | None) -> None:
@@ -126,7 +126,7 @@ class KeypointDetectorNode(Node):
             return
         began = perf_counter()
         image = self.feed.decode(pair)
-        if self.gate.enter(pair.stamp, self._now()):
+        if self.gate.enter(pair.stamp, self.now()):
             self._restart("the stamps went back: a new recording")
         self.found = {}  # until they are found again
         self.found = self.detector.detect(image)
@@ -142,15 +142,14 @@ class KeypointDetectorNode(Node):
     def _publish(self, stamp: int, color: NDArray, began: float) -> None:
         """Publish the key points of an image, (h, w, 3), while they are fresh."""
         found = self.found
-        self.gate.check_age(stamp, self._now())
-        for side, health in self.health.items():
+        self.gate.check_age(stamp, self.now())
+        for side in self.health:
             outcome = outcome_of_keypoints(found.get(side), side, self.detector.warnings.get(side, ""))
             if side not in found:
-                self._refuse(outcome, (side,))
+                self.reject(outcome, side)
                 continue
             self.out.send_jaw(side, stamp, found[side])
-            age = (self._now() - stamp) / ros.NANOSECONDS
-            health.publish(outcome, latency=perf_counter() - began, age=age)
+            self.confirm(side, stamp, outcome, began)
         self.out.send_annotated(stamp, color, found)
 
     def _restart(self, reason: str) -> str:
@@ -160,19 +159,6 @@ class KeypointDetectorNode(Node):
         self.get_logger().warning(f"{reason}; images and jaws are forgotten")
         return reason
 
-    @contextmanager
-    def _refusals(self) -> Iterator[None]:
-        """Survive what is wrong with a message, and say it."""
-        try:
-            yield
-        except FinforceError as error:
-            self._refuse(Outcome.of_error(error), self.parameters.sides)
-
-    def _refuse(self, outcome: Outcome, sides: Sequence[str]) -> None:
-        self.get_logger().warning(f"no key points: {outcome.text}", throttle_duration_sec=2.0)
-        for side in sides:
-            self.health[side].refuse(outcome)
-
     def _report(self, side: str, alarms: list[Outcome]) -> Report:
         """Return how one jaw is seen."""
         known = describe(self.feed, self.detector.name, self.found.get(side)) | self.skips.describe()
@@ -180,9 +166,6 @@ class KeypointDetectorNode(Node):
         if monotonic() - self.rested > self.parameters.max_age:
             return report
         return report_of_rest(alarms, report.values)
-
-    def _now(self) -> int:
-        return self.get_clock().now().nanoseconds
 
 
 def main(args: Sequence[str] | None = None) -> int:

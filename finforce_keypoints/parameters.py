@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from finforce.gripper_frames import ROBOT_CAMERA
 from finforce.settings import TimeParameters, check_bounds, setting
-from finforce.skipping import IDLE, STILL
 from finforce.transforms import pose_from_quaternion, pose_numbers
 from finforce_keypoints.errors import DetectorSettingsError
 
@@ -21,7 +20,6 @@ CAMERA = "/camera/camera"
 COLOR_TOPIC, OLD_COLOR_TOPIC = f"{CAMERA}/color/image_raw", f"{CAMERA}/color/image_rect_raw"
 DEPTH_TOPIC = f"{CAMERA}/aligned_depth_to_color/image_raw"
 INFO_TOPIC = f"{CAMERA}/color/camera_info"
-RULES = (STILL, IDLE)  # of what is skipped
 DEPTHS = ALIGNED, AUTO, NO_DEPTH = ("aligned", "auto", "none")
 
 

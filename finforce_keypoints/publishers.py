@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce.messages import CloudColumns
 from finforce.ros import node as ros
 from finforce.transforms import pose_numbers
 from finforce_keypoints.diagnostics import build_skeleton, describe_names, draw_keypoints
@@ -21,35 +19,25 @@ if TYPE_CHECKING:
     from finforce_keypoints.geometry.jaw_localizer import JawKeypoints
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Kept:
-    """The messages of one jaw, and the key points that they were made of."""
-
-    points: NDArray
-    pose: ros.KeptMessage
-    cloud: ros.KeptMessage
-
-
 class DetectorOutputs:
     """The publishers of a key point detector node.
 
     Args:
-        qos: makes publishers and watches them.
+        stage: makes publishers and watches them.
         parameters: which jaws, and the camera's frame.
         names: of the rows of the clouds; sent once, and kept for whoever comes later.
         detector: that finds them.
     """
 
     def __init__(
-        self, qos: ros.QosWatch, parameters: DetectorParameters, names: Sequence[str], detector: KeypointDetector
+        self, stage: ros.Stage, parameters: DetectorParameters, names: Sequence[str], detector: KeypointDetector
     ) -> None:
         sides = parameters.sides
         self._frame, self._skeleton = parameters.camera_frame, build_skeleton(names)
-        self.keypoints = {side: qos.publisher(ros.PointCloud2, f"{side}/keypoints", ros.RESULT) for side in sides}
-        self.pose = {side: qos.publisher(ros.PoseStamped, f"{side}/jaw_pose", ros.RESULT) for side in sides}
-        self.annotated = qos.publisher(ros.Image, "~/annotated", ros.RESULT)
-        self.names = qos.publisher(ros.String, "~/keypoint_names", ros.LATCHED)
-        self._kept: dict[str, _Kept] = {}
+        self.keypoints = {side: stage.publisher(ros.PointCloud2, f"{side}/keypoints", ros.RESULT) for side in sides}
+        self.pose = {side: stage.publisher(ros.PoseStamped, f"{side}/jaw_pose", ros.RESULT) for side in sides}
+        self.annotated = stage.publisher(ros.Image, "~/annotated", ros.RESULT)
+        self.names = stage.publisher(ros.String, "~/keypoint_names", ros.LATCHED)
         self.names.publish(ros.String(data=describe_names(names, detector)))
 
     @property
@@ -59,22 +47,12 @@ class DetectorOutputs:
         return any(output.get_subscription_count() for output in outputs)
 
     def send_jaw(self, side: str, stamp: int, found: JawKeypoints) -> None:
-        """Send the key points of a jaw and its pose, of the image at `stamp` [ns].
-
-        What was sent before is not put together again.
-        """
-        kept = self._kept.get(side)
-        if kept is None or kept.points is not found.points:
-            kept = self._kept[side] = self._build(side, found)
+        """Send the key points of a jaw and its pose, of the image at `stamp` [ns]."""
+        time = ros.stamp_message(stamp)
         # the pose goes first: the contact estimator and the solver work at the same time then
-        ros.send_kept(self.pose[side], kept.pose, stamp)
-        ros.send_kept(self.keypoints[side], kept.cloud, stamp)
-
-    def _build(self, side: str, found: JawKeypoints) -> _Kept:
-        """Return the messages of a jaw, without a stamp."""
-        pose = ros.pose_message(ros.Header(frame_id=self._frame), pose_numbers(found.T_camera_jaw))
-        cloud = CloudColumns(ros.Header(frame_id=f"{side}_jaw"), keypoint_columns(found))
-        return _Kept(points=found.points, pose=ros.KeptMessage(pose), cloud=ros.KeptMessage(cloud))
+        header = ros.Header(stamp=time, frame_id=self._frame)
+        self.pose[side].publish(ros.pose_message(header, pose_numbers(found.T_camera_jaw)))
+        ros.send_cloud(self.keypoints[side], ros.Header(stamp=time, frame_id=f"{side}_jaw"), keypoint_columns(found))
 
     def send_annotated(self, stamp: int, color: NDArray, found: Mapping[str, JawKeypoints]) -> None:
         """Send the image at `stamp` [ns], (h, w, 3), with what was found in it, while someone subscribes."""

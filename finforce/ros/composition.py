@@ -15,8 +15,6 @@ from rclpy.node import Node
 
 from finforce.processors import bind_caller
 from finforce.ros import node as ros
-from finforce.ros.executor import TolerantExecutor
-from finforce.ros.pipeline import Pipeline, Stage
 from finforce.ros.start import NODES
 
 CLASSES = {
@@ -58,11 +56,11 @@ def build_nodes(parts: Sequence[Part]) -> list[Node]:
     Raises:
         FinforceError: one of them cannot be built.
     """
-    pipeline, nodes = Pipeline(), []
+    pipeline, nodes = ros.Pipeline(), []
     for part in parts:
         kind = getattr(import_module(NODES[part.executable]), CLASSES[part.executable])
-        stage = {} if part.executable in APART else {"stage": Stage(pipeline)}
-        nodes.append(kind(**stage, cli_args=["--ros-args", *part.words]))
+        shared = {} if part.executable in APART else {"pipeline": pipeline}
+        nodes.append(kind(**shared, cli_args=["--ros-args", *part.words]))
     pipeline.open()
     return nodes
 
@@ -80,7 +78,7 @@ def spin(parts: Sequence[Part], nodes: Sequence[Node], executor: Executor) -> No
 def _spin_apart(node: Node) -> None:
     """Let one node work in this thread; what nobody catches ends it alone."""
     try:
-        ros.spin([node], TolerantExecutor(context=node.context))
+        ros.spin([node], ros.TolerantExecutor(context=node.context))
     except ExternalShutdownException:
         pass
     except Exception:

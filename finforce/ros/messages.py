@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import array
 import math
-import struct
 from collections.abc import Mapping, Sequence
-from copy import copy
 from functools import lru_cache
 from typing import Any
 
@@ -15,7 +13,6 @@ from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, Twist, TwistStamped, Vector3, Wrench, WrenchStamped
 from numpy.typing import ArrayLike, NDArray
-from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Image, PointCloud2, PointField
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker
@@ -32,30 +29,6 @@ def stamp_message(stamp: int) -> Time:
     """Return integer nanoseconds as a builtin_interfaces/Time."""
     seconds, rest = divmod(stamp, NANOSECONDS)
     return Time(sec=seconds, nanosec=rest)
-
-
-class KeptMessage:
-    """A message with a header, which can be sent again under other stamps without being serialised again.
-
-    Args:
-        message: of any type that begins with a std_msgs/Header, or the columns of a cloud.
-    """
-
-    def __init__(self, message: Any) -> None:
-        self._message = message
-        self._data = bytearray()
-
-    def at(self, stamp: int) -> bytes:
-        """Return the serialised message with a stamp [ns]."""
-        self._data = self._data or bytearray(serialize_message(pack(self._message)))
-        struct.pack_into("<iI" if self._data[1] & 1 else ">iI", self._data, 4, *divmod(stamp, NANOSECONDS))
-        return bytes(self._data)
-
-    def message_at(self, stamp: int) -> Any:
-        """Return the message with a stamp [ns]; all that it has beside its header is shared."""
-        message = copy(self._message)
-        message.header = Header(stamp=stamp_message(stamp), frame_id=self._message.header.frame_id)
-        return message
 
 
 def cloud_message(header: Header, columns: Mapping[str, ArrayLike]) -> PointCloud2:

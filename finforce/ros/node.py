@@ -3,32 +3,29 @@
 from __future__ import annotations
 
 import gc
-import inspect
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import Field, fields
-from functools import partial
+from functools import cache, partial
 from threading import Event, Thread
+from time import perf_counter
 from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: F401 - for those who publish
 from geometry_msgs.msg import PoseStamped, TwistStamped, WrenchStamped  # noqa: F401 - for those who publish
-from numpy.typing import NDArray
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.callback_groups import CallbackGroup
 from rclpy.clock import Clock, ClockType
-from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.exceptions import NameValidationException, ParameterException
-from rclpy.executors import Executor, ExternalShutdownException
+from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.expand_topic_name import expand_topic_name
+from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.qos import DurabilityPolicy, QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
-from rclpy.subscription import Subscription
 from rclpy.task import Future
 from rclpy.validate_full_topic_name import validate_full_topic_name
 from rclpy.validate_topic_name import validate_topic_name
@@ -39,12 +36,9 @@ from visualization_msgs.msg import MarkerArray  # noqa: F401 - for those who pub
 
 from finforce.caches import is_compiled
 from finforce.errors import FinforceError
-from finforce.health import Level, Outcome, Report
-from finforce.messages import CloudColumns
+from finforce.health import Health, Level, Outcome, Report
 from finforce.processors import free_caller
-from finforce.ros.executor import TolerantExecutor
 from finforce.ros.messages import (  # noqa: F401 - for those who publish
-    KeptMessage,
     cloud_message,
     force_stddev,
     grasp_force,
@@ -60,20 +54,25 @@ from finforce.ros.messages import (  # noqa: F401 - for those who publish
     wrench_message,
     xyz_columns,
 )
-from finforce.ros.pipeline import Outlet, Port, Stage
-from finforce.ros.tracing import note, write_trace
+from finforce.ros.topics import (  # noqa: F401 - for those with topics
+    BUFFERED,
+    LATCHED,
+    NEWEST,
+    REQUESTS,
+    RESULT,
+    SENSOR,
+    Outlet,
+    Pipeline,
+    Stage,
+    is_wanted,
+    send_cloud,
+)
+from finforce.ros.tracing import write_trace
 from finforce.ros.transport import CHOICES, PROFILES, TRANSPORT, provide_transport  # noqa: F401 - for tests
 from finforce.settings import ParameterError, RecordT, bounds_of, check_value, constraints, describe, is_parameter
-from finforce.skipping import UNHEARD, Skips
-from finforce.stamps import NANOSECONDS  # noqa: F401 - for those with stamps
+from finforce.stamps import NANOSECONDS
 
-SENSOR = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
-NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)  # whoever is slow misses what was overtaken
-RESULT = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
-STEADY = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)  # the newest alone
-REQUESTS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)  # one that is passed over waits for ever
-LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-
+_GLANCE = 0.1  # [s] between looks at whether a node that is being built is still wanted
 STEADY_CLOCK = Clock(clock_type=ClockType.STEADY_TIME)
 
 provide_transport()  # read when the first context is made, whoever makes it
@@ -153,184 +152,64 @@ def describe_field(entry: Field) -> ParameterDescriptor:
     return text
 
 
-class QosWatch:
-    """Makes a node's ends of topics, and says which do not meet because the two ends ask for different service.
+class ImageNode(Node):
+    """A node that answers images of one jaw or two: what it cannot use is rejected, said and counted.
 
     Attributes:
-        node: whose connections these are.
-
-    Args:
-        node: the same.
-        stage: what the node is in a process of several.
+        health: how each jaw's answers are doing, by side; filled by the node.
+        answer: what is not published of a rejected image, as "wrench".
     """
 
-    def __init__(self, node: Node, stage: Stage | None = None) -> None:
-        self.node, self._stage = node, stage
-        self._suspects: dict[str, tuple[bool, QoSProfile]] = {}
+    answer = "answer"
 
-    @property
-    def fault(self) -> str:
-        """What has stopped this node while others of its process go on; empty while it works."""
-        return self._stage.fault if self._stage else ""
+    def __init__(self, name: str, **options: Any) -> None:
+        super().__init__(name, **options)
+        self.health: dict[str, Health] = {}
 
-    def guard(self, callback: Callable) -> Callable:
-        """Return a callback whose failure stops this node alone, where its process has others."""
-        return self._stage.guard(self.node, callback) if self._stage else callback
+    def now(self) -> int:
+        """Return the time of the node's clock [ns]."""
+        return self.get_clock().now().nanoseconds
 
-    def guard_taker(self, topic: str, callback: Callable) -> Callable:
-        """Return a guarded callback for a topic's messages, after which others of the process may have their turn."""
-        if not inspect.iscoroutinefunction(callback):
-            callback = note(self.node.get_name(), self.node.resolve_topic_name(topic), callback)
-        return self._stage.pipeline.turn(self.guard(callback)) if self._stage else callback
+    def confirm(self, side: str, stamp: int, outcome: Outcome, began: float) -> None:
+        """Count a published answer to an image of `stamp` [ns] that was begun at `began` [s of perf_counter]."""
+        age = (self.now() - stamp) / NANOSECONDS
+        self.health[side].publish(outcome, latency=perf_counter() - began, age=age)
 
-    def afterwards(self, action: Callable[[], None]) -> None:
-        """Do something once the image is through the whole process."""
-        if self._stage:
-            self._stage.pipeline.afterwards(self.guard(action))
-        else:
-            action()
+    @contextmanager
+    def rejections(self, *sides: str) -> Iterator[None]:
+        """Survive what is wrong with a message of some jaws, of all without a name, and say it."""
+        try:
+            yield
+        except FinforceError as error:
+            self.reject(Outcome.of_error(error), *sides)
 
-    def when_open(self, connect: Callable[[], None]) -> None:
-        """Connect to the outside, once all nodes of the process are there."""
-        if self._stage:
-            self._stage.pipeline.when_open(connect)
-        else:
-            connect()
-
-    def publisher(self, kind: type, topic: str, qos: QoSProfile) -> Any:
-        """Create a watched publisher."""
-        events = PublisherEventCallbacks(incompatible_qos=lambda _: self._suspect(topic, True, qos))
-        made = self.node.create_publisher(kind, topic, qos, event_callbacks=events)
-        return self._stage.pipeline.outlet(self.node.resolve_topic_name(topic), made, qos) if self._stage else made
-
-    def subscription(
-        self,
-        kind: type,
-        topic: str,
-        callback: Callable,
-        qos: QoSProfile,
-        *,
-        can_wait: bool = False,
-        **options: Any,
-    ) -> Subscription | Port:
-        """Create a watched subscription.
-
-        Args:
-            kind: of the messages.
-            topic: of the messages.
-            callback: takes them.
-            qos: that is asked for.
-            can_wait: a process of several nodes may go on without this one where it takes long.
-            options: of the subscription, as its callback group.
-        """
-        events = SubscriptionEventCallbacks(incompatible_qos=lambda _: self._suspect(topic, False, qos))
-        guarded = self.guard_taker(topic, callback)
-        subscribe = partial(self.node.create_subscription, kind, topic, guarded, qos, event_callbacks=events, **options)
-        if self._stage is None:
-            return subscribe()
-        port = Port(
-            self._stage,
-            self.node.resolve_topic_name(topic),
-            guarded,
-            subscribe,
-            self.node.destroy_subscription,
-            can_wait=can_wait,
-        )
-        return self._stage.pipeline.add(port)
-
-    def drop(self, subscription: Subscription | Port) -> None:
-        """End a subscription."""
-        if isinstance(subscription, Port):
-            subscription.close()
-        else:
-            self.node.destroy_subscription(subscription)
-
-    def _suspect(self, topic: str, writes: bool, qos: QoSProfile) -> None:
-        self._suspects[self.node.resolve_topic_name(topic)] = (writes, qos)
-        self.node.get_logger().error("; ".join(self.faults()))
-
-    def faults(self) -> list[str]:
-        """Return one sentence per mismatch that still stands."""
-        found = [self._mismatches(topic, *end) for topic, end in self._suspects.items()]
-        return [sentence for sentences in found for sentence in sentences]
-
-    def _mismatches(self, topic: str, writes: bool, qos: QoSProfile) -> list[str]:
-        """Compare our end of a topic with every other end that stands against it."""
-        node, sentences = self.node, []
-        for end in (node.get_subscriptions_info_by_topic if writes else node.get_publishers_info_by_topic)(topic):
-            pair = (qos, end.qos_profile) if writes else (end.qos_profile, qos)
-            verdict, why = qos_check_compatible(*pair)
-            if verdict == QoSCompatibility.ERROR:
-                sentences.append(f"quality of service of {topic} does not match {end.node_name}: {why}")
-        return sentences
+    def reject(self, outcome: Outcome, *sides: str) -> None:
+        """Say why some jaws, all without a name, have no answer."""
+        self.get_logger().warning(f"no {self.answer}: {outcome.text}", throttle_duration_sec=2.0)
+        for side in sides or self.health:
+            self.health[side].refuse(outcome)
 
 
-class LargeSubscription:
-    """A subscription to messages of a megabyte, whose lost pieces come again, unless their publisher keeps nothing.
-
-    Best effort alone loses most of such messages where Fast DDS has its default of 512 kB of shared memory.
-
-    Attributes:
-        current: the subscription; None until all nodes of the process are there.
-
-    Args:
-        qos: makes subscriptions and watches them.
-        kind: of the messages.
-        topic: of the messages.
-        callback: takes them.
-        options: of the subscription, as its callback group.
-    """
-
-    def __init__(self, qos: QosWatch, kind: type, topic: str, callback: Callable, **options: Any) -> None:
-        self._qos, self._node, self._steady = qos, qos.node, True
-        self._asked: Any = (kind, topic, callback)
-        self._options = options
-        self.current: Subscription | Port | None = None
-        qos.when_open(self._connect)
-
-    def _connect(self) -> None:
-        kind, topic, callback = self._asked
-        events = SubscriptionEventCallbacks(incompatible_qos=self._on_mismatch)
-        self.current = self._node.create_subscription(
-            kind, topic, self._qos.guard_taker(topic, callback), STEADY, event_callbacks=events, **self._options
-        )
-
-    def _on_mismatch(self, _: Any) -> None:
-        """Take the messages as they come from a publisher that offers no more."""
-        if self._steady:
-            self._steady = False
-            self._node.get_logger().warning(f"{self._asked[1]} comes with best effort: large messages may be lost")
-            self._node.destroy_subscription(self.current)
-            self.current = self._qos.subscription(*self._asked, SENSOR, **self._options)
-
-
-def is_wanted(publisher: Any, skips: Skips) -> bool:
-    """Say whether anybody subscribes to a topic, whose message need not be made otherwise; that is counted."""
-    wanted = publisher.get_subscription_count() > 0 or not skips.allows(UNHEARD)
-    if not wanted:
-        skips.count(UNHEARD)
-    return wanted
-
-
-def warn_first_start(node: Node) -> None:
-    """Log that a first start compiles, where nothing was compiled before."""
+@cache
+def warn_first_start() -> None:
+    """Log, once in a process, that a first start compiles, where nothing was compiled before."""
     if not is_compiled():
-        node.get_logger().info("compiling, which takes about a minute once; `finforce prepare` does it ahead of time")
+        get_logger("finforce").info(
+            "compiling, which takes about a minute once; `finforce prepare` does it ahead of time"
+        )
 
 
-def publish_diagnostics(
-    node: Node, qos: QosWatch, name: str, period: float, report: Callable[[list[Outcome]], Report]
-) -> None:
-    """Publish a report on /diagnostics every `period` seconds; mismatches of `qos` are its alarms."""
-    publisher = qos.publisher(DiagnosticArray, "/diagnostics", RESULT)
+def publish_diagnostics(stage: Stage, name: str, period: float, report: Callable[[list[Outcome]], Report]) -> None:
+    """Publish a report on /diagnostics every `period` seconds; mismatches of the stage are its alarms."""
+    node, publisher = stage.node, stage.publisher(DiagnosticArray, "/diagnostics", RESULT)
 
     def make() -> Report | None:
-        return report([Outcome(level=Level.ERROR, reason="qos", text=fault) for fault in qos.faults()])
+        return report([Outcome(level=Level.ERROR, reason="qos", text=fault) for fault in stage.mismatches()])
 
-    guarded = qos.guard(make)
+    guarded = stage.guard(make)
 
     def publish() -> None:
-        made = guarded() or Report(level=Level.ERROR, message=f"stopped by {qos.fault}; start the process again")
+        made = guarded() or Report(level=Level.ERROR, message=f"stopped by {stage.fault}; start the process again")
         status = status_message(name, node.get_name(), made)
         publisher.publish(DiagnosticArray(header=Header(stamp=node.get_clock().now().to_msg()), status=[status]))
 
@@ -338,18 +217,18 @@ def publish_diagnostics(
     node.create_timer(period, publish, clock=STEADY_CLOCK)
 
 
-def serve_trigger(qos: QosWatch, name: str, action: Callable[[], str], group: CallbackGroup | None = None) -> None:
+def serve_trigger(stage: Stage, name: str, action: Callable[[], str], group: CallbackGroup | None = None) -> None:
     """Offer an action as a Trigger service, aside in a group if it takes long; a refusal comes back as the message."""
-    _serve(qos, Trigger, name, lambda _: action(), group)
+    _serve(stage, Trigger, name, lambda _: action(), group)
 
 
-def serve_switch(qos: QosWatch, name: str, action: Callable[[bool], str]) -> None:
+def serve_switch(stage: Stage, name: str, action: Callable[[bool], str]) -> None:
     """Offer an action that is told yes or no as a SetBool service; what it refuses comes back as the message."""
-    _serve(qos, SetBool, name, lambda request: action(request.data), None)
+    _serve(stage, SetBool, name, lambda request: action(request.data), None)
 
 
-def _serve(qos: QosWatch, kind: type, name: str, action: Callable[[Any], str], group: CallbackGroup | None) -> None:
-    node = qos.node
+def _serve(stage: Stage, kind: type, name: str, action: Callable[[Any], str], group: CallbackGroup | None) -> None:
+    node = stage.node
 
     def act(request: Any) -> tuple[bool, str]:
         try:
@@ -357,10 +236,10 @@ def _serve(qos: QosWatch, kind: type, name: str, action: Callable[[Any], str], g
         except FinforceError as error:
             return False, str(error)
 
-    guarded = qos.guard(act)
+    guarded = stage.guard(act)
 
     def attempt(request: Any) -> tuple[bool, str]:
-        return guarded(request) or (False, f"stopped by {qos.fault}; start the process again")
+        return guarded(request) or (False, f"stopped by {stage.fault}; start the process again")
 
     async def answer(request: Any, response: Any) -> Any:
         answered = await run_aside(node, partial(attempt, request)) if group else attempt(request)
@@ -386,41 +265,16 @@ async def run_aside(node: Node, action: Callable[[], Any]) -> Any:
     return await done
 
 
-def send_cloud(publisher: Any, header: Header, columns: Mapping[str, NDArray]) -> None:
-    """Publish a cloud of columns (n,), which is packed only where it leaves the process."""
-    cloud = CloudColumns(header, columns)
-    publisher.publish(cloud if isinstance(publisher, Outlet) else pack(cloud))
+class TolerantExecutor(SingleThreadedExecutor):
+    """Drops bytes that are no message of their topic's type; rclpy's own executor would end with the node."""
 
-
-def send_kept(publisher: Any, kept: KeptMessage, stamp: int) -> None:
-    """Publish a kept message under a stamp [ns]."""
-    publisher.publish(kept.message_at(stamp) if isinstance(publisher, Outlet) else kept.at(stamp))
-
-
-def take_waiting(subscription: Subscription | Port) -> Iterator[Any]:
-    """Yield the messages that wait to be taken, which would have their turn later."""
-    if isinstance(subscription, Port):
-        subscription = subscription.outside
-    if subscription is None:
-        return  # it is of the same process, where nothing waits
-    yield from _take_all(subscription)
-
-
-_GLANCE = 0.1  # [s] between looks at whether a node that is being built is still wanted
-_MOST_WAITING = 1000  # messages, more than any queue keeps
-
-
-def _take_all(subscription: Subscription) -> Iterator[Any]:
-    """Yield the messages that wait in a subscription; bytes that are none are passed over."""
-    with (handle := subscription.handle):
-        for _ in range(_MOST_WAITING):
-            try:
-                taken = handle.take_message(subscription.msg_type, subscription.raw)
-            except RuntimeError:  # the middleware's error of bytes that it cannot read; they are taken all the same
-                continue
-            if taken is None:
-                return
-            yield taken[0]
+    def _take_subscription(self, sub: Any) -> Any:
+        """Return what calls back with a message; nothing for one that the middleware cannot read."""
+        try:
+            return super()._take_subscription(sub)
+        except RuntimeError as error:
+            get_logger("finforce").warning(f"dropped a message on {sub.topic_name}: {error}", throttle_duration_sec=2.0)
+            return None
 
 
 def run_node(

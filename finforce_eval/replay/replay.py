@@ -9,8 +9,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
+from finforce.health import IDLE
 from finforce.ros.tracing import FOLDER
-from finforce.skipping import IDLE
 from finforce.systems.processes import Process, ReplayOptions, compose, replay_processes
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.contact_source import FIXED, ContactChoice

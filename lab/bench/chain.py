@@ -24,7 +24,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from finforce.skipping import IDLE
+from finforce.health import IDLE
 from finforce.stamps import NANOSECONDS
 from finforce.systems.processes import Process, ReplayOptions, compose, replay_processes
 from finforce_eval.errors import OptionError

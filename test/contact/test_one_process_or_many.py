@@ -11,7 +11,7 @@ from sensor_msgs.msg import PointCloud2
 
 import finforce as ff
 from finforce.ros import node as ros
-from finforce.ros.pipeline import Pipeline, Stage
+from finforce.ros.topics import Pipeline
 from finforce_contact.node import ContactEstimatorNode
 from finforce_ifea.node import IfeaSolverNode
 
@@ -22,11 +22,11 @@ PATIENT = {"max_age": 60.0, "skip_off": ["idle image"]}
 class Detector(Node):
     """Says the poses and key points of the left jaw, as a key point detector does."""
 
-    def __init__(self, stage, context):
+    def __init__(self, pipeline, context):
         super().__init__("detector", context=context)
-        self.qos = ros.QosWatch(self, stage)
-        self.pose = self.qos.publisher(PoseStamped, "left/jaw_pose", ros.RESULT)
-        self.cloud = self.qos.publisher(PointCloud2, "left/keypoints", ros.RESULT)
+        self.stage = ros.Stage(self, pipeline)
+        self.pose = self.stage.publisher(PoseStamped, "left/jaw_pose", ros.RESULT)
+        self.cloud = self.stage.publisher(PointCloud2, "left/keypoints", ros.RESULT)
 
     def say(self, stamp, image):
         self.pose.publish(pose(stamp, T_CAMERA_JAW))
@@ -43,13 +43,12 @@ def read_images():
 def solve(probe, composed, mesh, images, shift):
     """Force, torque and their deviations of every image, by one process or by many."""
     pipeline = Pipeline()
-    stage = (lambda: Stage(pipeline)) if composed else lambda: None
 
     def build(kind, **given):
         overrides = [Parameter(name, value=value) for name, value in (PATIENT | given).items()]
-        return kind(stage=stage(), context=probe.context, parameter_overrides=overrides)
+        return kind(pipeline=pipeline if composed else None, context=probe.context, parameter_overrides=overrides)
 
-    detector = Detector(stage(), probe.context)
+    detector = Detector(pipeline if composed else None, probe.context)
     contact = build(
         ContactEstimatorNode,
         jaws="left",

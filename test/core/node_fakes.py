@@ -20,7 +20,7 @@ from std_msgs.msg import Header
 
 from finforce.errors import ObservationError
 from finforce.ros import node as ros
-from finforce.ros.executor import TolerantExecutor
+from finforce.ros.node import TolerantExecutor
 from finforce.ros.transport import free_domain
 from finforce_ifea.errors import UnderLoadError
 from finforce_ifea.jaw.jaw import load_jaw

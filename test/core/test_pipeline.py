@@ -20,9 +20,9 @@ from finforce.errors import ObservationError
 from finforce.health import Level, Report
 from finforce.messages import CloudColumns, decode_columns, stamp_of
 from finforce.ros import node as ros
-from finforce.ros import pipeline as pipeline_module
+from finforce.ros import topics
 from finforce.ros.composition import read_part
-from finforce.ros.pipeline import Pipeline, Stage
+from finforce.ros.topics import Pipeline
 from finforce_ifea.node import IfeaSolverNode
 
 
@@ -31,13 +31,13 @@ class Relay(Node):
 
     def __init__(self, pipeline, name, hears, says="", **options):
         super().__init__(name, context=options.pop("context"))
-        self.qos = ros.QosWatch(self, Stage(pipeline))
+        self.stage = ros.Stage(self, pipeline)
         self.heard, self.fails, self.takes = [], False, 0.0
-        self.out = self.qos.publisher(PointCloud2, says, ros.RESULT) if says else None
-        self.port = self.qos.subscription(PointCloud2, hears, self.take, ros.SENSOR, **options) if hears else None
-        ros.serve_trigger(self.qos, "~/ask", self.answer)
+        self.out = self.stage.publisher(PointCloud2, says, ros.RESULT) if says else None
+        self.port = self.stage.subscription(PointCloud2, hears, self.take, ros.SENSOR, **options) if hears else None
+        ros.serve_trigger(self.stage, "~/ask", self.answer)
         report = Report(level=Level.OK, message="well")
-        ros.publish_diagnostics(self, self.qos, name, 0.05, lambda alarms: report)
+        ros.publish_diagnostics(self.stage, name, 0.05, lambda alarms: report)
 
     def take(self, message):
         if self.fails:
@@ -96,7 +96,7 @@ def test_a_message_is_through_before_its_publisher_goes_on_and_is_the_same_objec
 def test_nothing_is_packed_for_nobody_and_everything_for_who_listens_outside(line, probe, monkeypatch):
     first, second, third = line
     packed = []
-    monkeypatch.setattr(pipeline_module, "pack", lambda message: packed.append(message) or ros.pack(message))
+    monkeypatch.setattr(topics, "pack", lambda message: packed.append(message) or ros.pack(message))
 
     def clouds():
         return [message for message in packed if isinstance(message, CloudColumns)]  # diagnostics go out, too
@@ -122,8 +122,6 @@ def test_a_topic_that_no_stage_publishes_comes_from_outside(probe):
     out.publish(keypoint_cloud(7))
     work(probe, executor, lambda: node.heard)
     assert stamp_of(node.heard[0]) == 7 and node.heard[0].width == 15
-    node.qos.drop(node.port)
-    work(probe, executor, lambda: out.get_subscription_count() == 0)
     node.destroy_node()
 
 
@@ -133,8 +131,8 @@ def test_a_fault_stops_one_stage_and_says_so_while_the_others_go_on(line, probe)
     first.say(COLUMNS)
     second.fails = False
     first.say(COLUMNS)
-    assert not second.heard and not third.heard and not third.qos.fault
-    assert second.qos.fault == "ValueError: no way"
+    assert not second.heard and not third.heard and not third.stage.fault
+    assert second.stage.fault == "ValueError: no way"
 
     def states(name):
         arrays = probe.got["/diagnostics"][-6:]
@@ -153,11 +151,11 @@ def test_a_service_that_fails_stops_its_stage_and_answers(line, probe):
     answer = client.call_async(Trigger.Request())
     first.work(answer.done)
     assert not answer.result().success and "no answer" in answer.result().message
-    assert second.qos.fault and not first.qos.fault
+    assert second.stage.fault and not first.stage.fault
 
 
 def test_nobody_waits_for_a_stage_that_takes_longer_than_its_budget(probe, monkeypatch):
-    monkeypatch.setattr(pipeline_module, "WATCHED", 3)
+    monkeypatch.setattr(topics, "WATCHED", 3)
     pipeline, order = Pipeline(), []
     source = Relay(pipeline, "source", "", "one", context=probe.context)
     slow = Relay(pipeline, "slow", "one", context=probe.context, can_wait=True)
@@ -168,7 +166,7 @@ def test_nobody_waits_for_a_stage_that_takes_longer_than_its_budget(probe, monke
     say = pipeline.turn(lambda _: source.say(COLUMNS))
     say(None)
     assert order == ["slow", "quick"]
-    slow.port._times.extend([2.0 * pipeline_module.BUDGET] * 3)
+    slow.port._times.extend([2.0 * topics.BUDGET] * 3)
     say(None)
     assert order[2:] == ["quick", "slow"]  # after the others, and with its own image
     for _ in range(3):
@@ -181,15 +179,15 @@ def test_nobody_waits_for_a_stage_that_takes_longer_than_its_budget(probe, monke
 
 def test_what_no_force_waits_for_is_done_once_the_outermost_callback_has_returned(line):
     first, second, _ = line
-    pipeline, order = first.qos._stage.pipeline, []
+    pipeline, order = first.stage.pipeline, []
 
     def take(_):
-        second.qos.afterwards(lambda: order.append("later"))
+        second.stage.afterwards(lambda: order.append("later"))
         order.append("now")
 
     pipeline.turn(take)(None)
     assert order == ["now", "later"]
-    second.qos.afterwards(lambda: order.append("at once"))  # nobody is at work
+    second.stage.afterwards(lambda: order.append("at once"))  # nobody is at work
     assert order[2:] == ["at once"]
 
 
@@ -199,7 +197,7 @@ def test_a_solver_in_a_pipeline_solves_what_it_is_handed(probe):
     overrides = [Parameter("contact_height", value=0.04), Parameter("max_age", value=60.0)]
     estimator = FakeEstimator()
     solver = IfeaSolverNode(
-        lambda *_: estimator, stage=Stage(pipeline), context=probe.context, parameter_overrides=overrides
+        lambda *_: estimator, pipeline=pipeline, context=probe.context, parameter_overrides=overrides
     )
     pipeline.open()
     stamp = solver.get_clock().now().to_msg()

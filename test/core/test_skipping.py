@@ -9,15 +9,13 @@ import pytest
 from contact_fakes import JAW, cylinder
 from estimator_fakes import BENCH, CALIBRATION, PERIOD, magnitudes, ramp, record
 
-from finforce import skipping as rules
-from finforce.skipping import ALL, EVERYWHERE, SkippingError, Skips
+from finforce.health import ALL, IDLE, RULES, STILL, SkippingError, Skips
 from finforce.stamps import Idling
 from finforce_contact.estimator import ContactEstimator
 from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.observation import Contact, ObjectOutline
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tracking.influence import AWAY, is_out_of_reach
-from finforce_keypoints.parameters import RULES as DETECTOR
 
 RADIUS, HEIGHT = 0.0125, 0.040
 DEPTHS = ramp(2, 0)
@@ -28,18 +26,18 @@ TENTH = 100_000_000  # ns
 class TestRules:
     def test_only_rules_that_exist_can_be_off(self):
         with pytest.raises(SkippingError, match="no rule 'no object'; expected .*nothing moved"):
-            Skips(rules.CONTACT, ("no object",))
-        assert Skips(rules.CONTACT, ("",)).allows(rules.STILL)
+            Skips(("no object",))
+        assert Skips(("",)).allows(STILL)
 
     def test_one_rule_or_all_can_be_off(self):
-        one, everything = Skips(rules.CONTACT, (rules.STILL,)), Skips(rules.CONTACT, (ALL,))
-        assert not one.allows(rules.STILL) and one.allows(rules.IDLE)
-        assert not any(everything.allows(rule) for rule in (*rules.CONTACT, *EVERYWHERE))
+        one, everything = Skips((STILL,)), Skips((ALL,))
+        assert not one.allows(STILL) and one.allows(IDLE)
+        assert not any(everything.allows(rule) for rule in RULES)
 
     def test_the_diagnostics_say_how_often_each_was_applied(self):
-        skips = Skips(rules.CONTACT, (rules.IDLE,))
-        skips.count(rules.STILL)
-        skips.count(rules.STILL, 2)
+        skips = Skips((IDLE,))
+        skips.count(STILL)
+        skips.count(STILL, 2)
         said = skips.describe()
         assert (said["skipped: nothing moved"], said["skipped: idle image"]) == ("3", "off")
 
@@ -47,8 +45,7 @@ class TestRules:
         page = (Path(__file__).parents[2] / "docs" / "skipping.md").read_text(encoding="utf-8")
         table = page.partition("\n## The rules")[2].partition("\n## ")[0]
         listed = re.findall(r"^\| `([^`]+)` \|", table, flags=re.MULTILINE)
-        counted = {*EVERYWHERE, *rules.SOLVER, *rules.CONTACT, *DETECTOR}
-        assert sorted(listed) == sorted(counted)
+        assert sorted(listed) == sorted(RULES)
 
 
 class TestIdling:
@@ -162,7 +159,7 @@ class TestAnObjectOutOfReach:
 class TestContactThatNeedNotBeLookedFor:
     def follow(self, off, gap, noise):
         """Mean heights (n,) [m] and touch (n,) of a cylinder whose pose trembles before the undeformed jaw."""
-        estimator = ContactEstimator(JAW, mesh=cylinder(), skips=Skips(rules.CONTACT, off))
+        estimator = ContactEstimator(JAW, mesh=cylinder(), skips=Skips(off))
         random, heights, touching = np.random.default_rng(3), [], []
         for frame in range(40):
             T = np.eye(4)

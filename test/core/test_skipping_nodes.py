@@ -9,7 +9,7 @@ from geometry_msgs.msg import WrenchStamped
 from node_fakes import FakeEstimator, keypoint_cloud, ros_domain, start_solver
 from sensor_msgs.msg import PointCloud2
 
-from finforce.skipping import ALL, IDLE, UNHEARD
+from finforce.health import ALL, IDLE, UNHEARD
 
 TENTH = 100_000_000
 AWAY_GAP, NEAR_GAP = 0.03, 0.001
@@ -35,9 +35,9 @@ def counted(node, rule):
 class TestSolver:
     def send(self, probe, node, out, stamps):
         for stamp in stamps:
-            before = node.health._arrived
+            before = node.health["left"]._arrived
             out.publish(keypoint_cloud(stamp))
-            probe.wait_for(lambda before=before: node.health._arrived > before)
+            probe.wait_for(lambda before=before: node.health["left"]._arrived > before)
 
     def begin(self, probe, estimator, *topics, **parameters):
         for topic in topics:

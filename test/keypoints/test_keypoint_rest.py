@@ -8,9 +8,8 @@ import pytest
 from keypoint_node_fakes import JAW, MILLISECOND, CameraBench, FakeKeypoints
 from sensor_msgs.msg import PointCloud2
 
-from finforce.health import Level
+from finforce.health import IDLE, STILL, UNHEARD, Level
 from finforce.messages import stamp_of
-from finforce.skipping import IDLE, STILL, UNHEARD
 
 PERIOD = 100 * MILLISECOND  # of the answers while nothing moves
 

@@ -1,0 +1,358 @@
+"""The topics of nodes, also of several in one process: there messages go from one to the next as they are."""
+
+from __future__ import annotations
+
+import inspect
+import traceback
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from statistics import median
+from time import perf_counter
+from typing import Any
+
+from numpy.typing import NDArray
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
+from rclpy.subscription import Subscription
+from std_msgs.msg import Header
+
+from finforce.health import UNHEARD, Skips
+from finforce.messages import CloudColumns
+from finforce.ros.messages import pack
+from finforce.ros.tracing import note
+
+SENSOR = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+BUFFERED = QoSProfile(depth=20, reliability=ReliabilityPolicy.BEST_EFFORT)  # a tenth of a second, and more
+NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)  # whoever is slow misses what was overtaken
+RESULT = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+STEADY = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)  # the newest alone
+REQUESTS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)  # one that is passed over waits for ever
+LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+BUDGET = 5e-3  # [s] that a stage may take before those that could go on without it do
+WATCHED = 15  # messages over which that is judged
+_MOST_WAITING = 1000  # messages, more than any queue keeps
+
+
+class Pipeline:
+    """The topics between the nodes of one process, which are its stages.
+
+    A message is taken by all stages that wait for it before its publisher goes on, so that an image is through once the
+    first stage has done with it. Of a stage that takes more than its budget the others do not wait: it has its turn
+    after them, with the newest message.
+
+    Args:
+        is_shared: whether there are several nodes; they are connected by `open`, and a fault stops one of them alone.
+    """
+
+    def __init__(self, is_shared: bool = True) -> None:
+        self.is_shared, self._is_open = is_shared, not is_shared
+        self._ports: dict[str, list[Port]] = {}
+        self._topics: set[str] = set()
+        self._waiting: dict[Port, Any] = {}
+        self._left: deque[Callable[[], None]] = deque()
+        self._delayed: list[Callable[[], None]] = []
+        self._depth = 0
+
+    def publishes(self, topic: str) -> bool:
+        """Say whether a stage publishes a topic."""
+        return topic in self._topics
+
+    def count_ports(self, topic: str) -> int:
+        """Return how many stages take a topic's messages from another one."""
+        return len(self._ports.get(topic, ())) if topic in self._topics else 0
+
+    def add(self, port: Port) -> Port:
+        """Take a subscription; before `open` it waits for who may publish."""
+        self._ports.setdefault(port.topic, []).append(port)
+        self.when_open(port.connect)
+        return port
+
+    def when_open(self, connect: Callable[[], None]) -> None:
+        """Do something once all stages are there."""
+        if self._is_open:
+            connect()
+        else:
+            self._delayed.append(connect)
+
+    def outlet(self, topic: str, publisher: Publisher, qos: QoSProfile) -> Outlet:
+        """Return what publishes a topic, inside and outside."""
+        self._topics.add(topic)
+        return Outlet(self, topic, publisher, qos)
+
+    def open(self) -> None:
+        """Connect the stages, all of which are there."""
+        self._is_open = True
+        while self._delayed:
+            self._delayed.pop(0)()
+
+    def hand_on(self, topic: str, message: Any) -> None:
+        """Give a message to the stages that take it."""
+        for port in tuple(self._ports.get(topic, ())):
+            if port.outside is not None or not self._is_open:
+                continue
+            if port.is_slow:
+                self._waiting[port] = message
+            else:
+                port.take(message)
+
+    def turn(self, callback: Callable) -> Callable:
+        """Return a callback for messages, after which those have their turn that nobody waited for."""
+        if inspect.iscoroutinefunction(callback):
+            return callback
+
+        def call(message: Any) -> None:
+            self._depth += 1
+            try:
+                callback(message)
+            finally:
+                self._depth -= 1
+                self._catch_up()
+
+        return call
+
+    def afterwards(self, action: Callable[[], None]) -> None:
+        """Do something once the outermost callback has returned."""
+        self._left.append(action)
+        self._catch_up()
+
+    def _catch_up(self) -> None:
+        while self._waiting and not self._depth:
+            port, message = self._waiting.popitem()
+            port.take(message)
+        while self._left and not self._depth:
+            self._left.popleft()()
+
+
+class Port:
+    """A subscription, to another stage of the process or to what comes from outside.
+
+    Attributes:
+        topic: its full name.
+        outside: the subscription to what comes from outside; None while there is none.
+
+    Args:
+        pipeline: of the process.
+        topic: the same.
+        callback: takes messages, guarded.
+        subscribe: makes the subscription to what comes from outside.
+        can_wait: whether the process goes on without it where it takes too long.
+    """
+
+    def __init__(
+        self,
+        pipeline: Pipeline,
+        topic: str,
+        callback: Callable,
+        subscribe: Callable[[], Subscription],
+        can_wait: bool = False,
+    ) -> None:
+        self.topic, self._pipeline, self._callback = topic, pipeline, callback
+        self._subscribe, self._can_wait = subscribe, can_wait
+        self._times: deque[float] = deque(maxlen=WATCHED)
+        self.outside: Subscription | None = None
+
+    def connect(self) -> None:
+        """Subscribe to what comes from outside, if no stage of this process publishes it."""
+        if not self._pipeline.publishes(self.topic):
+            self.outside = self._subscribe()
+
+    @property
+    def is_slow(self) -> bool:
+        """Whether it takes more than its budget, and others need not wait for it."""
+        return self._can_wait and len(self._times) == WATCHED and median(self._times) > BUDGET
+
+    def take(self, message: Any) -> None:
+        """Take a message of another stage."""
+        before = perf_counter()
+        self._callback(message)
+        self._times.append(perf_counter() - before)
+
+    def take_waiting(self) -> Iterator[Any]:
+        """Yield the messages that wait to be taken, which would have their turn later; bytes that are none are dropped.
+
+        Of another stage of the same process nothing ever waits.
+        """
+        if self.outside is None:
+            return
+        with (handle := self.outside.handle):
+            for _ in range(_MOST_WAITING):
+                try:
+                    taken = handle.take_message(self.outside.msg_type, self.outside.raw)
+                except RuntimeError:  # the middleware's error of bytes that it cannot read; they are taken all the same
+                    continue
+                if taken is None:
+                    return
+                yield taken[0]
+
+
+class Outlet:
+    """A publisher of a stage: to other stages as it is, to listeners outside serialised, where there are any.
+
+    Args:
+        pipeline: of the process.
+        topic: its full name.
+        publisher: to the outside.
+        qos: what it keeps for listeners that come later.
+    """
+
+    def __init__(self, pipeline: Pipeline, topic: str, publisher: Publisher, qos: QoSProfile) -> None:
+        self._pipeline, self._topic, self._publisher = pipeline, topic, publisher
+        self._is_kept = qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
+
+    def publish(self, message: Any) -> None:
+        """Publish a message; of `CloudColumns` the cloud, packed only where it leaves the process."""
+        self._pipeline.hand_on(self._topic, message)
+        if self._is_kept or self._publisher.get_subscription_count():
+            self._publisher.publish(pack(message))
+
+    def get_subscription_count(self) -> int:
+        """Return how many listen, here and outside."""
+        return self._pipeline.count_ports(self._topic) + self._publisher.get_subscription_count()
+
+
+class Stage:
+    """One node's ends of topics: says which do not meet because the two ends ask for different service.
+
+    Attributes:
+        node: whose ends these are.
+        pipeline: of its process.
+        fault: what has stopped this node while others of its process go on; empty while it works.
+
+    Args:
+        node: the same.
+        pipeline: the same; None where the node is alone.
+    """
+
+    def __init__(self, node: Node, pipeline: Pipeline | None = None) -> None:
+        self.node, self.pipeline, self.fault = node, pipeline or Pipeline(is_shared=False), ""
+        self._suspects: dict[str, tuple[bool, QoSProfile]] = {}
+
+    def guard(self, callback: Callable) -> Callable:
+        """Return a callback whose failure stops this node alone, where its process has others; then it does nothing."""
+        if not self.pipeline.is_shared:
+            return callback
+        if inspect.iscoroutinefunction(callback):
+
+            async def wait(*words: Any) -> Any:
+                try:
+                    return None if self.fault else await callback(*words)
+                except Exception as error:
+                    return self._stop(error)
+
+            return wait
+
+        def call(*words: Any) -> Any:
+            try:
+                return None if self.fault else callback(*words)
+            except Exception as error:
+                return self._stop(error)
+
+        return call
+
+    def _stop(self, error: Exception) -> None:
+        """Stop for an error, unless the process ends anyway."""
+        if not self.node.context.ok():
+            raise error
+        self.fault = f"{type(error).__name__}: {error}"
+        self.node.get_logger().error(f"this stage has stopped, the others go on\n{traceback.format_exc()}")
+
+    def guard_taker(self, topic: str, callback: Callable) -> Callable:
+        """Return a guarded callback for a topic's messages, after which others of the process may have their turn."""
+        if not inspect.iscoroutinefunction(callback):
+            callback = note(self.node.get_name(), self.node.resolve_topic_name(topic), callback)
+        return self.pipeline.turn(self.guard(callback))
+
+    def afterwards(self, action: Callable[[], None]) -> None:
+        """Do something once the image is through the whole process."""
+        self.pipeline.afterwards(self.guard(action))
+
+    def publisher(self, kind: type, topic: str, qos: QoSProfile) -> Outlet:
+        """Create a watched publisher."""
+        events = PublisherEventCallbacks(incompatible_qos=lambda _: self._suspect(topic, True, qos))
+        made = self.node.create_publisher(kind, topic, qos, event_callbacks=events)
+        return self.pipeline.outlet(self.node.resolve_topic_name(topic), made, qos)
+
+    def subscription(
+        self, kind: type, topic: str, callback: Callable, qos: QoSProfile, *, can_wait: bool = False, **options: Any
+    ) -> Port:
+        """Create a watched subscription.
+
+        Args:
+            kind: of the messages.
+            topic: of the messages.
+            callback: takes them.
+            qos: that is asked for.
+            can_wait: a process of several nodes may go on without this one where it takes long.
+            options: of the subscription, as its callback group.
+        """
+        events = SubscriptionEventCallbacks(incompatible_qos=lambda _: self._suspect(topic, False, qos))
+        guarded = self.guard_taker(topic, callback)
+
+        def subscribe() -> Subscription:
+            return self.node.create_subscription(kind, topic, guarded, qos, event_callbacks=events, **options)
+
+        return self.pipeline.add(
+            Port(self.pipeline, self.node.resolve_topic_name(topic), guarded, subscribe, can_wait=can_wait)
+        )
+
+    def large_subscription(self, kind: type, topic: str, callback: Callable, **options: Any) -> None:
+        """Subscribe to messages of a megabyte from outside, whose lost pieces come again, unless nobody keeps them.
+
+        Best effort alone loses most of such messages where Fast DDS has its default of 512 kB of shared memory. From a
+        publisher that offers no more, the messages are taken as they come.
+
+        Args:
+            kind: of the messages.
+            topic: of the messages.
+            callback: takes them.
+            options: of the subscription, as its callback group.
+        """
+        made: list[Subscription] = []
+
+        def take_as_it_comes(_: Any) -> None:
+            if made:
+                self.node.get_logger().warning(f"{topic} comes with best effort: large messages may be lost")
+                self.node.destroy_subscription(made.pop())
+                self.subscription(kind, topic, callback, SENSOR, **options)
+
+        def connect() -> None:
+            events = SubscriptionEventCallbacks(incompatible_qos=take_as_it_comes)
+            taker = self.guard_taker(topic, callback)
+            made.append(self.node.create_subscription(kind, topic, taker, STEADY, event_callbacks=events, **options))
+
+        self.pipeline.when_open(connect)
+
+    def _suspect(self, topic: str, writes: bool, qos: QoSProfile) -> None:
+        self._suspects[self.node.resolve_topic_name(topic)] = (writes, qos)
+        self.node.get_logger().error("; ".join(self.mismatches()))
+
+    def mismatches(self) -> list[str]:
+        """Return one sentence per mismatch that still stands."""
+        found = [self._mismatches_of(topic, *end) for topic, end in self._suspects.items()]
+        return [sentence for sentences in found for sentence in sentences]
+
+    def _mismatches_of(self, topic: str, writes: bool, qos: QoSProfile) -> list[str]:
+        """Compare our end of a topic with every other end that stands against it."""
+        node, sentences = self.node, []
+        for end in (node.get_subscriptions_info_by_topic if writes else node.get_publishers_info_by_topic)(topic):
+            pair = (qos, end.qos_profile) if writes else (end.qos_profile, qos)
+            compatibility, why = qos_check_compatible(*pair)
+            if compatibility == QoSCompatibility.ERROR:
+                sentences.append(f"quality of service of {topic} does not match {end.node_name}: {why}")
+        return sentences
+
+
+def is_wanted(publisher: Outlet, skips: Skips) -> bool:
+    """Say whether anybody subscribes to a topic, whose message need not be made otherwise; that is counted."""
+    wanted = publisher.get_subscription_count() > 0 or not skips.allows(UNHEARD)
+    if not wanted:
+        skips.count(UNHEARD)
+    return wanted
+
+
+def send_cloud(publisher: Outlet, header: Header, columns: Mapping[str, NDArray]) -> None:
+    """Publish a cloud of columns (n,), which is packed only where it leaves the process."""
+    publisher.publish(CloudColumns(header, columns))
