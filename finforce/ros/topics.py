@@ -191,26 +191,29 @@ class Port:
 class Outlet:
     """A publisher of a stage: to other stages as it is, to listeners outside serialised, where there are any.
 
+    Attributes:
+        topic_name: the full name of the topic.
+
     Args:
         pipeline: of the process.
-        topic: its full name.
+        topic: the same.
         publisher: to the outside.
         qos: what it keeps for listeners that come later.
     """
 
     def __init__(self, pipeline: Pipeline, topic: str, publisher: Publisher, qos: QoSProfile) -> None:
-        self._pipeline, self._topic, self._publisher = pipeline, topic, publisher
+        self.topic_name, self._pipeline, self._publisher = topic, pipeline, publisher
         self._is_kept = qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
 
     def publish(self, message: Any) -> None:
         """Publish a message; of `CloudColumns` the cloud, packed only where it leaves the process."""
-        self._pipeline.hand_on(self._topic, message)
+        self._pipeline.hand_on(self.topic_name, message)
         if self._is_kept or self._publisher.get_subscription_count():
             self._publisher.publish(pack(message))
 
     def get_subscription_count(self) -> int:
         """Return how many listen, here and outside."""
-        return self._pipeline.count_ports(self._topic) + self._publisher.get_subscription_count()
+        return self._pipeline.count_ports(self.topic_name) + self._publisher.get_subscription_count()
 
 
 class Stage:

@@ -79,7 +79,7 @@ def test_bytes_that_are_no_message_cost_themselves(probe, topic):
 
 def test_images_that_announce_more_than_they_hold_are_refused(probe):
     node, refused = start_detector(probe), []
-    node._refuse = lambda outcome, sides: refused.append(outcome.text)
+    node.reject = lambda outcome, *sides: refused.append(outcome.text)
     probe.hear("/left/keypoints", PointCloud2)
     probe.wait_for(lambda: node.out.are_heard)
     seen = Header(frame_id="camera_color_optical_frame")
