@@ -10,8 +10,8 @@ from keypoint_node_fakes import CameraBench
 from node_fakes import KEYPOINTS, FakeEstimator, keypoint_cloud, start_solver
 from rgbd_fakes import FakeDetector, make_footage
 
+from finforce.health import IDLE
 from finforce.messages import stamp_of
-from finforce.skipping import IDLE
 from finforce.stamps import Idling
 from finforce_contact.loop import GivenContact
 from finforce_eval.cli.main import parse
