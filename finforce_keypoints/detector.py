@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,18 @@ _FEW, _MEMORY = 0.4, 45  # share of a jaw's key points that are too few on avera
 _PRACTICE_SIZE, _RATE = (640, 480), 30.0  # px, Hz
 _SCALE_DRIFT = 1e-3  # [1/s^0.5] random walk of the depth scale's error
 _LEAST_SCALE_STDDEV = 5e-4  # images do not err independently: no average is better than this
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Sight:
+    """What the colours of an image show: key points by side where nothing has moved, else the pixels found.
+
+    `is_watched` says whether anybody looked for motion.
+    """
+
+    is_watched: bool
+    still: Mapping[str, JawKeypoints] | None
+    detections: Mapping[str, PixelDetection]
 
 
 class KeypointDetector:
@@ -87,6 +99,7 @@ class KeypointDetector:
         self._stamp: float | None = None
         self._looks, self._shares = dict.fromkeys(self._jaws, 0), dict.fromkeys(self._jaws, 0.0)
         self._scale = DepthScale(error=0.0, stddev=self.settings.scale_stddev)
+        self._sights: dict[float, _Sight] = {}
         self.was_still = False
         self.counts: Counter[str] = Counter()
 
@@ -166,24 +179,43 @@ class KeypointDetector:
                 "reset for a new recording"
             )
         self._drift(image.stamp)
-        watch = self._still_watch
-        if watch is None or not all(jaw.is_settled for jaw in self._jaws.values()):
-            self.was_still = False
-            return self._find(image)
-        still = watch.confirm(image)
-        self.was_still = still is not None
-        if still is None:
-            found = self._find(image)
-            return watch.take(found if len(found) == len(self._jaws) else {}, image) or found
+        sight = self._sights.pop(image.stamp, None) or self._see(image)
+        self._sights = {stamp: later for stamp, later in self._sights.items() if stamp > image.stamp}
+        self.was_still = sight.still is not None
+        if sight.still is None:
+            found = self._find(image, sight.detections)
+            if not sight.is_watched:
+                return found
+            return self._still_watch.take(found if len(found) == len(self._jaws) else {}, image) or found
         for jaw in self._jaws.values():
             jaw.rest(image.stamp)
         self.counts["still"] += 1
-        return still
+        return sight.still
 
-    def _find(self, image: RgbdImage) -> dict[str, JawKeypoints]:
-        """Return the key points of the jaws in an image that has to be looked at."""
+    def look(self, image: RgbdImage) -> None:
+        """Look at an image whose depth is yet to come, so that less is left for `detect` to do once it is there.
+
+        Raises:
+            ImageError: colours and camera do not fit each other.
+            KeypointError: the pixel detector cannot use it.
+        """
+        if self._stamp is None or image.stamp > self._stamp:
+            check_image(image)
+            self._sights[image.stamp] = self._see(image)
+
+    def _see(self, image: RgbdImage) -> _Sight:
+        """Return what the colours of an image show."""
+        watch = self._still_watch
+        is_watched = watch is not None and all(jaw.is_settled for jaw in self._jaws.values())
+        still = watch.confirm(image) if is_watched else None
+        if still is not None:
+            return _Sight(is_watched=True, still=still, detections={})
         expected = {side: jaw.expect(image.stamp) for side, jaw in self._jaws.items()}
-        found = self._locate(image, self._pixel_detector.detect(image, expected))
+        return _Sight(is_watched=is_watched, still=None, detections=self._pixel_detector.detect(image, expected))
+
+    def _find(self, image: RgbdImage, detections: Mapping[str, PixelDetection]) -> dict[str, JawKeypoints]:
+        """Return the key points of the jaws in an image that has to be looked at."""
+        found = self._locate(image, detections)
         self.counts["images"] += 1
         if self._off_centre > self.settings.largest_offset:  # intrinsics or place of a camera that bend every finger
             self.counts["off centre"] += 1

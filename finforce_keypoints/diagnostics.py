@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from finforce.health import Level, Outcome, Report
 
 if TYPE_CHECKING:
-    from finforce_keypoints.camera_feed import RgbdFeed
     from finforce_keypoints.detector import KeypointDetector
     from finforce_keypoints.geometry.jaw_localizer import JawKeypoints
+    from finforce_keypoints.images import RgbdFeed
 
 LEAST_VISIBLE = 3  # key points; a solver gives no force with fewer
 

@@ -1,16 +1,20 @@
-"""Colour images with aligned depth, what is found in them, and a camera that fails."""
+"""Colour images with aligned depth: brought together as they come, what is found in them, and a camera that fails."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from time import monotonic
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from finforce.camera import CameraIntrinsics, ImageError
-from finforce_keypoints.errors import BlackImageError, EmptyDepthError, FrozenImageError
+from finforce.messages import camera_from_info, check_frame, color_from_image, depth_from_image, same_camera, stamp_of
+from finforce.stamps import SECOND, Stamped, Synchronizer
+from finforce_keypoints.errors import BlackImageError, EmptyDepthError, FrozenImageError, SyncError
+from finforce_keypoints.parameters import ALIGNED, AUTO, NO_DEPTH, DetectorParameters
 
 REFERENCE = "reference"  # the name of the reference point, the last row of every detection
 FROZEN_AFTER = 2  # repetitions of a picture, to the bit, after which a camera counts as frozen
@@ -19,6 +23,9 @@ _DARKEST = 10  # of 255: a picture whose brightest hundredth is below this shows
 _BRIGHTEST_PERCENT = 99.0
 _TILES = 4  # rows and columns of parts, each of which can stand still
 _NEAR_BLACK, _NEAR_WHITE = 8, 247  # of 255: what is beyond may stay the same without a fault
+SILENCE = 1.0  # s without an image, after which another colour topic may be the camera's
+WAITING = 3  # colour images that may wait for their depth: a tenth of a second at 30 Hz
+_COLOR, _DEPTH = "color", "depth"
 _LIVELY = 0.2  # share of a part's pixels between these, from which on it has to change
 
 
@@ -37,14 +44,6 @@ class RgbdImage:
     color: NDArray
     depth: NDArray | None
     camera: CameraIntrinsics
-
-
-class ImagePair(NamedTuple):
-    """A colour image and its depth image, None without, both as they came, and the exact stamp of the first [ns]."""
-
-    stamp: int
-    color: Any
-    depth: Any
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -205,3 +204,138 @@ class ImageWatch:
         is_same = not is_plain and np.array_equal(measured, self._depth, equal_nan=True)
         self._same_depth = self._same_depth + 1 if is_same else 0
         self._color, self._depth = seen, measured
+
+
+class RgbdFeed:
+    """Brings the images of a camera together by their stamps, the newest first.
+
+    A colour image waits for its depth image; one that a newer whole image overtook is passed over. Where depth may be
+    missing, the first image that waited in vain is taken alone, and so are those after it, until depth comes again. Of
+    several colour topics the first that brings an image is listened to, until it is silent.
+
+    Attributes:
+        camera: intrinsics of both images, None until they came.
+        passed: colour images that were overtaken while they waited.
+        topic: the colour topic that is listened to, None before the first image.
+
+    Args:
+        parameters: frame, topics, unit of depth and maximum difference of stamps.
+        clock: the time [s] of an arrival.
+    """
+
+    def __init__(self, parameters: DetectorParameters, clock: Callable[[], float] = monotonic) -> None:
+        self._parameters, self._clock = parameters, clock
+        self._tolerance = round(parameters.sync_tolerance / SECOND)
+        self.camera: CameraIntrinsics | None = None
+        self.passed = 0
+        self.topic: str | None = None
+        self._heard = clock()
+        self.reset()
+
+    @property
+    def source(self) -> str:
+        """The colour topic that is listened to, or those that may be."""
+        return self.topic or " or ".join(self._parameters.color_topics)
+
+    @property
+    def waiting(self) -> Stamped | None:
+        """The newest `RgbdImage` without depth that waits for it."""
+        waiting = self._images.entries(_COLOR)
+        return waiting[-1] if waiting else None
+
+    def reset(self) -> None:
+        """Forget all images; intrinsics and topic stay."""
+        self._images = Synchronizer({_COLOR: None, _DEPTH: WAITING + 1}, self._tolerance)
+        self._alone = self._parameters.depth == NO_DEPTH
+
+    def take_info(self, info: Any) -> None:
+        """Take a sensor_msgs/CameraInfo.
+
+        Raises:
+            ObservationError: the frame is another one.
+            IntrinsicsError: the numbers are no camera's.
+        """
+        camera = camera_from_info(info, self._parameters.camera_frame)
+        if not same_camera(self.camera, camera):
+            self.camera = camera
+
+    def listens(self, topic: str) -> bool:
+        """Say whether an image that has come on a colour topic is to be taken; after a silence another topic may be."""
+        now = self._clock()
+        if self.topic != topic and (self.topic is None or now - self._heard > SILENCE):
+            self.topic = topic
+            self._images.reset(_COLOR)
+        if self.topic == topic:
+            self._heard = now
+        return self.topic == topic
+
+    def take_color(self, topic: str, message: Any) -> Stamped | None:
+        """Take a colour image and return it, an `RgbdImage`, whole; None while its depth has not come, or of no use.
+
+        Raises:
+            SyncError: no depth image came for an earlier image, and every one needs its own.
+            ObservationError: its frame is another one.
+            ImageError: it cannot be used, or the intrinsics are not known yet.
+        """
+        if not self.listens(topic):
+            return None
+        taken = Stamped(stamp_of(message), self._read_color(message))
+        if self._alone:
+            return taken
+        self._images.add(_COLOR, taken.stamp, taken.value)
+        found, waiting = self._match(), self._images.entries(_COLOR)
+        if found is not None or len(waiting) <= WAITING:
+            return found
+        if self._parameters.depth == ALIGNED:
+            raise self._missing_depth(waiting.popleft().stamp)
+        self._alone = True
+        self.passed += len(waiting)
+        self._images.reset(_COLOR)
+        return taken
+
+    def take_depth(self, message: Any) -> Stamped | None:
+        """Take a depth image and return it with its colour, an `RgbdImage`; None while that has not come.
+
+        Raises:
+            ObservationError: its frame is another one.
+            ImageError: it cannot be used.
+        """
+        depth = depth_from_image(message, self._parameters.camera_frame, self._parameters.depth_scale)
+        is_empty = self._parameters.depth == AUTO and not np.isfinite(depth).any()
+        self._alone = False
+        self._images.add(_DEPTH, stamp_of(message), None if is_empty else depth)
+        return self._match()
+
+    def _match(self) -> Stamped | None:
+        """Return the newest colour image that has its depth, and pass the older ones over."""
+        pair = self._images.newest_pair(_COLOR, _DEPTH)
+        if pair is None:
+            return None
+        color, depth = pair
+        waiting = self._images.entries(_COLOR)
+        while waiting.popleft() is not color:
+            self.passed += 1
+        return Stamped(color.stamp, replace(color.value, depth=depth.value))
+
+    def _read_color(self, message: Any) -> RgbdImage:
+        """Return the image of a colour image alone."""
+        if self.camera is None:
+            raise ImageError(f"images came, but no camera_info on {self._parameters.info_topic} yet")
+        check_frame(message, self._parameters.camera_frame, "the colour image")
+        color = color_from_image(message)
+        return RgbdImage(stamp=SECOND * stamp_of(message), color=color, depth=None, camera=self.camera)
+
+    def _missing_depth(self, stamp: int) -> SyncError:
+        """Return the error of a colour image [ns] that has waited long enough."""
+        nearest = self._images.nearest(_DEPTH, stamp)
+        limit = f"{1e3 * self._parameters.sync_tolerance:g} ms"
+        if nearest is None:
+            return SyncError(
+                f"colour images come, but no depth image on {self._parameters.depth_topic}; "
+                "start the camera with align_depth.enable:=true, or the detector with depth:=none"
+            )
+        return SyncError(
+            f"no depth image within {limit} of the colour image at {SECOND * stamp:.3f} s, the nearest lies "
+            f"{1e3 * SECOND * abs(nearest.stamp - stamp):.1f} ms away; start the camera with enable_sync:=true or "
+            "raise sync_tolerance"
+        )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from time import monotonic, perf_counter
 from typing import TYPE_CHECKING, Any
@@ -12,15 +13,15 @@ from numpy.typing import NDArray
 from rcl_interfaces.msg import ParameterDescriptor
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
+from finforce.errors import FinforceError
 from finforce.health import IDLE, STILL, UNHEARD, Health, Outcome, Report, Skips
 from finforce.processors import bind_caller
 from finforce.ros import node as ros
-from finforce.stamps import Idling, StampGate
+from finforce.stamps import Idling, Stamped, StampGate
 from finforce_keypoints.build import build_detector
-from finforce_keypoints.camera_feed import RgbdFeed
 from finforce_keypoints.detectors.dots import DotSettings
 from finforce_keypoints.diagnostics import describe, outcome_of_keypoints, report_of_rest
-from finforce_keypoints.images import ImagePair
+from finforce_keypoints.images import RgbdFeed
 from finforce_keypoints.parameters import (
     NO_DEPTH,
     DetectorParameters,
@@ -113,31 +114,41 @@ class KeypointDetectorNode(ros.ImageNode):
             self.skips.count(UNHEARD)
             return
         with self.rejections():
-            self._answer(self.feed.take_color(topic, message))
+            whole = self.feed.take_color(topic, message)
+            if whole is None:
+                self._look_ahead()
+            self._answer(whole)
 
     def _on_depth(self, message: Image) -> None:
         """Take a depth image."""
         with self.rejections():
             self._answer(self.feed.take_depth(message))
 
-    def _answer(self, pair: ImagePair | None) -> None:
+    def _look_ahead(self) -> None:
+        """Find the pixels of a colour image while its depth is on its way; what is wrong with it is said after that."""
+        waiting = self.feed.waiting
+        if waiting is not None:
+            with suppress(FinforceError):
+                self.gate.check_age(waiting.stamp, self.now())
+                self.detector.look(waiting.value)
+
+    def _answer(self, whole: Stamped | None) -> None:
         """Find the key points of all jaws in an image that is whole."""
-        if pair is None:
+        if whole is None:
             return
-        began = perf_counter()
-        image = self.feed.decode(pair)
-        if self.gate.enter(pair.stamp, self.now()):
+        began, image = perf_counter(), whole.value
+        if self.gate.enter(whole.stamp, self.now()):
             self._restart("the stamps went back: a new recording")
         self.found = {}  # until they are found again
         self.found = self.detector.detect(image)
         is_still = self.detector.was_still
         if is_still:
             self.skips.count(STILL)
-            if self.skips.allows(IDLE) and self.idling.passes(pair.stamp):
+            if self.skips.allows(IDLE) and self.idling.passes(whole.stamp):
                 self.skips.count(IDLE)
                 return
-        self._publish(pair.stamp, image.color, began)
-        self.idling.note(pair.stamp, is_still)
+        self._publish(whole.stamp, image.color, began)
+        self.idling.note(whole.stamp, is_still)
 
     def _publish(self, stamp: int, color: NDArray, began: float) -> None:
         """Publish the key points of an image, (h, w, 3), while they are fresh."""

@@ -45,10 +45,13 @@ class FakeDetector:
 
     def __init__(self, sides):
         self.answer = {side: FakeKeypoints() for side in sides}
-        self.images, self.resets, self.error, self.delay = [], 0, None, 0.0
+        self.images, self.looks, self.resets, self.error, self.delay = [], [], 0, None, 0.0
         self.warnings, self.warmed, self.was_still = {}, False, False
         self.name, self.sha256 = "fake", "ab12"
         self.watch = ImageWatch()
+
+    def look(self, image):
+        self.looks.append(image)
 
     def detect(self, image):
         check_image(image)

@@ -8,9 +8,8 @@ import pytest
 from keypoint_node_fakes import COLOR, HEIGHT, OLD_COLOR, WIDTH, camera_info, image_of
 
 from finforce.camera import ImageError
-from finforce_keypoints.camera_feed import SILENCE, RgbdFeed
 from finforce_keypoints.errors import SyncError
-from finforce_keypoints.images import ImagePair, check_image
+from finforce_keypoints.images import SILENCE, RgbdFeed, check_image
 from finforce_keypoints.parameters import DetectorParameters
 
 PERIOD = 0.03  # s
@@ -36,8 +35,7 @@ class Camera:
         if picture is None:
             picture = self.rng.integers(90, 160, (HEIGHT, WIDTH, 3), dtype=np.uint8)
         self.feed.take_depth(image_of(stamp, np.full((HEIGHT, WIDTH), 120, dtype=np.uint16), "16UC1"))
-        pair = self.feed.take_color(topic, image_of(stamp, picture, "rgb8"))
-        return pair is not None and self.feed.decode(pair).stamp > 0.0
+        return self.feed.take_color(topic, image_of(stamp, picture, "rgb8")) is not None
 
 
 def test_a_camera_that_comes_back_under_the_other_name_is_taken_after_a_silence():
@@ -71,7 +69,7 @@ def depth_of(number, value=120):
 def test_without_depth_every_colour_image_is_whole():
     camera = Camera(depth="none")
     for number in range(1, 5):
-        image = camera.feed.decode(camera.feed.take_color(COLOR, color_of(camera, number)))
+        image = camera.feed.take_color(COLOR, color_of(camera, number)).value
         assert image.depth is None and image.stamp == pytest.approx(PERIOD * number)
 
 
@@ -79,9 +77,9 @@ def test_depth_that_comes_and_goes_is_used_while_it_comes():
     camera, had = Camera(depth="auto"), []
 
     def shoot(number, with_depth):
-        pairs = [camera.feed.take_depth(depth_of(number)) if with_depth else None]
-        pairs.append(camera.feed.take_color(COLOR, color_of(camera, number)))
-        had.extend((number, pair.depth is not None) for pair in pairs if pair is not None)
+        whole = [camera.feed.take_depth(depth_of(number)) if with_depth else None]
+        whole.append(camera.feed.take_color(COLOR, color_of(camera, number)))
+        had.extend((number, taken.value.depth is not None) for taken in whole if taken is not None)
 
     for number in range(1, 16):
         shoot(number, with_depth=number < 4 or number > 11)
@@ -95,12 +93,12 @@ def test_an_empty_depth_image_counts_as_none_only_where_none_is_needed():
     for depth, is_taken in (("auto", True), ("aligned", False)):
         camera = Camera(depth=depth)
         camera.feed.take_depth(depth_of(0, value=0))
-        pair = camera.feed.take_color(COLOR, color_of(camera, 0))
+        image = camera.feed.take_color(COLOR, color_of(camera, 0)).value
         if is_taken:
-            assert camera.feed.decode(pair).depth is None
+            assert image.depth is None
         else:
             with pytest.raises(ImageError, match="empty"):
-                check_image(camera.feed.decode(pair))
+                check_image(image)
 
 
 def test_where_every_image_needs_its_depth_one_without_is_refused():
@@ -123,14 +121,13 @@ def test_a_jpeg_stream_is_decoded_and_a_damaged_one_refused():
     picture = cv2.GaussianBlur(np.frombuffer(raw.data, np.uint8).reshape(HEIGHT, WIDTH, 3), (0, 0), 3.0)
     _, data = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])
     topic = f"{COLOR}/compressed"
-    pair = camera.feed.take_color(topic, Picture(raw.header, data.tobytes()))
-    image = camera.feed.decode(pair)
+    image = camera.feed.take_color(topic, Picture(raw.header, data.tobytes())).value
     assert np.abs(image.color.astype(int) - picture).mean() < 3.0
     for broken in (b"", b"no picture", data.tobytes()[:40]):
         later = color_of(camera, 2)
         with pytest.raises(ImageError, match="neither jpeg nor png|damaged"):
-            camera.feed.decode(ImagePair(1, Picture(later.header, broken), None))
+            camera.feed.take_color(topic, Picture(later.header, broken))
     huge = data.tobytes().replace(bytes([0xFF, 0xC0, 0, 17, 8, *divmod(HEIGHT, 256)]), b"\xff\xc0\0\x11\x08\xff\xff")
     huge = huge[: huge.index(b"\xff\xff") + 2] + b"\xff\xff" + huge[huge.index(b"\xff\xff") + 4 :]
     with pytest.raises(ImageError, match="expected at most 50000000 pixels"):
-        camera.feed.decode(ImagePair(1, Picture(raw.header, huge), None))
+        camera.feed.take_color(topic, Picture(raw.header, huge))

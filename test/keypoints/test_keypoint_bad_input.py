@@ -7,7 +7,7 @@ import pytest
 from keypoint_node_fakes import HEIGHT, MILLISECOND, OLD_COLOR, TOPICS, WIDTH, CameraBench, camera_info
 from sensor_msgs.msg import Image
 
-import finforce_keypoints.camera_feed as camera_feed
+import finforce_keypoints.images as images
 from finforce.health import Level
 from finforce_keypoints.images import FROZEN_AFTER
 
@@ -206,7 +206,7 @@ def speaks_on_another_topic(probe):
 
 
 def test_a_camera_that_restarts_under_the_other_name_is_heard_and_named(probe, monkeypatch):
-    monkeypatch.setattr(camera_feed, "SILENCE", 0.0)
+    monkeypatch.setattr(images, "SILENCE", 0.0)
     bench = speaks_on_another_topic(probe)
     bench.shoot()
     bench.wait_for_clouds(2)
@@ -215,7 +215,7 @@ def test_a_camera_that_restarts_under_the_other_name_is_heard_and_named(probe, m
 
 
 def test_images_of_the_topic_that_is_not_listened_to_hide_no_silence(probe, monkeypatch):
-    monkeypatch.setattr(camera_feed, "SILENCE", 1e9)
+    monkeypatch.setattr(images, "SILENCE", 1e9)
     bench = speaks_on_another_topic(probe)
     probe.got["/diagnostics"].clear()
     for _ in range(35):  # more than max_age

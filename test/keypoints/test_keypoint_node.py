@@ -106,6 +106,17 @@ def test_stamps_within_the_tolerance_belong_together_and_others_do_not(probe):
     assert stamp_of(bench.wait_for_clouds()) == stamp
 
 
+def test_a_colour_image_is_looked_at_before_its_depth_comes(probe):
+    bench, stamp = CameraBench(probe), time_ns()
+    bench.color(stamp)
+    (seen,) = bench.node.detector.looks
+    assert seen.depth is None and not bench.node.detector.images
+    bench.depth(stamp)
+    bench.wait_for_clouds()
+    (whole,) = bench.node.detector.images
+    assert whole.depth is not None and whole.color is seen.color
+
+
 def test_depth_that_is_an_image_late_is_waited_for(probe):
     bench = CameraBench(probe)
     stamps = [time_ns(), time_ns() + 20 * MILLISECOND]

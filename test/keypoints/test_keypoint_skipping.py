@@ -93,3 +93,23 @@ def test_a_jaw_that_rested_long_is_not_lost():
     found = watched.show(picture(93, move_tip(1e-3)))
     assert set(found) == set(SIDES)
     assert all(pose is not None for pose in watched.pixel_detector.expected[-1].values())
+
+
+def test_an_image_that_was_looked_at_before_its_depth_came_is_found_the_same():
+    ahead, at_once = Watched(), Watched()
+    for seed in range(LEARNING):
+        color, stamp = picture(seed), seed * PERIOD
+        ahead.detector.look(replace(bare_image(stamp, None), color=color))
+        looks = ahead.looks
+        found, expected = ahead.show(color), at_once.show(color)
+        assert ahead.looks == looks == at_once.looks  # nothing was left to look at
+        assert ahead.detector.was_still == at_once.detector.was_still
+        for side in SIDES:
+            np.testing.assert_array_equal(found[side].points, expected[side].points)
+
+
+def test_an_image_that_is_not_younger_than_the_last_one_is_not_looked_at():
+    watched = Watched()
+    watched.show(picture(0), 1.0)
+    watched.detector.look(replace(bare_image(0.5, None), color=picture(1)))
+    assert watched.looks == 1
