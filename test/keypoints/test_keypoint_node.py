@@ -323,7 +323,7 @@ def test_what_a_cloud_says_against_each_key_point_is_what_the_detector_said():
 
     from finforce_eval.replay.live import heard_keypoints
     from finforce_keypoints.geometry.jaw_localizer import REASONS
-    from finforce_keypoints.publishers import keypoint_columns
+    from finforce_keypoints.node import keypoint_columns
 
     said = FakeKeypoints()
     said.reasons[: len(REASONS)] = REASONS
