@@ -17,7 +17,7 @@ from finforce.transforms import invert_pose
 from finforce_ifea.grasp_force import Wrench
 from finforce_sim.emulator.adapter import EmulatedAdapter
 from finforce_sim.emulator.firmware import EmulatedGripper
-from finforce_sim.emulator.mechanism import EmulatorSettings
+from finforce_sim.emulator.mechanism import STROKE
 from finforce_sim.emulator.pty_port import PtyPort
 from finforce_sim.footage import FINGER, TwinFrame, disturb_pose, set_stage, true_jaw
 from finforce_sim.gripper import PressedGrasp, RelaxedGrasp
@@ -64,12 +64,10 @@ class LiveScene(Generic[T]):
     """
 
     def __init__(self, grasp: PressedGrasp, photographer: Photographer, seed: int) -> None:
-        gripper = EmulatorSettings()
-        self._low, self._high = gripper.closed_opening, gripper.closed_opening + gripper.stroke
-        if grasp.touch_opening + LEAST_CLEARANCE > self._high:
+        if grasp.touch_opening + LEAST_CLEARANCE > STROKE:
             raise ScenarioError(
                 f"{grasp.assembly.scenario.name}: the object is {1e3 * grasp.touch_opening:.0f} mm wide between the "
-                f"jaws, expected at most {1e3 * (self._high - LEAST_CLEARANCE):.0f} mm; give another object or scene"
+                f"jaws, expected at most {1e3 * (STROKE - LEAST_CLEARANCE):.0f} mm; give another object or scene"
             )
         self.grasp = grasp
         self.camera, self.depth_step = photographer.setting.camera, photographer.setting.depth_step
@@ -82,7 +80,7 @@ class LiveScene(Generic[T]):
 
     def render(self, keep: Callable[[TwinFrame], T], tell: Callable[[int, int], None]) -> None:
         """Take the images at all openings of the gripper; see `render_openings`."""
-        openings = choose_openings(self.grasp, self._low, self._high)
+        openings = choose_openings(self.grasp, 0.0, STROKE)
         self.table = render_openings(self.grasp, self._photographer, openings, keep, tell)
 
     def take(self, opening: float, now: float) -> Moment[T]:

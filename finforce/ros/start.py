@@ -14,7 +14,7 @@ NODES = {
     "keypoint_detector": "finforce_keypoints.node",
     "pipeline": "finforce.ros.composition",
     "gripper_driver": "finforce_driver.node",
-    "emulated_gripper": "finforce_sim.emulator.pty_port",
+    "emulated_gripper": "finforce_sim.emulator.__main__",
     "recording_player": "finforce_eval.replay.node",
     "twin_camera": "finforce_sim.node",
 }

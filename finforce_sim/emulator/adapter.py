@@ -7,14 +7,12 @@ from collections import Counter, deque
 from collections.abc import Iterable
 
 from finforce_driver.can.protocol import CanMessage
-from finforce_driver.can.slcan import BELL, END, EXTENDED, decode_line, encode_message
+from finforce_driver.can.slcan import BELL, END, EXTENDED, LONGEST_LINE, decode_line, encode_message
 from finforce_driver.errors import TargetError
 from finforce_sim.emulator.firmware import EmulatedGripper
 
 ACK_MODES = ("none", "lawicel")
-_LONGEST_LINE = 64
-_CLOCK_PERIOD = 60_000  # [ms] after which time stamps begin again
-_SETTER = re.compile(r"Z[01]|X[01]|M.*|m.*|W.*")
+_RATE = re.compile(r"S[0-8]|s[0-9A-Fa-f]{4,}")
 
 
 class EmulatedAdapter:
@@ -25,7 +23,6 @@ class EmulatedAdapter:
         latency: from a message on the bus to its line at the host [s].
         plugged: whether the host sees the adapter; `unplug` and `replug` change it.
         counts: lines that were no command, messages sent, messages refused, messages lost to a wrong bit rate.
-        traffic: the last messages of the host that reached the bus, with their times [s].
     """
 
     def __init__(
@@ -47,7 +44,6 @@ class EmulatedAdapter:
         self.latency = latency
         self.plugged = True
         self.counts: Counter[str] = Counter()
-        self.traffic: deque[tuple[float, CanMessage]] = deque(maxlen=1000)
         self.now = 0.0
         self._acknowledges = ack_mode == "lawicel"
         self._lose_power()
@@ -60,7 +56,7 @@ class EmulatedAdapter:
     @property
     def joined(self) -> bool:
         """Return whether the channel is open at the gripper's bit rate."""
-        return self._opened and self._rate == "8"
+        return self._opened and self._rate == "S8"
 
     @property
     def has_output(self) -> bool:
@@ -72,10 +68,10 @@ class EmulatedAdapter:
         if not self.plugged:
             return
         for byte in data:
-            if byte == 0x0D:
+            if byte == END[0]:
                 self._take_line(bytes(self._line).decode("latin-1"))
                 self._line.clear()
-            elif len(self._line) < _LONGEST_LINE:
+            elif len(self._line) < LONGEST_LINE:
                 self._line.append(byte)
 
     def read(self) -> bytes:
@@ -89,8 +85,7 @@ class EmulatedAdapter:
         """Let `dt` [s] pass for the adapter and the grippers."""
         self.now += dt
         for gripper in self.grippers:
-            for message in gripper.step(dt):
-                self.deliver(message)
+            gripper.step(dt)
 
     def put_on_bus(self, message: CanMessage) -> None:
         """Let another participant of the bus send a message: grippers answer it, the host sees it and the answers."""
@@ -99,10 +94,8 @@ class EmulatedAdapter:
 
     def deliver(self, message: CanMessage) -> None:
         """Send a message from the bus to the host, if the channel is open."""
-        if not (self.plugged and self.joined):
-            return
-        stamp = f"{round(self.now * 1000.0) % _CLOCK_PERIOD:04X}".encode() if self._stamps else b""
-        self._output.append((self.now + self.latency, encode_message(message)[:-1] + stamp + END))
+        if self.plugged and self.joined:
+            self._output.append((self.now + self.latency, encode_message(message)))
 
     def unplug(self) -> None:
         """Take the adapter off the host; the grippers keep their own supply."""
@@ -114,8 +107,7 @@ class EmulatedAdapter:
         self.plugged = True
 
     def _lose_power(self) -> None:
-        self._opened = self._listens = self._stamps = False
-        self._polled = True
+        self._opened = False
         self._rate = ""
         self._line = bytearray()
         self._output: deque[tuple[float, bytes]] = deque()
@@ -125,29 +117,30 @@ class EmulatedAdapter:
             return
         if line[0] in "trTR":
             self._transmit(line)
-        elif line[0] in "Ss":
-            self._set_rate(line)
-        elif line in ("O", "L", "C"):
-            self._switch(line)
+        elif line in ("O", "C"):
+            self._obey(self._opened != (line == "O"))
+            self._opened = line == "O"
+        elif _RATE.fullmatch(line):
+            self._rate = self._rate if self._opened else line
+            self._obey(not self._opened)
         else:
-            self._answer(line)
+            self._refuse("garbage")
 
     def _transmit(self, line: str) -> None:
         raw = line.encode("latin-1")
         message = decode_line(raw, stamped=False)
         if message is None and not EXTENDED.fullmatch(raw):
             self._refuse("garbage")
-        elif not self._opened or self._listens:
+        elif not self._opened:
             self._refuse("refused")
         else:
-            self._say((b"z" if line[0] in "tr" else b"Z") if self._polled else b"")
+            self._say(b"z" if line[0] in "tr" else b"Z")
             if message is None:  # the firmware would misread a long identifier; what it reads is not known
                 self.gripper.violations["long identifier"] += 1
             elif not self.joined:
                 self.counts["wrong bit rate"] += 1
             else:
                 self.counts["messages"] += 1
-                self.traffic.append((self.now, message))
                 self._broadcast(message)
 
     def _broadcast(self, message: CanMessage) -> None:
@@ -155,46 +148,18 @@ class EmulatedAdapter:
             for answer in gripper.handle(message):
                 self.deliver(answer)
 
-    def _set_rate(self, line: str) -> None:
-        if self._opened or not re.fullmatch(r"S[0-8]|s[0-9A-Fa-f]{4,}", line):
-            self._refuse("refused")
-            return
-        self._rate = line[1:] if line[0] == "S" else ""
-        self._say(b"")
-
-    def _switch(self, line: str) -> None:
-        opens = line != "C"
-        if opens == self._opened:
-            self._refuse("repeated")
-            return
-        self._opened, self._listens = opens, line == "L"
-        self._say(b"")
-
-    def _answer(self, line: str) -> None:
-        """Answer a question, obey a setter, refuse the rest."""
-        if line == "V":
-            self._put(b"V1013\r" if self._acknowledges else b"emulated adapter\r")
-        elif line == "N" and self._acknowledges:
-            self._put(b"NA123\r")
-        elif line == "F" and self._acknowledges and self._opened:
-            self._put(b"F00\r" if self._rate == "8" else b"F84\r")
-        elif _SETTER.fullmatch(line):
-            if line[0] == "Z":
-                self._stamps = line == "Z1"
-            elif line[0] == "X":
-                self._polled = line == "X1"
+    def _obey(self, possible: bool) -> None:
+        """Acknowledge a command, or refuse one that the channel's state does not allow."""
+        if possible:
             self._say(b"")
         else:
-            self._refuse("garbage")
+            self._refuse("refused")
 
     def _say(self, word: bytes) -> None:
         if self._acknowledges:
-            self._put(word + b"\r")
+            self._output.append((self.now, word + END))
 
     def _refuse(self, name: str) -> None:
         self.counts[name] += 1
         if self._acknowledges:
-            self._put(BELL)
-
-    def _put(self, data: bytes) -> None:
-        self._output.append((self.now, data))
+            self._output.append((self.now, BELL))

@@ -31,7 +31,6 @@ class Firmware:
         confirm_time: how long a stop must be felt [ms].
         calibration_timeout: after which a calibration is given up [ms].
         watchdog_length: data bytes without which the watchdog's setter is ignored.
-        has_torque_constant: whether the request for it is answered.
     """
 
     closing_code: int
@@ -46,7 +45,6 @@ class Firmware:
     confirm_time: int
     calibration_timeout: int
     watchdog_length: int
-    has_torque_constant: bool
 
 
 VARIANTS = {
@@ -63,7 +61,6 @@ VARIANTS = {
         confirm_time=640,
         calibration_timeout=30_000,
         watchdog_length=5,
-        has_torque_constant=True,
     ),
     "old": Firmware(  # the maker's prebuilt file of 2024-09-02
         closing_code=2,
@@ -78,7 +75,6 @@ VARIANTS = {
         confirm_time=1,
         calibration_timeout=14_000,
         watchdog_length=4,
-        has_torque_constant=False,
     ),
 }
 

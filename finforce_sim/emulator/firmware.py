@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from enum import Enum
 
-from finforce_driver.can.protocol import CanMessage, Move, decode_move, encode
+from finforce_driver.can.protocol import CanMessage, Command, Move, decode_move, encode
 from finforce_driver.errors import TargetError
 from finforce_sim.emulator.control import (
     VARIANTS,
@@ -18,9 +18,9 @@ from finforce_sim.emulator.control import (
     find_stops,
     list_violations,
 )
-from finforce_sim.emulator.mechanism import STEP, EmulatorSettings, Jaws
+from finforce_sim.emulator.mechanism import STEP, Jaws
 
-_REPLY, _ORDER = 60, 61
+_BOOT_TIME = 0.3  # [s] of silence after a reset
 _FIFO = 3  # messages that the CAN controller keeps while the firmware is busy
 _ADVISED_BURST = 2
 
@@ -37,7 +37,6 @@ class EmulatedGripper:
         mode: of the control loop.
         calibrated: whether the firmware believes in its end stops.
         configured: as a gripper; else it calibrates, but never moves nor changes its position byte.
-        heartbeat_period: [ms]; 0: none.
         violations: of good practice by name.
     """
 
@@ -47,7 +46,6 @@ class EmulatedGripper:
         node_id: int = 0,
         object_opening: float | None = None,
         load: Callable[[float], float] | None = None,
-        settings: EmulatorSettings | None = None,
     ) -> None:
         """Make a gripper that has been powered for long.
 
@@ -56,7 +54,6 @@ class EmulatedGripper:
             node_id: on the CAN bus, 0 to 15.
             object_opening: at which a rigid object stops the closing jaws [m].
             load: elastic grip force [N] of what is between the jaws at an opening [m].
-            settings: of build and environment.
 
         Raises:
             TargetError: there is no such variant or node.
@@ -66,16 +63,14 @@ class EmulatedGripper:
         if not 0 <= node_id <= 15:
             raise TargetError(f"node_id: got {node_id!r}, expected 0 to 15")
         self.variant = variant
-        self.settings = settings or EmulatorSettings()
-        self.jaws = Jaws(self.settings)
+        self.node_id = node_id
+        self.jaws = Jaws()
         self.jaws.object_opening, self.jaws.load = object_opening, load
-        self.protection = Protection(self.settings.supply_limit)
+        self.protection = Protection()
         self.violations: Counter[str] = Counter()
         self.configured = True
         self._firmware = VARIANTS[variant]
-        # outlives a reset once it was saved: node, watchdog and heartbeat [ms]
-        self._stored = {"node_id": node_id, "watchdog": 0, "heartbeat": 0}
-        self._steps = self._deaf_until = self._last_sent = 0
+        self._steps = self._deaf_until = 0
         self._rest = 0.0
         self._blip_until = self._received = 0
         self._blip_current = 0.0
@@ -88,13 +83,8 @@ class EmulatedGripper:
 
     @property
     def booting(self) -> bool:
-        """Return whether it is deaf and mute because it boots or writes its configuration."""
+        """Return whether it is deaf and mute because it boots."""
         return self._steps < self._deaf_until
-
-    @property
-    def true_opening(self) -> float:
-        """Return the true opening between the undeformed inner faces [m]."""
-        return self.jaws.opening
 
     @property
     def faults(self) -> set[Fault]:
@@ -112,18 +102,14 @@ class EmulatedGripper:
         current = self._blip_current if self._steps < self._blip_until else self.jaws.current
         return max(min(int(current), 0x7FFF), -0x8000)
 
-    def step(self, dt: float = STEP) -> list[CanMessage]:
-        """Go on for `dt` [s] in whole milliseconds, keeping the rest; return the heartbeats sent meanwhile."""
+    def step(self, dt: float = STEP) -> None:
+        """Go on for `dt` [s] in whole milliseconds, keeping the rest."""
         self._rest += dt
         self._received = 0
         count = int(self._rest / STEP + 1e-6)
         self._rest -= count * STEP
-        heartbeats = []
         for _ in range(count):
             self._step_once()
-            if self.heartbeat_period and self._steps - self._last_sent >= self.heartbeat_period and not self.booting:
-                heartbeats.append(self._send(9, b""))
-        return heartbeats
 
     def handle(self, message: CanMessage) -> list[CanMessage]:
         """Take a message from the bus and return the answers."""
@@ -141,7 +127,7 @@ class EmulatedGripper:
                 return []
             self.protection.feed()
             return [self._send(command, answer)]
-        if command == _ORDER:
+        if command == Command.MOVE:
             return [self._take_order(message)]
         self._obey(command, message.data)
         return []
@@ -150,7 +136,7 @@ class EmulatedGripper:
         """Reset: silence while booting, then the state after power-up; whole encoder turns are lost."""
         self._power_up()
         self.jaws.reset_encoder()
-        self._deaf_until = self._steps + round(self.settings.boot_time / STEP)
+        self._deaf_until = self._steps + round(_BOOT_TIME / STEP)
 
     def blip(self, duration: float = 0.01) -> None:
         """Report contact with a high current for some time [s], as can happen at the start of a move."""
@@ -161,73 +147,46 @@ class EmulatedGripper:
     def _answer(self, command: int) -> bytes | None:
         """Return the data that answers a remote message; None where nothing does."""
         match command:
-            case 10:
+            case Command.PING:
                 return b""
-            case 23:
-                return struct.pack(">h", self.protection.reported_temperature)
-            case 24:
+            case Command.TEMPERATURE:
+                return struct.pack(">h", round(self.protection.temperature))
+            case Command.SUPPLY:
                 return struct.pack(">H", round(1000.0 * self.protection.voltage))
-            case 25:
-                return struct.pack(">BBBi", 1, 1, 101, 48)
-            case 26:
+            case Command.ERRORS:
                 return self.protection.error_bytes
-            case 27:
+            case Command.CURRENT:
                 return struct.pack(">h", self.reported_current)
-            case 28:
+            case Command.ENCODER:
                 return struct.pack(">ii", self.jaws.encoder, round(self.jaws.velocity))
-            case 33 if self._firmware.has_torque_constant:
-                return struct.pack(">f", 0.325)
         return None
 
     def _obey(self, command: int, data: bytes) -> None:
         """Do what a command says that nothing answers."""
         match command, len(data):
-            case 0, _:
+            case Command.ESTOP, _:
                 self.faults.add(Fault.ESTOP_COMMAND)
-            case 1, _:
+            case Command.CLEAR, _:
                 self.faults.clear()
                 self.mode = Mode.IDLE
-            case 2 | 4, _:
-                self.violations["raw motor command"] += 1
-                self.protection.feed()
-            case 12, _:
+            case Command.IDLE, _:
                 self.mode = Mode.IDLE
-            case 14, _:
+            case Command.RESET, _:
                 self.reboot()
-            case 62, 0:
+            case Command.CALIBRATE, 0:
                 self.mode = Mode.CALIBRATE
-            case _:
-                self._configure(command, data)
-
-    def _configure(self, command: int, data: bytes) -> None:
-        """Take a setting, or save all of them."""
-        protection = self.protection
-        match command, len(data):
-            case 11, 1:
-                self.violations.update(["node id out of range"] * (data[0] > 15))
-                self.node_id = data[0]
-            case 13, _:
-                watchdog, heartbeat = protection.watchdog_period, self.heartbeat_period
-                self._stored = {"node_id": self.node_id, "watchdog": watchdog, "heartbeat": heartbeat}
-                self._deaf_until = self._steps + round(self.settings.save_time / STEP)
-            case 15, self._firmware.watchdog_length:
-                protection.watchdog_period = int.from_bytes(data[:4], "big", signed=True)
-                protection.feed()
-            case 30, 4:
-                self.heartbeat_period = max(int.from_bytes(data, "big", signed=True), 0)
+            case Command.WATCHDOG, self._firmware.watchdog_length:
+                self.protection.watchdog_period = int.from_bytes(data[:4], "big", signed=True)
+                self.protection.feed()
 
     def _power_up(self) -> None:
-        self.node_id = self._stored["node_id"]
-        self.heartbeat_period = self._stored["heartbeat"]
         self.protection.restart()
-        self.protection.watchdog_period = self._stored["watchdog"]
         self.calibrated = False
         self.mode = Mode.IDLE
         self.endpoints = Endpoints()
         self._control = MoveControl(self._firmware)
         self._restart_calibration()
         self._position = self.endpoints.position(self.jaws.encoder) if self.configured else 0
-        self._last_sent = self._steps
 
     def _step_once(self) -> None:
         self._steps += 1
@@ -258,8 +217,7 @@ class EmulatedGripper:
         self._calibrating = 0  # [ms], not counted anew after an abort
 
     def _send(self, command: int, data: bytes) -> CanMessage:
-        self._last_sent = self._steps
-        message = encode(self.node_id & 0xF, command, data)
+        message = encode(self.node_id, command, data)
         return replace(message, id=message.id | bool(self.faults))
 
     def _take_order(self, message: CanMessage) -> CanMessage:
@@ -268,13 +226,11 @@ class EmulatedGripper:
         if len(message.data) == 5:
             order = decode_move(message)
             self.violations.update(list_violations(order, self._control, self.mode))
-            if self.settings.resets_integrators:
-                self.jaws.current = 0.0
             self._control.take(order)
             self.protection.estop_flag = order.estop
             if not self.faults:
                 self.mode = Mode.GRIPPER
-        return self._send(_REPLY, self._reply())
+        return self._send(Command.REPLY, self._reply())
 
     def _reply(self) -> bytes:
         code = self._control.object_code
@@ -292,7 +248,7 @@ class EmulatedGripper:
 
 
 _COLDEST, _HOTTEST = -20.0, 75.0  # [deg C] of the motor
-_LEAST_SUPPLY = 9.0  # [V]
+_LEAST_SUPPLY, _LARGEST_SUPPLY = 9.0, 29.0  # [V]
 
 
 class Fault(Enum):
@@ -315,20 +271,17 @@ class Protection:
     """The environment that the firmware watches, and what it has latched.
 
     Attributes:
-        supply_limit: above which the supply is a fault [V].
         temperature: of the motor [deg C].
-        thermistor: whether it is enabled; else the firmware says 23 deg C and watches nothing.
         voltage: of the supply [V].
         magnet: whether the encoder sees its magnet.
         motor_calibrated: whether the motor itself was ever calibrated.
         estop_flag: of the last order; it latches its fault again and again.
         watchdog_period: longest silence [ms]; 0: any.
         faults: that are latched.
+        silence: since the watchdog was fed [ms].
     """
 
-    supply_limit: float
     temperature: float = 26.0
-    thermistor: bool = True
     voltage: float = 24.0
     magnet: bool = True
     motor_calibrated: bool = True
@@ -345,16 +298,16 @@ class Protection:
         """Forget what does not outlive a reset."""
         self.faults = set()
         self.estop_flag = False
-        self.silence = 0
+        self.watchdog_period = self.silence = 0
 
     def step(self) -> bool:
         """Watch for one millisecond and return whether a fault is latched."""
         self.silence += 1
         if self.watchdog_period > 0 and self.silence >= self.watchdog_period:
             self.faults.add(Fault.WATCHDOG)
-        if self.thermistor and not _COLDEST <= self.temperature <= _HOTTEST:
+        if not _COLDEST <= self.temperature <= _HOTTEST:
             self.faults.add(Fault.TEMPERATURE)
-        if not _LEAST_SUPPLY <= self.voltage <= self.supply_limit:
+        if not _LEAST_SUPPLY <= self.voltage <= _LARGEST_SUPPLY:
             self.faults.add(Fault.SUPPLY)
         if not self.magnet:
             self.faults.add(Fault.ENCODER)
@@ -381,8 +334,3 @@ class Protection:
         for fault in self.faults:
             first |= _FIRST_BYTE.get(fault, 0)
         return bytes([first, 0x80 * self.motor_calibrated | 0x20 * (Fault.WATCHDOG in self.faults)])
-
-    @property
-    def reported_temperature(self) -> int:
-        """Return what the firmware says of the temperature [deg C]."""
-        return round(self.temperature) if self.thermistor else 23

@@ -1,60 +1,29 @@
-"""An emulated gripper's build, and its motor, racks and jaws: motion, current, what they press on, step by step."""
+"""An emulated gripper's motor, racks and jaws: motion, current, what they press on, step by step."""
 
 from __future__ import annotations
 
 import math
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
-
-from finforce.settings import check_bounds, setting
-from finforce_driver.errors import TargetError
 
 STEP = 0.001  # [s]
 TURN = 16384  # ticks of the encoder
+STOP_OPEN, STOP_CLOSED = 10329, -229  # [ticks] of the motor at the end stops
+STROKE = 0.048  # [m] of the opening between them; closed jaws touch
+FORCE_PER_CURRENT = 47.7  # [N/A]
+_PER_TICK = STROKE / (STOP_OPEN - STOP_CLOSED)
+_CURRENT_LAG = 0.02  # [s]
+_FREE_CURRENT = 60.0  # [mA] that moves the unloaded jaws, at most a fifth of the limit
+_HOLD_SPEED = 80_000.0  # [ticks/s] of the drive's own position control
 _FILTER_STEPS = 4  # of the velocity reading: 20 samples of 0.2 ms
 _GIVE_WAY = 20.0  # [ticks] in one step, by which a load that is too strong pushes the jaws open
 _BISECTIONS = 30
 
 
-@dataclass(frozen=True, kw_only=True)
-class EmulatorSettings:
-    """Settings of `EmulatedGripper`; each field's metadata says unit, bounds and meaning."""
-
-    stop_open: int = setting(10329, "of the motor at the open end stop", "ticks", 0, 16383)
-    stop_closed: int = setting(-229, "of the motor at the closed end stop", "ticks", -16384, 0)
-    stroke: float = setting(0.048, "opening of the mechanism between its end stops", "m", 0.001, 0.5)
-    closed_opening: float = setting(0.0, "between the jaws' inner faces when the mechanism is closed", "m", 0.0, 0.2)
-    start_opening: float = setting(0.048, "between the jaws when the emulation begins", "m", 0.0, 0.7)
-    force_per_current: float = setting(47.7, "grip force per motor current", "N/A", 1.0, 500.0)
-    current_lag: float = setting(0.02, "time constant of the current", "s", 0.001, 1.0)
-    free_current: float = setting(0.06, "that moves the unloaded jaws, at most a fifth of the limit", "A", 0.0, 0.5)
-    limp_force: float = setting(0.0, "grip force below which jaws without power stay where they are", "N", 0.0, 100.0)
-    hold_speed: float = setting(80_000.0, "of the drive's own position control", "ticks/s", 1000.0, 800_000.0)
-    rest_error: int = setting(0, "that the position control leaves, positive on the open side", "ticks", -4, 4)
-    boot_time: float = setting(0.3, "of silence after a reset", "s", 0.0, 10.0)
-    save_time: float = setting(0.5, "of deafness while the configuration is written", "s", 0.0, 10.0)
-    resets_integrators: bool = setting(False, "each order of five bytes lets the current start anew", "")
-    supply_limit: float = setting(29.0, "supply above which a fault is latched", "V", 9.0, 30.0)
-
-    def __post_init__(self) -> None:
-        """Refuse values out of bounds.
-
-        Raises:
-            TargetError: a value is out of its bounds, or the jaws would start beyond an end stop.
-        """
-        check_bounds(self, TargetError)
-        widest = self.closed_opening + self.stroke
-        if not self.closed_opening <= self.start_opening <= widest:
-            raise TargetError(
-                f"start_opening: got {self.start_opening:g} m, expected {self.closed_opening:g} to {widest:g} m"
-            )
-
-
 class Jaws:
     """The moving parts, with the truth about them.
 
-    The opening grows with the motor's angle, stroke * (ticks - stop_closed) / (stop_open - stop_closed).
+    The opening grows with the motor's angle, STROKE * (ticks - STOP_CLOSED) / (STOP_OPEN - STOP_CLOSED).
 
     Attributes:
         ticks: true angle of the motor [ticks], not forgotten in a reset.
@@ -65,22 +34,20 @@ class Jaws:
         slips: the motor turns through at a stop, so that its current never tells of it.
     """
 
-    def __init__(self, settings: EmulatorSettings) -> None:
+    def __init__(self) -> None:
         self.object_opening: float | None = None
         self.wall_opening: float | None = None
         self.load: Callable[[float], float] | None = None
         self.slips = False
-        self._settings = settings
-        self._per_tick = settings.stroke / (settings.stop_open - settings.stop_closed)
-        self._blend = 1.0 - math.exp(-STEP / settings.current_lag)
-        self.ticks = float(round(self.ticks_at(settings.start_opening)))
+        self._blend = 1.0 - math.exp(-STEP / _CURRENT_LAG)
+        self.ticks = float(STOP_OPEN)
         self.current = 0.0
         self.reset_encoder()
 
     @property
     def opening(self) -> float:
         """Return the true opening between the undeformed inner faces [m]."""
-        return (self.ticks - self._settings.stop_closed) * self._per_tick + self._settings.closed_opening
+        return (self.ticks - STOP_CLOSED) * _PER_TICK
 
     @property
     def force(self) -> float:
@@ -99,7 +66,7 @@ class Jaws:
 
     def ticks_at(self, opening: float) -> float:
         """Return the motor's angle [ticks] at an opening [m]."""
-        return (opening - self._settings.closed_opening) / self._per_tick + self._settings.stop_closed
+        return opening / _PER_TICK + STOP_CLOSED
 
     def reset_encoder(self) -> None:
         """Forget whole turns, as the encoder does without power."""
@@ -119,15 +86,15 @@ class Jaws:
         if abs(moved) < 0.5 * abs(wanted) and not self.slips:
             self._settle_current(math.copysign(limit, velocity))
             return
-        free = min(1000.0 * self._settings.free_current, 0.2 * limit)
+        free = min(_FREE_CURRENT, 0.2 * limit)
         pressing = -min(self._current_for(self.force), limit) if self.load is not None else 0.0
         self._settle_current(pressing if -pressing > free else math.copysign(free, velocity))
 
     def hold(self, count: int, limit: float) -> None:
         """Go on for one step under position control towards an encoder count, with a current limit [mA]."""
-        error = count + self._settings.rest_error - self._offset - self.ticks
+        error = count - self._offset - self.ticks
         if abs(error) > 1e-6:
-            self.drive(math.copysign(self._settings.hold_speed, error), limit, abs(error))
+            self.drive(math.copysign(_HOLD_SPEED, error), limit, abs(error))
             return
         self._move(0.0, limit)
         self._settle_current(-min(self._current_for(self.force), limit))
@@ -135,14 +102,14 @@ class Jaws:
     def rest(self) -> None:
         """Go on for one step without power."""
         if self.load is not None:
-            self._give_way(self._settings.limp_force)
+            self._give_way(0.0)
         self._settle_current(0.0)
         self._counts.append(self._count())
 
     def _move(self, way: float, limit: float) -> float:
         """Go `way` [ticks] or as far as stops, object and load let a current [mA] go; return the way gone."""
         before = self.ticks
-        capacity = 1e-3 * max(limit, 0.0) * self._settings.force_per_current
+        capacity = 1e-3 * max(limit, 0.0) * FORCE_PER_CURRENT
         if self.load is not None and self._force_at(before) > capacity * (1.0 + 1e-6) + 1e-9:
             self._give_way(capacity)
         elif limit > 0.0:
@@ -154,7 +121,7 @@ class Jaws:
         return self.ticks - before
 
     def _bounds(self) -> tuple[float, float]:
-        low, high = float(self._settings.stop_closed), float(self._settings.stop_open)
+        low, high = float(STOP_CLOSED), float(STOP_OPEN)
         if self.object_opening is not None:
             low = max(low, self.ticks_at(self.object_opening))
         if self.wall_opening is not None:
@@ -165,7 +132,7 @@ class Jaws:
         """Let a load that is stronger than `capacity` [N] push the jaws open for one step."""
         if self._force_at(self.ticks) <= capacity:
             return
-        wider = min(self.ticks + _GIVE_WAY, float(self._settings.stop_open))
+        wider = min(self.ticks + _GIVE_WAY, float(STOP_OPEN))
         self.ticks = wider if self._force_at(wider) > capacity else self._balance(self.ticks, wider, capacity)
 
     def _balance(self, narrow: float, wide: float, capacity: float) -> float:
@@ -179,13 +146,10 @@ class Jaws:
         return wide
 
     def _force_at(self, ticks: float) -> float:
-        if self.load is None:
-            return 0.0
-        settings = self._settings
-        return float(self.load((ticks - settings.stop_closed) * self._per_tick + settings.closed_opening))
+        return 0.0 if self.load is None else float(self.load((ticks - STOP_CLOSED) * _PER_TICK))
 
     def _current_for(self, force: float) -> float:
-        return 1000.0 * force / self._settings.force_per_current
+        return 1000.0 * force / FORCE_PER_CURRENT
 
     def _settle_current(self, goal: float) -> None:
         self.current += (goal - self.current) * self._blend

@@ -1,28 +1,19 @@
-"""A pseudo-terminal with an emulated adapter behind it, in real time, and the program that opens one."""
+"""A pseudo-terminal with an emulated adapter behind it, in real time."""
 
 from __future__ import annotations
 
-import argparse
 import os
 import pty
 import select
-import sys
 import termios
 import tty
-from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from threading import Event, RLock, Thread
 from time import monotonic
-from types import TracebackType
 
-from finforce.errors import FinforceError
-from finforce.signals import StopSignals
 from finforce_driver.errors import LinkError, TargetError
-from finforce_sim.emulator.adapter import ACK_MODES, EmulatedAdapter
-from finforce_sim.emulator.control import VARIANTS
-from finforce_sim.emulator.faults import FaultyAdapter, draw_plan
-from finforce_sim.emulator.firmware import EmulatedGripper
+from finforce_sim.emulator.adapter import EmulatedAdapter
 
 _IDLE_PERIOD = 0.004  # [s] between two steps of the emulation while nothing comes in
 _BUSY_PERIOD = 0.0005  # [s] the same while an answer waits for its time
@@ -105,9 +96,7 @@ class PtyPort:
         self.open()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _follow_adapter(self) -> None:
@@ -172,61 +161,3 @@ class PtyPort:
             return
         with suppress(BlockingIOError):  # nobody reads, and the buffer is full: an adapter loses it too
             os.write(self._master, answer.translate(_GARBLED) if garbles else answer)
-
-
-_FAULTS = 10_000  # planned ahead
-
-
-def build_parser() -> argparse.ArgumentParser:
-    """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m finforce_sim.emulator", description="An emulated SSG-48 behind a pseudo-terminal (SLCAN)."
-    )
-    parser.add_argument("--link", help="path of a symbolic link to the port")
-    parser.add_argument("--variant", choices=tuple(VARIANTS), default="new", help="of the firmware")
-    parser.add_argument("--node", type=int, default=0, help="of the gripper on the CAN bus, 0 to 15")
-    parser.add_argument("--object-mm", type=float, help="width of what is between the jaws [mm]; without: nothing")
-    parser.add_argument("--stiffness", type=float, help="of that object [N per mm of opening]; without: rigid")
-    parser.add_argument("--ack", choices=ACK_MODES, default="none", help="answers of the adapter")
-    parser.add_argument("--baud", type=int, help="that the other side must set; without: any")
-    parser.add_argument("--latency-ms", type=float, default=0.0, help="from the bus to the host [ms]")
-    parser.add_argument("--faults", type=float, default=0.0, help="random faults per minute, every kind")
-    parser.add_argument("--seed", type=int, default=0, help="of the random faults")
-    return parser
-
-
-def build_load(width: float, stiffness: float) -> Callable[[float], float]:
-    """Return the grip force [N] by opening [m] of a spring of a free width [m] and a stiffness [N/m]."""
-    return lambda opening: stiffness * max(width - opening, 0.0)
-
-
-def build_adapter(options: argparse.Namespace) -> EmulatedAdapter:
-    """Return the adapter with the gripper that a command line describes.
-
-    Raises:
-        TargetError: a value is out of bounds.
-    """
-    width = None if options.object_mm is None else 1e-3 * options.object_mm
-    soft = width is not None and options.stiffness is not None
-    gripper = EmulatedGripper(
-        options.variant,
-        options.node,
-        object_opening=None if soft else width,
-        load=build_load(width, 1e3 * options.stiffness) if soft else None,
-    )
-    plan = draw_plan(options.seed, _FAULTS, 60.0 / options.faults) if options.faults > 0.0 else ()
-    return FaultyAdapter(gripper, plan, options.seed, ack_mode=options.ack, latency=1e-3 * options.latency_ms)
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Serve an emulated gripper until Ctrl-C or a request to end; return the exit status."""
-    options = build_parser().parse_args(arguments)
-    try:
-        with StopSignals() as stop, PtyPort(build_adapter(options), options.link, options.baud) as port:
-            print(port.path, flush=True)
-            while not stop.wait():  # another handled signal wakes it, too
-                pass
-    except FinforceError as error:
-        print(error, file=sys.stderr)
-        return 2
-    return 0

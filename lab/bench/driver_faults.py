@@ -248,7 +248,7 @@ class FaultRun:
     def _works(self) -> bool:
         """Return whether a move reaches its goal."""
         self.gripper.activate(True)
-        self._goal, self._allowed = 0.030 if self.emulated.true_opening < 0.02 else 0.010, True
+        self._goal, self._allowed = 0.030 if self.emulated.jaws.opening < 0.02 else 0.010, True
         self.gripper.move(self._goal, 0.1)
         state = self.gripper.wait(lambda state: state.phase is not Phase.MOVING, 5.0)
         distance = self.tape.truths[-1].position - self.gripper.settings.counts_of(self._goal)
@@ -328,7 +328,7 @@ class Tape:
                 echo=(gripper.order.activated, gripper.order.action),
                 mode=gripper.mode,
                 blocked=_blocked(jaws),
-                temperature=float(gripper.protection.reported_temperature),
+                temperature=float(round(gripper.protection.temperature)),
                 voltage=gripper.protection.voltage,
             )
         )

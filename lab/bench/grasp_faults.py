@@ -256,7 +256,7 @@ class FaultyGrasp(World):
 
     def _check_state(self, state: GripperState) -> None:
         """Check what the gripper reports: it is not ready while it closes."""
-        opening, now = self.emulated.true_opening, self.clock.now()
+        opening, now = self.emulated.jaws.opening, self.clock.now()
         if state.phase is not Phase.READY or state.outcome is not self._outcome or now - self._unlinked < SETTLED:
             self._ready_at, self._ready_opening = now, math.inf
         elif now - self._ready_at > DEBOUNCED:
@@ -269,7 +269,7 @@ class FaultyGrasp(World):
         """Check whether the jaws close after the end."""
         if not now - max(self._ended, self._unlinked) > SETTLED:
             return
-        opening = self.emulated.true_opening
+        opening = self.emulated.jaws.opening
         if (self._least - opening) / self.gripper.resolution > CREEP and self._least < math.inf:
             self._complain("motion after stop")
         self._least = opening if self._least == math.inf else self._least

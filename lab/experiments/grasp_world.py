@@ -160,7 +160,7 @@ class World:
 
     def step(self, dt: float) -> None:
         """Bend and relax the fingers, and take an image where one is due."""
-        now, opening = self.clock.now(), self.emulated.true_opening
+        now, opening = self.clock.now(), self.emulated.jaws.opening
         elastic = np.array([self._case.plant.force_at(opening), 0.0, 0.0])
         self.force = float(self._relaxation.update(elastic, dt)[0])
         self.course.times.append(now)

@@ -66,7 +66,7 @@ def trial():
 def test_joints_go_to_half_the_opening_each(trial):
     status, result = trial.parallel(name=JOINTS, position=[0.01, 0.01], velocity=[0.05, 0.05])
     assert status == GoalStatus.STATUS_SUCCEEDED and result.reached_goal and not result.stalled
-    assert trial.bench.gripper.true_opening == pytest.approx(0.02, abs=2 * STEP)
+    assert trial.bench.gripper.jaws.opening == pytest.approx(0.02, abs=2 * STEP)
     assert list(result.state.name) == JOINTS
     assert list(result.state.position) == pytest.approx([0.01] * 2, abs=2 * STEP)
     assert list(result.state.effort) == []  # nobody sees a force
@@ -76,7 +76,7 @@ def test_joints_go_to_half_the_opening_each(trial):
 def test_one_joint_that_the_other_mimics_moves_both(trial):
     status, _ = trial.parallel(name=["left_jaw_joint"], position=[0.015])
     assert status == GoalStatus.STATUS_SUCCEEDED
-    assert trial.bench.gripper.true_opening == pytest.approx(0.03, abs=2 * STEP)
+    assert trial.bench.gripper.jaws.opening == pytest.approx(0.03, abs=2 * STEP)
 
 
 def test_what_is_grasped_on_the_way_is_a_success_that_stalled(trial):
@@ -90,9 +90,9 @@ def test_a_goal_that_is_cancelled_holds_in_place(trial):
     trial.probe.wait_for(lambda: trial.feedback)
     trial.probe.wait_for(handle.cancel_goal_async().done)
     assert trial.result(handle)[0] == GoalStatus.STATUS_CANCELED
-    place = trial.bench.gripper.true_opening
+    place = trial.bench.gripper.jaws.opening
     trial.probe.spin(0.5)
-    assert trial.bench.gripper.true_opening == pytest.approx(place, abs=2 * STEP) and place > 0.01
+    assert trial.bench.gripper.jaws.opening == pytest.approx(place, abs=2 * STEP) and place > 0.01
 
 
 @pytest.mark.parametrize("effort", [5.0, 100.0])

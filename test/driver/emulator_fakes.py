@@ -313,4 +313,4 @@ class Fingers:
 
     @property
     def present(self):
-        return self.force(self.bench.gripper.true_opening)
+        return self.force(self.bench.gripper.jaws.opening)

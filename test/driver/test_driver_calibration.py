@@ -39,7 +39,7 @@ def test_a_calibration_finds_the_stops_and_ends_closed(rig):
     state = rig.wait_for(Phase.READY)
     assert state.calibrated
     assert state.opening == pytest.approx(0.0, abs=1e-4)
-    assert rig.emulated.true_opening == pytest.approx(0.0, abs=1e-4)
+    assert rig.emulated.jaws.opening == pytest.approx(0.0, abs=1e-4)
     assert rig.arrive(0.02).outcome is MoveOutcome.REACHED
 
 
@@ -71,7 +71,7 @@ def test_a_calibration_with_an_object_between_the_jaws_is_refused(rig, width):
     rig.gripper.calibrate()
     rig.wait_for(Phase.READY)
     rig.arrive(0.03)
-    assert rig.emulated.true_opening == pytest.approx(0.03, abs=2e-4)
+    assert rig.emulated.jaws.opening == pytest.approx(0.03, abs=2e-4)
 
 
 @both_variants
@@ -205,8 +205,8 @@ def test_something_soft_between_the_jaws_is_no_reason_to_doubt_the_gripper(rig, 
     rig.gripper.calibrate()
     assert rig.wait_for(Phase.READY, Phase.UNCALIBRATED).phase is Phase.READY
     rig.live(0.5)  # limp, the jaws are pushed open; the stops were found all the same
-    assert rig.emulated.true_opening == pytest.approx(0.025, abs=2e-3)
-    assert rig.arrive(0.040).opening == pytest.approx(rig.emulated.true_opening, abs=2e-4)
+    assert rig.emulated.jaws.opening == pytest.approx(0.025, abs=2e-3)
+    assert rig.arrive(0.040).opening == pytest.approx(rig.emulated.jaws.opening, abs=2e-4)
 
 
 @both_variants

@@ -46,7 +46,7 @@ class Lab:
 
     def step(self, dt):
         now = self.clock.now()
-        self.forces.append(press(self.emulated.true_opening))
+        self.forces.append(press(self.emulated.jaws.opening))
         for when in [when for when in self.actions if now - self.begin > when]:
             self.actions.pop(when)(self)
         if now >= self._next:
@@ -75,10 +75,10 @@ class Lab:
         self.clock.wait(0.05)
         for _ in range(10):
             self.gripper.turn()
-        before = self.emulated.true_opening
+        before = self.emulated.jaws.opening
         for _ in range(100):
             self.gripper.turn()
-        assert self.emulated.true_opening == pytest.approx(before, abs=1e-4)  # half a step
+        assert self.emulated.jaws.opening == pytest.approx(before, abs=1e-4)  # half a step
 
 
 @pytest.fixture(params=["new", "old"])
@@ -137,7 +137,7 @@ def test_gripper_that_is_not_calibrated_is_not_moved():
     emulated, clock = EmulatedGripper(), VirtualClock()
     gripper = Gripper(VirtualBus(EmulatedAdapter(emulated), clock), clock=clock)
     gripper.wait(lambda state: state.phase is Phase.UNCALIBRATED, 5.0)
-    before = emulated.true_opening
+    before = emulated.jaws.opening
     with pytest.raises(GraspError, match="uncalibrated"):
         hold_force(gripper, list, GraspGoal(force=1.0))
-    assert emulated.true_opening == before
+    assert emulated.jaws.opening == before

@@ -60,7 +60,7 @@ def test_past_openings_are_known_for_five_seconds(rig):
     rig.gripper.move(0.0, 0.008)
     for _ in range(300):
         rig.gripper.turn()
-        truth.append((rig.clock.now(), rig.emulated.true_opening))
+        truth.append((rig.clock.now(), rig.emulated.jaws.opening))
     for when, opening in truth[20::7]:
         if when <= rig.state.stamp and when > rig.clock.now() - 5.0:
             assert rig.gripper.opening_at(when) == pytest.approx(opening, abs=0.8 * COUNT)
@@ -102,10 +102,10 @@ def test_the_end_of_the_driver_leaves_the_gripper_as_it_is_told_to(release):
     rig.gripper.move(0.0, 0.02)
     rig.live(0.5)
     rig.gripper.close()
-    place, order = rig.emulated.true_opening, rig.emulated.order
+    place, order = rig.emulated.jaws.opening, rig.emulated.order
     assert order.flags & (Flag.ACTIVATE | Flag.GO) == (0 if release else Flag.ACTIVATE | Flag.GO)
     rig.clock.wait(1.0)
-    assert rig.emulated.true_opening == pytest.approx(place, abs=2 * COUNT)
+    assert rig.emulated.jaws.opening == pytest.approx(place, abs=2 * COUNT)
     assert rig.state.phase is Phase.DISCONNECTED
 
 
@@ -118,7 +118,7 @@ def test_a_gripper_that_is_commanded_by_threads_in_real_time():
         gripper.move(0.03, 0.1)
         state = gripper.wait(lambda state: state.phase is Phase.READY, 10.0)
         assert state.outcome is MoveOutcome.REACHED
-        assert emulated.true_opening == pytest.approx(0.03, abs=COUNT)
+        assert emulated.jaws.opening == pytest.approx(0.03, abs=COUNT)
         gripper.estop()
         gripper.wait(lambda _: len(emulated.faults) == 2, 10.0)
 

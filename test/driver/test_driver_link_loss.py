@@ -29,7 +29,7 @@ def test_an_unplugged_adapter_is_told_at_once_and_found_again(rig):
     begin = rig.clock.now()
     state = rig.wait_for(Phase.READY)
     assert rig.clock.now() - begin < 3.0 + 2.0
-    assert state.opening == pytest.approx(rig.emulated.true_opening, abs=2e-4)
+    assert state.opening == pytest.approx(rig.emulated.jaws.opening, abs=2e-4)
     assert "unplugged" not in state.message
     rig.live(1.0)
     assert rig.orders(begin) == []
@@ -129,7 +129,7 @@ def test_an_order_that_could_not_leave_before_the_silence_never_leaves(rig):
     rig.live(0.06)
     rig.gripper.move(0.0, 0.02)
     rig.live(3.0)
-    place = rig.emulated.true_opening
+    place = rig.emulated.jaws.opening
     assert rig.state.phase is Phase.READY
     assert place == pytest.approx(0.048) or rig.state.outcome is not MoveOutcome.ABORTED
 
@@ -204,17 +204,17 @@ def test_jaws_that_went_on_moving_without_a_link_are_held_and_never_said_to_be_r
     rig.adapter.inject(FaultKind.UNPLUGGED, duration=0.3)
     begin = rig.clock.now()
     moved, ready = [], []
-    last = rig.emulated.true_opening
+    last = rig.emulated.jaws.opening
     for _ in range(400):
         rig.live(0.01)
-        moved.append(abs(rig.emulated.true_opening - last) > 2e-5)
+        moved.append(abs(rig.emulated.jaws.opening - last) > 2e-5)
         ready.append(rig.state.phase is Phase.READY)
-        last = rig.emulated.true_opening
+        last = rig.emulated.jaws.opening
     assert any(moved) and not moved[-1]
     assert not any(was and is_ready for was, is_ready in zip(moved, ready, strict=True))
-    assert rig.emulated.true_opening > 0.010  # it had 37 mm to go
+    assert rig.emulated.jaws.opening > 0.010  # it had 37 mm to go
     assert rig.state.phase is Phase.READY and "they are held" in rig.state.message
-    assert rig.state.opening == pytest.approx(rig.emulated.true_opening, abs=2e-4)
+    assert rig.state.opening == pytest.approx(rig.emulated.jaws.opening, abs=2e-4)
     assert len(states_since(rig, begin)) > 10
 
 
@@ -229,11 +229,11 @@ def test_a_driver_that_is_started_anew_holds_what_the_last_one_left_moving(rig):
         again.turn()
         if again.state.phase is Phase.MOVING:
             phases.add("moving")
-        moving = rig.emulated.true_opening
+        moving = rig.emulated.jaws.opening
         again.turn()
-        assert again.state.phase is not Phase.READY or abs(rig.emulated.true_opening - moving) < 5e-4
+        assert again.state.phase is not Phase.READY or abs(rig.emulated.jaws.opening - moving) < 5e-4
     again.wait(lambda state: state.phase is Phase.READY, 5.0)
-    assert phases == {"moving"} and rig.emulated.true_opening > 0.010
+    assert phases == {"moving"} and rig.emulated.jaws.opening > 0.010
 
 
 @both_variants

@@ -95,8 +95,8 @@ def test_an_adapter_that_gives_our_messages_back_is_no_other_program(rig):
 def test_jaws_that_are_pulled_away_from_their_target_are_no_sign_of_another_program(rig):
     rig.emulated.jaws.load = lambda opening: 60.0  # more than the current limit gives
     rig.live(0.05)
-    assert rig.emulated.true_opening > 0.021
+    assert rig.emulated.jaws.opening > 0.021
     rig.live(1.0)
     assert "foreign commands" not in rig.state.counts
     assert rig.state.outcome is MoveOutcome.REACHED
-    assert rig.state.opening == pytest.approx(rig.emulated.true_opening, abs=2e-4)
+    assert rig.state.opening == pytest.approx(rig.emulated.jaws.opening, abs=2e-4)

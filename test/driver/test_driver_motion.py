@@ -21,7 +21,7 @@ def test_a_move_reaches_its_opening(rig, opening):
     # closing to the end the stop comes first: "closed on nothing" says more than "reached"
     assert state.outcome in (MoveOutcome.REACHED, MoveOutcome.CLOSED_EMPTY)
     assert state.opening == pytest.approx(opening, abs=0.6 * COUNT)
-    assert rig.emulated.true_opening == pytest.approx(opening, abs=COUNT)
+    assert rig.emulated.jaws.opening == pytest.approx(opening, abs=COUNT)
 
 
 @both_variants
@@ -30,7 +30,7 @@ def test_the_opening_that_is_told_is_the_true_one_throughout(rig):
     while rig.state.phase is Phase.MOVING:
         rig.gripper.turn()
         # half a count of truncation, and what the jaws go between two polls
-        assert rig.state.opening == pytest.approx(rig.emulated.true_opening, abs=0.5 * COUNT + 0.03 * 0.025)
+        assert rig.state.opening == pytest.approx(rig.emulated.jaws.opening, abs=0.5 * COUNT + 0.03 * 0.025)
 
 
 @both_variants
@@ -86,7 +86,7 @@ def test_a_slow_move_is_smooth_within_a_fifth_of_a_millimetre(rig):
         rig.gripper.turn()
         ideal = max(0.02 - 0.001 * (rig.clock.now() - begin), 0.012)
         # the jaws follow a step within 40 ms
-        assert abs(rig.emulated.true_opening - ideal) < 0.0002
+        assert abs(rig.emulated.jaws.opening - ideal) < 0.0002
     assert rig.state.outcome is MoveOutcome.REACHED
     orders = rig.orders(begin)
     assert all(abs(after.position - before.position) == 1 for before, after in zip(orders, orders[1:], strict=False))
@@ -98,12 +98,12 @@ def test_a_new_goal_of_a_slow_move_goes_on_without_a_jerk(rig):
     rig.arrive(0.03)
     rig.gripper.move(0.01, 0.002)
     rig.live(1.0)
-    begin, place = rig.clock.now(), rig.emulated.true_opening
+    begin, place = rig.clock.now(), rig.emulated.jaws.opening
     for goal, speed in ((0.02, 0.002), (0.015, 0.001), (0.04, 0.002), (0.0, 0.002)):
         rig.gripper.move(goal, speed)
         rig.live(0.25)
-        assert abs(rig.emulated.true_opening - place) < 0.002 * 0.25 + 1.5 * COUNT
-        place = rig.emulated.true_opening
+        assert abs(rig.emulated.jaws.opening - place) < 0.002 * 0.25 + 1.5 * COUNT
+        place = rig.emulated.jaws.opening
     steps = [order.position for order in rig.orders(begin)]
     assert max(abs(after - before) for before, after in zip(steps, steps[1:], strict=False)) == 1
 
@@ -117,7 +117,7 @@ def test_a_slow_move_grasps_and_follows_what_gives_way(rig):
     assert min(order.position for order in rig.orders()[-1:]) - rig.gripper.settings.counts_of(0.025) < 5.0
     rig.emulated.jaws.object_opening = 0.020
     begin = rig.clock.now()
-    rig.gripper.wait(lambda _: rig.emulated.true_opening < 0.0205, 10.0)
+    rig.gripper.wait(lambda _: rig.emulated.jaws.opening < 0.0205, 10.0)
     assert rig.clock.now() - begin > 0.7 * 0.0045 / 0.002
 
 
@@ -152,7 +152,7 @@ def test_switching_off_lets_go_and_refuses_moves(rig):
     rig.gripper.activate(True)
     rig.live(0.3)
     assert rig.state.activated
-    assert rig.emulated.true_opening == pytest.approx(0.02, abs=1.1 * COUNT)
+    assert rig.emulated.jaws.opening == pytest.approx(0.02, abs=1.1 * COUNT)
     assert rig.arrive(0.01).outcome is MoveOutcome.REACHED
 
 

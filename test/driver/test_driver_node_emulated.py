@@ -41,7 +41,7 @@ def test_joint_states_follow_the_gripper_with_the_times_of_its_replies(bench):
     assert all(later > earlier for earlier, later in zip(stamps, stamps[1:], strict=False))
     # none from the future, none older than the test's patience
     assert 0 < time_ns() - stamps[-1] < 10 * ros.NANOSECONDS
-    assert list(bench.joints[-1].position) == pytest.approx([bench.gripper.true_opening / 2] * 2, abs=STEP)
+    assert list(bench.joints[-1].position) == pytest.approx([bench.gripper.jaws.opening / 2] * 2, abs=STEP)
     numbers = [value for m in bench.joints for value in (*m.position, *m.velocity, *m.effort)]
     assert all(map(math.isfinite, numbers))
 
@@ -51,7 +51,7 @@ def test_a_command_moves_the_gripper(bench, variant):
     bench = bench(variant)
     bench.wait_for_joints()
     bench.move(0.03, velocity=[0.1], effort=[15.0])
-    bench.probe.wait_for(lambda: abs(bench.gripper.true_opening - 0.03) < 2 * STEP)
+    bench.probe.wait_for(lambda: abs(bench.gripper.jaws.opening - 0.03) < 2 * STEP)
     bench.probe.wait_for(lambda: abs(2 * bench.joints[-1].position[0] - 0.03) < 2 * STEP)
     assert min(message.velocity[0] for message in bench.joints) < 0.0
 
@@ -70,13 +70,13 @@ def test_a_calibration_makes_the_gripper_ready(bench, variant):
 def test_a_gripper_that_is_not_calibrated_refuses_to_move_and_says_what_helps(bench):
     bench = bench(calibrated=False)
     bench.diagnosis(Level.WARN, "not calibrated")
-    before = bench.gripper.true_opening
+    before = bench.gripper.jaws.opening
     bench.move(0.02)
     bench.diagnosis(Level.ERROR, "calibrate")
     for name in ("release", "grasp_without_vision", "stop", "grasp"):
         answer = bench.call(name)
         assert not answer.success and "calibrate" in answer.message, name
-    assert bench.gripper.true_opening == before
+    assert bench.gripper.jaws.opening == before
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -84,18 +84,18 @@ def test_an_emergency_stop_stops_a_motion_and_clearing_it_lets_the_next_one_go(b
     bench = bench(variant)
     bench.wait_for_joints()
     bench.move(0.005, velocity=[0.01])
-    bench.probe.wait_for(lambda: bench.gripper.true_opening < 0.047)
+    bench.probe.wait_for(lambda: bench.gripper.jaws.opening < 0.047)
     assert bench.call("estop").success
-    stopped = bench.gripper.true_opening
+    stopped = bench.gripper.jaws.opening
     bench.diagnosis(Level.ERROR, "emergency stop")
-    assert bench.gripper.true_opening == pytest.approx(stopped, abs=STEP)
+    assert bench.gripper.jaws.opening == pytest.approx(stopped, abs=STEP)
     bench.move(0.005)
     bench.probe.spin(0.1)
-    assert bench.gripper.true_opening == pytest.approx(stopped, abs=STEP)
+    assert bench.gripper.jaws.opening == pytest.approx(stopped, abs=STEP)
     answer = bench.call("clear_errors")
     assert answer.success, answer.message
     bench.move(0.03, velocity=[0.1])
-    bench.probe.wait_for(lambda: abs(bench.gripper.true_opening - 0.03) < 2 * STEP)
+    bench.probe.wait_for(lambda: abs(bench.gripper.jaws.opening - 0.03) < 2 * STEP)
 
 
 def test_a_port_that_is_unplugged_is_an_error_until_it_is_back(bench):
@@ -109,7 +109,7 @@ def test_a_port_that_is_unplugged_is_an_error_until_it_is_back(bench):
     assert len(bench.joints) <= have + 1  # one may have been on its way
     bench.port.replug()
     bench.wait_for_joints(3)
-    assert bench.gripper.true_opening == pytest.approx(0.048, abs=STEP)
+    assert bench.gripper.jaws.opening == pytest.approx(0.048, abs=STEP)
     bench.diagnosis(Level.OK, "")
 
 
@@ -146,7 +146,7 @@ def test_another_program_that_commands_the_gripper_is_named(bench):
     bench = bench()
     bench.wait_for_joints()
     bench.move(0.03, velocity=[0.1])
-    bench.probe.wait_for(lambda: abs(bench.gripper.true_opening - 0.03) < 2 * STEP)
+    bench.probe.wait_for(lambda: abs(bench.gripper.jaws.opening - 0.03) < 2 * STEP)
     with bench.port.lock:
         bench.port.adapter.put_on_bus(CanMessage(id=0x07A, data=bytes([0x40, 0x80, 0x01, 0xF4, 0xC0])))
     bench.diagnosis(Level.WARN, "another program")
@@ -167,7 +167,7 @@ def test_bad_commands_are_named_and_move_nothing(bench):
         bench.probe.got["/diagnostics"].clear()
         bench.move(**fields)
         bench.diagnosis(Level.ERROR, "got")
-        assert bench.gripper.true_opening == pytest.approx(0.048, abs=STEP), name
+        assert bench.gripper.jaws.opening == pytest.approx(0.048, abs=STEP), name
     assert not bench.gripper.order.action
 
 
@@ -211,12 +211,12 @@ def test_a_camera_that_falls_silent_ends_the_grasp_in_place(bench):
     bench, fingers = grasped(bench)
     fingers.timer.cancel()
     bench.probe.wait_for(lambda: not bench.node.session.runs)
-    held = bench.gripper.true_opening
+    held = bench.gripper.jaws.opening
     state = bench.probe.got["/gripper_driver/grasp_state"]
     bench.probe.wait_for(lambda: state and state[-1].level[0] == Level.WARN)
     assert "s old" in state[-1].message or "silent" in state[-1].message or "force" in state[-1].message
     bench.probe.spin(0.3)
-    assert bench.gripper.true_opening == pytest.approx(held, abs=STEP)
+    assert bench.gripper.jaws.opening == pytest.approx(held, abs=STEP)
 
 
 def test_an_emergency_stop_ends_a_grasp(bench):
@@ -232,32 +232,32 @@ def test_a_grasp_without_vision_holds_with_the_motors_force(bench):
     bench.gripper.jaws.object_opening = 0.04
     answer = bench.call("grasp_without_vision")
     assert answer.success and "without vision" in answer.message, answer.message
-    assert bench.gripper.true_opening == pytest.approx(0.04, abs=STEP)
+    assert bench.gripper.jaws.opening == pytest.approx(0.04, abs=STEP)
 
 
 def test_release_opens_again(bench):
     bench = bench(release_opening=0.045, **{"gripper.default_speed": 0.1})
     bench.wait_for_joints()
     bench.move(0.04, velocity=[0.1])
-    bench.probe.wait_for(lambda: bench.gripper.true_opening < 0.041)
+    bench.probe.wait_for(lambda: bench.gripper.jaws.opening < 0.041)
     answer = bench.call("release")
     assert answer.success, answer.message
-    assert bench.gripper.true_opening == pytest.approx(0.045, abs=2 * STEP)
+    assert bench.gripper.jaws.opening == pytest.approx(0.045, abs=2 * STEP)
 
 
 def test_what_was_asked_for_before_a_stop_does_not_move_the_jaws_after_it(bench):
     bench = bench(**{"gripper.default_speed": 0.01})
     bench.wait_for_joints()
     bench.move(0.04, velocity=[0.1])
-    bench.probe.wait_for(lambda: bench.gripper.true_opening < 0.041)
+    bench.probe.wait_for(lambda: bench.gripper.jaws.opening < 0.041)
     answers = [ask(bench.probe, Trigger, "release") for _ in range(3)]
-    bench.probe.wait_for(lambda: bench.gripper.true_opening > 0.0415)
+    bench.probe.wait_for(lambda: bench.gripper.jaws.opening > 0.0415)
     assert bench.call("stop").success
-    left = bench.gripper.true_opening
+    left = bench.gripper.jaws.opening
     bench.probe.wait_for(lambda: all(answer.done() for answer in answers))
     bench.probe.spin(0.3)  # in which a waiting release would open by 3 mm
     assert not any(answer.result().success for answer in answers)
-    assert bench.gripper.true_opening == pytest.approx(left, abs=2 * STEP)
+    assert bench.gripper.jaws.opening == pytest.approx(left, abs=2 * STEP)
 
 
 def test_a_driver_that_ends_while_the_gripper_calibrates_stops_it(bench):
@@ -273,8 +273,8 @@ def test_a_driver_that_ends_leaves_moving_jaws_where_they_are(bench):
     bench = bench()
     bench.wait_for_joints()
     bench.move(0.005, velocity=[0.01])
-    bench.probe.wait_for(lambda: bench.gripper.true_opening < 0.047)
+    bench.probe.wait_for(lambda: bench.gripper.jaws.opening < 0.047)
     bench.node.destroy_node()
-    left = bench.gripper.true_opening
+    left = bench.gripper.jaws.opening
     bench.probe.spin(0.2)
-    assert bench.gripper.true_opening == pytest.approx(left, abs=2 * STEP)
+    assert bench.gripper.jaws.opening == pytest.approx(left, abs=2 * STEP)

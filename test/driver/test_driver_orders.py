@@ -18,11 +18,11 @@ both_variants = pytest.mark.parametrize("variant", VARIANTS)
 def test_hold_stops_the_jaws_where_they_are(rig):
     rig.gripper.move(0.0, 0.02)
     rig.live(1.0)
-    place = rig.emulated.true_opening
+    place = rig.emulated.jaws.opening
     rig.gripper.hold()
     rig.live(0.3)
     assert (rig.state.phase, rig.state.outcome) == (Phase.READY, MoveOutcome.REPLACED)
-    assert rig.emulated.true_opening == pytest.approx(place, abs=0.02 * 0.03 + COUNT)
+    assert rig.emulated.jaws.opening == pytest.approx(place, abs=0.02 * 0.03 + COUNT)
     assert rig.emulated.order.current_mA == 500
 
 
@@ -80,7 +80,7 @@ def test_a_late_reply_shifts_nothing(rig):
         for _ in range(10):
             rig.gripper.turn()
         age = rig.clock.now() - rig.state.stamp
-        assert rig.state.opening - rig.emulated.true_opening < 0.05 * (age + 0.055) + COUNT
+        assert rig.state.opening - rig.emulated.jaws.opening < 0.05 * (age + 0.055) + COUNT
 
 
 @both_variants
@@ -90,11 +90,11 @@ def test_hold_after_a_gap_does_not_bring_the_jaws_back(rig):
     rig.live(0.1)
     rig.adapter.inject(FaultKind.LOST, 4)
     rig.live(0.16)
-    place = rig.emulated.true_opening
+    place = rig.emulated.jaws.opening
     rig.gripper.hold()
     rig.live(0.5)
-    assert rig.emulated.true_opening < place + COUNT
-    assert rig.emulated.true_opening > 0.005
+    assert rig.emulated.jaws.opening < place + COUNT
+    assert rig.emulated.jaws.opening > 0.005
     assert rig.state.phase is Phase.READY
 
 
@@ -103,7 +103,7 @@ def test_hold_aims_at_where_the_jaws_are_by_now(rig):
     rig.gripper.move(0.0, 0.1)
     rig.live(0.2)
     rig.clock.wait(0.018)
-    begin, place = rig.clock.now(), rig.gripper.settings.counts_of(rig.emulated.true_opening)
+    begin, place = rig.clock.now(), rig.gripper.settings.counts_of(rig.emulated.jaws.opening)
     rig.gripper.hold()
     rig.live(0.1)
     # 0.1 m/s are 10 counts in the 18 ms that the last reply is old

@@ -38,9 +38,9 @@ def test_a_stop_latches_at_once_and_no_motion_follows(rig, what):
     assert rig.state.estopped and rig.state.phase is Phase.FAULT
     rig.live(0.01)
     assert rig.emulated.faults >= LATCHED
-    place = rig.emulated.true_opening
+    place = rig.emulated.jaws.opening
     rig.live(1.0)
-    assert rig.emulated.true_opening == place
+    assert rig.emulated.jaws.opening == place
     assert not any(order.drives for order in rig.orders(begin))
     # repeated at most until the acknowledgement is believed
     assert 1 <= len(rig.orders(begin)) <= 3

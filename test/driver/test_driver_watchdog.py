@@ -18,9 +18,9 @@ def test_what_is_left_of_a_killed_drivers_order_ends_with_the_grippers_watchdog(
     rig.live(1.2)
     rig.gripper.move(0.0, 0.01)
     rig.live(0.5)
-    before = rig.emulated.true_opening
+    before = rig.emulated.jaws.opening
     rig.clock.wait(3.0)  # killed: nobody asks any more, the jaws go on
-    closed = before - rig.emulated.true_opening
+    closed = before - rig.emulated.jaws.opening
     assert closed > 0.02 if not watchdog else closed < 0.01 * (watchdog + 0.1)
 
 

@@ -1,9 +1,6 @@
 import pytest
 from emulator_fakes import CLEAR, IDLE, VARIANTS, Host, calibrated_host, code_of, current_of
 
-from finforce_driver.errors import TargetError
-from finforce_sim.emulator.mechanism import EmulatorSettings
-
 CONTACT = {("new", "closing"): 0x20, ("new", "opening"): 0x10, ("old", "closing"): 0x10, ("old", "opening"): 0x20}
 AT_POSITION = 0x30
 TICK = 0.048 / 10558  # [m]
@@ -19,14 +16,7 @@ def test_target_is_reached_and_reported_one_count_less(variant, position):
     assert position - 1 <= reply[0] <= position
     if variant == "new" and 0 < position < 255:
         assert reply[0] == position - 1
-    assert host.gripper.true_opening == pytest.approx(0.048 * (255 - position) / 255, abs=2 * TICK)  # truncation
-
-
-def test_rest_error_within_the_tolerance_is_reached_too():
-    host = calibrated_host(settings=EmulatorSettings(rest_error=-4))
-    host.order(100)
-    host.wait(1.0)
-    assert code_of(host.poll()) == AT_POSITION and host.poll()[0] == 100
+    assert host.gripper.jaws.opening == pytest.approx(0.048 * (255 - position) / 255, abs=2 * TICK)  # truncation
 
 
 @pytest.mark.parametrize(("speed", "ticks_per_second"), [(3, 980), (30, 9447), (100, 31396)])
@@ -56,7 +46,7 @@ def test_rigid_object_stops_the_jaws_and_the_current_tells_the_direction(variant
     reply = host.poll()
     assert code_of(reply) == CONTACT[variant, "closing"]
     assert current_of(reply) == pytest.approx(-500, abs=1)
-    assert host.gripper.true_opening == pytest.approx(0.02, abs=1e-12)
+    assert host.gripper.jaws.opening == pytest.approx(0.02, abs=1e-12)
 
 
 def test_wall_outside_stops_opening_jaws(variant):
@@ -69,7 +59,7 @@ def test_wall_outside_stops_opening_jaws(variant):
     reply = host.poll()
     assert code_of(reply) == CONTACT[variant, "opening"]
     assert current_of(reply) == pytest.approx(500, abs=1)
-    assert host.gripper.true_opening == pytest.approx(0.03, abs=1e-12)
+    assert host.gripper.jaws.opening == pytest.approx(0.03, abs=1e-12)
 
 
 def test_contact_shows_only_once_the_current_has_risen():
@@ -88,7 +78,7 @@ def test_spring_is_pressed_as_far_as_the_current_allows(variant, current):
     host.wait(2.0)
     force = 0.0477 * current
     assert host.gripper.jaws.force == pytest.approx(force, rel=1e-5)
-    assert host.gripper.true_opening == pytest.approx(0.045 - force / 2000.0, abs=1e-7)
+    assert host.gripper.jaws.opening == pytest.approx(0.045 - force / 2000.0, abs=1e-7)
     assert current_of(host.poll()) == pytest.approx(-current, abs=1)
     assert code_of(host.poll()) == CONTACT[variant, "closing"]
 
@@ -116,11 +106,11 @@ def test_relaxing_load_lets_the_jaws_creep_on():
     host = calibrated_host(load=lambda opening: weight[0] * 1000.0 * max(0.04 - opening, 0.0))
     host.order(255, 50, 300)
     host.wait(1.0)
-    before = host.gripper.true_opening
+    before = host.gripper.jaws.opening
     weight[0] = 0.9
     host.wait(0.5)
     assert host.gripper.jaws.force == pytest.approx(14.31, rel=1e-4)
-    assert before - host.gripper.true_opening == pytest.approx(0.01431 * (1 / 0.9 - 1), rel=1e-3)
+    assert before - host.gripper.jaws.opening == pytest.approx(0.01431 * (1 / 0.9 - 1), rel=1e-3)
 
 
 @pytest.mark.parametrize("stop", ["idle", "deactivate", "inactive action"])
@@ -134,7 +124,7 @@ def test_without_power_the_load_opens_the_jaws(variant, stop):
         host.order(200, 50, 500, 0x00 if stop == "deactivate" else 0x80)
     host.wait(1.0)
     assert host.gripper.jaws.force == pytest.approx(0.0, abs=1e-6)
-    assert host.gripper.true_opening == pytest.approx(0.03, abs=1e-6)
+    assert host.gripper.jaws.opening == pytest.approx(0.03, abs=1e-6)
 
 
 def test_new_firmware_forgets_the_object_code_without_action_and_old_keeps_it():
@@ -151,7 +141,7 @@ def test_nothing_moves_before_calibration(variant):
     host = Host(variant)
     host.order(255, 255)
     host.wait(0.5)
-    assert host.gripper.true_opening == pytest.approx(0.048, abs=1e-12)
+    assert host.gripper.jaws.opening == pytest.approx(0.048, abs=1e-12)
 
 
 @pytest.mark.parametrize("current", [0, -500])
@@ -159,7 +149,7 @@ def test_currents_that_are_no_limits_move_nothing_and_are_noted(current):
     host = calibrated_host()
     host.order(255, 50, current)
     host.wait(0.5)
-    assert host.gripper.true_opening == pytest.approx(0.048, abs=1e-12)
+    assert host.gripper.jaws.opening == pytest.approx(0.048, abs=1e-12)
     assert host.gripper.violations["current out of range"] == 1
 
 
@@ -172,7 +162,7 @@ def test_same_order_after_an_interruption_is_not_slow_any_more(variant):
     host.gripper.jaws.ticks = 9000.0  # moved by hand
     host.order(200, 3)
     host.wait(0.1)
-    assert host.gripper.true_opening == pytest.approx(0.048 * 55 / 255, abs=0.2e-3)
+    assert host.gripper.jaws.opening == pytest.approx(0.048 * 55 / 255, abs=0.2e-3)
     assert host.gripper.violations["stale latch"] == 1
 
 
@@ -200,23 +190,6 @@ def test_slowest_speeds_feel_contact_while_the_jaws_still_move():
             seen.add((code_of(host.poll()), host.gripper.jaws.ticks < before))
         openings[speed] = (CONTACT["new", "closing"], True) in seen
     assert openings == {2: True, 3: False}
-
-
-def test_jaws_can_be_those_of_longer_fingers():
-    host = calibrated_host(settings=EmulatorSettings(closed_opening=0.01))
-    assert host.gripper.true_opening == pytest.approx(0.058)
-    with pytest.raises(TargetError, match="start_opening"):
-        EmulatorSettings(closed_opening=0.06)
-
-
-def test_orders_that_reset_the_integrators_hide_contact():
-    host = calibrated_host(object_opening=0.04, settings=EmulatorSettings(resets_integrators=True))
-    for count in range(50):
-        host.order(255, 50, 500, 0xC0 | count & 1)
-        host.wait(0.019)
-        assert code_of(host.poll()) == 0
-    host.wait(0.1)
-    assert code_of(host.poll()) != 0
 
 
 def test_time_goes_in_whole_steps_however_it_is_cut():

@@ -13,10 +13,11 @@ import serial
 from process_fakes import running
 
 from finforce_driver.errors import LinkError, TargetError
+from finforce_sim.emulator.__main__ import build_adapter, build_parser, main
 from finforce_sim.emulator.adapter import EmulatedAdapter
 from finforce_sim.emulator.faults import FaultKind, FaultyAdapter
 from finforce_sim.emulator.firmware import EmulatedGripper
-from finforce_sim.emulator.pty_port import PtyPort, build_adapter, build_parser, main
+from finforce_sim.emulator.pty_port import PtyPort
 
 REPLY = b"t078400000030\r"
 POLL = b"t07A0\r"
@@ -113,7 +114,7 @@ def test_another_baud_rate_is_garbage():
             assert ask(device) == REPLY
             device.baudrate = 9600
             with port.lock:
-                port.adapter.deliver(next(iter(port.adapter.gripper.handle(port.adapter.traffic[-1][1]))))
+                port.adapter.write(POLL)
             garbage = device.read(len(REPLY))
             assert len(garbage) == len(REPLY) and min(garbage) >= 0x80
     with pytest.raises(TargetError, match="baud_rate"):

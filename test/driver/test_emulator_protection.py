@@ -3,7 +3,6 @@ from emulator_fakes import CALIBRATE, CLEAR, ESTOP, RESET, VARIANTS, Host, calib
 
 from finforce_sim.emulator.control import Mode
 from finforce_sim.emulator.firmware import Fault
-from finforce_sim.emulator.mechanism import EmulatorSettings
 
 
 @pytest.fixture(params=VARIANTS)
@@ -112,7 +111,7 @@ def test_some_messages_feed_the_watchdog(moving, line):
     assert moving.gripper.faults == {Fault.WATCHDOG} and moving.poll()[3] & 0x04
 
 
-@pytest.mark.parametrize("line", [CALIBRATE, CLEAR, "t0160", "t07A1FF", "t03C400000000"])
+@pytest.mark.parametrize("line", [CALIBRATE, CLEAR, "t07A1FF"])
 def test_others_do_not(moving, line):
     set_watchdog(moving, 100)
     moving.wait(0.09)
@@ -127,33 +126,3 @@ def test_each_variant_takes_its_own_length_of_the_watchdog_setter():
         host.tell(line)
         host.wait(1.0)
         assert host.gripper.faults == set()
-
-
-def test_heartbeats_come_only_in_silence():
-    host = Host(node_id=3)
-    assert host.gripper.step(10.0) == []
-    assert len(host.ask("t1FA0")) == 1
-    host.ask("t1BC4000003E8")
-    assert [message.id for message in host.gripper.step(3.5)] == [0x192] * 3
-    for _ in range(10):
-        host.ask("t1FA0")
-        assert host.gripper.step(0.9) == []
-    assert len(host.gripper.step(0.2)) == 1
-
-
-def test_saved_configuration_outlives_a_reset():
-    host = Host(settings=EmulatorSettings(save_time=0.2))
-    host.tell("t016105", "t29A0")
-    assert host.ask("t2FA0") == []  # writes
-    host.wait(0.2)
-    assert len(host.ask("t2FA0")) == 1
-    host.tell("t296106", "t31C0")
-    host.wait(0.4)
-    assert host.gripper.node_id == 5
-
-
-def test_node_beyond_the_range_is_never_heard_again():
-    host = Host()
-    host.tell("t016110")
-    assert all(host.ask(f"t{node << 7 | 0x7A:03X}0") == [] for node in range(16))
-    assert host.gripper.violations["node id out of range"] == 1

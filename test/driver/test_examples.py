@@ -138,7 +138,7 @@ def test_the_client_tells_what_the_driver_says(bench):
         assert "set 1.00 N" in answer
         bench.probe.wait_for(lambda: client.force is not None and client.opening is not None)
         assert client.force == pytest.approx(1.0, abs=0.3)
-        assert client.opening == pytest.approx(bench.gripper.true_opening, abs=4e-4)
+        assert client.opening == pytest.approx(bench.gripper.jaws.opening, abs=4e-4)
         assert client.grasp_state.startswith("holding")
         beside(bench, client.estop)
         with pytest.raises(ServiceError, match="gripper_driver/grasp: "):
