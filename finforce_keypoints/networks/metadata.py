@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, ConfigDict, Field, StrictBool, field_validator, model_validator
+from pydantic import AliasPath, BeforeValidator, ConfigDict, Field, StrictBool, field_validator, model_validator
 
 from finforce.files import FileError, read_yaml
 from finforce.typed_yaml import FileModel, Number, describe, parse_model
@@ -26,124 +26,15 @@ LARGEST_SIDE = 4096  # px of a picture: more is a mistake, and takes gigabytes
 Side = Annotated[int, Field(strict=True, ge=1, le=LARGEST_SIDE)]
 
 
-class _Table(FileModel):
-    """A table of DeepLabCut's configuration, of which a few keys are read; an empty value stands for its default."""
-
-    model_config = ConfigDict(extra="ignore")
-
-    @model_validator(mode="before")
-    @classmethod
-    def _drop_empty(cls, values: Any) -> Any:
-        return {k: v for k, v in values.items() if v is not None} if isinstance(values, Mapping) else values
-
-
-class Predictor(_Table):
-    """How heatmaps are decoded."""
-
-    type: str = Field(_PREDICTOR, description="Kind of decoding")
-    apply_sigmoid: StrictBool = Field(False, description="Whether scores are logits")
-    location_refinement: StrictBool = Field(True, description="Whether offsets are used")
-    locref_std: Number = Field(LOCREF_STD, gt=0.0, lt=1e30, description="Scale of the offset channels [px]")
-
-    @field_validator("type")
-    @classmethod
-    def _check_type(cls, kind: str) -> str:
-        if kind != _PREDICTOR:
-            raise ValueError(
-                f"got {kind}, expected {_PREDICTOR}; train a single-animal network with heatmaps (resnet_50, "
-                "hrnet_w18, hrnet_w32), RTMPose's SimCC and multi-animal heads are not decoded"
-            )
-        return kind
-
-
-class HeatmapConfig(_Table):
-    """The layers between the backbone and the heatmaps."""
-
-    strides: tuple[Annotated[Number, Field(gt=1e-3, lt=1e3)], ...] = Field((), description="Of each layer [-]")
-
-
-class Head(_Table):
-    """What makes the maps."""
-
-    predictor: Predictor = Field(Predictor(), description="How they are decoded")
-    heatmap_config: HeatmapConfig = Field(HeatmapConfig(), description="Layers of the heatmaps")
-    locref_config: dict | None = Field(None, description="Layers of the offsets, where there are any")
-
-
-class Heads(_Table):
-    """The heads of a network, of which one is read."""
-
-    bodypart: Head = Field(Head(), description="That of the body parts")
-
-
-class Backbone(_Table):
-    """What the heads stand on."""
-
-    output_stride: Number | None = Field(None, gt=0.0, lt=1e30, description="Input pixels per cell of its maps")
-
-
-class Architecture(_Table):
-    """The network."""
-
-    backbone: Backbone = Field(Backbone(), description="What the heads stand on")
-    heads: Heads = Field(Heads(), description="What makes the maps")
-
-
-class Padding(_Table):
-    """Multiples to which pictures are padded; DeepLabCut pads HRNet's images to those of 32."""
-
-    pad_height_divisor: Side = Field(1, description="Of the height [px]")
-    pad_width_divisor: Side = Field(1, description="Of the width [px]")
-
-
-class Inference(_Table):
-    """How pictures are prepared."""
-
-    normalize_images: StrictBool = Field(True, description="Whether ImageNet's mean and deviation are taken off")
-    auto_padding: Padding = Field(Padding(), description="Multiples to which pictures are padded")
-
-
-class Data(_Table):
-    """What the network is given."""
-
-    colormode: Annotated[Literal["RGB", "BGR"], BeforeValidator(lambda word: str(word).upper())] = Field(
-        "RGB", description="Order of the colours that the network was trained on"
-    )
-    inference: Inference = Field(Inference(), description="How pictures are prepared")
-
-
-class Names(_Table):
-    """Who is in the pictures."""
-
-    bodyparts: tuple[str, ...] = Field(min_length=1, description="Names in the order of the heatmaps")
-    individuals: tuple[str, ...] = Field((), description="Names of the animals")
-
-    @model_validator(mode="after")
-    def _check_names(self) -> Names:
-        if not all(name.strip() and name.isprintable() for name in self.bodyparts):
-            raise ValueError(f"bodyparts: got {describe(self.bodyparts)}, expected the list of the body parts' names")
-        doubled = sorted(name for name, count in Counter(self.bodyparts).items() if count > 1)
-        if doubled:
-            raise ValueError(f"bodyparts: {', '.join(doubled)} more than once, expected each name once")
-        if len(self.individuals) > 1:
-            raise ValueError(
-                f"individuals: got {len(self.individuals)}, expected one; name the points of the two jaws left_... and "
-                "right_..."
-            )
-        return self
-
-
-class TrainingSize(_Table):
+class TrainingSize(FileModel):
     """The size of the training images."""
 
     height: Side = Field(description="[px]")
     width: Side = Field(description="[px]")
 
 
-class OwnSection(_Table):
+class OwnSection(FileModel):
     """What this package keeps in a configuration; no other keys."""
-
-    model_config = ConfigDict(extra="forbid")
 
     training_size: TrainingSize | None = Field(None, description="Size of the training images")
     pooled: StrictBool = Field(False, description="Whether the offsets around a peak are averaged")
@@ -165,36 +56,132 @@ class OwnSection(_Table):
         return rows
 
 
-class ModelMetadata(_Table):
-    """What a DeepLabCut configuration says of its network."""
+def _at(*path: str) -> dict[str, AliasPath]:
+    """Return where a value stands in DeepLabCut's file."""
+    return {"validation_alias": AliasPath(*path)}
 
-    data: Data = Field(Data(), description="What the network is given")
-    metadata: Names = Field(description="Who is in the pictures")
-    model: Architecture = Field(Architecture(), description="The network")
+
+_HEAD = ("model", "heads", "bodypart")
+
+
+class ModelMetadata(FileModel):
+    """What is read of a DeepLabCut configuration; an empty value stands for its default."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    bodyparts: tuple[str, ...] = Field(
+        **_at("metadata", "bodyparts"), min_length=1, description="Names in the order of the heatmaps"
+    )
+    individuals: tuple[str, ...] = Field((), **_at("metadata", "individuals"), description="Names of the animals")
+    colormode: Annotated[Literal["RGB", "BGR"], BeforeValidator(lambda word: str(word).upper())] = Field(
+        "RGB", **_at("data", "colormode"), description="Order of the colours that the network was trained on"
+    )
+    normalize_images: StrictBool = Field(
+        True, **_at("data", "inference", "normalize_images"), description="Whether ImageNet's statistics are taken off"
+    )
+    pad_height_divisor: Side = Field(
+        1,
+        **_at("data", "inference", "auto_padding", "pad_height_divisor"),
+        description="Heights are padded to its multiples [px]; those of 32 for HRNet",
+    )
+    pad_width_divisor: Side = Field(
+        1,
+        **_at("data", "inference", "auto_padding", "pad_width_divisor"),
+        description="Widths are padded to its multiples [px]",
+    )
+    type: str = Field(_PREDICTOR, **_at(*_HEAD, "predictor", "type"), description="Kind of decoding")
+    apply_sigmoid: StrictBool = Field(
+        False, **_at(*_HEAD, "predictor", "apply_sigmoid"), description="Whether scores are logits"
+    )
+    location_refinement: StrictBool = Field(
+        True, **_at(*_HEAD, "predictor", "location_refinement"), description="Whether offsets are used"
+    )
+    locref_std: Number = Field(
+        LOCREF_STD,
+        **_at(*_HEAD, "predictor", "locref_std"),
+        gt=0.0,
+        lt=1e30,
+        description="Scale of the offset channels [px]",
+    )
+    locref_config: dict | None = Field(
+        None, **_at(*_HEAD, "locref_config"), description="Layers of the offsets, where there are any"
+    )
+    strides: tuple[Annotated[Number, Field(gt=1e-3, lt=1e3)], ...] = Field(
+        (), **_at(*_HEAD, "heatmap_config", "strides"), description="Of the layers of the heatmaps [-]"
+    )
+    output_stride: Number | None = Field(
+        None,
+        **_at("model", "backbone", "output_stride"),
+        gt=0.0,
+        lt=1e30,
+        description="Input pixels per cell of the backbone's maps",
+    )
     finforce: OwnSection = Field(OwnSection(), description="What this package keeps")
 
-    @property
-    def predictor(self) -> Predictor:
-        """How heatmaps are decoded."""
-        return self.model.heads.bodypart.predictor
+    @model_validator(mode="before")
+    @classmethod
+    def _check_tables(cls, values: Any) -> Any:
+        """Leave out what is empty, and refuse what should be a table and is none."""
+        if not isinstance(values, Mapping):
+            raise ValueError(f"got {describe(values)}, expected a mapping of data, metadata, model and finforce")
+        values = _drop_empty(values)
+        for entry in cls.model_fields.values():
+            part, path = values, entry.validation_alias.path if entry.validation_alias else []
+            for number, key in enumerate(path):
+                if not isinstance(part, Mapping):
+                    raise ValueError(f"{'.'.join(path[:number])}: got {describe(part)}, expected a mapping")
+                part = part.get(key, {})
+        return values
+
+    @field_validator("type")
+    @classmethod
+    def _check_type(cls, kind: str) -> str:
+        if kind != _PREDICTOR:
+            raise ValueError(
+                f"got {kind}, expected {_PREDICTOR}; train a single-animal network with heatmaps (resnet_50, "
+                "hrnet_w18, hrnet_w32), RTMPose's SimCC and multi-animal heads are not decoded"
+            )
+        return kind
+
+    @field_validator("bodyparts")
+    @classmethod
+    def _check_names(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        if not all(name.strip() and name.isprintable() for name in names):
+            raise ValueError(f"got {describe(names)}, expected the list of the body parts' names")
+        doubled = sorted(name for name, count in Counter(names).items() if count > 1)
+        if doubled:
+            raise ValueError(f"{', '.join(doubled)} more than once, expected each name once")
+        return names
+
+    @field_validator("individuals")
+    @classmethod
+    def _check_one(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        if len(names) > 1:
+            raise ValueError(f"got {len(names)}, expected one; name the points of the two jaws left_... and right_...")
+        return names
 
     @property
     def stride(self) -> float | None:
         """Input pixels per heatmap cell, None where the file does not tell."""
-        stride = self.model.backbone.output_stride
-        return None if stride is None else stride / prod(self.model.heads.bodypart.heatmap_config.strides)
+        return None if self.output_stride is None else self.output_stride / prod(self.strides)
 
     @property
     def divisors(self) -> tuple[int, int]:
         """Height and width are padded to multiples of these [px]; (1, 1) for none."""
-        padding = self.data.inference.auto_padding
-        return padding.pad_height_divisor, padding.pad_width_divisor
+        return self.pad_height_divisor, self.pad_width_divisor
 
     @property
     def training_size(self) -> tuple[int, int] | None:
         """Height and width of the training images [px], None if not kept."""
         size = self.finforce.training_size
         return None if size is None else (size.height, size.width)
+
+
+def _drop_empty(values: Any) -> Any:
+    """Return nested mappings without the keys that have no value."""
+    if not isinstance(values, Mapping):
+        return values
+    return {key: _drop_empty(value) for key, value in values.items() if value is not None}
 
 
 def read_metadata(path: str | Path) -> ModelMetadata:

@@ -255,7 +255,7 @@ class KeypointModel:
     @property
     def names(self) -> tuple[str, ...]:
         """The names (K,) of the body parts, in the order of the peaks."""
-        return self.metadata.metadata.bodyparts
+        return self.metadata.bodyparts
 
     @property
     def frozen_size(self) -> tuple[int | None, int | None]:
@@ -295,7 +295,7 @@ class KeypointModel:
             raise DetectionError(
                 f"the network made maps {heatmap.shape} of {len(batch)} pictures; expected one set each"
             )
-        return heatmap, locref if self.metadata.predictor.location_refinement else None
+        return heatmap, locref if self.metadata.location_refinement else None
 
     def locate(self, batch: NDArray) -> Peaks:
         """Return the best place of every body part in a batch of pictures (B, H, W, 3) uint8 RGB.
@@ -324,7 +324,7 @@ class KeypointModel:
             raise DetectionError(f"got {batch.dtype} {batch.shape}, expected uint8 RGB (batch, height, width, 3)")
         batch = self._pad(batch)
         layout = self._network.input
-        if self.metadata.data.colormode == "BGR":
+        if self.metadata.colormode == "BGR":
             batch = batch[..., ::-1]
         if layout.channel_axis == 1:
             batch = batch.transpose(0, 3, 1, 2)
@@ -350,8 +350,8 @@ class KeypointModel:
             )
         return DecodingRule(
             stride=float(stride),
-            locref_std=metadata.predictor.locref_std,
-            apply_sigmoid=metadata.predictor.apply_sigmoid,
+            locref_std=metadata.locref_std,
+            apply_sigmoid=metadata.apply_sigmoid,
             pooled=metadata.finforce.pooled,
             likelihood_stddev=DEFAULT_STDDEV if stddev is None else np.array(stddev),
         )
@@ -367,11 +367,7 @@ class KeypointModel:
         arrays = self._network.run(tensor)
         shapes = [(name, array.shape) for name, array in zip(self._network.output_names, arrays, strict=True)]
         layout = find_outputs(shapes, len(self.names), self._network.input.channel_axis)
-        if (
-            layout.locref is None
-            and self.metadata.model.heads.bodypart.locref_config is not None
-            and self.metadata.predictor.location_refinement
-        ):
+        if layout.locref is None and self.metadata.locref_config is not None and self.metadata.location_refinement:
             raise ModelError(
                 f"outputs {shapes}: the metadata have a locref_config; export the offsets too, or set "
                 "predictor.location_refinement: false"
@@ -419,6 +415,6 @@ class KeypointModel:
         """Return factor and shift per colour, in the axes of the network's input."""
         axes = (COLOURS, 1, 1) if self._network.input.channel_axis == 1 else (COLOURS,)
         scale, shift = np.full(COLOURS, 1.0 / 255.0, np.float32), np.zeros(COLOURS, np.float32)
-        if self.metadata.data.inference.normalize_images:
+        if self.metadata.normalize_images:
             scale, shift = scale / _STD, -_MEAN / _STD
         return scale.reshape(axes), shift.reshape(axes)

@@ -65,7 +65,7 @@ def test_every_key_of_a_shipped_file_is_a_field(path, kind):
 def test_the_configuration_of_the_shipped_network_has_the_keys_that_are_read():
     path = resources.files("finforce_keypoints").joinpath("models", "plane", "pytorch_config.yaml")
     metadata = read_model(path, ModelMetadata, FormError)
-    assert metadata.stride == 4.0 and len(metadata.metadata.bodyparts) == 16
+    assert metadata.stride == 4.0 and len(metadata.bodyparts) == 16
     assert set(yaml.safe_load(path.read_text())["finforce"]) <= set(OwnSection.model_fields)
 
 

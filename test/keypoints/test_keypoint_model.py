@@ -242,9 +242,9 @@ def test_without_onnxruntime_the_message_says_what_to_install(tmp_path, monkeypa
 
 def test_defaults_of_absent_keys_are_those_of_deeplabcut():
     metadata = parse_model({"metadata": {"bodyparts": ["a"]}}, ModelMetadata, ModelError)
-    assert metadata.data.inference.normalize_images and metadata.predictor.location_refinement
-    assert not metadata.predictor.apply_sigmoid
-    assert metadata.predictor.locref_std == 7.2801 and metadata.stride is None and metadata.divisors == (1, 1)
+    assert metadata.normalize_images and metadata.location_refinement
+    assert not metadata.apply_sigmoid
+    assert metadata.locref_std == 7.2801 and metadata.stride is None and metadata.divisors == (1, 1)
     with pytest.raises(ModelError, match="data: got a list .*, expected a mapping"):
         parse_model({"metadata": {"bodyparts": ["a"]}, "data": [1]}, ModelMetadata, ModelError)
     with pytest.raises(ModelError, match="got none, expected a mapping of data, metadata"):
@@ -253,8 +253,8 @@ def test_defaults_of_absent_keys_are_those_of_deeplabcut():
 
 def test_metadata_are_those_that_deeplabcut_writes():
     metadata = parse_model(yaml.safe_load(yaml.safe_dump(sidecar(Fake()))), ModelMetadata, ModelError)
-    assert metadata.stride == 8.0 and metadata.model.heads.bodypart.locref_config is not None
-    assert metadata.metadata.bodyparts == Fake().names
+    assert metadata.stride == 8.0 and metadata.locref_config is not None
+    assert metadata.bodyparts == Fake().names
 
 
 def test_threads_that_share_pictures_find_what_one_finds():
