@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import warnings
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import cache, cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -321,26 +321,31 @@ def open_picture(data: bytes, what: str, formats: tuple[str, ...] | None = _SENT
     Raises:
         ImageError: the bytes are none, are damaged, or unpack to more than 50 million pixels; `what` names them.
     """
-    from PIL import Image, UnidentifiedImageError
-
-    expected = f"at most {LARGEST_PICTURE} pixels"
+    image, expected = _import_pillow(), f"at most {LARGEST_PICTURE} pixels"
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # smaller ones are refused below
-            picture = Image.open(io.BytesIO(data), formats=formats)
+        picture = image.open(io.BytesIO(data), formats=formats)
         if picture.width * picture.height > LARGEST_PICTURE:
             raise ImageError(f"{what}: {picture.width} x {picture.height}; expected {expected}")
         picture.load()
     except ImageError:
         raise
-    except UnidentifiedImageError as error:
+    except image.UnidentifiedImageError as error:
         kinds = "no picture" if formats is None else f"neither {' nor '.join(map(str.lower, formats))}"
         raise ImageError(f"{what}: {len(data)} bytes that are {kinds}") from error
-    except Image.DecompressionBombError as error:
+    except image.DecompressionBombError as error:
         raise ImageError(f"{what}: expected {expected}: {error}") from error
     except Exception as error:  # each format has its own classes for damage
         raise ImageError(f"{what}: damaged: {one_line(error)}") from error
     return picture
+
+
+@cache
+def _import_pillow() -> Any:
+    """Return PIL.Image, which from then on warns of no picture that is refused here anyway."""
+    from PIL import Image
+
+    warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+    return Image
 
 
 def decode_picture(data: NDArray | bytes, what: str, formats: tuple[str, ...] | None = _SENT) -> NDArray[np.uint8]:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.health import Level, Outcome, Report
+from finforce.optional import import_cv2
 
 if TYPE_CHECKING:
     from finforce_keypoints.detector import KeypointDetector
@@ -105,6 +106,7 @@ COLORS = {  # by the reason why a key point is not used
     "image": (160, 160, 160),
 }
 LINE = (250, 230, 60)
+_FAR = 1e4  # [px] outside any picture, where nothing is drawn
 
 
 def draw_keypoints(
@@ -119,37 +121,20 @@ def draw_keypoints(
     Green is used; red, blue, orange and grey say why not: likelihood, depth, workspace, outside the image.
     `radius` is that of the discs [px]; a quarter of it stays free.
     """
-    picture = color.copy()
+    cv2, picture = import_cv2(), color.copy()
+
+    def place(pixel: NDArray) -> tuple[int, int]:
+        return tuple(np.rint(np.clip(pixel, -_FAR, _FAR)).astype(int).tolist())
+
     for jaw in jaws:
         for one, other in skeleton:
             if jaw.valid[one] and jaw.valid[other]:
-                _draw_line(picture, jaw.pixels[one], jaw.pixels[other])
+                cv2.line(picture, place(jaw.pixels[one]), place(jaw.pixels[other]), LINE)
         for pixel, reason in zip(jaw.pixels, jaw.reasons, strict=True):
             if np.isfinite(pixel).all():
-                _draw_disc(picture, pixel, COLORS.get(str(reason), COLORS["image"]), radius)
+                centre, free = place(pixel), int(0.25 * radius)
+                cv2.circle(picture, centre, round(radius), (0, 0, 0), cv2.FILLED)
+                cv2.circle(picture, centre, round(radius) - 1, COLORS.get(str(reason), COLORS["image"]), cv2.FILLED)
+                seen = tuple(slice(max(middle - free, 0), max(middle + free + 1, 0)) for middle in reversed(centre))
+                picture[seen] = color[seen]
     return picture
-
-
-def _draw_line(picture: NDArray[np.uint8], start: NDArray, end: NDArray) -> None:
-    """Colour the pixels from `start` to `end` (2,), column and row."""
-    count = int(np.ceil(np.abs(end - start).max())) + 1
-    _paint(picture, np.linspace(start, end, count), LINE)
-
-
-def _draw_disc(picture: NDArray[np.uint8], pixel: NDArray, color: Sequence[int], radius: float) -> None:
-    """Colour a disc with a dark rim about a pixel (2,), column and row; its centre stays as it was."""
-    reach = int(radius)
-    columns, rows = np.meshgrid(np.arange(-reach, reach + 1), np.arange(-reach, reach + 1))
-    distance = np.hypot(columns, rows)
-    for near, far, shade in ((radius - 1.0, radius, (0, 0, 0)), (0.25 * radius, radius - 1.0, color)):
-        ring = (distance > near) & (distance <= far)
-        _paint(picture, np.stack((columns[ring], rows[ring]), axis=-1) + pixel, shade)
-
-
-def _paint(picture: NDArray[np.uint8], pixels: NDArray, color: Sequence[int]) -> None:
-    """Colour pixels (n, 2), column and row, as far as they lie in the picture."""
-    # a key point may lie far outside, where no integer counts pixels
-    height, width, _ = picture.shape
-    inside = ((pixels > -0.5) & (pixels < (width - 0.5, height - 0.5))).all(axis=1)
-    columns, rows = np.rint(pixels[inside]).astype(int).T
-    picture[rows, columns] = color
