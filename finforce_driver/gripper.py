@@ -15,7 +15,7 @@ from __future__ import annotations
 import logging
 import secrets
 from collections.abc import Callable
-from threading import Condition, Event, RLock, Thread
+from threading import Condition, Event, Thread
 from time import monotonic
 
 from finforce.errors import FinforceError
@@ -116,7 +116,7 @@ class StateSource:
                 LOG.exception("a listener to the gripper failed")
 
 
-class Gripper(StateSource):
+class Gripper(GripperMachine, StateSource):
     """An SSG-48 behind a bus: one request at a time, and the bus opened again and again.
 
     Whatever is sent is chosen and sent under one lock, so that after an emergency stop, which takes it too, no message
@@ -129,15 +129,12 @@ class Gripper(StateSource):
     """
 
     def __init__(self, bus: Bus, settings: GripperSettings | None = None, clock: Clock | None = None) -> None:
-        super().__init__(clock)
-        self.settings = settings or GripperSettings()
+        StateSource.__init__(self, clock)
         # a gripper that an earlier program left must not take our first command for its last one
-        self._machine = GripperMachine(self.settings, salt=secrets.randbelow(16))
+        salt = secrets.randbelow(16)
+        GripperMachine.__init__(self, settings or GripperSettings(), self.clock.now, salt)
         self._bus = bus
-        self._lock = RLock()
-        self._wake = Event()
         self._thread: Thread | None = None
-        self._opened = False
         self._pause, self._next_open = FIRST_PAUSE, self.clock.now()
 
     def __enter__(self) -> Gripper:
@@ -148,11 +145,6 @@ class Gripper(StateSource):
     def __exit__(self, *_: object) -> None:
         """Close."""
         self.close()
-
-    @property
-    def state(self) -> GripperState:
-        """What is known now; never blocks."""
-        return self._machine.state
 
     @property
     def resolution(self) -> float:
@@ -173,11 +165,10 @@ class Gripper(StateSource):
         self._wake.set()
         if thread is not None:
             thread.join(JOIN_TIMEOUT)
-        if self._opened:
-            with self._lock:
-                self._machine.leave(self.clock.now())
+        if self.joined:
+            self.leave()
             for _ in range(LEAVING_TURNS):
-                if not (self._opened and self._machine.has_orders):
+                if not (self.joined and self.has_orders):
                     break
                 self.turn(0.0)
         self._drop("the driver has ended")
@@ -191,7 +182,7 @@ class Gripper(StateSource):
         """
         self._wake.clear()
         try:
-            if self._opened:
+            if self.joined:
                 self._exchange(longest)
             else:
                 self._open(longest)
@@ -202,71 +193,14 @@ class Gripper(StateSource):
             self._lose(f"unexpected error, please report it: {type(error).__name__}: {error}")
         self._tell()
 
-    def opening_at(self, time: float) -> float:
-        """Return the opening [m] at a time of the last 5 s [s]; NaN where it is not known."""
-        with self._lock:
-            return self._machine.opening_at(time)
-
-    def move(
-        self, opening: float, speed: float | None = None, force: float | None = None, *, current: float | None = None
-    ) -> None:
-        """Go to an opening, and stall with a force when something is in the way.
-
-        Args:
-            opening: to be reached [m].
-            speed: of the opening [m/s], both jaws together; the default of the settings where None.
-            force: grip force by the maker's curve [N]; the default current of the settings where None.
-            current: the motor's limit [A], in place of a force.
-
-        Raises:
-            TargetError: a value is no number or out of bounds, or force and current are both given.
-            GripperStateError: the gripper could not move: absent, faulty, not calibrated, calibrating, switched off.
-        """
-        if current is not None:
-            force = self.settings.force_for(current, force)
-        self._command(lambda machine, now: machine.move(opening, speed, force, now))
-
-    def check_move(self, opening: float, speed: float | None = None, force: float | None = None) -> None:
-        """Reject what `move` would reject in whatever state.
-
-        Raises:
-            TargetError: a value is no number or out of bounds.
-        """
-        self._machine.make_goal(opening, speed, force)
-
-    def hold(self) -> None:
-        """Stop in place and hold there; during a calibration: stop, limp.
-
-        Raises:
-            GripperStateError: the gripper is absent, faulty or not calibrated: its jaws are limp.
-        """
-        self._command(lambda machine, now: machine.hold(now))
-
-    def calibrate(self) -> None:
-        """Find the end stops: the jaws open fully, then close fully, with some 24 N.
-
-        Raises:
-            GripperStateError: the gripper is absent or faulty, or calibrates already.
-        """
-        self._command(lambda machine, now: machine.calibrate())
-
-    def clear_errors(self) -> None:
-        """Clear what is latched, an emergency stop too; does nothing without a fault, since it would let go.
-
-        Raises:
-            GripperStateError: the gripper is absent or calibrates.
-        """
-        self._command(lambda machine, now: machine.clear_errors())
-
     def estop(self) -> None:
         """Stop at once: the messages leave from the calling thread, and the jaws go limp.
 
         Repeated until the gripper says that it is stopped, also after a lost link; only `clear_errors` ends it.
         """
         with self._lock:
-            messages = self._machine.estop(self.clock.now())
-            self._machine.refresh()
-            if self._opened:
+            messages = self.demand_stop()
+            if self.joined:
                 try:
                     for message in messages:
                         self._bus.send(message)
@@ -274,35 +208,12 @@ class Gripper(StateSource):
                     LOG.warning("the emergency stop waits for the link: %s", error)
         self._wake.set()
 
-    def activate(self, on: bool) -> None:
-        """Switch the power stage on, holding in place, or off, limp: it then refuses moves.
-
-        Raises:
-            GripperStateError: the gripper is absent, faulty or calibrating.
-        """
-        self._command(lambda machine, now: machine.activate(on, now))
-
-    def release_power(self) -> None:
-        """Let the jaws go limp, ready for the next move; what is held may drop.
-
-        Raises:
-            GripperStateError: the gripper is absent, faulty or calibrating.
-        """
-        self._command(lambda machine, now: machine.release_power(now))
-
     def _pass_time(self, condition: StateCondition, left: float) -> None:
         """Let the gripper get on, by a turn of our own where no thread makes them."""
         if self._thread is None:
             self.turn(left)
         else:
             super()._pass_time(condition, left)
-
-    def _command(self, action: Callable[[GripperMachine, float], None]) -> None:
-        """Give the machine a command and wake the thread."""
-        with self._lock:
-            action(self._machine, self.clock.now())
-            self._machine.refresh()
-        self._wake.set()
 
     def _run(self) -> None:
         """Make turns until the gripper is closed."""
@@ -317,24 +228,23 @@ class Gripper(StateSource):
             return
         self._bus.open()
         with self._lock:
-            self._opened = True
-            self._machine.on_link_open()
+            self.on_link_open()
 
     def _exchange(self, longest: float) -> None:
         """Send what is due and receive its reply, or wait."""
         self._take_late_messages()
         with self._lock:
             now = self.clock.now()
-            request = self._machine.next_request(now)
+            request = self.next_request(now)
             if request is not None:
                 self._bus.send(request.message)
-            left = self._machine.next_time(now) - now
+            left = self.next_time(now) - now
         if request is None:
             self.clock.wait(max(min(left, longest), SHORTEST_WAIT), self._wake)
         elif request.answer is not None:
             self._receive(request, now)
-        if self._machine.must_reopen:
-            raise LinkError(self._machine.state.message)
+        if self.must_reopen:
+            raise LinkError(self.state.message)
 
     def _take_late_messages(self) -> None:
         """Take what has come without being asked for: it must not pass for the next reply."""
@@ -343,21 +253,21 @@ class Gripper(StateSource):
             if message is None:
                 return
             with self._lock:
-                self._machine.on_message(message, self.clock.now())
+                self.on_message(message, self.clock.now())
 
     def _receive(self, request: Request, sent: float) -> None:
         """Wait for the reply to a request that was sent at a time [s]."""
-        deadline = sent + self._machine.settings.reply_timeout
+        deadline = sent + self.settings.reply_timeout
         while (left := deadline - self.clock.now()) > 0.0:
             message = self._bus.receive(left)
             if message is None:
                 break
             with self._lock:
-                if self._machine.on_message(message, self.clock.now(), self._bus.counts):
+                if self.on_message(message, self.clock.now(), self._bus.counts):
                     self._pause = FIRST_PAUSE
                     return
         with self._lock:
-            self._machine.on_silence(self.clock.now(), self._bus.suspicion)
+            self.on_silence(self.clock.now(), self._bus.suspicion)
 
     def _lose(self, reason: str) -> None:
         """Close a bus that failed, and open it later."""
@@ -368,6 +278,5 @@ class Gripper(StateSource):
     def _drop(self, reason: str) -> None:
         """Close the bus and tell the machine."""
         with self._lock:
-            self._opened = False
-            self._machine.on_link_lost(reason)
+            self.on_link_lost(reason)
         self._bus.close()

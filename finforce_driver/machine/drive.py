@@ -263,11 +263,6 @@ class Drive:
         """Whether nothing has answered for so long that the link is to be opened anew."""
         return self.exchange.misses >= MISSED_REPLIES
 
-    def opening_at(self, time: float) -> float:
-        """Return the opening [m] at a past time; NaN unknown."""
-        validity = 2.0 / self.settings.poll_rate + self.settings.reply_timeout
-        return self.settings.opening_of(self.known.history.position_at(time, validity))
-
     def position_now(self, now: float) -> float:
         """Return where the jaws are by now [counts]; NaN unknown."""
         order = self.orders.taken

@@ -1,14 +1,16 @@
 """The gripper as a state machine: commands and CAN messages in, requests and a state out.
 
 Whoever carries its messages asks `next_request`, sends it, and gives what comes to `on_message`, or tells `on_silence`.
-Times are those of the carrier's clock [s].
 """
 
 from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import wraps
+from threading import Event, RLock
+from typing import Any
 
 from finforce_driver.can.protocol import CanMessage, Command, Flag, Reply, decode_reply, encode_watchdog
 from finforce_driver.errors import GripperStateError
@@ -45,21 +47,35 @@ REFUSALS = {
 }
 
 
+def _command(method: Callable[..., None]) -> Callable[..., None]:
+    """Have a method hold the lock and, unless it raises, make the state anew and wake the carrier."""
+
+    @wraps(method)
+    def run(self: GripperMachine, *values: Any, **named: Any) -> None:
+        with self._lock:
+            method(self, *values, **named)
+            self.refresh()
+        self._wake.set()
+
+    return run
+
+
 class GripperMachine(Drive):
     """Drives one gripper, without input or output of its own; what is known and wanted changes here.
 
-    The commands are those of `Gripper`, which says what they do and raise; each is followed by `refresh`.
-
     Attributes:
-        state: what is known now.
+        state: what is known now; reading it never blocks.
 
     Args:
         settings: of the gripper.
+        now: returns the time of the carrier's clock [s].
         salt: any number, other than that of the program that drove the gripper before.
     """
 
-    def __init__(self, settings: GripperSettings, salt: int = 0) -> None:
+    def __init__(self, settings: GripperSettings, now: Callable[[], float], salt: int = 0) -> None:
         super().__init__(settings, salt)
+        self._now = now
+        self._lock, self._wake = RLock(), Event()
         self._echo = EchoWatch()
         self._enabled = True  # not switched off
         self._sent: deque[CanMessage] = deque(maxlen=ECHOES)
@@ -71,15 +87,30 @@ class GripperMachine(Drive):
 
     # Commands
 
-    def move(self, opening: float, speed: float | None, force: float | None, now: float) -> None:
-        """Go to an opening [m] at a speed [m/s], stalling with a force [N]; the same goal again changes nothing."""
-        goal = self.make_goal(opening, speed, force)
+    @_command
+    def move(
+        self, opening: float, speed: float | None = None, force: float | None = None, *, current: float | None = None
+    ) -> None:
+        """Go to an opening, and stall with a force when something is in the way; the same goal again changes nothing.
+
+        Args:
+            opening: to be reached [m].
+            speed: of the opening [m/s], both jaws together; the default of the settings where None.
+            force: grip force by the maker's curve [N]; the default current of the settings where None.
+            current: the motor's limit [A], in place of a force.
+
+        Raises:
+            TargetError: a value is no number or out of bounds, or force and current are both given.
+            GripperStateError: the gripper could not move: absent, faulty, not calibrated, calibrating, switched off.
+        """
+        goal = self._make_goal(opening, speed, force if current is None else self.settings.force_for(current, force))
         self._require("move", USABLE)
         if not self._enabled:
             raise GripperStateError("move: the gripper was switched off: activate it first")
         job = self.job
         if job is not None and job.goal == goal and job.outcome in (MoveOutcome.NONE, MoveOutcome.REACHED):
             return
+        now = self._now()
         start = self.setpoint(now)
         self.hold_wanted = False
         self._end_job(MoveOutcome.REPLACED)
@@ -89,10 +120,22 @@ class GripperMachine(Drive):
         self.job = MoveJob(goal, start=start, now=now)
         self.want_position()
 
-    def hold(self, now: float) -> None:
+    def check_move(self, opening: float, speed: float | None = None, force: float | None = None) -> None:
+        """Reject what `move` would reject in whatever state.
+
+        Raises:
+            TargetError: a value is no number or out of bounds.
+        """
+        self._make_goal(opening, speed, force)
+
+    @_command
+    def hold(self) -> None:
         """Stop in place and hold, or end a calibration, limp; a gripper that stands or was let go stays as it is.
 
         One that has just fallen silent is held as soon as it answers again.
+
+        Raises:
+            GripperStateError: the gripper is absent, faulty or not calibrated: its jaws are limp.
         """
         if self.silent and self.calibration is None and self.known.driving:
             self._end_job(MoveOutcome.REPLACED)
@@ -100,10 +143,15 @@ class GripperMachine(Drive):
             self.refresh()
             raise GripperStateError("hold pending: the gripper does not answer; it is held as soon as it does")
         self._require("hold", (*USABLE, Phase.CALIBRATING))
-        self._hold(now)
+        self._hold(self._now())
 
+    @_command
     def calibrate(self) -> None:
-        """Find the end stops."""
+        """Find the end stops: the jaws open fully, then close fully, with some 24 N.
+
+        Raises:
+            GripperStateError: the gripper is absent or faulty, or calibrates already.
+        """
         self._require("calibrate", CONNECTED)
         self._end_job(MoveOutcome.REPLACED)
         self.orders.drop()
@@ -113,8 +161,13 @@ class GripperMachine(Drive):
             self.settings, calibrated=self.known.calibrated, reset=self.known.half_calibrated
         )
 
+    @_command
     def clear_errors(self) -> None:
-        """Clear what is latched; without a fault nothing is sent, since clearing lets go."""
+        """Clear what is latched, an emergency stop too; does nothing without a fault, since it would let go.
+
+        Raises:
+            GripperStateError: the gripper is absent or calibrates.
+        """
         self._require("clear_errors", (*CONNECTED, Phase.FAULT))
         self.note = ""
         if self.phase is Phase.FAULT and self.recovery is None:
@@ -122,48 +175,65 @@ class GripperMachine(Drive):
             self.recovery = Recovery(unflag=self.stop.active or bool(self.known.reply and self.known.reply.estopped))
             self.stop.begin_clearing()
 
-    def activate(self, on: bool, now: float) -> None:
-        """Switch the power stage on, holding in place, or off, limp."""
+    @_command
+    def activate(self, on: bool) -> None:
+        """Switch the power stage on, holding in place, or off, limp: it then refuses moves.
+
+        Raises:
+            GripperStateError: the gripper is absent, faulty or calibrating.
+        """
         self._require("activate", CONNECTED)
         self.note, self._enabled = "", on
         if not on:
-            self._let_go(Flag.OFF, now)
+            self._let_go(Flag.OFF)
         elif not self.known.calibrated:
             self.orders.want(self.order(position=0, flags=Flag.ACTIVATE))
         elif not self.known.driving:
             self._end_job(MoveOutcome.REPLACED)
-            self.orders.want(self.order(position=self.hold_position(now), flags=GO))
+            self.orders.want(self.order(position=self.hold_position(self._now()), flags=GO))
 
-    def release_power(self, now: float) -> None:
-        """Let the jaws go limp, ready for the next move."""
+    @_command
+    def release_power(self) -> None:
+        """Let the jaws go limp, ready for the next move; what is held may drop.
+
+        Raises:
+            GripperStateError: the gripper is absent, faulty or calibrating.
+        """
         self._require("release_power", CONNECTED)
         self.note = ""
-        self._let_go(Flag.ACTIVATE, now)
+        self._let_go(Flag.ACTIVATE)
 
-    def estop(self, now: float) -> list[CanMessage]:
+    def opening_at(self, time: float) -> float:
+        """Return the opening [m] at a time of the last 5 s [s]; NaN where it is not known."""
+        validity = 2.0 / self.settings.poll_rate + self.settings.reply_timeout
+        with self._lock:
+            return self.settings.opening_of(self.known.history.position_at(time, validity))
+
+    def demand_stop(self) -> list[CanMessage]:
         """Stop at once, in whichever state: return the messages to be sent before anything else; no motion follows."""
         self._break_calibration()
         self.recovery = None
         self._abort()
         self.stop.demand()
-        first = self.begin_stop(now)
+        first = self.begin_stop(self._now())
         # the gripper keeps three messages at most, and one is on the way already: the second follows its reply
         second = self.end_stop() if self.exchange.pending is None else None
         messages = [request.message for request in (first, second) if request is not None]
         self._sent.extend(messages)
+        self.refresh()
         return messages
 
-    def leave(self, now: float) -> None:
+    @_command
+    def leave(self) -> None:
         """Prepare to be ended: hold in place, or let go where the settings say so."""
         if self.phase in CONNECTED and self.settings.release_on_stop:
-            self.activate(False, now)
+            self.activate(False)
         elif self.phase in (*USABLE, Phase.CALIBRATING):
-            self.hold(now)
+            self.hold()
         if self.settings.watchdog and not self.settings.release_on_stop:
             # what is held stays held, with nobody to feed the watchdog
             self.watchdogs = deque(encode_watchdog(self.settings.node_id, 0.0))
             self.next_watchdog = math.inf
-        self.refresh()
 
     # What the carrier asks and tells
 
@@ -259,7 +329,7 @@ class GripperMachine(Drive):
         if self.phase not in phases:
             raise GripperStateError(f"{what}: {REFUSALS[self.phase]}" + (f" ({self.note})" if self.note else ""))
 
-    def make_goal(self, opening: float, speed: float | None, force: float | None) -> Goal:
+    def _make_goal(self, opening: float, speed: float | None, force: float | None) -> Goal:
         """Return a move in the gripper's units; raises TargetError."""
         check_numbers(opening=opening, speed=speed, force=force)
         settings = self.settings
@@ -298,11 +368,11 @@ class GripperMachine(Drive):
             return
         self._hold_here(now)
 
-    def _let_go(self, flags: Flag, now: float) -> None:
+    def _let_go(self, flags: Flag) -> None:
         """Want an order that moves nothing and holds nothing."""
         self._end_job(MoveOutcome.REPLACED)
         self.hold_wanted = False
-        self.orders.want(self.order(position=self.hold_position(now), flags=flags), urgent=True)
+        self.orders.want(self.order(position=self.hold_position(self._now()), flags=flags), urgent=True)
 
     def _end_job(self, outcome: MoveOutcome) -> None:
         """End a move that is under way; one that has ended keeps its outcome."""
