@@ -18,11 +18,11 @@ from finforce.typed_yaml import FileModel, Number, describe, parse_model
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_keypoints.errors import ModelError, NamingError
 from finforce_keypoints.images import REFERENCE
+from finforce_keypoints.networks.runtime import LARGEST_SIDE
 
 METADATA_FILE = "pytorch_config.yaml"
 LOCREF_STD = 7.2801  # DeepLabCut's default scale of its offset channels [px]
 _PREDICTOR = "HeatmapPredictor"
-LARGEST_SIDE = 4096  # px of a picture: more is a mistake, and takes gigabytes
 Side = Annotated[int, Field(strict=True, ge=1, le=LARGEST_SIDE)]
 
 
@@ -56,12 +56,14 @@ class OwnSection(FileModel):
         return rows
 
 
-def _at(*path: str) -> dict[str, AliasPath]:
-    """Return where a value stands in DeepLabCut's file."""
-    return {"validation_alias": AliasPath(*path)}
+def _key(path: str, default: Any, description: str, **bounds: Any) -> Any:
+    """Return the field of a value that stands at a path of keys in DeepLabCut's file."""
+    return Field(default, validation_alias=AliasPath(*path.split(".")), description=description, **bounds)
 
 
-_HEAD = ("model", "heads", "bodypart")
+_HEAD, _PADDING = "model.heads.bodypart", "data.inference.auto_padding"
+Colours = Annotated[Literal["RGB", "BGR"], BeforeValidator(lambda word: str(word).upper())]
+Strides = tuple[Annotated[Number, Field(gt=1e-3, lt=1e3)], ...]
 
 
 class ModelMetadata(FileModel):
@@ -69,52 +71,20 @@ class ModelMetadata(FileModel):
 
     model_config = ConfigDict(extra="ignore")
 
-    bodyparts: tuple[str, ...] = Field(
-        **_at("metadata", "bodyparts"), min_length=1, description="Names in the order of the heatmaps"
-    )
-    individuals: tuple[str, ...] = Field((), **_at("metadata", "individuals"), description="Names of the animals")
-    colormode: Annotated[Literal["RGB", "BGR"], BeforeValidator(lambda word: str(word).upper())] = Field(
-        "RGB", **_at("data", "colormode"), description="Order of the colours that the network was trained on"
-    )
-    normalize_images: StrictBool = Field(
-        True, **_at("data", "inference", "normalize_images"), description="Whether ImageNet's statistics are taken off"
-    )
-    pad_height_divisor: Side = Field(
-        1,
-        **_at("data", "inference", "auto_padding", "pad_height_divisor"),
-        description="Heights are padded to its multiples [px]; those of 32 for HRNet",
-    )
-    pad_width_divisor: Side = Field(
-        1,
-        **_at("data", "inference", "auto_padding", "pad_width_divisor"),
-        description="Widths are padded to its multiples [px]",
-    )
-    type: str = Field(_PREDICTOR, **_at(*_HEAD, "predictor", "type"), description="Kind of decoding")
-    apply_sigmoid: StrictBool = Field(
-        False, **_at(*_HEAD, "predictor", "apply_sigmoid"), description="Whether scores are logits"
-    )
-    location_refinement: StrictBool = Field(
-        True, **_at(*_HEAD, "predictor", "location_refinement"), description="Whether offsets are used"
-    )
-    locref_std: Number = Field(
-        LOCREF_STD,
-        **_at(*_HEAD, "predictor", "locref_std"),
-        gt=0.0,
-        lt=1e30,
-        description="Scale of the offset channels [px]",
-    )
-    locref_config: dict | None = Field(
-        None, **_at(*_HEAD, "locref_config"), description="Layers of the offsets, where there are any"
-    )
-    strides: tuple[Annotated[Number, Field(gt=1e-3, lt=1e3)], ...] = Field(
-        (), **_at(*_HEAD, "heatmap_config", "strides"), description="Of the layers of the heatmaps [-]"
-    )
-    output_stride: Number | None = Field(
-        None,
-        **_at("model", "backbone", "output_stride"),
-        gt=0.0,
-        lt=1e30,
-        description="Input pixels per cell of the backbone's maps",
+    bodyparts: tuple[str, ...] = _key("metadata.bodyparts", ..., "Names in the order of the heatmaps", min_length=1)
+    individuals: tuple[str, ...] = _key("metadata.individuals", (), "Names of the animals")
+    colormode: Colours = _key("data.colormode", "RGB", "Order of the colours that the network was trained on")
+    normalize_images: StrictBool = _key("data.inference.normalize_images", True, "Whether ImageNet's mean is taken off")
+    pad_height_divisor: Side = _key(f"{_PADDING}.pad_height_divisor", 1, "Heights are padded to its multiples [px]")
+    pad_width_divisor: Side = _key(f"{_PADDING}.pad_width_divisor", 1, "Widths are padded to its multiples [px]")
+    type: str = _key(f"{_HEAD}.predictor.type", _PREDICTOR, "Kind of decoding")
+    apply_sigmoid: StrictBool = _key(f"{_HEAD}.predictor.apply_sigmoid", False, "Whether scores are logits")
+    location_refinement: StrictBool = _key(f"{_HEAD}.predictor.location_refinement", True, "Whether offsets are used")
+    locref_std: Number = _key(f"{_HEAD}.predictor.locref_std", LOCREF_STD, "Scale of the offsets [px]", gt=0.0, lt=1e30)
+    locref_config: dict | None = _key(f"{_HEAD}.locref_config", None, "Layers of the offsets, where there are any")
+    strides: Strides = _key(f"{_HEAD}.heatmap_config.strides", (), "Of the layers of the heatmaps [-]")
+    output_stride: Number | None = _key(
+        "model.backbone.output_stride", None, "Input pixels per cell of the backbone's maps", gt=0.0, lt=1e30
     )
     finforce: OwnSection = Field(OwnSection(), description="What this package keeps")
 

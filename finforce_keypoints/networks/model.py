@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -11,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce_keypoints.errors import DetectionError, ModelError
-from finforce_keypoints.networks.metadata import LARGEST_SIDE, METADATA_FILE, ModelMetadata, read_metadata
-from finforce_keypoints.networks.network import COLOURS, Network, OutputLayout, find_network, find_outputs
+from finforce_keypoints.networks.metadata import METADATA_FILE, ModelMetadata, read_metadata
+from finforce_keypoints.networks.runtime import COLOURS, INPUT_TYPES, LARGEST_SIDE, Network, size_frozen
 
 # Likelihood and standard deviation [px of the network's input] of a network that was never calibrated: DeepLabCut's
 # networks err by 2 to 3 px above its cut-off of 0.6, and by tens of pixels where they see nothing.
@@ -215,12 +216,75 @@ def _is_near(pixels: NDArray, margin: float, size: tuple[int, int]) -> NDArray:
     return ((pixels >= -margin) & (pixels <= farthest)).all(axis=1)
 
 
+_HEATMAP_WORDS = ("heat", "score", "pred")
+_LOCREF_WORDS = ("locref", "offset")
 # ImageNet's, which DeepLabCut takes off
 _MEAN = np.array([0.485, 0.456, 0.406], np.float32)
 _STD = np.array([0.229, 0.224, 0.225], np.float32)
 _PROBE = 256  # px, of the picture that a network of any size is tried with
 # A border of up to one cell and a half is a network's habit; a stride off by a factor of two is an error.
 _STRIDE_TOLERANCE = 0.6  # of log2(H / h / stride)
+
+
+@dataclass(frozen=True, kw_only=True)
+class InputLayout:
+    """What a network takes.
+
+    Attributes:
+        channel_axis: 1 of NCHW, 3 of NHWC.
+        dtype: of the input; uint8 takes the image as it is.
+        height: frozen height [px], None where any will do.
+        width: frozen width [px], None where any will do.
+    """
+
+    channel_axis: int
+    dtype: type
+    height: int | None
+    width: int | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class OutputLayout:
+    """Where a network's maps are.
+
+    Attributes:
+        heatmap: number of the output that holds the heatmaps.
+        locref: number of the output that holds the offsets; that of the heatmaps when one output holds both (first K
+            channels heatmaps, then 2K offsets); None without offsets.
+        channel_axis: of the maps, 1 or 3.
+        count: K heatmaps.
+    """
+
+    heatmap: int
+    locref: int | None
+    channel_axis: int
+    count: int
+
+    def split(self, outputs: Sequence[NDArray]) -> tuple[NDArray, NDArray | None]:
+        """Return the heatmaps (B, K, h, w) and the offsets (B, 2K, h, w) or None, float32, of the outputs.
+
+        Raises:
+            DetectionError: they are not of these shapes; a network may make others of other pictures.
+        """
+        heatmap, locref = self._move_channels(outputs[self.heatmap]), None
+        if self.locref == self.heatmap:
+            heatmap, locref = heatmap[:, : self.count], heatmap[:, self.count :]
+        elif self.locref is not None:
+            locref = self._move_channels(outputs[self.locref])
+        batch, count, *cells = heatmap.shape
+        is_odd = locref is not None and locref.shape != (batch, 2 * self.count, *cells)
+        if count != self.count or 0 in heatmap.shape or is_odd:
+            offsets = None if locref is None else locref.shape
+            raise DetectionError(
+                f"heatmaps {heatmap.shape} and offsets {offsets}; expected {self.count} and {2 * self.count} maps of "
+                "the same number of cells"
+            )
+        return heatmap, locref
+
+    def _move_channels(self, maps: NDArray) -> NDArray:
+        if maps.ndim != 4:
+            raise DetectionError(f"output of shape {maps.shape}; expected maps (batch, parts, h, w)")
+        return np.moveaxis(maps, self.channel_axis, 1).astype(np.float32, copy=False)
 
 
 class KeypointModel:
@@ -245,6 +309,7 @@ class KeypointModel:
         self.path = find_network(path)
         self.metadata: ModelMetadata = read_metadata(self.path.parent / METADATA_FILE)
         self._network = Network(self.path, threads)
+        self._input = find_input(self._network.inputs)
         self._scale, self._shift = self._build_normalization()
         self._check_sizes()
         try:
@@ -260,7 +325,7 @@ class KeypointModel:
     @property
     def frozen_size(self) -> tuple[int | None, int | None]:
         """Height and width that are frozen into the network [px]; None where any will do."""
-        return self._network.input.height, self._network.input.width
+        return self._input.height, self._input.width
 
     @property
     def training_size(self) -> tuple[int, int] | None:
@@ -323,7 +388,7 @@ class KeypointModel:
         if batch.ndim != 4 or batch.shape[3] != COLOURS or batch.dtype != np.uint8 or 0 in batch.shape:
             raise DetectionError(f"got {batch.dtype} {batch.shape}, expected uint8 RGB (batch, height, width, 3)")
         batch = self._pad(batch)
-        layout = self._network.input
+        layout = self._input
         if self.metadata.colormode == "BGR":
             batch = batch[..., ::-1]
         if layout.channel_axis == 1:
@@ -366,7 +431,7 @@ class KeypointModel:
         tensor = self.preprocess(batch)
         arrays = self._network.run(tensor)
         shapes = [(name, array.shape) for name, array in zip(self._network.output_names, arrays, strict=True)]
-        layout = find_outputs(shapes, len(self.names), self._network.input.channel_axis)
+        layout = find_outputs(shapes, len(self.names), self._input.channel_axis)
         if layout.locref is None and self.metadata.locref_config is not None and self.metadata.location_refinement:
             raise ModelError(
                 f"outputs {shapes}: the metadata have a locref_config; export the offsets too, or set "
@@ -413,8 +478,111 @@ class KeypointModel:
 
     def _build_normalization(self) -> tuple[NDArray, NDArray]:
         """Return factor and shift per colour, in the axes of the network's input."""
-        axes = (COLOURS, 1, 1) if self._network.input.channel_axis == 1 else (COLOURS,)
+        axes = (COLOURS, 1, 1) if self._input.channel_axis == 1 else (COLOURS,)
         scale, shift = np.full(COLOURS, 1.0 / 255.0, np.float32), np.zeros(COLOURS, np.float32)
         if self.metadata.normalize_images:
             scale, shift = scale / _STD, -_MEAN / _STD
         return scale.reshape(axes), shift.reshape(axes)
+
+
+def find_network(path: str | Path) -> Path:
+    """Return the only .onnx file of a folder, or the file itself.
+
+    Raises:
+        ModelError: there is none, or there are several.
+    """
+    path = Path(path)
+    try:
+        if path.is_file():
+            return path
+        found = sorted(path.glob("*.onnx"))
+    except OSError as error:
+        raise ModelError(
+            f"model: cannot be looked for ({error.strerror}); expected a folder with one .onnx file"
+        ) from error
+    if len(found) != 1:
+        names = ", ".join(file.name for file in found) or "none"
+        raise ModelError(f"{path}: expected a folder with one .onnx file and its metadata, found {names}")
+    return found[0]
+
+
+def find_input(inputs: Sequence[tuple]) -> InputLayout:
+    """Return the layout of the only input.
+
+    Args:
+        inputs: name, shape (numbers, or names of free axes) and type of each.
+
+    Raises:
+        ModelError: there are several, or it is no batch of colour images.
+    """
+    if len(inputs) != 1:
+        raise ModelError(f"the network has the inputs {[item[0] for item in inputs]}, expected exactly one image")
+    name, shape, kind = inputs[0]
+    axes = [axis for axis in (1, 3) if len(shape) == 4 and shape[axis] == COLOURS]
+    if not axes:
+        raise ModelError(
+            f"input '{name}' has shape {shape}, expected (batch, 3, height, width) or (batch, height, width, 3)"
+        )
+    if kind not in INPUT_TYPES:
+        raise ModelError(f"input '{name}' is {kind}, expected one of {', '.join(INPUT_TYPES)}")
+    height, width = (2, 3) if axes[0] == 1 else (1, 2)
+    return InputLayout(
+        channel_axis=axes[0],
+        dtype=INPUT_TYPES[kind],
+        height=size_frozen(shape[height]),
+        width=size_frozen(shape[width]),
+    )
+
+
+def find_outputs(shapes: Sequence[tuple[str, tuple[int, ...]]], count: int, channel_axis: int) -> OutputLayout:
+    """Return where heatmaps and offsets are: by the outputs' names, else the heatmaps first.
+
+    Args:
+        shapes: name and shape of every output, for some image.
+        count: K body parts.
+        channel_axis: of the input, tried first.
+
+    Raises:
+        ModelError: the outputs are not those of a heatmap head of K body parts.
+    """
+    heatmap, locref = _sort_outputs(shapes)
+    _refuse_other_ranks([shapes[n] for n in (heatmap, locref) if n is not None])
+    name, shape = shapes[heatmap]
+    axes = sorted((1, 3), key=lambda axis: axis != channel_axis)
+    for axis in axes:
+        if locref is None and shape[axis] == COLOURS * count:
+            return OutputLayout(heatmap=heatmap, locref=heatmap, channel_axis=axis, count=count)
+        if shape[axis] == count and (locref is None or shapes[locref][1][axis] == 2 * count):
+            return OutputLayout(heatmap=heatmap, locref=locref, channel_axis=axis, count=count)
+    if locref is not None:
+        wanted = f"{count} heatmaps and {2 * count} offsets"
+        raise ModelError(f"outputs {list(shapes)}: expected {wanted} for the {count} body parts of the metadata")
+    raise ModelError(
+        f"output '{name}' has shape {shape}: expected {count} channels, or {3 * count} with offsets, for the {count} "
+        "body parts of the metadata; are network and metadata of the same training?"
+    )
+
+
+def _sort_outputs(shapes: Sequence[tuple[str, tuple[int, ...]]]) -> tuple[int, int | None]:
+    """Return the numbers of the outputs with the heatmaps and the offsets (None: there is no such output)."""
+    names = [name.lower() for name, _ in shapes]
+    locrefs = [n for n, name in enumerate(names) if any(word in name for word in _LOCREF_WORDS)]
+    heatmaps = [n for n, name in enumerate(names) if n not in locrefs and any(word in name for word in _HEATMAP_WORDS)]
+    if len(heatmaps) == 1 and len(locrefs) <= 1 and (locrefs or len(names) == 1):
+        return heatmaps[0], locrefs[0] if locrefs else None
+    if len(names) in (1, 2):
+        return 0, 1 if len(names) == 2 else None
+    raise ModelError(
+        f"the network has the outputs {[name for name, _ in shapes]}, expected 'heatmap', or 'heatmap' and 'locref', "
+        "or both in one"
+    )
+
+
+def _refuse_other_ranks(shapes: Sequence[tuple[str, tuple[int, ...]]]) -> None:
+    """Refuse outputs that are no maps."""
+    if all(len(shape) == 4 for _, shape in shapes):
+        return
+    hint = "its SimCC head (RTMPose) has one vector per axis; " if all(len(s) == 3 for _, s in shapes) else ""
+    raise ModelError(
+        f"outputs {list(shapes)}: {hint}expected heatmaps (batch, parts, h, w); export a network with a heatmap head"
+    )

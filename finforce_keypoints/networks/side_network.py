@@ -22,7 +22,7 @@ from finforce.errors import one_line
 from finforce.optional import import_cv2
 from finforce_keypoints.errors import DetectionError, ModelError
 from finforce_keypoints.geometry.template import fit_motion, trust
-from finforce_keypoints.networks.network import Helpers, open_session
+from finforce_keypoints.networks.runtime import Helpers, open_session
 
 METADATA = "finforce"  # key of the files' own metadata
 KIND = "side plane"

@@ -19,7 +19,7 @@ from finforce_eval.evaluate import evaluate_all
 from finforce_eval.evaluation.scoring import rms
 from finforce_eval.figures.figures import BLACK, BLUE, ORANGE
 from finforce_eval.recordings.images import StampedImage
-from finforce_keypoints.networks.network import open_session
+from finforce_keypoints.networks.runtime import open_session
 from finforce_keypoints.networks.side_network import METADATA
 from lab.experiments.experiment import Experiment, average, draw_panels, tabulate
 from lab.experiments.grasp import find_phases, join_jaws

@@ -31,7 +31,7 @@ from finforce_ifea.jaw.calibration import load_calibration
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.jaw.mesh_file import ClampRule, read_volume_mesh
 from finforce_keypoints.networks.metadata import read_metadata
-from finforce_keypoints.networks.trial import try_network
+from finforce_keypoints.networks.runtime import try_network
 
 JAWS, MODELS = Path(finforce_ifea.__file__).parent / "jaw", Path(finforce_keypoints.__file__).parent / "models"
 BOX = trimesh.creation.box((0.03, 0.04, 0.05))

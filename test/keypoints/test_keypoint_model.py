@@ -10,9 +10,8 @@ from finforce.errors import MissingDependencyError
 from finforce.typed_yaml import parse_model
 from finforce_keypoints.build import BENCH
 from finforce_keypoints.errors import DetectionError, ModelError
-from finforce_keypoints.networks import network as network_module
 from finforce_keypoints.networks.metadata import ModelMetadata
-from finforce_keypoints.networks.model import KeypointModel, decode
+from finforce_keypoints.networks.model import KeypointModel, decode, find_input
 
 # The squares of 12 px lie on the middles of cells: one cell is pure, its neighbours hold a quarter.
 SQUARES = {"red": (100, 68), "green": (340, 204), "blue": (628, 12), "yellow": (20, 460)}
@@ -194,7 +193,7 @@ def test_an_input_that_is_no_colour_image_is_refused(tmp_path):
 )
 def test_inputs_other_than_one_image_are_refused(inputs, message):
     with pytest.raises(ModelError, match=message):
-        network_module.find_input(inputs)
+        find_input(inputs)
 
 
 def test_pictures_that_the_network_cannot_take_are_refused(tmp_path):
