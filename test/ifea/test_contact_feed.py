@@ -6,9 +6,8 @@ from std_msgs.msg import Header
 
 from finforce.messages import CloudColumns
 from finforce_ifea.jaw.jaw import load_jaw
-from finforce_ifea.messages import columns_from_outline
+from finforce_ifea.messages import ContactFeed, columns_from_outline
 from finforce_ifea.observation import Contact
-from finforce_ifea.parameters import ContactFeed
 
 PERIOD, TIMEOUT = 33_000_000, 0.008
 FRAME = "left_jaw"

@@ -8,9 +8,8 @@ import pytest
 from finforce.errors import ObservationError
 from finforce.messages import encode_cloud
 from finforce_ifea.errors import ContactError
-from finforce_ifea.messages import columns_from_outline, outline_from_columns
+from finforce_ifea.messages import MOST_CORNERS, MOST_ROWS, ContactFeed, columns_from_outline, outline_from_columns
 from finforce_ifea.observation import ObjectOutline
-from finforce_ifea.parameters import MOST_CORNERS, MOST_ROWS, ContactFeed
 
 MS = 1_000_000
 SQUARE = np.array([[-0.03, -0.02], [0.03, -0.02], [0.03, 0.02], [-0.03, 0.02]])
