@@ -231,12 +231,12 @@ class KeypointDetector:
         keypoints = {}
         for side, jaw in self._jaws.items():
             detection = self._check(side, detections.get(side))
-            located = jaw.locate(image, detection, self._scale)
-            if located is not None:
-                stddev = max(located.scale.stddev, _LEAST_SCALE_STDDEV)
-                self._scale = replace(located.scale, stddev=min(stddev, self.settings.scale_stddev))
-                keypoints[side] = located.keypoints
-                self._count(side, located.keypoints)
+            found = jaw.locate(image, detection, self._scale)
+            if found is not None:
+                stddev = max(found.scale.stddev, _LEAST_SCALE_STDDEV)
+                self._scale = replace(found.scale, stddev=min(stddev, self.settings.scale_stddev))
+                keypoints[side] = found
+                self._count(side, found)
         return keypoints
 
     def _drift(self, stamp: float) -> None:

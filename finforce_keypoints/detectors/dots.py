@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -20,6 +20,7 @@ SIZE_TOLERANCE = 2.5  # factor by which a dot's area may be larger or smaller
 GATE = 0.006  # [m] by which a dot may be off where its neighbours let expect it
 _LARGEST_ELONGATION = 4.0  # a disc that is seen at 75 degrees off its normal
 _DIMMEST = 8  # of 255: darker pixels have no colour
+Weigh = Callable[[tuple[slice, slice]], NDArray]  # how much the pixels of a part of an image look like a dot
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,8 +81,9 @@ def find_dots(color: NDArray, settings: DotSettings, diameter: float) -> Dots:
         rim count by the part that the dot covers.
     """
     cv2 = import_cv2()
-    look = _ColoredLook(settings) if settings.kind == "colored" else _LightLook(settings, color, diameter)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(look.select(color), connectivity=8, ltype=cv2.CV_16U)
+    is_colored = settings.kind == "colored"
+    mask, weigh = _see_colored(color, settings) if is_colored else _see_light(color, settings, diameter)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8, ltype=cv2.CV_16U)
     expected = 0.25 * np.pi * diameter**2
     area = stats[:, cv2.CC_STAT_AREA]
     tolerance = 2.0 * SIZE_TOLERANCE  # the distance of each dot is not known here
@@ -90,64 +92,41 @@ def find_dots(color: NDArray, settings: DotSettings, diameter: float) -> Dots:
     for number in np.flatnonzero(is_wanted[1:]) + 1:
         x, y, width, height = stats[number, :4].tolist()
         part = slice(max(y - 1, 0), y + height + 1), slice(max(x - 1, 0), x + width + 1)
-        row = _measure(look.weigh(color, part), labels[part], number)
+        row = _measure(weigh(part), labels[part], number)
         if row is not None:
             rows.append(np.add(row, (part[1].start, part[0].start, 0.0, 0.0)))
     table = np.array(rows).reshape(-1, 4)
     return Dots(pixels=table[:, :2], areas=table[:, 2], fills=table[:, 3])
 
 
-class _ColoredLook:
-    """What pixels of one hue look like."""
-
-    def __init__(self, settings: DotSettings) -> None:
-        self._settings = settings
-        hue = np.deg2rad(settings.hue)
-        # a = R - (G + B) / 2, b = sqrt(3) / 2 (G - B): the chroma towards the hue is a cos + b sin.
-        self._direction = np.array([1.0, -0.5, -0.5]) * np.cos(hue) + np.array([0.0, 1.0, -1.0]) * (
-            np.sqrt(0.75) * np.sin(hue)
-        )
-
-    def select(self, color: NDArray) -> NDArray:
-        """Return where an image (h, w, 3) has the hue (h, w) uint8."""
-        cv2, settings = import_cv2(), self._settings
-        hsv = cv2.cvtColor(color, cv2.COLOR_RGB2HSV)
-        least = (255.0 * settings.least_saturation, _DIMMEST)
-        low, high = (0.5 * (settings.hue + sign * settings.hue_tolerance) for sign in (-1.0, 1.0))  # OpenCV: 180 a turn
-        mask = np.zeros(color.shape[:2], np.uint8)
-        for turn in (-180.0, 0.0, 180.0):
-            if low + turn <= 180.0 and high + turn >= 0.0:
-                bounds = max(low + turn, 0.0), min(high + turn, 180.0)
-                mask |= cv2.inRange(hsv, (bounds[0], *least), (bounds[1], 255.0, 255.0))
-        return mask
-
-    def weigh(self, color: NDArray, part: tuple[slice, slice]) -> NDArray:
-        """Return the chroma towards the hue of a part of the image."""
-        return np.maximum(color[part] @ self._direction, 0.0)
+def _see_colored(color: NDArray, settings: DotSettings) -> tuple[NDArray, Weigh]:
+    """Return where an image (h, w, 3) has the hue (h, w) uint8, and what gives the chroma towards it of a part."""
+    cv2, hue = import_cv2(), np.deg2rad(settings.hue)
+    hsv = cv2.cvtColor(color, cv2.COLOR_RGB2HSV)
+    least = (255.0 * settings.least_saturation, _DIMMEST)
+    low, high = (0.5 * (settings.hue + sign * settings.hue_tolerance) for sign in (-1.0, 1.0))  # OpenCV: 180 a turn
+    mask = np.zeros(color.shape[:2], np.uint8)
+    for turn in (-180.0, 0.0, 180.0):
+        if low + turn <= 180.0 and high + turn >= 0.0:
+            bounds = max(low + turn, 0.0), min(high + turn, 180.0)
+            mask |= cv2.inRange(hsv, (bounds[0], *least), (bounds[1], 255.0, 255.0))
+    # a = R - (G + B) / 2, b = sqrt(3) / 2 (G - B): the chroma towards the hue is a cos + b sin.
+    red, other = np.array([1.0, -0.5, -0.5]), np.sqrt(0.75) * np.array([0.0, 1.0, -1.0])
+    direction = red * np.cos(hue) + other * np.sin(hue)
+    return mask, lambda part: np.maximum(color[part] @ direction, 0.0)
 
 
-class _LightLook:
-    """What pixels lighter, or darker, than their surroundings look like."""
-
-    def __init__(self, settings: DotSettings, color: NDArray, diameter: float) -> None:
-        cv2 = import_cv2()
-        grey = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)
-        # Scaled until a dot has two pixels, the median of five by five does not see it, and is OpenCV's fastest.
-        scale = min(1.0, 2.0 / diameter)
-        small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-        around = cv2.resize(cv2.medianBlur(small, 5), grey.shape[::-1])
-        above = (grey, around) if settings.kind == "light" else (around, grey)
-        self._above, self._around = cv2.subtract(*above), around
-        self._contrast = settings.least_contrast
-
-    def select(self, color: NDArray) -> NDArray:
-        """Return where the image is light, or dark, (h, w) uint8."""
-        cv2 = import_cv2()
-        return cv2.compare(self._above, cv2.multiply(cv2.max(self._around, _DIMMEST), self._contrast), cv2.CMP_GT)
-
-    def weigh(self, color: NDArray, part: tuple[slice, slice]) -> NDArray:
-        """Return how much lighter, or darker, a part of the image is."""
-        return self._above[part].astype(float)
+def _see_light(color: NDArray, settings: DotSettings, diameter: float) -> tuple[NDArray, Weigh]:
+    """Return where an image (h, w, 3) is lighter, or darker, than around (h, w) uint8, and what tells by how much."""
+    cv2 = import_cv2()
+    grey = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)
+    # Scaled until a dot has two pixels, the median of five by five does not see it, and is OpenCV's fastest.
+    scale = min(1.0, 2.0 / diameter)
+    small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    around = cv2.resize(cv2.medianBlur(small, 5), grey.shape[::-1])
+    above = cv2.subtract(*((grey, around) if settings.kind == "light" else (around, grey)))
+    limit = cv2.multiply(cv2.max(around, _DIMMEST), settings.least_contrast)
+    return cv2.compare(above, limit, cv2.CMP_GT), lambda part: above[part].astype(float)
 
 
 def _measure(weight: NDArray, labels: NDArray, number: int) -> tuple | None:

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from finforce.camera import CameraIntrinsics, project, rays_from_pixels
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_keypoints.geometry.depth import (
-    DepthEvidence,
     DepthScale,
     SideFit,
     SideModel,
@@ -53,6 +52,7 @@ class JawKeypoints:
         stddev: (K, 3) one standard deviation along the jaw's axes [m].
         T_camera_jaw: (4, 4) where the jaw is.
         reasons: (K,) str, "" for valid points, else what speaks against them, one of `REASONS`.
+        scale: of the depth image, as this jaw shows it; None where nobody knows.
     """
 
     stamp: float
@@ -63,22 +63,7 @@ class JawKeypoints:
     stddev: NDArray
     T_camera_jaw: NDArray
     reasons: NDArray
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class SideEvidence:
-    """Where a jaw's points are across its side, and which of them (K + 1,) bool the depth image confirms."""
-
-    fit: SideFit
-    has_depth: NDArray
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Located:
-    """What one image says of a jaw: its key points, and how wrong the depth image's scale is."""
-
-    keypoints: JawKeypoints
-    scale: DepthScale
+    scale: DepthScale | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -161,7 +146,7 @@ class JawLocalizer:
         forecast = self._track.forecast(stamp)
         return None if forecast is None else self._origin.place(forecast)
 
-    def locate(self, image: RgbdImage, detection: PixelDetection | None, scale: DepthScale) -> Located | None:
+    def locate(self, image: RgbdImage, detection: PixelDetection | None, scale: DepthScale) -> JawKeypoints | None:
         """Return the jaw's key points, None when nobody knows where the jaw is.
 
         Args:
@@ -176,21 +161,22 @@ class JawLocalizer:
         origin = self._track.update(image.stamp, self._measure(seen))
         if origin is None:
             return None
-        located = self._describe(seen, scale, origin)
+        keypoints = self._describe(seen, scale, origin)
         # without one key point that depth confirms, a picture of a jaw would do as well
-        self._unconfirmed = 0 if located.keypoints.valid.any() else self._unconfirmed + 1
+        self._unconfirmed = 0 if keypoints.valid.any() else self._unconfirmed + 1
         if self._unconfirmed >= self._settings.lost_images:
             self._track.reset()
             return None
-        return located
+        return keypoints
 
     def _look(self, image: RgbdImage, detection: PixelDetection) -> _Seen:
-        """Return the rays to the points that were found."""
+        """Return the rays to the points that were found, and which of these the pixel detector believes in."""
         inside = lie_inside(image, detection.pixels)
+        likely = detection.likelihood >= self._settings.likelihood
         return _Seen(
             image=image,
             detection=detection,
-            likely=self._find_likely(image, detection),
+            likely=likely & inside & np.isfinite(detection.stddev),
             rays=rays_from_pixels(np.where(inside[:, None], detection.pixels, np.nan), image.camera),
             ray_stddev=detection.stddev / np.sqrt(image.camera.fx * image.camera.fy),
         )
@@ -204,22 +190,22 @@ class JawLocalizer:
             return self._patch.refine(seen.image.color, seen.image.camera, measured, self._origin.place)
         return measured
 
-    def _describe(self, seen: _Seen, scale: DepthScale, origin: Origin) -> Located:
+    def _describe(self, seen: _Seen, scale: DepthScale, origin: Origin) -> JawKeypoints:
         """Return the key points of the jaw at an origin."""
         T_camera_jaw = self._origin.place(origin)
         sight = look_along(seen.rays, T_camera_jaw)
-        side = self._fit_side(seen.image, sight, seen.likely, scale, T_camera_jaw)
-        depths = sight.depths_at(self._rest[:, 1] + side.fit.y)
-        self._check_rest(seen, sight, side)
-        points = np.where(side.has_depth[:, None], sight.camera + depths[:, None] * sight.rays, np.nan)
+        fit, has_depth = self._fit_side(seen.image, sight, seen.likely, scale, T_camera_jaw)
+        depths = sight.depths_at(self._rest[:, 1] + fit.y)
+        self._check_rest(seen, sight, fit)
+        points = np.where(has_depth[:, None], sight.camera + depths[:, None] * sight.rays, np.nan)
         late = self._find_delays(seen, T_camera_jaw)
         points[:, 0] -= self._sign * self._track.speed * (late - late[-1])
-        stddev = compute_stddev(sight, depths, side.fit.stddev, seen.ray_stddev)
+        stddev = compute_stddev(sight, depths, fit.stddev, seen.ray_stddev)
         stddev[:, 0] = np.hypot(stddev[:, 0], origin.stddev)
-        reasons = self._judge(seen.image, seen.detection, side, points)
+        reasons = self._judge(seen.image, seen.detection, has_depth, points)
         valid = reasons == ""
         count = len(valid)
-        keypoints = JawKeypoints(
+        return JawKeypoints(
             stamp=seen.image.stamp,
             points=points[:count],
             likelihood=np.where(valid, seen.detection.likelihood[:count], 0.0),
@@ -228,8 +214,8 @@ class JawLocalizer:
             stddev=stddev[:count],
             T_camera_jaw=self._origin.place(replace(origin, x=origin.x - self._track.speed * late[-1])),
             reasons=reasons,
+            scale=fit.scale,
         )
-        return Located(keypoints=keypoints, scale=side.fit.scale)
 
     def _find_delays(self, seen: _Seen, T_camera_jaw: NDArray) -> NDArray:
         """Return how long after the image's stamp the points' rows were exposed (K + 1,) [s].
@@ -240,10 +226,10 @@ class JawLocalizer:
         rows[-1] = project(self._rest[-1:] @ T_camera_jaw[:3, :3].T + T_camera_jaw[:3, 3], camera)[0, 1]
         return self._settings.readout * (rows / camera.height - 1.0)
 
-    def _check_rest(self, seen: _Seen, sight: SideView, side: SideEvidence) -> None:
+    def _check_rest(self, seen: _Seen, sight: SideView, fit: SideFit) -> None:
         """Compare the likely points with the jaw file: along the side where their rays meet it, across it by depth."""
         points = sight.points_at(self._rest[:, 1])
-        points[:, 1] += side.fit.y
+        points[:, 1] += fit.y
         self._rest_check.take(np.where(seen.likely[:, None], points, np.nan)[:-1])
 
     def _is_there(self, likely: NDArray) -> bool:
@@ -251,21 +237,19 @@ class JawLocalizer:
         least = min(_LEAST_SEEN, len(likely))
         return likely.sum() >= (max(least, _LEAST_FOUND * len(likely)) if self.is_lost else least)
 
-    def _find_likely(self, image: RgbdImage, detection: PixelDetection) -> NDArray:
-        """Return which points (K + 1,) bool the pixel_detector believes in."""
-        likely = detection.likelihood >= self._settings.likelihood
-        return likely & lie_inside(image, detection.pixels) & np.isfinite(detection.stddev)
-
     def _fit_side(
         self, image: RgbdImage, sight: SideView, likely: NDArray, scale: DepthScale, T_camera_jaw: NDArray
-    ) -> SideEvidence:
-        """Return where the points are across the jaw's side: first near the known plane, then near the one found."""
+    ) -> tuple[SideFit, NDArray]:
+        """Return where the points are across the jaw's side, and which of them (K + 1,) bool the depth confirms.
+
+        They are looked for first near the known plane, then near the one found.
+        """
         expected = sight.depths_at(self._rest[:, 1])
         lever = expected * sight.rays[:, 1]
         nothing = np.full(len(expected), np.nan)
         if image.depth is None:
             fit = fit_side(self._model, nothing, nothing, np.nan_to_num(lever), scale)
-            return SideEvidence(fit=fit, has_depth=np.full(len(expected), self._settings.plane_depth))
+            return fit, np.full(len(expected), self._settings.plane_depth)
         points = sight.camera + expected[:, None] * sight.rays
         excess = sample_depths(image.depth, image.camera, points, self._samples, T_camera_jaw)
         fit = None
@@ -273,7 +257,8 @@ class JawLocalizer:
             away = np.zeros(len(expected)) if fit is None else fit.y / sight.rays[:, 1]
             error = scale.error if fit is None else fit.scale.error
             evidence = weigh_depths(excess, away + error * expected, gate, self._settings.quantum)
-            measured = self._measures(evidence)
+            # enough depths, and most of them, are the finger's
+            measured = (evidence.count >= LEAST_DEPTHS) & (evidence.share >= LEAST_SHARE)
             used = measured & likely
             fit = fit_side(
                 self._model,
@@ -285,20 +270,16 @@ class JawLocalizer:
         with np.errstate(invalid="ignore"):
             refused = np.abs(fit.misfit) > MISFIT
         hole = (evidence.known < LEAST_DEPTHS) & self._settings.plane_depth
-        return SideEvidence(fit=fit, has_depth=(measured & ~refused) | hole)
+        return fit, (measured & ~refused) | hole
 
-    def _measures(self, evidence: DepthEvidence) -> NDArray:
-        """Return at which points (K + 1,) bool enough depths, and most of them, are the finger's."""
-        return (evidence.count >= LEAST_DEPTHS) & (evidence.share >= LEAST_SHARE)
-
-    def _judge(self, image: RgbdImage, detection: PixelDetection, side: SideEvidence, points: NDArray) -> NDArray:
+    def _judge(self, image: RgbdImage, detection: PixelDetection, has_depth: NDArray, points: NDArray) -> NDArray:
         """Return what speaks against each key point (K,) str, the first reason that does; "" for nothing."""
         with np.errstate(invalid="ignore"):
             outside = (np.abs(points - self._rest) > self._box).any(axis=1)
         against = (
             ~lie_inside(image, detection.pixels),
             ~(detection.likelihood >= self._settings.likelihood),
-            ~side.has_depth | ~np.isfinite(points).all(axis=1),
+            ~has_depth | ~np.isfinite(points).all(axis=1),
             outside,
         )
         return np.select(against, REASONS, default="")[:-1]

@@ -131,19 +131,6 @@ class OriginEstimator:
         return np.stack((x, depth * stddev / np.sqrt(square), off))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Slide:
-    """How a patch lies beside the template.
-
-    Attributes:
-        x: way along the jaw's x [px].
-        likeness: their correlation, brightness and contrast aside.
-    """
-
-    x: float
-    likeness: float
-
-
 class ReferencePatch:
     """Follows the reference point of one jaw by what surrounds it.
 
@@ -208,15 +195,14 @@ class ReferencePatch:
     ) -> Origin | None:
         """Return the origin, without the anchor, at which the patch is the template; None when it is nowhere near."""
         x = measured.x - self._anchor
-        self._matcher = self._matcher or build_matcher(self._template)
+        self._matcher = self._matcher or PatchMatcher(self._template)
         for _ in range(ITERATIONS):
-            slide = self._matcher.match(self._take(color, camera, place(Origin(x=x, stddev=0.0))))
-            step = self._sign * slide.x * SCALE
-            x += step
+            slide, likeness = self._matcher.match(self._take(color, camera, place(Origin(x=x, stddev=0.0))))
+            x += self._sign * slide * SCALE
             if abs(x + self._anchor - measured.x) > FARTHEST or not np.isfinite(x):
                 return None
-            if abs(slide.x) < SETTLED:
-                return Origin(x=x, stddev=STDDEV) if slide.likeness >= LEAST_LIKENESS else None
+            if abs(slide) < SETTLED:
+                return Origin(x=x, stddev=STDDEV) if likeness >= LEAST_LIKENESS else None
         return None
 
     def _take(self, color: NDArray, camera: CameraIntrinsics, T_camera_jaw: NDArray) -> NDArray:
@@ -227,40 +213,31 @@ class ReferencePatch:
         return import_cv2().GaussianBlur(grey, (0, 0), BLUR).astype(np.float64)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
 class PatchMatcher:
     """Tells by how much patches have slid against one template, by least squares to first order in the slide s.
 
     patch = a template - a (s_x d_x + s_z d_z) template + b
 
-    Attributes:
-        template: (n,) of the inner pixels, without its mean and of length 1.
-        inverse: (4, n) that gives -a s_x, -a s_z, a and b of a patch.
+    Args:
+        template: (h, w) grey values.
     """
 
-    template: NDArray
-    inverse: NDArray
+    def __init__(self, template: NDArray) -> None:
+        by_z, by_x = np.gradient(template)
+        values = template[_INNER].ravel()
+        columns = np.column_stack([by_x[_INNER].ravel(), by_z[_INNER].ravel(), values, np.ones(values.size)])
+        self._inverse = np.linalg.solve(columns.T @ columns + 1e-6 * np.eye(4), columns.T)
+        known = values - values.mean()
+        self._template = known / max(np.linalg.norm(known), 1e-9)
 
-    def match(self, patch: NDArray) -> Slide:
-        """Return by how much a patch (h, w) has slid."""
+    def match(self, patch: NDArray) -> tuple[float, float]:
+        """Return the slide [px] of a patch (h, w) along the jaw's x, and its correlation with the template."""
         values = patch[_INNER].ravel()
-        slope_x, _, gain, _ = self.inverse @ values
+        slope_x, _, gain, _ = self._inverse @ values
         if not gain > 0.0:
-            return Slide(x=0.0, likeness=0.0)
+            return 0.0, 0.0
         seen = values - values.sum() / values.size
-        likeness = float(seen @ self.template / max(sqrt(seen @ seen), 1e-9))
-        return Slide(x=float(-slope_x / gain), likeness=likeness)
-
-
-def build_matcher(template: NDArray) -> PatchMatcher:
-    """Return what compares patches with a template (h, w)."""
-    by_z, by_x = np.gradient(template)
-    values = template[_INNER].ravel()
-    columns = np.column_stack([by_x[_INNER].ravel(), by_z[_INNER].ravel(), values, np.ones(values.size)])
-    normal = columns.T @ columns + 1e-6 * np.eye(4)
-    known = values - values.mean()
-    known /= max(np.linalg.norm(known), 1e-9)
-    return PatchMatcher(template=known, inverse=np.linalg.solve(normal, columns.T))
+        return float(-slope_x / gain), float(seen @ self._template / max(sqrt(seen @ seen), 1e-9))
 
 
 class OriginTrack:

@@ -56,14 +56,6 @@ class JawSpots:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Learnt:
-    """One image of jaws that seem to stand still: key points and grey patches (n, s, s), by side."""
-
-    found: Mapping[str, JawKeypoints]
-    patches: Mapping[str, NDArray]
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class StillReference:
     """What one jaw looks like while it stands still: d = design @ c for the differences d (N,) of a picture from it.
 
@@ -115,7 +107,8 @@ class StillWatch:
     def reset(self) -> None:
         """Forget all pictures."""
         self.references: dict[str, StillReference] = {}
-        self._learning: list[_Learnt] = []
+        self._learning: list[Mapping[str, JawKeypoints]] = []  # of images in which the jaws seem to stand still, and
+        self._patches: list[Mapping[str, NDArray]] = []  # the grey patches (n, s, s) of these
         self._spots: dict[str, JawSpots | None] = {}
         self._camera: CameraIntrinsics | None = None
         self._creep: dict[str, NDArray] = {}
@@ -169,23 +162,23 @@ class StillWatch:
 
     def _learn(self, found: Mapping[str, JawKeypoints], image: RgbdImage) -> None:
         """Learn from one more image; a motion begins anew."""
-        last = self._learning[-1].found if self._learning else found
+        last = self._learning[-1] if self._learning else found
         if found.keys() != last.keys() or image.camera is not self._camera or have_moved(found, last):
-            self._learning = []
+            self._learning, self._patches = [], []
         if not self._learning:
             self._camera = image.camera
             self._spots = {side: place_spots(jaw, image.camera) for side, jaw in found.items()}
         if not found or None in self._spots.values():
-            self._learning = []
+            self._learning, self._patches = [], []
             return
-        patches = {side: gather(image.color, spots.places) for side, spots in self._spots.items()}
-        self._learning.append(_Learnt(found=found, patches=patches))
+        self._learning.append(found)
+        self._patches.append({side: gather(image.color, spots.places) for side, spots in self._spots.items()})
         if len(self._learning) == LEARNT:
-            learnt, self._learning = self._learning, []
             references = {
-                side: build_reference(spots, [one.found[side] for one in learnt], [one.patches[side] for one in learnt])
+                side: build_reference(spots, [f[side] for f in self._learning], [p[side] for p in self._patches])
                 for side, spots in self._spots.items()
             }
+            self._learning, self._patches = [], []
             if None not in references.values():
                 self.references, self._creep = references, {side: np.zeros(4) for side in references}
 

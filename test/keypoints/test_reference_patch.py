@@ -5,7 +5,7 @@ from scipy.ndimage import gaussian_filter
 from finforce.gripper_frames import ROBOT_CAMERA, jaw_in_camera
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints.geometry import jaw_pose as reference_patch
-from finforce_keypoints.geometry.jaw_pose import TEMPLATE_IMAGES, Origin, ReferencePatch, build_matcher
+from finforce_keypoints.geometry.jaw_pose import TEMPLATE_IMAGES, Origin, PatchMatcher, ReferencePatch
 from finforce_keypoints.geometry.side_picture import find_side, intersect_plane
 from finforce_sim.sensor import build_d405_vga
 
@@ -89,6 +89,6 @@ def test_a_slide_by_half_a_pixel_is_read_off_to_a_hundredth():
     def spot(x):
         return 200.0 * np.exp(-((columns - 20.0 - x) ** 2 + (rows - 20.0) ** 2) / 50.0)
 
-    assert build_matcher(spot(0.0)).match(spot(0.5)).x == pytest.approx(0.5, abs=0.01)
-    assert build_matcher(spot(0.0)).match(spot(-0.5)).x == pytest.approx(-0.5, abs=0.01)
-    assert build_matcher(spot(0.0)).match(200.0 - spot(0.0)).likeness == 0.0
+    assert PatchMatcher(spot(0.0)).match(spot(0.5))[0] == pytest.approx(0.5, abs=0.01)
+    assert PatchMatcher(spot(0.0)).match(spot(-0.5))[0] == pytest.approx(-0.5, abs=0.01)
+    assert PatchMatcher(spot(0.0)).match(200.0 - spot(0.0))[1] == 0.0
