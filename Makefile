@@ -5,10 +5,11 @@ export OPENBLAS_NUM_THREADS ?= 1
 
 PYTHON := .venv/bin/python
 SET_UP := tools/setup_venv.sh
+STRESS_COUNT ?= 4
 DESCRIBED := setup.py setup.cfg pyproject.toml $(SET_UP)
 ROS := $(if $(AMENT_PREFIX_PATH),ament,plain)
 
-.PHONY: demo test lint bench docs build clean
+.PHONY: demo test lint bench stress docs build clean
 
 demo: .venv/.$(ROS)-run
 	$(PYTHON) -m finforce_eval.cli.main demo --report report
@@ -26,6 +27,12 @@ lint: .venv/.$(ROS)-lint
 
 bench: .venv/.$(ROS)-run
 	$(PYTHON) -m finforce_eval.cli.main bench --json report/bench.json
+
+# Every finger with the fixed seed and with one that is drawn anew and printed.
+stress: .venv/.$(ROS)-run
+	@status=0; for seed in 0 new; do for jaw in bench umi ssg48_fin_ray_1 xlerobot; do \
+	  $(PYTHON) -m finforce_eval.cli.main stress --seed $$seed --jaw $$jaw --count $(STRESS_COUNT) || status=1; \
+	done; done; exit $$status
 
 docs: .venv/.$(ROS)-docs
 	NO_MKDOCS_2_WARNING=1 $(PYTHON) -m mkdocs build --strict

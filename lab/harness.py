@@ -151,6 +151,24 @@ def time_calls(call: Callable[[], Any], count: int, clock: Callable[[], float] =
     return times
 
 
+def measure_sharpness(stated: NDArray, errors: NDArray) -> NDArray:
+    """Return how sharp stated standard deviations are, their root mean square over that of the errors.
+
+    Below 1 they are too small, far above 1 they say nothing.
+
+    Args:
+        stated: standard deviations (n, k); rows with one that is not finite count for nothing.
+        errors: (n, k).
+
+    Returns:
+        One number for each column (k,); NaN where there is no error.
+    """
+    known = np.isfinite(stated).all(axis=1) & np.isfinite(errors).all(axis=1)
+    sums = np.square(stated[known]).sum(axis=0), np.square(errors[known]).sum(axis=0)
+    ratio = np.full(stated.shape[1], np.nan)
+    return np.sqrt(np.divide(*sums, out=ratio, where=sums[1] > NO_ERROR))
+
+
 def format_figures(figures: Figures) -> str:
     """Return the tables, each below its name, and the notes in Markdown."""
     tables = [f"**{name}**\n\n{format_table(table)}" for name, table in figures.tables.items()]
@@ -183,6 +201,9 @@ def figures_json(figures: Figures) -> dict[str, Any]:
     rows = {name: table.to_dict("records") for name, table in figures.tables.items()}
     text = {name: format_table(table) for name, table in figures.tables.items()}
     return without_nan({"rows": rows, "tables": text, "notes": list(figures.notes), **figures.more})
+
+
+NO_ERROR = 1e-12  # sum of squared errors that are rounding
 
 
 MARKS = (

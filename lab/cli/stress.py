@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import secrets
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -13,18 +14,26 @@ from tqdm import tqdm
 from finforce_eval.cli.parser import MESHES, SOLVERS, whole_number
 from finforce_eval.errors import OptionError
 from finforce_eval.machine import describe_machine, write_figures
+from lab.stress import inputs, objects
 from lab.stress.stress import (
+    AXES,
     Family,
     Plan,
     Trial,
-    find_families,
     format_summaries,
     run_family,
     summarise_family,
     summarise_levels,
 )
 
-WORST = 5
+WORST, WORST_OF_LEVEL = 5, 2
+LARGEST_SEED, NEW = 2**32, "new"
+FAMILIES = {family.name: family for family in (*inputs.FAMILIES, *objects.FAMILIES)}
+
+
+def read_seed(text: str) -> int:
+    """Return an option as a seed; one that is drawn for `new`."""
+    return secrets.randbelow(LARGEST_SEED) if text == NEW else whole_number(0, LARGEST_SEED)(text)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -36,26 +45,26 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="trials per family; without, as many as each takes",
     )
-    parser.add_argument("--seed", type=whole_number(0, 2**32), default=0, help="of everything that is drawn (0)")
+    text = "of everything that is drawn (0); new: drawn, and printed"
+    parser.add_argument("--seed", type=read_seed, default=0, metavar="N|new", help=text)
     parser.add_argument("--solver", default="default", choices=SOLVERS, help="model and objective")
     parser.add_argument("--mesh", default="default", choices=MESHES, help="mesh density")
-    text = "shipped jaw or jaw file of the families about key points and places (bench)"
-    parser.add_argument("--jaw", default="bench", metavar="FILE", help=text)
+    parser.add_argument("--jaw", default="bench", metavar="FILE", help="shipped jaw or jaw file (bench)")
     parser.add_argument("--json", metavar="OUT", help="write the figures as JSON")
     parser.add_argument("--report", metavar="DIR", help="write a page with every family by level")
 
 
-def choose_families(names: str | None, known: Mapping[str, Family]) -> list[Family]:
+def choose_families(names: str | None) -> list[Family]:
     """Return the families of a comma-separated list, all without one.
 
     Raises:
         OptionError: A name is not known.
     """
-    chosen = list(known) if not names else [name.strip() for name in names.split(",")]
+    chosen = list(FAMILIES) if not names else [name.strip() for name in names.split(",")]
     for name in chosen:
-        if name not in known:
-            raise OptionError(f"--families {name}: expected one of {', '.join(known)}")
-    return [known[name] for name in chosen]
+        if name not in FAMILIES:
+            raise OptionError(f"--families {name}: expected one of {', '.join(FAMILIES)}")
+    return [FAMILIES[name] for name in chosen]
 
 
 def run_families(families: Sequence[Family], plan: Plan) -> dict[str, list[Trial]]:
@@ -75,50 +84,61 @@ def worst_trials(trials: Sequence[Trial]) -> list[Trial]:
     return (defects + [t for t in sure if t not in defects])[:WORST]
 
 
+def list_broken(summary: Mapping[str, Any], trials: Sequence[Trial]) -> list[str]:
+    """Return a line for every rule that a family breaks, or one of its levels by itself, with the worst trials."""
+    lines = []
+    for number, part in enumerate((summary, *summarise_levels(trials))):
+        name, own, most = summary["name"], trials, WORST
+        if number:
+            own = [trial for trial in trials if trial.level == part["name"]]
+            name, most = f"{name}, {part['name']}", WORST_OF_LEVEL
+        lines += [f"broken: {name}: {words}" for words in part["broken"]]
+        lines += [f"  {describe_trial(trial)}" for trial in worst_trials(own)[:most] if part["broken"]]
+    return lines
+
+
 def write_page(
     folder: Path, summaries: Sequence[Mapping[str, Any]], trials: Mapping[str, Sequence[Trial]], what: Mapping[str, str]
 ) -> None:
-    """Write `stress.md`: the table, then each family by level with its worst trials."""
+    """Write `stress.md`: the table, then each family by level with what is broken."""
     folder.mkdir(parents=True, exist_ok=True)
     lines = ["# Numerical stress", "", format_summaries(summaries), ""]
     for summary in summaries:
         name = summary["name"]
         lines += [f"## {name}", "", f"{what[name]}.", ""]
-        lines += [f"- **broken:** {words}" for words in summary["broken"]] + [""] * bool(summary["broken"])
         lines += [format_summaries(summarise_levels(trials[name]), "level"), ""]
-        lines += [f"- {describe_trial(trial)}" for trial in worst_trials(trials[name])] + [""]
+        lines += [f"- {line.strip()}" for line in list_broken(summary, trials[name])] + [""]
     (folder / "stress.md").write_text("\n".join(lines), encoding="utf-8")
 
 
 def describe_trial(trial: Trial) -> str:
     """Return a trial in one line."""
-    error = f"error {trial.force_error:.3g} N, stated {trial.stddev:.3g} N, {trial.sigmas:.1f} sigma"
-    return f"seed {trial.seed}, {trial.level}: {trial.outcome}, {error}{'; ' + trial.note if trial.note else ''}"
+    errors = zip(AXES, trial.errors, trial.stated, strict=False)
+    words = ", ".join(f"{axis} {error:.3g} ± {stated:.2g}" for axis, error, stated in errors)
+    notes = "; ".join(filter(None, (f"{trial.sigmas:.1f} sigma", words, trial.note)))
+    return f"seed {trial.seed}, {trial.level}: {trial.outcome}, {notes}"
 
 
 def run(options: argparse.Namespace) -> int:
     """Run the families, print the table, write what was asked for.
 
     Returns:
-        0; 1 when a rule is broken by a family that it is asked of.
+        0; 1 when a rule is broken by a family that it is asked of, or by one of its levels.
     """
-    families = choose_families(options.families, find_families())
+    families = choose_families(options.families)
     plan = Plan(seed=options.seed, solver=options.solver, mesh=options.mesh, count=options.count, jaw=options.jaw)
+    machine = describe_machine()
+    print(f"seed {plan.seed}, jaw {plan.jaw}, solver {plan.solver}, {machine['processor']}, {machine['commit']}")
     trials = run_families(families, plan)
     summaries = [summarise_family(family, trials[family.name]) for family in families]
     print(format_summaries(summaries))
-    for summary in summaries:
-        for words in summary["broken"]:
-            print(f"broken: {summary['name']}: {words}")
-            print("\n".join(f"  {describe_trial(trial)}" for trial in worst_trials(trials[summary["name"]])))
+    broken = {summary["name"]: list_broken(summary, trials[summary["name"]]) for summary in summaries}
+    print("\n".join(line for lines in broken.values() for line in lines))
     if options.json:
         write_figures(options.json, {"plan": asdict(plan), "families": collect_figures(summaries, trials)})
     if options.report:
         write_page(Path(options.report), summaries, trials, {family.name: family.what for family in families})
-    machine = describe_machine()
-    print(f"seed {plan.seed}, solver {plan.solver}, {machine['processor']}, {machine['commit']}")
-    ruled = {family.name for family in families if family.ruled}
-    return int(any(summary["broken"] for summary in summaries if summary["name"] in ruled))
+    return int(any(broken[family.name] for family in families if family.ruled))
 
 
 def collect_figures(summaries: Sequence[Mapping[str, Any]], trials: Mapping[str, Sequence[Trial]]) -> dict[str, Any]:

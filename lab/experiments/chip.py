@@ -17,7 +17,7 @@ from finforce_sim.scenarios import build_scenario
 from lab.experiments.experiment import Experiment, draw_panels, tabulate
 from lab.experiments.grasp_world import EstimatorSensor, GraspCase, ImageSensor, NoisySensor, World, build_plant
 from lab.experiments.runs import Case, RunOptions
-from lab.harness import Figures
+from lab.harness import Figures, measure_sharpness
 
 BEARS, BREAKS = 5.0, 5.43  # [N]
 SPEED = 0.004  # [m/s] of the opening
@@ -54,7 +54,7 @@ def list_cases(options: RunOptions) -> Sequence[Case]:
 
 def run(options: RunOptions, case: Case, folder: Path) -> dict[str, Any]:
     """Return the figures of a grasp."""
-    way, seed, untold = case.settings["way"], case.settings["seed"], []
+    way, seed, told, untold = case.settings["way"], case.settings["seed"], [], []
     pressed = _lay(seed)
     grasp = GraspCase(plant=build_plant(OBJECT, pressed), force=BEARS, speed=SPEED, latency=LATENCY, seed=seed)
     if way == "force":
@@ -62,9 +62,11 @@ def run(options: RunOptions, case: Case, folder: Path) -> dict[str, Any]:
         more = {"size": case.settings["size"]} if make is ImageSensor else {}
         sensor = make(pressed, seed, **more)
         course, untold = World(grasp, sensor, holding=HOLDING).run(), sensor.untold
+        told = sensor.told
     else:
         opening = find_taught_opening() if way == "position" else 0.0
         course = World(grasp, NoisySensor(0.0, seed)).run_blind(opening, STRONG if way == "position" else CURRENT)
+    stated, off = np.reshape(told, (-1, 2)).T
     times, forces = np.array(course.times), np.array(course.forces)
     start = course.touched_at if np.isfinite(course.touched_at) else 0.0
     return {
@@ -73,6 +75,8 @@ def run(options: RunOptions, case: Case, folder: Path) -> dict[str, Any]:
         "end_N": float(forces[times > times[-1] - 1.0].mean()),
         "is_broken": bool(forces.max(initial=0.0) >= BREAKS),
         "error": course.error,
+        "within_3_sigma_pct": 100.0 * float((np.abs(off) <= 3.0 * stated).mean()) if told else float("nan"),
+        "sharp": float(measure_sharpness(stated[:, None], off[:, None])[0]),
         "untold": [[round(stamp - start, 3), words] for stamp, words in untold],
         "violations": sum(course.violations.values()),
         "drawn": {
@@ -91,6 +95,7 @@ def find(options: RunOptions, figures: Mapping[str, Mapping[str, Any]], folder: 
         for column, heading in (("peak_N", "peak/N"), ("end_N", "at the end/N")):
             spread = grasps[column].agg(["min", "mean", "max"]).tolist()
             row |= {f"{heading}: {name}": value for name, value in zip(SPREAD, spread, strict=True)}
+        row |= {"within 3σ/%": grasps.within_3_sigma_pct.mean(), "sharp": grasps.sharp.mean()}
         row["ended early"] = int(grasps.error.astype(bool).sum())
         row["images without force"] = int(grasps.untold.map(len).sum())
         rows.append(row | {"violations": int(grasps.violations.sum())})

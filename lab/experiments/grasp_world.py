@@ -300,6 +300,7 @@ class EstimatorSensor:
     Attributes:
         touching: whether a jaw was said to touch in the last image.
         stddev: of the jaw whose force is less certain, as the driver takes it from `wrench_stddev` [N].
+        told: stated deviation and error of every force [N].
         untold: time [s] of every image without a force since the first one with, and what the jaws said.
     """
 
@@ -309,8 +310,8 @@ class EstimatorSensor:
         self._next_pose = 0.0
         self.touching: bool | None = None
         self.stddev = 0.0
+        self.told: list[tuple[float, float]] = []
         self.untold: list[tuple[float, str]] = []
-        self._has_told = False
 
     def measure(self, stamp: float, force: float, opening: float) -> float | None:
         """Return min(|F_left|, |F_right|), None unless both are trusted."""
@@ -327,12 +328,13 @@ class EstimatorSensor:
             self.touching = any(jaw.touching for jaw in self._jaws.values())
         silent |= {side: f"{one.status}: {one.message}" for side, one in solutions.items() if not one.trusted}
         if silent:
-            if self._has_told:
+            if self.told:
                 self.untold.append((stamp, "; ".join(f"{side} {words}" for side, words in silent.items())))
             return None
-        self._has_told = True
         self.stddev = max(magnitude_stddev(solution.force_stddev) for solution in solutions.values())
-        return min(float(np.linalg.norm(solution.force)) for solution in solutions.values())
+        found = min(float(np.linalg.norm(solution.force)) for solution in solutions.values())
+        self.told.append((self.stddev, found - force))
+        return found
 
     def _look(self, state: TwinState) -> Mapping[str, Observation]:
         """Return the key points of the jaws that are found in a state."""

@@ -16,17 +16,17 @@ from finforce_eval.evaluation.scoring import join_net, rms
 from finforce_eval.evaluation.setup import EvaluationSetup
 from finforce_eval.figures.figures import BLACK, BLUE, new_figure
 from finforce_eval.recordings.tracks import Recording
-from finforce_eval.table import ForceSeries
+from finforce_eval.table import AXES, ForceSeries
 from finforce_ifea.grasp_force import R_GRIPPER_JAW
 from finforce_sim.footage import START
 from finforce_sim.scenarios import build_scenario, write_script
 from lab.experiments.experiment import Experiment, average, tabulate
-from lab.experiments.runs import Case, RunOptions, build_setup
-from lab.harness import Figures
+from lab.experiments.runs import SHARP, Case, RunOptions, build_setup
+from lab.harness import Figures, measure_sharpness
 
 MASS, SPEED = 0.1, 1.2  # [kg], [rad/s]
 # The axis of the turn, and how the gripper looks at first: level for a turn about where it points, else down.
-AXES = {
+TURNS = {
     "roll": {"turn_tilt": 0.5 * np.pi, "pitch": 0.5 * np.pi},
     "y": {"turn_heading": 0.5 * np.pi},
     "x": {"turn_heading": 0.0},
@@ -44,7 +44,7 @@ def list_cases(options: RunOptions) -> Sequence[Case]:
     if options.bags:
         return options.bag_cases()
     cases, times = [], QUICK if options.quick else {"turn_angle": 2.0 * np.pi}
-    for axis, posture in AXES.items():
+    for axis, posture in TURNS.items():
         for light, scene in LIGHTS.items():
             for jaws, turned in JAWS.items():
                 words = {"axis": axis, "light": light, "jaws": jaws}
@@ -63,7 +63,7 @@ def run(options: RunOptions, case: Case, folder: Path) -> dict[str, Any]:
         if options.bags:
             return figures
         told = score_turn(tell_gravity(recording, true_gravity(case.settings)), setup)
-    return figures | {f"told_{key}": told[key] for key in KEYS}
+    return figures | {"told_along_rmse_N": told["along_rmse_N"]}
 
 
 def find(options: RunOptions, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Figures:
@@ -95,6 +95,7 @@ KEYS = {
     "y_rmse_N": "y/N",
     "z_rmse_N": "z/N",
     "within_3_sigma_pct": "within 3σ/%",
+    **SHARP,
     "answered_pct": "answered/%",
 }
 COLUMNS = {"case": "turn", "axis": "axis", "light": "light", "told_along_rmse_N": "direction told/N", **KEYS}
@@ -140,8 +141,9 @@ def score_weight(net: ForceSeries) -> dict[str, Any]:
         "along_rmse_N": rms(along),
         "along_bias_N": float(along.mean()) if held.any() else float("nan"),
         "across_rmse_N": rms(np.linalg.norm(error - along[:, None] * down, axis=1)),
-        **{f"{axis}_rmse_N": rms(error[:, row]) for row, axis in enumerate("xyz")},
+        **{f"{axis}_rmse_N": rms(error[:, row]) for row, axis in enumerate(AXES)},
         "within_3_sigma_pct": 100.0 * float((np.abs(along) <= 3.0 * sigma).mean()) if known else float("nan"),
+        "sharpness": dict(zip(AXES, measure_sharpness(stated, error).tolist(), strict=True)),
         "answered_pct": answered,
         "drawn": {
             "angle": np.round(angle, 4).tolist(),

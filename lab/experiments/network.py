@@ -23,7 +23,7 @@ from finforce_keypoints.networks.runtime import open_session
 from finforce_keypoints.networks.side_network import METADATA
 from lab.experiments.experiment import Experiment, average, draw_panels, tabulate
 from lab.experiments.grasp import find_phases, join_jaws
-from lab.experiments.runs import Case, RunOptions, build_setup
+from lab.experiments.runs import SHARP, Case, RunOptions, axis_sharpness, build_setup
 from lab.harness import Figures
 
 SHOWN = 10  # images that the network is given at a time
@@ -108,7 +108,8 @@ def run(options: RunOptions, case: Case, folder: Path) -> dict[str, Any]:
     """Return the errors of both on one grasp."""
     with options.open_case(case, folder) as recording:
         stamps, forces = load_network().follow(recording.images.colors_alone())
-        grasp = join_jaws(evaluate_all([recording], build_setup(case.settings)), recording.name)
+        evaluation = evaluate_all([recording], build_setup(case.settings))
+    grasp = join_jaws(evaluation, recording.name)
     grasp["network"] = grasp.stamp.map(dict(zip(stamps.tolist(), forces.tolist(), strict=True)))
     held = grasp[find_phases(grasp)["all"] & grasp.network.notna()]
     error, both = held.network - held.truth, held[held.found.notna()]
@@ -119,6 +120,7 @@ def run(options: RunOptions, case: Case, folder: Path) -> dict[str, Any]:
         "network_rmse_N": rms(error.to_numpy()),
         "network_bias_N": float(error.mean()),
         "answered_pct": 100.0 * len(both) / max(len(held), 1),
+        "sharpness": axis_sharpness(evaluation),
         "drawn": grasp[["seconds", "truth", "found", "network"]].round(4).to_dict("list"),
     }
 
@@ -157,6 +159,7 @@ GRASP_COLUMNS = {
     "network_rmse_N": "network/N",
     "network_bias_N": "network's bias/N",
     "answered_pct": "answered/%",
+    **SHARP,
 }
 
 

@@ -16,8 +16,9 @@ from finforce_eval.evaluation.contact_source import ContactChoice
 from finforce_eval.evaluation.scoring import ONSET_FORCE, Evaluation
 from finforce_eval.evaluation.setup import EvaluationSetup
 from finforce_eval.recordings.tracks import Recording
+from finforce_eval.table import AXES
 from lab.experiments.experiment import Experiment
-from lab.experiments.runs import Case, RunOptions, build_setup
+from lab.experiments.runs import SHARP, Case, RunOptions, axis_sharpness, build_setup
 from lab.harness import Figures
 
 # Ø [mm] and height of the axis [mm] of the twin's cylinders, whose finger the paper's heights do not fit
@@ -102,6 +103,8 @@ def score_contact(recording: Recording, setup: EvaluationSetup) -> dict[str, Any
         "unload_N": cycles["unload"]["mean"],
         "nrmsd_pct": score.cycles["all"]["nrmsd_pct"]["mean"],
         "bias_N": score.all.bias_N,
+        "within_3_sigma_pct": score.all.within_3_sigma_pct,
+        "sharpness": axis_sharpness(evaluation),
         "solved_pct": _share_solved(evaluation),
         "place_median_mm": score.place["median_mm"],
         "place_p95_mm": score.place["p95_mm"],
@@ -147,7 +150,7 @@ def find_bench(options: RunOptions, figures: Mapping[str, Mapping[str, Any]], fo
         known = [value for value in known if value is not None]
         if known:
             notes.append(f"With {words}: mean {np.mean(known):.3f} N, worst {np.max(known):.3f} N.")
-    return Figures(tables=tables, notes=[*notes, "The paper's in brackets."])
+    return Figures(tables=tables | tabulate_deviations(figures), notes=[*notes, "The paper's in brackets."])
 
 
 def list_places(options: RunOptions) -> Sequence[Case]:
@@ -174,7 +177,23 @@ def find_places(options: RunOptions, figures: Mapping[str, Mapping[str, Any]], f
             rows.append((place, *ours, *others))
     head = ("really at", "estimated", *(f"fixed {place}" for place in HEIGHTS), *OTHERS.values())
     note = "RMSE [N] over the record phases, the paper's in brackets; %: share of the images that was answered."
-    return Figures(tables={"Ø15": pd.DataFrame(rows, columns=head)}, notes=[note])
+    return Figures(tables={"Ø15": pd.DataFrame(rows, columns=head)} | tabulate_deviations(figures), notes=[note])
+
+
+def tabulate_deviations(figures: Mapping[str, Mapping[str, Any]]) -> dict[str, pd.DataFrame]:
+    """Return how many errors of each case and contact are within three stated deviations, and how sharp these are."""
+    rows = [
+        {
+            "case": name,
+            "contact": contact,
+            **{f"{axis} within 3σ/%": share for axis, share in zip(AXES, cell["within_3_sigma_pct"], strict=True)},
+            **{heading: cell["sharpness"][column[-1]] for column, heading in SHARP.items()},
+        }
+        for name, row in figures.items()
+        for contact, cell in row["contacts"].items()
+        if cell.get("within_3_sigma_pct")
+    ]
+    return {"Stated deviations": pd.DataFrame(rows).astype(float, errors="ignore")} if rows else {}
 
 
 def _find_cell(

@@ -30,7 +30,7 @@ from finforce_sim.gripper import TwinGripper
 from finforce_sim.scenarios import build_scenario
 from lab.experiments.experiment import Experiment
 from lab.experiments.grasp import join_jaws, score_grasp
-from lab.experiments.runs import Case, RunOptions, build_setup, keep_poses
+from lab.experiments.runs import SHARP, Case, RunOptions, axis_sharpness, build_setup, keep_poses
 from lab.harness import Figures
 
 SCENES = {
@@ -112,6 +112,7 @@ def run(options: RunOptions, case: Case, folder: Path) -> dict[str, Any]:
             places = [score.solved_place["median_mm"] for score in evaluation.scores.values()]
             known = [place for place in places if place is not None]
             score = score_grasp(join_jaws(evaluation, recording.name))
+            score |= {"sharpness": axis_sharpness(evaluation)}
             found[way] = {**score, "place_median_mm": max(known) if known else float("nan")}
     return {"ways": found, "poses": seen_mm}
 
@@ -123,7 +124,7 @@ def find(options: RunOptions, figures: Mapping[str, Mapping[str, Any]], folder: 
         for name, row in figures.items()
         for way, one in row["ways"].items()
     ]
-    scores = pd.DataFrame(rows)
+    scores = pd.json_normalize(rows, sep=" ")
     errors = scores.pivot(index="case", columns="poses", values="rmse_N").astype(float)
     errors = errors[scores.poses.unique()].dropna(axis=1)
     added, ways = errors.sub(errors["on time"], axis=0), scores.groupby("poses")
@@ -133,6 +134,8 @@ def find(options: RunOptions, figures: Mapping[str, Mapping[str, Any]], folder: 
         "most added/N": added.max(),
         "place: worst median/mm": ways.place_median_mm.max(),
         "answered/%": ways.answered_pct.mean(),
+        "within 3σ/%": ways.within_3_sigma_pct.mean(),
+        **{heading: ways[column].mean() for column, heading in SHARP.items()},
     }
     by_way = pd.DataFrame(summary).loc[errors.columns].reset_index()
     tables = {"By way": by_way, "By source": _source_table(figures, errors.mean()), EACH: errors.reset_index()}

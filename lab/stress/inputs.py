@@ -5,8 +5,10 @@ Few key points, noisy or wrong ones; forces of any size; odd stamps; contacts th
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
+from itertools import product
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,93 +19,129 @@ from finforce_ifea.observation import Contact, ObjectOutline
 from lab.stress.session import PERIOD, Bench, Session, SessionStep, noise_of, open_session, take_another
 from lab.stress.stress import Family, Plan, Trial
 
-NOISES = (0.0, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
+Disturb = Callable[[Session, Any], Iterable[SessionStep]]
+
+
+def press_family(
+    name: str,
+    what: str,
+    levels: Callable[[Bench], Mapping[str, Any]],
+    disturb: Disturb,
+    *,
+    rounds: int,
+    tare: Callable[[Any], float] = lambda setting: 1.0,
+    build: Callable[[Plan], Bench | None] = Bench,
+    **rules: Any,
+) -> Family:
+    """Return a family of presses that are disturbed, one level after the other.
+
+    Args:
+        name: of the family.
+        what: is done.
+        levels: setting of each level by its name.
+        disturb: returns the steps of a press at a setting; all chance is the session's.
+        rounds: trials of each level.
+        tare: noise of the tare at a setting, in that of a bench camera.
+        build: returns the bench; None where the plan's model cannot have the family.
+        rules: of `Family`.
+    """
+
+    def run(plan: Plan) -> Iterator[Trial]:
+        bench = build(plan)
+        if bench is None:
+            yield Trial(level="planar model", outcome="refused", note="forces in three axes need a solid")
+            return
+        settings = list(levels(bench).items())
+        for seed in range(plan.share(rounds * len(settings))):
+            level, setting = settings[
+                (seed + plan.seed) % len(settings)
+            ]  # a few trials of another seed see other levels
+            session = open_session(bench, plan.random(name, seed), tare=tare(setting), level=level)
+            yield from session.play(seed, disturb(session, setting))
+
+    return Family(name=name, what=what, run=run, **rules)
+
+
+NOISES = (0.0, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)  # [mm]
 SHARES = (0.1, 0.2, 0.3, 0.4)
-USUAL = 0.2
+USUAL = 0.2  # [mm]
 WORKSPACE = 0.03
-# Young's modulus of the softest finger that a calibration may have [Pa].
-SOFTEST = 1e3
 FARTHEST_SHIFT = 0.01
 
 
-def run_subsets(plan: Plan) -> Iterator[Trial]:
-    """Yield trials with random subsets of the key points, down to none; some hidden for good, some now and then."""
-    bench = Bench(plan)
-    count = len(bench.jaw.keypoints)
-    for seed in range(plan.share(3 * (count + 1))):
-        random = plan.random("subsets", seed)
-        kept, flickers = seed % (count + 1), bool(seed // (count + 1) % 2)
-        level = f"{kept:2d} key points, {'others each time' if flickers else 'the same'}"
-        session = open_session(bench, random, level=level)
-        steps = session.press()
-        order = random.permutation(count)
-        for step in steps:
-            order = random.permutation(count) if flickers else order
-            step.points[order[kept:]] = np.nan
-        yield from session.play(seed, steps)
+def list_subsets(bench: Bench) -> Mapping[str, Any]:
+    """Return how many key points are kept, down to none, and whether they are others in each image."""
+    words = {False: "the same", True: "others each time"}
+    counts = range(len(bench.jaw.keypoints) + 1)
+    return {f"{kept:2d} key points, {words[flickers]}": (kept, flickers) for flickers, kept in product(words, counts)}
 
 
-def run_noise(plan: Plan) -> Iterator[Trial]:
-    """Yield trials with noise from 0 to 10 mm, from the start or only after a tare that saw the usual noise."""
-    bench = Bench(plan)
-    for seed in range(plan.share(6 * len(NOISES))):
-        random = plan.random("noise", seed)
-        noise, late = NOISES[seed % len(NOISES)], bool(seed // len(NOISES) % 2)
-        level = f"{noise:g} mm {'after the tare' if late else 'from the start'}"
-        session = open_session(bench, random, tare=1.0 if late else noise / USUAL, level=level)
-        yield from session.play(seed, session.press(scale=noise / USUAL))
+def hide_others(session: Session, setting: tuple[int, bool]) -> Iterable[SessionStep]:
+    """Return a press of which a random subset of the key points is seen; some hidden for good, some now and then."""
+    (kept, flickers), steps = setting, session.press()
+    count = len(session.bench.jaw.keypoints)
+    order = session.random.permutation(count)
+    for step in steps:
+        order = session.random.permutation(count) if flickers else order
+        step.points[order[kept:]] = np.nan
+    return steps
 
 
-def run_gross(plan: Plan) -> Iterator[Trial]:
-    """Yield trials in which a share of the key points lies anywhere in the workspace, with high likelihood."""
-    bench = Bench(plan)
-    for seed in range(plan.share(10 * len(SHARES))):
-        random = plan.random("gross", seed)
-        share, lasts = SHARES[seed % len(SHARES)], bool(seed // len(SHARES) % 2)
-        session = open_session(bench, random, level=f"{100 * share:g} %, {'lasting' if lasts else 'drawn anew'}")
-        steps = session.press()
-        wrong, places = _draw_wrong(bench, random, share), _draw_places(bench, random)
-        for step in steps:
-            if not lasts:
-                wrong, places = _draw_wrong(bench, random, share), _draw_places(bench, random)
-            step.points[wrong] = places[wrong] + noise_of(random, (len(wrong),))
-        yield from session.play(seed, steps)
+def list_noises(_: Bench) -> Mapping[str, Any]:
+    """Return noise [mm] from the start, or only after a tare that saw the usual noise."""
+    words = {False: "from the start", True: "after the tare"}
+    return {f"{noise:g} mm {words[late]}": (noise, late) for late, noise in product(words, NOISES)}
 
 
-def run_clusters(plan: Plan) -> Iterator[Trial]:
-    """Yield trials in which a share of the key points errs together: shifted alike, or as of another press."""
-    bench = Bench(plan)
-    for seed in range(plan.share(10 * len(SHARES))):
-        random = plan.random("clusters", seed)
-        share, alike = SHARES[seed % len(SHARES)], bool(seed // len(SHARES) % 2)
-        session = open_session(bench, random, level=f"{100 * share:g} %, {'shifted' if alike else 'another press'}")
-        steps = session.press()
-        wrong = _draw_wrong(bench, random, share)
-        shift = random.uniform(-FARTHEST_SHIFT, FARTHEST_SHIFT, 3)
-        other = bench.press(random)
-        elsewhere = other.keypoints(other.depth)[wrong]
-        for step in steps[int(random.integers(0, len(steps) - 5)) :]:
-            if alike:
-                step.points[wrong] += shift
-            else:
-                step.points[wrong] = elsewhere + noise_of(random, (len(wrong),))
-        yield from session.play(seed, steps)
+def list_shares(usual: str, lasting: str) -> Callable[[Bench], Mapping[str, Any]]:
+    """Return shares of the key points that are wrong, in one way and in another."""
+    words = {False: usual, True: lasting}
+    levels = {f"{100 * share:g} %, {words[kind]}": (share, kind) for kind, share in product(words, SHARES)}
+    return lambda _: levels
 
 
-def _draw_wrong(bench: Bench, random: np.random.Generator, share: float) -> NDArray:
+def throw_points(session: Session, setting: tuple[float, bool]) -> Iterable[SessionStep]:
+    """Return a press in which a share of the key points lies anywhere in the workspace, with high likelihood."""
+    (share, lasts), steps, random = setting, session.press(), session.random
+    wrong, places = _draw_wrong(session, share), _draw_places(session)
+    for step in steps:
+        if not lasts:
+            wrong, places = _draw_wrong(session, share), _draw_places(session)
+        step.points[wrong] = places[wrong] + noise_of(random, (len(wrong),))
+    return steps
+
+
+def err_together(session: Session, setting: tuple[float, bool]) -> Iterable[SessionStep]:
+    """Return a press in which a share of the key points errs together: shifted alike, or as of another press."""
+    (share, alike), steps, random = setting, session.press(), session.random
+    wrong = _draw_wrong(session, share)
+    shift = random.uniform(-FARTHEST_SHIFT, FARTHEST_SHIFT, 3)
+    other = session.bench.press(random)
+    elsewhere = other.keypoints(other.depth)[wrong]
+    for step in steps[int(random.integers(0, len(steps) - 5)) :]:
+        if alike:
+            step.points[wrong] += shift
+        else:
+            step.points[wrong] = elsewhere + noise_of(random, (len(wrong),))
+    return steps
+
+
+def _draw_wrong(session: Session, share: float) -> NDArray:
     """Return the indices of the key points that are wrong."""
-    count = len(bench.jaw.keypoints)
-    return random.permutation(count)[: round(share * count)]
+    count = len(session.bench.jaw.keypoints)
+    return session.random.permutation(count)[: round(share * count)]
 
 
-def _draw_places(bench: Bench, random: np.random.Generator) -> NDArray:
+def _draw_places(session: Session) -> NDArray:
     """Return places (K, 3) [m] anywhere in the workspace."""
-    return bench.jaw.keypoints + random.uniform(-WORKSPACE, WORKSPACE, bench.jaw.keypoints.shape)
+    rest = session.bench.jaw.keypoints
+    return rest + session.random.uniform(-WORKSPACE, WORKSPACE, rest.shape)
 
 
 FORCES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 1e1, 1e2, 1e3)
-JUMPS = ("teleport", "walk", "alternate", "between presses")
 DEPTH, LEAST_DEPTH, RADIUS = 4e-3, 1e-4, 12e-3
+# Young's modulus of the softest finger that a calibration may have [Pa].
+SOFTEST = 1e3
 
 
 def run_forces(plan: Plan) -> Iterator[Trial]:
@@ -114,11 +152,12 @@ def run_forces(plan: Plan) -> Iterator[Trial]:
         force = FORCES[seed % len(FORCES)]
         height = random.uniform(0.02, 0.06)
         history = usual.history(height=height, radius=RADIUS, depth=DEPTH)
-        full = float(np.linalg.norm(history.forces(DEPTH)))
+        full = float(np.linalg.norm(history.forces(history.depth)))
         if seed // len(FORCES) % 2 and force < full:
             bench, level = usual, f"{force:g} N, the usual jaw"
             depth = DEPTH * force / full
-            history = replace(bench.history(height=height, radius=RADIUS, depth=max(depth, LEAST_DEPTH)), depth=depth)
+            history = bench.history(height=height, radius=RADIUS, depth=max(depth, LEAST_DEPTH))
+            history = replace(history, depth=bench.find_depth(depth))
         else:
             softer = max(force / full, SOFTEST / usual.jaw.material.young_modulus)
             bench, level = Bench(plan, modulus=softer), f"{force:g} N, a jaw to match"
@@ -127,37 +166,23 @@ def run_forces(plan: Plan) -> Iterator[Trial]:
         yield from session.play(seed, session.press())
 
 
-def run_model_error(plan: Plan) -> Iterator[Trial]:
-    """Yield presses of a jaw whose key points move by 1 % more or less each, and whose force is 1 % off."""
-    bench = Bench(plan)
-    for seed in range(plan.share(30)):
-        random = plan.random("model", seed)
-        session = open_session(bench, random, level="1 %")
-        stretch, stiffer = 0.01 * random.normal(size=(len(bench.jaw.keypoints), 1)), 1 + 0.01 * random.normal()
-        steps = []
-        for step in session.press():
-            way = step.points - bench.jaw.keypoints - session.offsets
-            steps.append(
-                replace(
-                    step, points=step.points + stretch * way, force=stiffer * step.force, torque=stiffer * step.torque
-                )
-            )
-        yield from session.play(seed, steps)
+def bend_otherwise(session: Session, _: None) -> Iterable[SessionStep]:
+    """Yield a press of a jaw whose key points move by 1 % more or less each, and whose force is 1 % off."""
+    random, rest = session.random, session.bench.jaw.keypoints + session.offsets
+    stretch, stiffer = 0.01 * random.normal(size=(len(rest), 1)), 1 + 0.01 * random.normal()
+    for step in session.press():
+        points = step.points + stretch * (step.points - rest)
+        yield replace(step, points=points, force=stiffer * step.force, torque=stiffer * step.torque)
 
 
-def run_jumps(plan: Plan) -> Iterator[Trial]:
-    """Yield loads that jump: to any depth, in a random walk, on and off, from one press to another."""
-    bench = Bench(plan)
-    for seed in range(plan.share(8 * len(JUMPS))):
-        random = plan.random("jumps", seed)
-        kind = JUMPS[seed % len(JUMPS)]
-        session = open_session(bench, random, level=kind)
-        yield from session.play(seed, _jump(session, kind, random))
+def same(*kinds: str) -> Callable[[Bench], Mapping[str, Any]]:
+    """Return levels that are called like their settings."""
+    return lambda _: dict(zip(kinds, kinds, strict=True))
 
 
-def _jump(session: Session, kind: str, random: np.random.Generator, count: int = 60) -> list[SessionStep]:
-    """Return `count` steps whose depth changes as `kind` says."""
-    deepest = session.history.depth
+def jump(session: Session, kind: str, count: int = 60) -> list[SessionStep]:
+    """Return `count` steps whose depth jumps: to any depth, in a random walk, on and off, from one press to another."""
+    deepest, random = session.history.depth, session.random
     if kind == "teleport":
         return session.steps(np.repeat(random.uniform(0.0, deepest, count // 4), 4))
     if kind == "walk":
@@ -170,25 +195,15 @@ def _jump(session: Session, kind: str, random: np.random.Generator, count: int =
     return [pair[i // 10 % 2] for i, pair in enumerate(zip(first, second, strict=True))]
 
 
-STAMPS = ("jitter", "gaps", "stall", "repeat", "backwards", "not finite")
 LONGEST_GAP = 1e5
 SHORTEST = 1e-9
-MANY = 20_000
-# One in so many steps of the long run is kept: what is kept must not be what grows.
-KEPT = 10
-PRESSES = 8
 
 
-def run_stamps(plan: Plan) -> Iterator[Trial]:
-    """Yield presses whose stamps are not those of a camera."""
-    bench = Bench(plan)
-    for seed in range(plan.share(8 * len(STAMPS))):
-        random = plan.random("stamps", seed)
-        kind = STAMPS[seed % len(STAMPS)]
-        session = open_session(bench, random, level=kind)
-        steps = session.press()
-        stamps = session.start + np.cumsum(_draw_periods(kind, random, len(steps)))
-        yield from session.play(seed, [replace(s, stamp=float(t)) for s, t in zip(steps, stamps, strict=True)])
+def stamp_otherwise(session: Session, kind: str) -> Iterable[SessionStep]:
+    """Return a press whose stamps are not those of a camera."""
+    steps = session.press()
+    stamps = session.start + np.cumsum(_draw_periods(kind, session.random, len(steps)))
+    return [replace(step, stamp=float(stamp)) for step, stamp in zip(steps, stamps, strict=True)]
 
 
 def _draw_periods(kind: str, random: np.random.Generator, count: int) -> np.ndarray:
@@ -209,6 +224,12 @@ def _draw_periods(kind: str, random: np.random.Generator, count: int) -> np.ndar
         case _:
             periods[-1] = np.nan if random.random() < 0.5 else np.inf
     return periods
+
+
+MANY = 20_000
+# One in so many steps of the long run is kept: what is kept must not be what grows.
+KEPT = 10
+PRESSES = 8
 
 
 def run_long(plan: Plan) -> Iterator[Trial]:
@@ -242,77 +263,34 @@ def _press_on(presses: list[Session], random: np.random.Generator, count: int) -
 
 
 KINDS = ("height", "outline", "fixed", "none", "no rows", "regions")
-WRONG = (
-    "wrong height",
-    "wrong outline",
-    "larger outline",
-    "wrong fixed",
-    "outline and height in turn",
-    "of the object before",
-)
-RIGHT = ("height", "outline", "fixed", "regions")
 OUTLINE_STDDEV = np.array([1e-4, 3e-4, 3e-3])
 CORNERS = 90
 FARTHEST = 0.045
 
 
-def run_contacts(plan: Plan) -> Iterator[Trial]:
-    """Yield presses with another kind of contact in every image, or in every few."""
-    bench = Bench(plan)
-    for seed in range(plan.share(30)):
-        random = plan.random("contacts", seed)
-        lasts = (1, 2, 5, 12)[seed % 4]
-        session = open_session(bench, random, level=f"another every {lasts} images")
-        offered = {kind: _contact_of(kind, session, random) for kind in KINDS}
-        steps, kind = [], "height"
-        for index, step in enumerate(session.press() + session.press()):
-            kind = KINDS[int(random.integers(len(KINDS)))] if index % lasts == 0 else kind
-            steps.append(replace(step, stamp=session.start + (index + 1) / 30, contact=offered[kind]))
-        yield from session.play(seed, steps)
+def list_changes(_: Bench) -> Mapping[str, Any]:
+    """Return for how many images a contact lasts."""
+    return {f"another every {lasts} images": lasts for lasts in (1, 2, 5, 12)}
 
 
-def run_wrong(plan: Plan) -> Iterator[Trial]:
-    """Yield presses whose contact is said to be up to 45 mm away from where it is, or of another object."""
-    bench = Bench(plan)
-    for seed in range(plan.share(12 * len(WRONG))):
-        random = plan.random("wrong", seed)
-        kind = WRONG[seed % len(WRONG)]
-        session = open_session(bench, random, level=kind)
-        first, second = _contact_of(kind, session, random), session.contact
-        steps = session.press()
-        if kind == "of the object before":
-            later, last = take_another(session, random).press(), steps[-1].stamp - session.start
-            yield from session.play(seed, steps)
-            steps = [replace(step, stamp=step.stamp + last) for step in later]
-            first = session.contact
-        for index, step in enumerate(steps):
-            given = second if kind == "outline and height in turn" and index % 2 else first
-            steps[index] = replace(step, contact=given)
-        yield from session.play(seed, steps)
+def switch_contacts(session: Session, lasts: int) -> Iterable[SessionStep]:
+    """Yield two presses with another kind of contact in every image, or in every few."""
+    offered = {kind: _contact_of(kind, session) for kind in KINDS}
+    kind = "height"
+    for index, step in enumerate(session.press() + session.press()):
+        kind = KINDS[int(session.random.integers(len(KINDS)))] if index % lasts == 0 else kind
+        yield replace(step, stamp=session.start + (index + 1) * PERIOD, contact=offered[kind])
 
 
-def run_right(plan: Plan) -> Iterator[Trial]:
-    """Yield presses whose contact is told in every form there is, and is right."""
-    bench = Bench(plan)
-    for seed in range(plan.share(12 * len(RIGHT))):
-        random = plan.random("right", seed)
-        kind = RIGHT[seed % len(RIGHT)]
-        session = open_session(bench, random, level=kind)
-        contact = _contact_of(kind, session, random)
-        yield from session.play(seed, [replace(step, contact=contact) for step in session.press()])
-
-
-def run_axes(plan: Plan) -> Iterator[Trial]:
-    """Yield presses whose force at a given place has three axes; one refusal where a model is planar."""
-    bench = _build_three(plan)
-    if bench is None:
-        yield Trial(level="planar model", outcome="refused", note="forces in three axes need a solid")
-        return
-    for seed in range(plan.share(12)):
-        random = plan.random("axes", seed)
-        session = open_session(bench, random, level="three axes")
-        contact = _contact_of("fixed", session, random)
-        yield from session.play(seed, [replace(step, contact=contact) for step in session.press()])
+def tell_contact(session: Session, kind: str) -> Iterable[SessionStep]:
+    """Return a press whose contact is told in a form, right or wrong."""
+    first, second, steps = _contact_of(kind, session), session.contact, session.press()
+    if kind == "of the object before":
+        last = steps[-1].stamp - session.start
+        later = take_another(session, session.random).press()
+        return steps + [replace(step, stamp=step.stamp + last, contact=second) for step in later]
+    in_turn = kind == "outline and height in turn"
+    return [replace(step, contact=second if in_turn and i % 2 else first) for i, step in enumerate(steps)]
 
 
 def _build_three(plan: Plan) -> Bench | None:
@@ -324,9 +302,9 @@ def _build_three(plan: Plan) -> Bench | None:
     return bench if bench.estimator.mechanics.model.rotations is None else None
 
 
-def _contact_of(kind: str, session: Session, random: np.random.Generator) -> Contact | None:
+def _contact_of(kind: str, session: Session) -> Contact | None:
     """Return the contact of a session in the form, or with the error, that `kind` names."""
-    height, radius = session.history.height, session.history.radius
+    height, radius, random = session.history.height, session.history.radius, session.random
     heights = session.bench.jaw.candidates[:, 2]
     away = float(np.clip(height + random.choice((-1, 1)) * random.uniform(5e-3, FARTHEST), heights[0], heights[-1]))
     match kind:
@@ -338,7 +316,7 @@ def _contact_of(kind: str, session: Session, random: np.random.Generator) -> Con
             return session.contact
         case "wrong height":
             return Contact.fixed(session.bench.jaw, away)
-        case "fixed":
+        case "fixed" | "three axes":
             return replace(session.contact, free=False)
         case "wrong fixed":
             return replace(Contact.fixed(session.bench.jaw, away), free=False)
@@ -370,18 +348,55 @@ def _round(session: Session, height: float, radius: float, tilt: float) -> Conta
     return Contact(points=np.array([[face, 0.0, height]]), weights=np.ones(1), outline=outline)
 
 
+JUMPS = ("teleport", "walk", "alternate", "between presses")
+STAMPS = ("jitter", "gaps", "stall", "repeat", "backwards", "not finite")
+WRONG = (
+    "wrong height",
+    "wrong outline",
+    "larger outline",
+    "wrong fixed",
+    "outline and height in turn",
+    "of the object before",
+)
+RIGHT = ("height", "outline", "fixed", "regions")
 FAMILIES = (
-    Family(name="subsets", what="random subsets of the key points, down to none", run=run_subsets),
-    Family(name="noise", what="key point noise from 0 to 10 mm, known to the tare or not", run=run_noise),
-    Family(name="gross", what="up to 40 % of the key points anywhere in the workspace", run=run_gross),
-    Family(name="clusters", what="up to 40 % of the key points wrong together", run=run_clusters),
+    press_family("subsets", "random subsets of the key points, down to none", list_subsets, hide_others, rounds=2),
+    press_family(
+        "noise",
+        "key point noise from 0 to 10 mm, known to the tare or not",
+        list_noises,
+        lambda session, setting: session.press(scale=setting[0] / USUAL),
+        tare=lambda setting: 1.0 if setting[1] else setting[0] / USUAL,
+        rounds=3,
+    ),
+    press_family(
+        "gross",
+        "up to 40 % of the key points anywhere in the workspace",
+        list_shares("drawn anew", "lasting"),
+        throw_points,
+        rounds=5,
+    ),
+    press_family(
+        "clusters",
+        "up to 40 % of the key points wrong together",
+        list_shares("another press", "shifted"),
+        err_together,
+        rounds=5,
+    ),
     Family(name="forces", what="forces from 1e-4 to 1e3 N", run=run_forces, timed=False),
-    Family(name="model", what="a jaw that is 1 % off its model", run=run_model_error),
-    Family(name="jumps", what="targets that jump between images", run=run_jumps),
-    Family(name="stamps", what="stamps that stall, jitter, repeat or leap", run=run_stamps),
+    press_family("model", "a jaw that is 1 % off its model", lambda _: {"1 %": None}, bend_otherwise, rounds=30),
+    press_family("jumps", "targets that jump between images", same(*JUMPS), jump, rounds=8),
+    press_family("stamps", "stamps that stall, jitter, repeat or leap", same(*STAMPS), stamp_otherwise, rounds=8),
     Family(name="long", what="one in ten of many steps without a new start", run=run_long),
-    Family(name="contacts", what="another contact in every image", run=run_contacts),
-    Family(name="wrong", what="contacts said to be where they are not", run=run_wrong, ruled=False),
-    Family(name="right", what="contacts in every form there is", run=run_right),
-    Family(name="axes", what="forces in three axes at a given place", run=run_axes),
+    press_family("contacts", "another contact in every image", list_changes, switch_contacts, rounds=8),
+    press_family("wrong", "contacts said to be where they are not", same(*WRONG), tell_contact, rounds=12, ruled=False),
+    press_family("right", "contacts in every form there is", same(*RIGHT), tell_contact, rounds=12),
+    press_family(
+        "axes",
+        "forces in three axes at a given place",
+        same("three axes"),
+        tell_contact,
+        rounds=12,
+        build=_build_three,
+    ),
 )

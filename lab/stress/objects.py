@@ -57,12 +57,12 @@ class PressedImage:
     torque: NDArray
 
 
-def plan_depths(scene: HardScene) -> NDArray:
+def plan_depths(depth: float) -> NDArray:
     """Return the depth of the object in each image (n,) [m], from well clear of the jaw on."""
-    last = min(scene.depth, 0.0)
+    last = min(depth, 0.0)
     approach = np.linspace(-CLEAR + last, last, APPROACH)
-    rise = np.linspace(0.0, scene.depth, RISE + 1)[1:] if scene.depth > 0.0 else np.full(RISE, last)
-    return np.concatenate([approach, rise, np.full(HOLD, scene.depth)])
+    rise = np.linspace(0.0, depth, RISE + 1)[1:] if depth > 0.0 else np.full(RISE, last)
+    return np.concatenate([approach, rise, np.full(HOLD, depth)])
 
 
 def press_scene(bench: Bench, scene: HardScene) -> list[PressedImage]:
@@ -72,15 +72,16 @@ def press_scene(bench: Bench, scene: HardScene) -> list[PressedImage]:
         ContactError: The jaw has no equilibrium with the object.
     """
     R, jaw, surface = rotation_of(scene.tilt), bench.jaw, bench.mechanics.contact.surface
+    height = bench.find_height(scene.height)
     polygons = cut_outline(scene.mesh, R, float(surface.high[0]), scene.across)
     try:
         rigid = PressedOutline(polygons, float(surface.high[1]))
     except ContactError:
         rigid = None
-    depths, presses = plan_depths(scene), {}
+    depths, presses = plan_depths(bench.find_depth(scene.depth)), {}
     if rigid is not None and not scene.is_impossible:
         rising = np.unique(depths[depths > 0.0])
-        found = press_jaw(bench.mechanics.model, surface, jaw.inner_face_x, rigid, scene.height, rising)
+        found = press_jaw(bench.mechanics.model, surface, jaw.inner_face_x, rigid, height, rising)
         presses = {press.depth: press for press in found}
     leading = min(polygon[:, 0].min() for polygon in polygons)
     frames = []
@@ -88,8 +89,8 @@ def press_scene(bench: Bench, scene: HardScene) -> list[PressedImage]:
         T = np.eye(4)
         T[:3, :3] = R
         flat = jaw.inner_face_x - leading - depth
-        x = flat if rigid is None else rigid.find_origin(jaw.inner_face_x, depth, scene.height)
-        T[:3, 3] = x, scene.across, scene.height
+        x = flat if rigid is None else rigid.find_origin(jaw.inner_face_x, depth, height)
+        T[:3, 3] = x, scene.across, height
         frames.append(_frame_of(bench, T, presses.get(depth)))
     return frames
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
@@ -17,7 +16,7 @@ from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_ifea.mechanics import build_mechanics
 from finforce_ifea.observation import Contact, Observation, Solution
 from finforce_ifea.settings import EstimatorSettings
-from lab.forward_press import PressState, RigidCylinder, follow_points, measure_penalty_energy, press_jaw
+from lab.forward_press import RigidCylinder, follow_points, press_jaw
 from lab.stress.stress import Plan, Trial, attempt
 
 PERIOD = 1 / 30
@@ -114,7 +113,7 @@ class Session:
             yield attempt(
                 seed,
                 lambda s=step: update(self.bench, s),
-                lambda got, s=step: judge(got, s, self.history.balance),
+                lambda got, s=step: judge(got, s),
                 level=step.level,
             )
 
@@ -159,46 +158,23 @@ def update(bench: Bench, step: SessionStep) -> Solution:
     return bench.estimator.update(step.observation, step.contact)
 
 
-def judge(solution: Solution, step: SessionStep, balance: float = math.nan) -> Trial:
-    """Return how a solution compares with the truth: along x, along z, in magnitude and in torque."""
+def judge(solution: Solution, step: SessionStep) -> Trial:
+    """Return how a solution compares with the truth: force, its magnitude, and torque about y."""
     error = solution.force - step.force
     magnitude = np.linalg.norm(solution.force) - np.linalg.norm(step.force)
-    torque = solution.torque - step.torque
-    errors = np.abs([error[0], error[2], magnitude, torque[1]])
-    stated = np.array(
-        [
-            solution.force_stddev[0],
-            solution.force_stddev[2],
-            solution.magnitude_stddev,
-            solution.torque_stddev[1],
-        ]
-    )
+    stated = (*solution.force_stddev, solution.magnitude_stddev, solution.torque_stddev[1])
     wrench = np.concatenate([solution.force, solution.torque, solution.force_stddev, solution.torque_stddev])
     return Trial(
         converged=solution.converged,
         sure=solution.trusted,
         residual=solution.residual,
         kkt=solution.kkt,
-        force_error=float(np.linalg.norm(error)),
-        stddev=solution.magnitude_stddev,
-        deviation=compare(errors, stated),
+        errors=tuple(np.abs([*error, magnitude, solution.torque[1] - step.torque[1]]).tolist()),
+        stated=tuple(map(float, stated)),
         condition=solution.condition,
-        energy_balance=balance,
         nan=not np.isfinite([*wrench, solution.magnitude_stddev]).all(),
-        note=f"{solution.status}: true {np.linalg.norm(step.force):.3g} N; {describe(errors, stated)}",
+        note=f"{solution.status}: true {np.linalg.norm(step.force):.3g} N",
     )
-
-
-def compare(errors: NDArray, stated: NDArray) -> float:
-    """Return the largest of the errors over their stated standard deviations; no error needs none."""
-    ratio = np.divide(errors, stated, out=np.full(len(errors), np.inf), where=stated > 0.0)
-    return float(np.where(errors > 1e-9, ratio, 0.0).max())
-
-
-def describe(errors: NDArray, stated: NDArray) -> str:
-    """Return errors and standard deviations in words."""
-    names = ("x", "z", "magnitude", "torque")
-    return ", ".join(f"{n} {e:.3g} ± {s:.2g}" for n, e, s in zip(names, errors, stated, strict=True))
 
 
 # The truth comes from the estimator's own mechanics: no more than this share of a force is left to it.
@@ -220,7 +196,6 @@ class PressHistory:
         keypoints: by depth, (n,) -> (n, K, 3) [m].
         forces: by depth, (n,) -> (n, 3) [N].
         torques: by depth, (n,) -> (n, 3) [N m].
-        balance: work of the object less energy stored, relative to the energy.
     """
 
     height: float
@@ -229,7 +204,6 @@ class PressHistory:
     keypoints: PchipInterpolator
     forces: PchipInterpolator
     torques: PchipInterpolator
-    balance: float
 
 
 class Bench:
@@ -240,6 +214,7 @@ class Bench:
         self.plan = plan
         jaw = jaw or load_jaw(plan.jaw)
         self._reach = jaw.candidates[[0, -1], 2]
+        self._size = float(np.diff(self._reach)[0] / np.diff(_BENCH_REACH)[0]) if plan.jaw != "bench" else 1.0
         calibration = Calibration(
             young_modulus=modulus * jaw.material.young_modulus, force_error=FORCE_ERROR, clamped_z=0.0
         )
@@ -249,6 +224,14 @@ class Bench:
         self.jaw = self.estimator.jaw
         own, full = plan.solver in OWN_MECHANICS, replace(chosen, solver=self.jaw.model)
         self.mechanics = self.estimator.mechanics if own else build_mechanics(self.jaw, full)
+
+    def find_height(self, height: float) -> float:
+        """Return the height on this finger of a height on the bench finger [m]: at the same share of its candidates."""
+        return float(self._reach[0] + self._size * (height - _BENCH_REACH[0])) if self._size != 1.0 else height
+
+    def find_depth(self, depth: float) -> float:
+        """Return the depth for this finger of a depth for the bench finger [m]: as much less as it is shorter."""
+        return depth * min(self._size, 1.0)
 
     def press(self, random: np.random.Generator, *, depth: float | None = None) -> PressHistory:
         """Return a press by a drawn cylinder at a drawn height, `depth` [m] deep or drawn too.
@@ -266,14 +249,10 @@ class Bench:
     def history(self, *, height: float, radius: float, depth: float) -> PressHistory:
         """Return the press of a cylinder at a height and depth [m] that are meant for the bench finger.
 
-        Another finger is pressed at the same share of its candidates, and a shorter one as much less.
-
         Raises:
             ContactError: There is no equilibrium.
         """
-        if self.plan.jaw != "bench":
-            larger = float(np.diff(self._reach)[0] / np.diff(_BENCH_REACH)[0])
-            height, depth = float(self._reach[0] + larger * (height - _BENCH_REACH[0])), depth * min(larger, 1.0)
+        height, depth = self.find_height(height), self.find_depth(depth)
         model, surface = self.mechanics.model, self.mechanics.contact.surface
         depths = np.linspace(0.0, depth, COURSE_STEPS + 1)[1:]
         presses = press_jaw(model, surface, self.jaw.inner_face_x, RigidCylinder(radius=radius), height, depths)
@@ -285,15 +264,4 @@ class Bench:
             keypoints=PchipInterpolator(grid, follow_points(model, self.jaw.keypoints, presses)),
             forces=PchipInterpolator(grid, np.concatenate([zero, [press.force for press in presses]])),
             torques=PchipInterpolator(grid, np.concatenate([zero, [press.torque for press in presses]])),
-            balance=self._balance(presses, RigidCylinder(radius=radius), height, grid),
         )
-
-    def _balance(self, presses: list[PressState], rigid: RigidCylinder, height: float, grid: NDArray) -> float:
-        """Return work less energy of a press, over the energy; that of the springs of the surface counts."""
-        model, surface = self.mechanics.model, self.mechanics.contact.surface
-        pushes = np.array([0.0, *(-press.force[0] for press in presses)])
-        work = float(PchipInterpolator(grid, pushes).integrate(grid[0], grid[-1]))
-        points = model.positions(surface.probe, presses[-1].q)
-        contact = rigid.press(points, surface.stiffness, self.jaw.inner_face_x, presses[-1].depth, height)
-        energy = presses[-1].energy + measure_penalty_energy(contact.forces, surface.stiffness)
-        return (work - energy) / max(work, energy)

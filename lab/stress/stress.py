@@ -4,28 +4,28 @@ from __future__ import annotations
 
 import gc
 import math
-import pkgutil
 import signal
 import threading
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, replace
-from importlib import import_module
-from pathlib import Path
+from dataclasses import dataclass, replace
 from time import thread_time
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from finforce.errors import FinforceError
-from lab.harness import format_table
+from lab.harness import format_table, measure_sharpness
 
 TIME_LIMIT = 60.0
 # No step may take more medians than this.
 LONGEST_STEP = 10.0
+AXES = ("x", "y", "z", "magnitude", "torque")  # of an answer: force, its magnitude, torque about y
+NO_ERROR = 1e-9  # [N, N m], which needs no standard deviation
 
 
 class HangError(BaseException):
@@ -41,14 +41,12 @@ class Trial:
         level: what was set in this trial, such as "noise 2 mm".
         converged: whether the answer is a converged one.
         sure: whether it was given as one that may be published.
-        residual: what is left of the equations, scaled as the family says.
+        residual: weighted root mean square of the used key points' residuals [m].
         kkt: scaled residual of the optimality conditions.
-        force_error: norm of the difference of the forces [N]; NaN where there is no truth to compare with.
-        stddev: standard deviation of the force that was stated [N].
-        deviation: largest error over its stated standard deviation; NaN for force_error / stddev.
+        errors: sizes of the errors along `AXES` [N, N m]; none where there is no truth to compare with.
+        stated: standard deviations that were stated along `AXES` [N, N m].
         step_time: CPU time of the step [s]; NaN where it is not to be compared with the others.
         condition: condition number of what was solved.
-        energy_balance: work done less energy stored, relative to the larger of the two.
         nan: whether something that is not finite left in an answer that was sure.
         outcome: "answer", "refused" by one of our errors, "crashed" by any other, or "hung".
         note: the error's words, or what else is to be known.
@@ -60,24 +58,32 @@ class Trial:
     sure: bool = False
     residual: float = math.nan
     kkt: float = math.nan
-    force_error: float = math.nan
-    stddev: float = math.nan
-    deviation: float = math.nan
+    errors: tuple[float, ...] = ()
+    stated: tuple[float, ...] = ()
     step_time: float = math.nan
     condition: float = math.nan
-    energy_balance: float = math.nan
     nan: bool = False
     outcome: str = "answer"
     note: str = ""
 
     @property
+    def force_error(self) -> float:
+        """Norm of the difference of the forces [N]; NaN without truth."""
+        return float(np.linalg.norm(self.errors[:3])) if self.errors else math.nan
+
+    @property
+    def stddev(self) -> float:
+        """Standard deviation of the force's magnitude that was stated [N]; NaN without truth."""
+        return self.stated[AXES.index("magnitude")] if self.stated else math.nan
+
+    @property
     def sigmas(self) -> float:
-        """Error in stated standard deviations, infinite where none was stated; NaN without truth."""
-        if not math.isnan(self.deviation):
-            return self.deviation
-        if math.isnan(self.force_error) or self.force_error == 0.0:
-            return self.force_error
-        return self.force_error / self.stddev if self.stddev > 0.0 else math.inf
+        """Largest error in stated standard deviations, infinite where none was stated; NaN without truth."""
+        if not self.errors:
+            return math.nan
+        errors, stated = np.array(self.errors), np.array(self.stated)
+        ratio = np.divide(errors, stated, out=np.full(len(errors), np.inf), where=stated > 0.0)
+        return float(np.where(errors > NO_ERROR, ratio, 0.0).max())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -225,16 +231,10 @@ def _run_once(family: Family, plan: Plan) -> list[Trial]:
     return trials
 
 
-def find_families() -> dict[str, Family]:
-    """Return every family by name: the `FAMILIES` of this package's modules."""
-    folder = Path(__file__).parent
-    modules = [import_module(f"{__package__}.{module.name}") for module in pkgutil.iter_modules([str(folder)])]
-    return {family.name: family for module in modules for family in getattr(module, "FAMILIES", ())}
-
-
 SIGMAS = 3.0
 SHARE_WITHIN = 0.99
-TRIAL = tuple(field.name for field in fields(Trial))
+TRIAL = ("converged", "sure", "residual", "kkt", "step_time", "condition", "nan", "outcome")
+JUDGED = ("force_error", "stddev", "sigmas")
 # the figures of a summary that are printed: heading and factor
 PRINTED = {
     "n": ("n", 1),
@@ -247,10 +247,10 @@ PRINTED = {
     "within": ("in 3σ %", 100),
     "median_sigmas": ("median σ", 1),
     "median_stddev": ("stated N", 1),
+    **{f"sharpness_{axis}": (f"sharp {axis}", 1) for axis in AXES[:4]},
     "step_p50": ("p50 ms", 1000),
     "step_ratio": ("max/p50", 1),
     "worst_condition": ("cond.", 1),
-    "worst_balance": ("energy", 1),
     "nans": ("NaN", 1),
     "refused": ("refused", 1),
     "crashed": ("crashed", 1),
@@ -265,7 +265,7 @@ def summarise(name: str, trials: Sequence[Trial], *, least_sure: float = 0.0, ti
     crashes, or leaves that is not finite; no step exceeds ten times the median; enough answers are sure.
     """
     table = pd.DataFrame([vars(trial) for trial in trials], columns=TRIAL)
-    table["sigmas"] = np.array([trial.sigmas for trial in trials], float)
+    table[list(JUDGED)] = np.array([[getattr(trial, name) for name in JUDGED] for trial in trials]).reshape(-1, 3)
     sure, converged = (table[table[column].astype(bool)] for column in ("sure", "converged"))
     judged, outcomes = sure.sigmas.dropna(), Counter(table.outcome)
     figures = {
@@ -282,11 +282,20 @@ def summarise(name: str, trials: Sequence[Trial], *, least_sure: float = 0.0, ti
         "step_p50": table.step_time.median(),
         "step_ratio": measure_longest(trials),
         "worst_condition": table.condition.max(),
-        "worst_balance": table.energy_balance.abs().max(),
+        **dict(zip((f"sharpness_{axis}" for axis in AXES), _measure_sharpness(trials), strict=True)),
     }
     counts = {"nans": int(table.nan.sum()), **{name: outcomes[name] for name in ("refused", "crashed", "hung")}}
     figures = {key: value if key == "n" else float(value) for key, value in figures.items()} | counts
     return {"name": name, **figures, "broken": list(_find_broken(figures, least_sure, timed))}
+
+
+def _measure_sharpness(trials: Sequence[Trial]) -> NDArray:
+    """Return the sharpness of the sure answers along `AXES`, see `lab.harness.measure_sharpness`."""
+    judged = [trial for trial in trials if trial.sure and trial.errors]
+    stated, errors = (
+        np.array([getattr(trial, name) for trial in judged]).reshape(-1, len(AXES)) for name in ("stated", "errors")
+    )
+    return measure_sharpness(stated, errors)
 
 
 def summarise_family(family: Family, trials: Sequence[Trial]) -> dict[str, Any]:
@@ -295,7 +304,10 @@ def summarise_family(family: Family, trials: Sequence[Trial]) -> dict[str, Any]:
 
 
 def summarise_levels(trials: Sequence[Trial]) -> list[dict[str, Any]]:
-    """Return one summary per level, in the order in which they came; nothing is demanded of a level's time."""
+    """Return one summary per level, in the order in which they came.
+
+    A level is held to the same rules as its family, but for its time.
+    """
     levels = dict.fromkeys(trial.level for trial in trials)
     return [summarise(level, [t for t in trials if t.level == level], timed=False) for level in levels]
 

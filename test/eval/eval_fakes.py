@@ -231,7 +231,8 @@ def drawn_hues(path):
 
 def answers(count, *, error=0.01, stddev=0.01, **fields):
     """Sure, converged answers with the same error and the same stated standard deviation [N]."""
-    usual = {"converged": True, "sure": True, "force_error": error, "stddev": stddev, "step_time": 1e-3}
+    told = {"errors": (error, 0.0, 0.0, error, 0.0), "stated": (stddev,) * 5}
+    usual = {"converged": True, "sure": True, **told, "step_time": 1e-3}
     return [Trial(seed=i, **{**usual, **fields}) for i in range(count)]
 
 

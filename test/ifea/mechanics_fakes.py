@@ -20,6 +20,12 @@ from finforce_ifea.settings import EstimatorSettings
 from lab.forward_press import RigidCylinder, press_jaw
 
 SHIPPED_BENCH = load_jaw("bench")
+MODULUS, RATIO = 30e6, 0.45
+
+
+def build_jaw(modulus=MODULUS, ratio=RATIO):
+    """The bench jaw of a material, Young's modulus [Pa] and Poisson's ratio."""
+    return replace(SHIPPED_BENCH, material=Material(young_modulus=modulus, poisson_ratio=ratio))
 
 
 def shoelace_area(corners):

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from mechanics_fakes import build_jaw
 from numpy.typing import NDArray
 
 from finforce.errors import FinforceError
@@ -16,7 +17,6 @@ from finforce_ifea.fem.solid import SolidModel
 from finforce_ifea.jaw.mesh import VolumeMesh, build_volume_mesh, check_connection
 from finforce_ifea.mechanics import LockingWarning, measure_shape, warn_of_locking
 from lab.forward_press import RigidCylinder, press_jaw
-from lab.stress.mechanics import build_jaw
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

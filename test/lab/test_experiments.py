@@ -283,6 +283,7 @@ def test_images_without_a_force_are_told_with_what_the_jaws_said(monkeypatch):
 def test_why_a_grasp_ended_early_is_on_the_page(tmp_path):
     row = {"way": "force", "peak_N": 3.0, "end_N": 2.9, "is_broken": False, "error": "", "violations": 0,
            "drawn": {"seconds": [0.0], "force": [0.0]}, "untold": []}  # fmt: skip
+    row |= {"within_3_sigma_pct": 100.0, "sharp": 1.5}
     early = {"error": "the newest force is 0.27 s old", "untold": [[0.1, "left waiting"], [0.2, "right unobservable"]]}
     findings = CHIP.find(RunOptions(), {"force_00": row, "force_01": row | early}, tmp_path)
     assert "force_01 ended early: the newest force is 0.27 s old (right unobservable)" in findings.notes[1]
@@ -422,6 +423,7 @@ def test_the_end_to_end_network_needs_ten_images():
 def test_both_methods_are_compared_by_what_the_network_has_seen(tmp_path):
     series = {"seconds": [0.0, 1.0], "truth": [0.0, 2.0], "found": [0.0, 2.1], "network": [None, 1.0]}
     row = {"peak_N": 2.0, "span_N": 2.0, "network_bias_N": 0.0, "answered_pct": 100.0, "drawn": series}
+    row |= {"sharpness": {"x": 1.5, "y": None, "z": 2.0}}
     figures = {
         "known": {**row, "group": "as trained", "rmse_N": 0.1, "network_rmse_N": 0.2},
         "new": {**row, "group": "another object", "rmse_N": 0.1, "network_rmse_N": 0.6},
@@ -436,7 +438,8 @@ def test_both_methods_are_compared_by_what_the_network_has_seen(tmp_path):
 def test_what_each_way_of_poses_adds_is_counted_from_those_on_time(tmp_path):
     def grasp(*errors):
         ways = ("on time", "late")
-        scores = {"answered_pct": 99.0, "place_median_mm": 1.0}
+        scores = {"answered_pct": 99.0, "place_median_mm": 1.0, "within_3_sigma_pct": 100.0}
+        scores |= {"sharpness": {"x": 1.5, "y": 1.0, "z": 2.0}}
         return {
             "ways": {way: {"rmse_N": {"all": error}, **scores} for way, error in zip(ways, errors, strict=True)},
             "poses": {"on time": {"rate_Hz": 10.0, "delay_ms": 0.0}},
@@ -446,6 +449,7 @@ def test_what_each_way_of_poses_adds_is_counted_from_those_on_time(tmp_path):
     rows = first_table(found).set_index("poses")
     assert rows["added/N"].to_dict() == pytest.approx({"on time": 0.0, "late": 0.15})
     assert rows["most added/N"]["late"] == pytest.approx(0.3)
+    assert rows["sharp x"]["late"] == pytest.approx(1.5)
     assert found.tables["By source"]["rate/Hz"].tolist() == [10.0]
 
 
@@ -454,10 +458,12 @@ def test_grasps_and_turns_are_put_in_tables(tmp_path):
     series = {"seconds": [0.0, 1.0], "truth": [0.0, 2.0], "found": [0.0, 2.1]}
     score = {"rmse_N": phases, "nrmsd_pct": phases, "peak_N": 2.0, "bias_N": 0.0, "max_error_N": 0.1}
     score |= {"answered_pct": 100.0, "within_3_sigma_pct": 100.0, "delay_ms": [100.0, None]}
+    score |= {"sharp": 1.2, "sharpness": {"x": 1.5, "y": None, "z": 2.0}}
     row = {**score, "hidden": score, "drawn": series, "object": "cube", "place": "upper", "level": "low"}
     found = GRASP.find(RunOptions(), {"one": row}, tmp_path)
     assert first_table(found).force.tolist() == ["low", "all"]
     assert first_table(found)["shows after/ms"].tolist() == [100.0, 100.0]
+    assert first_table(found)["sharp z"].tolist() == [2.0, 2.0]
     one = np.eye(3)[:2]
     net = ForceSeries.build("one", "gripper", np.arange(2), force=one, true_force=one)
     turn = score_weight(net) | {"axis": "roll", "light": "dim"}

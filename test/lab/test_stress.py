@@ -10,12 +10,11 @@ from eval_fakes import answers, divide, fail_with, family_of, refuse
 
 from finforce_eval.cli.main import main
 from finforce_eval.errors import OptionError
-from lab.cli.stress import choose_families, worst_trials, write_page
+from lab.cli.stress import FAMILIES, choose_families, worst_trials, write_page
 from lab.stress.stress import (
     Plan,
     Trial,
     attempt,
-    find_families,
     format_summaries,
     measure_longest,
     run_family,
@@ -56,8 +55,8 @@ def test_an_error_without_any_stated_deviation_is_a_lie():
 
 
 def test_the_farthest_component_decides():
-    assert broken(answers(10, deviation=3.1))
-    assert broken(answers(10, deviation=2.9)) == []
+    assert broken(answers(10, errors=(0.01, 0.0, 0.031, 0.0, 0.0)))
+    assert broken(answers(10, errors=(0.01, 0.0, 0.029, 0.0, 0.0))) == []
 
 
 def test_who_is_never_sure_is_useless():
@@ -138,12 +137,18 @@ def test_judging_is_not_timed():
 
 
 def test_figures_are_of_what_they_say():
-    trials = answers(3, error=0.02, residual=1e-5, condition=4.0, energy_balance=-0.2)
+    trials = answers(3, error=0.02, residual=1e-5, condition=4.0)
     trials += answers(1, sure=False, converged=False, error=9.0, residual=1.0)
     summary = summarise("made", trials)
     expected = {"n": 4, "converged": 0.75, "sure": 0.75, "worst_error": 0.02, "worst_residual": 1e-5}
-    expected |= {"median_sigmas": pytest.approx(2.0), "worst_balance": 0.2, "worst_condition": 4.0}
+    expected |= {"median_sigmas": pytest.approx(2.0), "worst_condition": 4.0}
     assert {key: summary[key] for key in expected} == expected
+
+
+def test_stated_deviations_as_large_as_the_errors_are_sharp():
+    summary = summarise("made", answers(3, error=0.01, stddev=0.02) + answers(3, error=0.03, stddev=0.02))
+    assert summary["sharpness_x"] == pytest.approx(0.02 / np.sqrt(5e-4))
+    assert np.isnan(summary["sharpness_y"])  # no error, nothing to be sharp about
 
 
 def test_levels_keep_their_order():
@@ -167,7 +172,7 @@ def test_page_shows_what_is_broken(tmp_path):
     trials = run_family(family, Plan())
     write_page(tmp_path / "report", [summarise_family(family, trials)], {"made": trials}, {"made": "made up"})
     page = (tmp_path / "report" / "stress.md").read_text()
-    assert "**broken:** 50.0 %" in page and "| far " in page
+    assert "broken: made: 50.0 %" in page and "broken: made, far: 0.0 %" in page and "| far " in page
 
 
 # --- plans and the command
@@ -181,22 +186,20 @@ def test_a_seed_draws_the_same_and_other_keys_another():
 
 
 def test_families_have_names_of_their_own_and_say_what_they_do():
-    families = find_families()
-    assert {"subsets", "noise", "gross", "clusters", "jumps", "stamps", "long", "contacts", "forces"} <= set(families)
-    assert all(family.what and "\n" not in family.what for family in families.values())
+    assert {"subsets", "noise", "gross", "clusters", "jumps", "stamps", "long", "contacts", "forces"} <= set(FAMILIES)
+    assert all(family.what and "\n" not in family.what for family in FAMILIES.values())
 
 
 def test_unknown_family_is_refused_with_their_names():
-    known = find_families()
     with pytest.raises(OptionError, match="expected one of.*noise"):
-        choose_families("nothing", known)
-    assert [family.name for family in choose_families("noise, gross", known)] == ["noise", "gross"]
+        choose_families("nothing")
+    assert [family.name for family in choose_families("noise, gross")] == ["noise", "gross"]
 
 
 @pytest.fixture
 def one_family(monkeypatch):
     def use(trials):
-        monkeypatch.setattr("lab.cli.stress.find_families", lambda: {"made": family_of(trials)})
+        monkeypatch.setattr("lab.cli.stress.FAMILIES", {"made": family_of(trials)})
 
     return use
 
@@ -214,6 +217,21 @@ def test_command_ends_with_one_when_a_rule_is_broken(one_family, capsys):
     one_family(answers(5, error=1.0))
     assert main(["stress"]) == 1
     assert "broken: made: 0.0 % of the sure answers" in capsys.readouterr().out
+
+
+def test_a_level_that_breaks_the_rule_is_not_averaged_away(one_family, capsys):
+    one_family(answers(300, level="near") + answers(2, error=1.0, level="far"))
+    assert main(["stress"]) == 1
+    out = capsys.readouterr().out
+    assert "broken: made, far: 0.0 % of the sure answers" in out and "broken: made: " not in out
+
+
+def test_a_new_seed_is_drawn_and_told(one_family, capsys):
+    one_family(answers(5))
+    main(["stress", "--seed", "new"])
+    main(["stress", "--seed", "new"])
+    first, second = (line for line in capsys.readouterr().out.splitlines() if line.startswith("seed "))
+    assert first.split(",")[0] != second.split(",")[0]
 
 
 WRONG = [("--count", "0"), ("--count", "1e20"), ("--seed", "-1"), ("--families", "nothing")]

@@ -61,7 +61,7 @@ def test_what_an_outline_cannot_describe_is_refused_in_words(name):
 
 def test_a_press_begins_clear_of_the_jaw():
     for scene in build_scenes():
-        depths = plan_depths(scene)
+        depths = plan_depths(scene.depth)
         assert depths[0] <= -CLEAR and depths[-1] == pytest.approx(scene.depth)
         assert (np.diff(depths) >= -1e-15).all()
 

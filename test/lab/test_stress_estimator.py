@@ -13,8 +13,9 @@ from finforce_ifea.jaw.calibration import Calibration
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.observation import Contact
 from finforce_ifea.settings import EstimatorSettings
+from lab.cli.stress import FAMILIES
 from lab.stress.session import Bench, judge, open_session, update
-from lab.stress.stress import Plan, find_families, run_family, summarise_family
+from lab.stress.stress import Plan, run_family, summarise_family
 
 # Families whose answers are right within what they state, with as many trials as there is time for; see docs/stress.md.
 SHORT = {"subsets": 8, "noise": 8, "gross": 4, "clusters": 4, "jumps": 4, "stamps": 6, "model": 3, "right": 4}
@@ -41,21 +42,16 @@ def play(steps):
 
 @pytest.mark.parametrize("name", SHORT)
 def test_family_breaks_no_rule(name):
-    family = replace(find_families()[name], timed=False)
+    family = replace(FAMILIES[name], timed=False)
     summary = summarise_family(family, run_family(family, Plan(solver="frame", count=SHORT[name], seed=1)))
     assert summary["broken"] == [] and summary["n"] > 0
 
 
 def test_forces_of_a_long_run_do_not_drift():
-    family = replace(find_families()["long"], timed=False)
+    family = replace(FAMILIES["long"], timed=False)
     trials = run_family(family, Plan(solver="frame", count=1500))
     assert summarise_family(family, trials)["broken"] == []
     assert "memory" in trials[-1].note
-
-
-def test_work_of_the_object_is_the_energy_stored():
-    # 16 steps of a smooth history: the integral is good to a thousandth
-    assert abs(bench().history(height=30e-3, radius=10e-3, depth=6e-3).balance) < 1e-3
 
 
 # --- what is stated
