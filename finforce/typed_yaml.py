@@ -130,6 +130,7 @@ def _name_axes(value: Any) -> Any:
     return value
 
 
+Text = Annotated[str, Field(pattern=r"\S")]
 Number = Annotated[float, BeforeValidator(_refuse_switch)]
 Count = Annotated[int, Field(strict=True, ge=1, le=10_000)]
 Length = Annotated[Number, AfterValidator(refuse_millimetres(1.0))]

@@ -14,12 +14,11 @@ from finforce_ifea.contact_mechanics.pressed_jaw import (
     measure_stiffness,
 )
 from finforce_ifea.errors import ContactError, JawFileError
-from finforce_ifea.fem.elements import to_tet4, to_tet10
 from finforce_ifea.fem.model import JawModel
 from finforce_ifea.fem.solid import SolidModel
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_ifea.jaw.jaw_file import Material
-from finforce_ifea.jaw.mesh import VolumeMesh, shape_gradients
+from finforce_ifea.jaw.mesh import VolumeMesh, shape_gradients, to_tet4, to_tet10
 from finforce_ifea.settings import EstimatorSettings
 
 _REDUCED = ("reduced", "linear")
@@ -83,7 +82,7 @@ def build_plane_model(jaw: Jaw, mesh: VolumeMesh, density: str | None = None) ->
             for model in (solid, held)
         ]
         _WIDTH_SHARES[key] = stiffness[0] / stiffness[1]
-    material = replace(jaw.material, young_modulus=jaw.material.young_modulus * _WIDTH_SHARES[key])
+    material = jaw.material.model_copy(update={"young_modulus": jaw.material.young_modulus * _WIDTH_SHARES[key]})
     return PlaneModel(mesh, jaw.build_plane(density), jaw.section, material)
 
 
@@ -148,7 +147,7 @@ def measure_locking(jaw: Jaw, mesh: VolumeMesh) -> float:
     strain. The load acts along -x at the middle contact candidate.
     """
     material = jaw.material
-    easy = replace(material, poisson_ratio=min(material.poisson_ratio, _EASY_RATIO))
+    easy = material.model_copy(update={"poisson_ratio": min(material.poisson_ratio, _EASY_RATIO)})
     plane = (1.0 - easy.poisson_ratio**2) / (1.0 - material.poisson_ratio**2)
     return _measure_point_stiffness(jaw, mesh, material) / (_measure_point_stiffness(jaw, to_tet10(mesh), easy) * plane)
 

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 
 from finforce_ifea.errors import MeshError
@@ -32,21 +33,6 @@ class Attachment:
         return np.einsum("pm,pm...->p...", self.weights, values[self.nodes])
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class SurfacePoint:
-    """The closest points of a mesh's surface to some points.
-
-    Attributes:
-        points: (p, 3) [m].
-        distances: (p,) [m].
-        triangles: (p,) indices into the mesh's surface.
-    """
-
-    points: NDArray
-    distances: NDArray
-    triangles: NDArray
-
-
 def attach_points(
     mesh: VolumeMesh, points: NDArray, max_distance: float, names: Sequence[str] | None = None
 ) -> Attachment:
@@ -71,11 +57,10 @@ def attach_points(
     location = _locate(mesh, points)
     outside = np.flatnonzero(location.excess > _INSIDE)
     if len(outside):
-        closest = find_closest_surface(mesh, points[outside])
-        outside_names = [names[row] for row in outside]
-        _check_distances(points[outside], closest.distances, outside_names, max_distance, "mesh")
+        closest, distances = find_closest(mesh, points[outside])
+        _check_distances(points[outside], distances, [names[row] for row in outside], max_distance, "mesh")
         points = points.copy()
-        points[outside] = closest.points
+        points[outside] = closest
         location = _locate(mesh, points)
     nodes = mesh.elements[location.elements]
     count = nodes.shape[1]
@@ -101,38 +86,16 @@ def attach_surface_points(
     """
     points = _check_points(points)
     names = names or [f"point {row}" for row in range(len(points))]
-    closest = find_closest_surface(mesh, points)
-    _check_distances(points, closest.distances, names, max_distance, "surface")
-    return attach_points(mesh, closest.points, max(max_distance, 1e-6))
+    closest, distances = find_closest(mesh, points)
+    _check_distances(points, distances, names, max_distance, "surface")
+    return attach_points(mesh, closest, max(max_distance, 1e-6))
 
 
-def find_closest_surface(mesh: VolumeMesh, points: NDArray) -> SurfacePoint:
-    """Find the closest point on the surface's triangles for each of points (p, 3) [m].
-
-    It is the projection onto the triangle's plane where that falls into the triangle, else on an edge.
-    """
-    corners = mesh.nodes[mesh.surface]
-    results = [_closest_on_triangles(point, corners) for point in points]
-    triangles = np.array([result[0] for result in results], dtype=np.int64)
-    closest = np.array([result[1] for result in results]).reshape(-1, 3)
-    return SurfacePoint(points=closest, distances=np.linalg.norm(closest - points, axis=1), triangles=triangles)
-
-
-def _closest_on_triangles(point: NDArray, corners: NDArray) -> tuple[int, NDArray]:
-    """Return the index of the triangle (t, 3, 3) closest to a point and the closest point (3,) on it."""
-    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
-    normal = np.cross(b - a, c - a)
-    height = ((point - a) * normal).sum(axis=1) / (normal**2).sum(axis=1)
-    foot = point - height[:, None] * normal
-    along = np.roll(corners, -1, axis=1) - corners
-    turn = np.cross(along, foot[:, None] - corners)
-    inside = (np.einsum("tei,ti->te", turn, normal) >= 0.0).all(axis=1)
-    share = ((point - corners) * along).sum(axis=2) / (along**2).sum(axis=2)
-    on_edges = corners + np.clip(share, 0.0, 1.0)[:, :, None] * along
-    nearest = np.linalg.norm(on_edges - point, axis=2).argmin(axis=1)
-    closest = np.where(inside[:, None], foot, on_edges[np.arange(len(corners)), nearest])
-    best = int(np.linalg.norm(closest - point, axis=1).argmin())
-    return best, closest[best]
+def find_closest(mesh: VolumeMesh, points: NDArray) -> tuple[NDArray, NDArray]:
+    """Return the closest points (p, 3) [m] of the surface to points (p, 3) [m], and how far they are (p,) [m]."""
+    surface = trimesh.Trimesh(mesh.nodes, mesh.surface, process=False)
+    closest, distances, _ = trimesh.proximity.closest_point_naive(surface, points)
+    return closest, distances
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -68,7 +68,7 @@ class Calibration(FileModel):
                 f"the calibration belongs to a finger of another shape ({self.finger}, the jaw {jaw.name!r} is "
                 f"{jaw.digest}): calibrate this one"
             )
-        material = replace(jaw.material, young_modulus=float(self.young_modulus))
+        material = jaw.material.model_copy(update={"young_modulus": self.young_modulus})
         if jaw.drawing is None:
             return replace(jaw, material=material)
         drawing = replace(

@@ -4,6 +4,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Literal
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 from finforce_ifea.errors import JawFileError, MeshError
@@ -169,26 +170,14 @@ class Drawing:
     def distance_to(self, points: NDArray) -> NDArray:
         """Compute the distances (n,) [m] of points (n, 3) [m, jaw frame] from the finger, 0 inside."""
         beside = np.maximum(np.abs(points[:, 1]) - 0.5 * self.width, 0.0)
-        parts = [_distance_to_quadrilateral(points[:, [0, 2]], part) for part in self.outlines()]
-        in_plane = np.min(parts, axis=0)
-        return np.hypot(beside, in_plane)
+        parts = shapely.polygons(self.outlines())
+        in_plane = shapely.distance(parts, shapely.points(points[:, [0, 2]])[:, None])
+        return np.hypot(beside, in_plane.min(axis=1))
 
 
 def _quadrilateral(x_first: NDArray, x_second: NDArray, z: NDArray) -> NDArray:
     """Return the corners (4, 2) of the area between two lines, each given at two heights."""
     return np.array([[x_first[0], z[0]], [x_second[0], z[0]], [x_second[1], z[1]], [x_first[1], z[1]]])
-
-
-def _distance_to_quadrilateral(points: NDArray, corners: NDArray) -> NDArray:
-    """Compute the distance (n,) of points (n, 2) from a convex quadrilateral (4, 2), 0 inside."""
-    along = np.roll(corners, -1, axis=0) - corners
-    relative = points[:, None, :] - corners
-    squared = np.maximum((along**2).sum(axis=1), np.finfo(float).tiny)
-    share = np.clip((relative * along).sum(axis=2) / squared, 0.0, 1.0)
-    distance = np.linalg.norm(relative - share[:, :, None] * along, axis=2).min(axis=1)
-    turn = along[:, 0] * relative[:, :, 1] - along[:, 1] * relative[:, :, 0]
-    inside = (turn > 0).all(axis=1) | (turn < 0).all(axis=1)
-    return np.where(inside, 0.0, distance)
 
 
 def _check_sizes(drawing: Drawing) -> None:

@@ -14,9 +14,9 @@ from finforce.typed_yaml import read_model
 from finforce_ifea.errors import JawFileError, MeshError
 from finforce_ifea.jaw.attachment import attach_points, attach_surface_points
 from finforce_ifea.jaw.drawing import Drawing, MeshDensity, mesh_drawing
-from finforce_ifea.jaw.jaw_file import CandidateRule, JawEntry, JunctionRule, Material, MeshFile
+from finforce_ifea.jaw.jaw_file import CandidateRule, JawEntry, JunctionRule, Material
 from finforce_ifea.jaw.mesh import VolumeMesh
-from finforce_ifea.jaw.mesh_file import read_volume_mesh
+from finforce_ifea.jaw.mesh_file import MeshFile, read_volume_mesh
 from finforce_ifea.jaw.section import FaceLine, Section, find_face
 from finforce_ifea.jaw.section_mesh import SHARES, PlaneMesh, extrude_section, mesh_section
 
@@ -80,9 +80,9 @@ class Jaw:
             return extrude_section(self.section, _find_share(density))
         if density in (None, "default"):
             file = self.mesh_file
-            mesh = read_volume_mesh(file.path, scale=file.scale, clamp=file.clamp)
+            mesh = read_volume_mesh(self.path.parent / file.file, scale=file.scale, clamp=file.clamped)
         else:
-            raise MeshError(f"mesh density {density!r}: {self.mesh_file.path.name} has its own; use 'default'")
+            raise MeshError(f"mesh density {density!r}: {self.mesh_file.file} has its own; use 'default'")
         return mesh if self.side == "left" else mesh.mirrored()
 
     def build_plane(self, density: str | None = None) -> PlaneMesh:
@@ -106,7 +106,8 @@ class Jaw:
         """What the finger's shape is known by: 12 hexadecimal digits of its content, the same for both sides."""
         shape = self.drawing or self.section
         if shape is None:
-            content = self.mesh_file.path.read_bytes() + repr((self.mesh_file.scale, self.mesh_file.clamp)).encode()
+            file = self.mesh_file
+            content = (self.path.parent / file.file).read_bytes() + repr((file.scale, file.clamped)).encode()
         else:
             content = repr(self.drawing).encode() if self.section is None else self.section.content
         return hashlib.sha256(content).hexdigest()[:12]
@@ -191,16 +192,13 @@ def _build_jaw(entry: JawEntry, path: Path) -> Jaw:
         candidates = candidates.build(
             FaceLine.flat(inner_face_x) if section is None else find_face(section, inner_face_x)
         )
-    material = entry.material
     jaw = Jaw(
         name=entry.name or path.stem,
         path=path,
         drawing=drawing,
         section=section,
-        mesh_file=entry.mesh and entry.mesh.build(path.parent),
-        material=Material(
-            young_modulus=material.young_modulus, poisson_ratio=material.poisson_ratio, spread=material.spread
-        ),
+        mesh_file=entry.mesh,
+        material=entry.material,
         keypoint_names=tuple(points),
         keypoints=np.array(list(points.values())),
         reference_point=entry.reference_point,

@@ -1,21 +1,19 @@
 """The jaw file: what may stand in it, and the parts of a jaw that it stands for."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, StrictBool, StrictInt, Tag, model_validator
+from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, StrictBool, Tag, model_validator
 
-from finforce.typed_yaml import TAGS, Count, FileModel, Length, Number, Point, Thickness
+from finforce.typed_yaml import TAGS, Count, FileModel, Length, Number, Point, Text, Thickness
 from finforce_ifea.errors import JawFileError
 from finforce_ifea.jaw.drawing import Band, Drawing, Rib
-from finforce_ifea.jaw.mesh_file import ClampRule
+from finforce_ifea.jaw.mesh_file import MeshFile
 from finforce_ifea.jaw.section import FaceLine, Section, join_loops, order_rings, read_loops
 
 LIST, MAPPING = TAGS
-Text = Annotated[str, Field(pattern=r"\S")]
 
 
 def _list_one(value: Any) -> Any:
@@ -27,19 +25,23 @@ Lengths = Annotated[tuple[Length, ...], BeforeValidator(_list_one)]
 Thicknesses = Annotated[tuple[Thickness, ...], BeforeValidator(_list_one)]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Material:
-    """A linear elastic material.
+def _refuse_megapascals(modulus: float) -> float:
+    if 0.0 < modulus < 1e4:
+        raise ValueError(f"got {modulus:g}, which looks like MPa; expected Pa, such as {modulus * 1e6:.3e}")
+    return modulus
 
-    Attributes:
-        young_modulus: [Pa].
-        poisson_ratio: [-].
-        spread: relative standard deviation of the modulus among parts of that material; 0 where it was not stated.
-    """
 
-    young_modulus: float
-    poisson_ratio: float
-    spread: float = 0.0
+class Material(FileModel):
+    """A linear elastic material."""
+
+    young_modulus: Annotated[Number, AfterValidator(_refuse_megapascals)] = Field(
+        gt=0.0, description="Young's modulus [Pa]"
+    )
+    poisson_ratio: Number = Field(gt=-1.0, lt=0.5, description="Poisson's ratio [-]")
+    spread: Number = Field(
+        0.0, ge=0.0, le=1.0, description="Relative standard deviation of the modulus among parts [-]"
+    )
+    name: Text = Field("", description="What it is called, for people")
 
 
 # What printed parts of a material are like before anybody has measured one: Young's modulus at small strain [MPa],
@@ -64,26 +66,7 @@ def _look_up(value: Any) -> Any:
     known = MATERIALS.get(value.lower())
     if known is None:
         raise ValueError(f"got {value!r}, expected one of {', '.join(MATERIALS)}, or young_modulus [Pa]")
-    return MaterialEntry(young_modulus=known.young_modulus, poisson_ratio=known.poisson_ratio, spread=known.spread)
-
-
-def _refuse_megapascals(modulus: float) -> float:
-    if 0.0 < modulus < 1e4:
-        raise ValueError(f"got {modulus:g}, which looks like MPa; expected Pa, such as {modulus * 1e6:.3e}")
-    return modulus
-
-
-class MaterialEntry(FileModel):
-    """A material: a name in `MATERIALS`, or these numbers."""
-
-    young_modulus: Annotated[Number, AfterValidator(_refuse_megapascals)] = Field(
-        gt=0.0, description="Young's modulus [Pa]"
-    )
-    poisson_ratio: Number = Field(gt=-1.0, lt=0.5, description="Poisson's ratio [-]")
-    spread: Number = Field(
-        0.0, ge=0.0, le=1.0, description="Relative standard deviation of the modulus among parts [-]"
-    )
-    name: Text = Field("", description="What it is called, for people")
+    return known
 
 
 class BandEntry(FileModel):
@@ -198,52 +181,6 @@ class DrawingEntry(FileModel):
         )
 
 
-class ClampEntry(FileModel):
-    """Which nodes of a mesh are clamped, by one rule of three."""
-
-    z_below: Length | None = Field(None, description="All up to this height [m]")
-    box: Annotated[list[Point], Field(min_length=2, max_length=2)] | None = Field(
-        None, description="All between two corners [[x, y, z], [x, y, z]], the lowest first [m]"
-    )
-    nodes: Annotated[tuple[StrictInt, ...], Field(min_length=1)] | None = Field(None, description="Indices from 0")
-
-    @model_validator(mode="after")
-    def _check(self) -> "ClampEntry":
-        self.expect_one_of("z_below", "box", "nodes")
-        if self.box is not None and (self.box[0] > self.box[1]).any():
-            raise ValueError("box: got the highest corner first, expected the lowest corner first")
-        return self
-
-
-class MeshEntry(FileModel):
-    """A volume mesh file."""
-
-    file: Text = Field(description="Its path, relative to the folder of the jaw file")
-    scale: Number = Field(1.0, gt=0.0, description="Factor on its coordinates [-]; 0.001 for millimetres")
-    clamped: ClampEntry = Field(description="Which of its nodes are clamped")
-
-    def build(self, folder: Path) -> "MeshFile":
-        """Return the file and how to read it."""
-        box = None if self.clamped.box is None else np.array(self.clamped.box)
-        clamp = ClampRule(z_below=self.clamped.z_below, box=box, nodes=self.clamped.nodes)
-        return MeshFile(path=folder / self.file, scale=self.scale, clamp=clamp)
-
-
-@dataclass(frozen=True, kw_only=True)
-class MeshFile:
-    """A volume mesh file and how to read it.
-
-    Attributes:
-        path: the file.
-        scale: [-], multiplies its coordinates; 0.001 for millimetres.
-        clamp: which of its nodes are clamped.
-    """
-
-    path: Path
-    scale: float
-    clamp: ClampRule
-
-
 class SectionClamp(FileModel):
     """What the holder keeps from moving: all below a height, circles about bolts, or both."""
 
@@ -353,9 +290,9 @@ class JawEntry(FileModel):
     model: Literal["solid", "frame", "plane"] | None = Field(None, description="Recommended mechanics")
     drawing: DrawingEntry | None = Field(None, description="Finger of bands, ribs and a tip")
     section: SectionEntry | None = Field(None, description="Finger of one section all along its width")
-    mesh: MeshEntry | None = Field(None, description="Finger as a volume mesh")
+    mesh: MeshFile | None = Field(None, description="Finger as a volume mesh")
     inner_face_x: Length | None = Field(None, description="Plane of the inner face [m]; of a section or a mesh")
-    material: Annotated[MaterialEntry, BeforeValidator(_look_up)] = Field(description="Name in MATERIALS, or numbers")
+    material: Annotated[Material, BeforeValidator(_look_up)] = Field(description="Name in MATERIALS, or numbers")
     keypoints: KeypointsEntry = Field(description="Points by name: [x, y, z] [m], or rule: rib_junctions")
     reference_point: Point = Field(np.zeros(3), description="Dot on the rigid holder [m]")
     candidates: CandidatesEntry = Field(description="Contact candidates: points [m], or first_z, step_z, count")

@@ -1,13 +1,15 @@
 """Volume meshes from files, checked."""
 
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import AfterValidator, Field, StrictInt, model_validator
 
 from finforce.files import FileError
 from finforce.surfaces import read_cells
+from finforce.typed_yaml import FileModel, Length, Number, Point, Text
 from finforce_ifea.errors import MeshError
 from finforce_ifea.jaw.mesh import EDGES_TET10, VolumeMesh, build_volume_mesh, check_connection
 
@@ -16,29 +18,21 @@ _VOLUME_CELLS = ("tetra", "tetra10", "hexahedron")
 _OTHER_CELLS = ("vertex", "line", "line3", "triangle", "triangle6", "quad", "quad8", "quad9")
 
 
-@dataclass(frozen=True, kw_only=True)
-class ClampRule:
-    """Which nodes of a mesh are clamped; exactly one of the three is given.
+class ClampRule(FileModel):
+    """Which nodes of a mesh are clamped, by one rule of three."""
 
-    Attributes:
-        z_below: [m], nodes up to this height.
-        box: (2, 3) [m], lowest and highest corner of a box, jaw frame.
-        nodes: explicit node indices, from 0.
-    """
+    z_below: Length | None = Field(None, description="All up to this height [m]")
+    box: Annotated[list[Point], Field(min_length=2, max_length=2), AfterValidator(np.array)] | None = Field(
+        None, description="All between two corners [[x, y, z], [x, y, z]], the lowest first [m]"
+    )
+    nodes: Annotated[tuple[StrictInt, ...], Field(min_length=1)] | None = Field(None, description="Indices from 0")
 
-    z_below: float | None = None
-    box: NDArray | None = None
-    nodes: tuple[int, ...] | None = None
-
-    def __post_init__(self) -> None:
-        """Refuse none or several of the three.
-
-        Raises:
-            MeshError: Not exactly one rule is given.
-        """
-        given = [rule for rule in (self.z_below, self.box, self.nodes) if rule is not None]
-        if len(given) != 1:
-            raise MeshError(f"clamped: got {len(given)} rules, expected exactly one of z_below, box, nodes")
+    @model_validator(mode="after")
+    def _check(self) -> "ClampRule":
+        self.expect_one_of("z_below", "box", "nodes")
+        if self.box is not None and (self.box[0] > self.box[1]).any():
+            raise ValueError("box: got the highest corner first, expected the lowest corner first")
+        return self
 
     def select(self, nodes: NDArray) -> NDArray:
         """Return the indices (c,) of the clamped ones among nodes (n, 3) [m]."""
@@ -48,6 +42,14 @@ class ClampRule:
             low, high = self.box
             return np.flatnonzero(((nodes >= low) & (nodes <= high)).all(axis=1))
         return np.unique(np.asarray(self.nodes, dtype=np.int64))
+
+
+class MeshFile(FileModel):
+    """A volume mesh file and how to read it."""
+
+    file: Text = Field(description="Its path, relative to the folder of the jaw file")
+    scale: Number = Field(1.0, gt=0.0, description="Factor on its coordinates [-]; 0.001 for millimetres")
+    clamped: ClampRule = Field(description="Which of its nodes are clamped")
 
 
 def read_volume_mesh(path: Path | str, *, scale: float = 1.0, clamp: ClampRule) -> VolumeMesh:

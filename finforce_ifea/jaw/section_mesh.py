@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial import Delaunay, cKDTree
 
 from finforce_ifea.errors import MeshError
-from finforce_ifea.jaw.mesh import EDGES_TET10, VolumeMesh, build_volume_mesh
+from finforce_ifea.jaw.mesh import VolumeMesh, build_volume_mesh, to_tet10
 from finforce_ifea.jaw.section import Section
 
 # Size [m] of the elements of the default mesh, unless that makes too many, and of presets as a share of it.
@@ -228,9 +228,5 @@ def extrude_section(section: Section, share: float = 1.0) -> VolumeMesh:
     edges = [nodes[tets[:, k]] - nodes[tets[:, 0]] for k in (1, 2, 3)]
     flipped = np.einsum("ij,ij->i", np.cross(edges[0], edges[1]), edges[2]) < 0.0
     tets = np.where(flipped[:, None], tets[:, [0, 2, 1, 3]], tets)
-    sides, number = np.unique(np.sort(tets[:, EDGES_TET10].reshape(-1, 2), axis=1), axis=0, return_inverse=True)
-    tets = np.hstack([tets, len(nodes) + number.reshape(-1, 6)])
-    held = section.find_clamped(nodes[:, [0, 2]])
-    held = np.concatenate([held, held[sides].all(axis=1)])
-    nodes = np.vstack([nodes, nodes[sides].mean(axis=1)])
-    return build_volume_mesh(nodes=nodes, tets=tets, clamped=np.flatnonzero(held))
+    held = np.flatnonzero(section.find_clamped(nodes[:, [0, 2]]))
+    return to_tet10(build_volume_mesh(nodes=nodes, tets=tets, clamped=held))

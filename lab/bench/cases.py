@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
+from finforce_ifea.jaw.jaw_file import Material
 from finforce_ifea.observation import Contact, ObjectOutline, Observation
 
 TRUTH = Path(__file__).parents[1] / "data" / "pressed_bench.npz"
@@ -97,7 +98,7 @@ def load_cases(path: Path | str = TRUTH) -> tuple[BenchCase, ...]:
 def bench_finger() -> Jaw:
     """Return the bench jaw with the material of the truth."""
     jaw = load_jaw("bench")
-    return replace(jaw, material=replace(jaw.material, young_modulus=YOUNG_MODULUS, poisson_ratio=POISSON_RATIO))
+    return replace(jaw, material=Material(young_modulus=YOUNG_MODULUS, poisson_ratio=POISSON_RATIO))
 
 
 def record_press(case: BenchCase, jaw: Jaw, camera: NoisyCamera | None = None, seed: int = 0) -> ReplayedPress:

@@ -18,6 +18,7 @@ from tqdm import tqdm
 
 from finforce_ifea.jaw.calibration import load_calibration
 from finforce_ifea.jaw.jaw import Jaw, list_shipped_jaws, load_jaw
+from finforce_ifea.jaw.jaw_file import Material
 from finforce_ifea.mechanics import build_mechanics
 from finforce_ifea.settings import EstimatorSettings
 from lab.bench.cases import POISSON_RATIO, YOUNG_MODULUS, BenchCase, load_cases
@@ -69,7 +70,7 @@ def measure(quick: bool) -> Figures:
 def press_model(chosen: Model, cases: Sequence[BenchCase]) -> list[dict[str, Any]]:
     """Return a row for each case: errors of a model that is pressed as the truth was."""
     jaw = load_calibration(chosen.calibration).apply(load_jaw("bench")) if chosen.calibration else load_jaw("bench")
-    jaw = replace(jaw, material=replace(jaw.material, young_modulus=YOUNG_MODULUS, poisson_ratio=POISSON_RATIO))
+    jaw = replace(jaw, material=Material(young_modulus=YOUNG_MODULUS, poisson_ratio=POISSON_RATIO))
     mechanics = build_mechanics(jaw, EstimatorSettings(solver=chosen.solver, mesh=chosen.mesh))
     model, surface, rows = mechanics.model, mechanics.contact.surface, []
     for case in cases:

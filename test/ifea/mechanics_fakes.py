@@ -6,15 +6,15 @@ from functools import cache
 
 import meshio
 import numpy as np
+import trimesh
 import yaml
 
 from finforce_ifea.contact_mechanics.indenter import flat_profile
 from finforce_ifea.contact_mechanics.pressed_jaw import limit_step
-from finforce_ifea.fem.elements import to_tet4, to_tet10
 from finforce_ifea.fem.solid import find_mirror_nodes
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.jaw.jaw_file import Material
-from finforce_ifea.jaw.mesh import build_volume_mesh
+from finforce_ifea.jaw.mesh import build_volume_mesh, to_tet4, to_tet10
 from finforce_ifea.mechanics import build_mechanics
 from finforce_ifea.settings import EstimatorSettings
 from lab.forward_press import RigidCylinder, press_jaw
@@ -26,6 +26,11 @@ MODULUS, RATIO = 30e6, 0.45
 def build_jaw(modulus=MODULUS, ratio=RATIO):
     """The bench jaw of a material, Young's modulus [Pa] and Poisson's ratio."""
     return replace(SHIPPED_BENCH, material=Material(young_modulus=modulus, poisson_ratio=ratio))
+
+
+def compute_volume(mesh) -> float:
+    """Return the volume [m^3] that the surface of a volume mesh encloses."""
+    return trimesh.Trimesh(mesh.nodes, mesh.surface, process=False).volume
 
 
 def shoelace_area(corners):

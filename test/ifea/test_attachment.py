@@ -8,11 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from finforce_ifea.errors import MeshError
-from finforce_ifea.fem.elements import to_tet4, to_tet10
-from finforce_ifea.jaw.attachment import attach_points, attach_surface_points, find_closest_surface
+from finforce_ifea.jaw.attachment import attach_points, attach_surface_points, find_closest
 from finforce_ifea.jaw.drawing import Rib, mesh_drawing
 from finforce_ifea.jaw.jaw import load_jaw
-from finforce_ifea.jaw.mesh import build_volume_mesh, shape_gradients, shape_values
+from finforce_ifea.jaw.mesh import build_volume_mesh, shape_gradients, shape_values, to_tet4, to_tet10
 
 TILTED = replace(load_jaw("bench").drawing, ribs=(Rib(inner_z=0.02, outer_z=0.03, thickness=0.001),), clamped_z=0.002)
 HEXES = mesh_drawing(TILTED, "coarse")
@@ -108,14 +107,13 @@ def test_shape_gradients_are_the_derivatives_of_the_shape_values(count):
 @given(x=st.floats(-0.03, 0.03), y=st.floats(-0.02, 0.02), z=st.floats(-0.01, 0.09), seed=st.integers(0, 1000))
 def test_no_surface_point_is_closer_than_the_closest(x, y, z, seed):
     point = np.array([[x, y, z]])
-    closest = find_closest_surface(HEXES, point)
+    closest, distances = find_closest(HEXES, point)
     rng = np.random.default_rng(seed)
     corners = HEXES.nodes[HEXES.surface]
     samples = np.einsum("ts,tsi->ti", rng.dirichlet(np.ones(3), len(corners)), corners)
-    assert closest.distances[0] <= np.linalg.norm(samples - point, axis=1).min() + 1e-12
-    chosen = corners[closest.triangles[0]]
-    barycentric = np.linalg.lstsq(np.vstack([chosen.T, np.ones(3)]), np.append(closest.points[0], 1.0), rcond=None)[0]
-    assert (barycentric > -1e-6).all()
+    assert distances[0] <= np.linalg.norm(samples - point, axis=1).min() + 1e-12
+    assert distances[0] == pytest.approx(np.linalg.norm(closest[0] - point[0]), abs=1e-12)
+    assert find_closest(HEXES, closest)[1][0] < 1e-9
 
 
 def test_far_points_are_refused_by_number_place_and_distance():

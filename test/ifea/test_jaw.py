@@ -9,9 +9,9 @@ import yaml
 from mechanics_fakes import SHIPPED_BENCH, changed, content_of, write_jaw, write_mesh_jaw
 
 from finforce_ifea.errors import MeshError
-from finforce_ifea.fem.elements import to_tet10
 from finforce_ifea.fem.solid import find_mirror_nodes
 from finforce_ifea.jaw.jaw import list_shipped_jaws, load_jaw
+from finforce_ifea.jaw.mesh import to_tet10
 
 STEEL = load_jaw("steel")
 # As an independent finite-element program has them, in mm.

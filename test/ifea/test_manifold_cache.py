@@ -149,8 +149,8 @@ def test_name_depends_on_geometry_and_poissons_ratio_but_not_on_the_modulus(solv
     def name(jaw):
         return name_manifold(build_mechanics(jaw, EstimatorSettings(solver=solver, mesh="coarse")), jaw)
 
-    stiff = replace(BENCH, material=replace(BENCH.material, young_modulus=1e9))
-    squashy = replace(BENCH, material=replace(BENCH.material, poisson_ratio=0.3))
+    stiff = replace(BENCH, material=BENCH.material.model_copy(update={"young_modulus": 1e9}))
+    squashy = replace(BENCH, material=BENCH.material.model_copy(update={"poisson_ratio": 0.3}))
     assert name(stiff) == name(BENCH)
     assert len({name(BENCH), name(squashy), name(thicker(BENCH, 1.001))}) == 3
 
@@ -162,8 +162,8 @@ def test_models_and_meshes_have_equilibria_of_their_own():
 
 def test_both_jaws_of_a_gripper_share_their_equilibria(folder, monkeypatch):
     monkeypatch.setattr(manifold_cache, "build_manifold", lambda full, modulus, *_: build_rest(full, modulus))
-    left = replace(BENCH, material=replace(BENCH.material, poisson_ratio=0.377))
-    stiff = replace(left, material=replace(left.material, young_modulus=5e7))
+    left = replace(BENCH, material=BENCH.material.model_copy(update={"poisson_ratio": 0.377}))
+    stiff = replace(left, material=left.material.model_copy(update={"young_modulus": 5e7}))
     first, second, stiffer = (build_mechanics(jaw, COARSE) for jaw in (left, left.mirrored(), stiff))
     assert second.model.manifold is first.model.manifold
     assert stiffer.model.manifold.young_modulus == 5e7

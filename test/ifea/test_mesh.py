@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mechanics_fakes import shoelace_area
+from mechanics_fakes import compute_volume, shoelace_area
 
 from finforce_ifea.errors import JawFileError, MeshError
-from finforce_ifea.fem.elements import split_hexes, to_tet4, to_tet10
 from finforce_ifea.jaw.drawing import PRESETS, MeshDensity, Rib, mesh_drawing
 from finforce_ifea.jaw.jaw import load_jaw
-from finforce_ifea.jaw.mesh import FACES_HEX, FACES_TET, build_volume_mesh, compute_volume
+from finforce_ifea.jaw.mesh import FACES_HEX, FACES_TET, build_volume_mesh, split_hexes, to_tet4, to_tet10
 
 BENCH = load_jaw("bench").drawing
 CUBE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]], dtype=float)

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from finforce.errors import FinforceError
 from finforce_ifea.contact_mechanics.pressed_jaw import build_contact_surface
 from finforce_ifea.errors import MeshError
-from finforce_ifea.fem.elements import to_tet10
 from finforce_ifea.fem.solid import SolidModel
-from finforce_ifea.jaw.mesh import VolumeMesh, build_volume_mesh, check_connection
+from finforce_ifea.jaw.mesh import VolumeMesh, build_volume_mesh, check_connection, to_tet10
 from finforce_ifea.mechanics import LockingWarning, measure_shape, warn_of_locking
 from lab.forward_press import RigidCylinder, press_jaw
 

@@ -96,7 +96,8 @@ def test_jaw_that_has_lost_contact_comes_back_to_touch():
 
 
 def test_forces_are_in_proportion_to_the_modulus():
-    stiff = replace(BENCH, material=replace(BENCH.material, young_modulus=7.0 * BENCH.material.young_modulus))
+    modulus = 7.0 * BENCH.material.young_modulus
+    stiff = replace(BENCH, material=BENCH.material.model_copy(update={"young_modulus": modulus}))
     settings = EstimatorSettings(solver="reduced", mesh="coarse")
     place = (np.log(0.0125), 0.040, [0.005])
     [(_, soft)] = press(reduced().contact, RoundIndenter(), *place)

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
+from mechanics_fakes import compute_volume
 from section_fakes import BASE, LENGTH, MILLIMETRE, TPU, draw_keypoints, draw_polygon, make_section, write_section_jaw
 
 from finforce_ifea.errors import CalibrationError, JawFileError, MeshError
@@ -16,7 +17,6 @@ from finforce_ifea.fem.solid import SolidModel
 from finforce_ifea.jaw.calibration import Calibration
 from finforce_ifea.jaw.jaw import list_shipped_jaws, load_jaw
 from finforce_ifea.jaw.jaw_file import MATERIALS, Material
-from finforce_ifea.jaw.mesh import compute_volume
 from finforce_ifea.jaw.section_mesh import extrude_section, mesh_section
 from finforce_ifea.mechanics import build_mechanics
 from finforce_ifea.observation import Contact, Observation
@@ -257,7 +257,7 @@ def test_curved_face_has_the_solid_finger_s_force(curved):
 def test_force_on_a_curved_face_is_estimated(curved, height):
     """Key points of the plane model under a rod, by stored equilibria: within 3 % and three deviations."""
     settings = EstimatorSettings(solver="reduced", mesh="coarse", radius=0.0125, radius_log_stddev=0.05)
-    modelled = replace(curved, material=replace(curved.material, spread=0.0))
+    modelled = replace(curved, material=curved.material.model_copy(update={"spread": 0.0}))
     estimator = JawEstimator(modelled, settings=settings)
     mechanics = build_mechanics(modelled, replace(settings, solver="plane"))
     probe = mechanics.model.attach(curved.keypoints, 3e-3)

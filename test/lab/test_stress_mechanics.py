@@ -8,9 +8,8 @@ import pytest
 from mechanics_fakes import BENCH, MODULUS, bench_mechanics, block, build_jaw
 
 from finforce_ifea.errors import ContactError, MeshError
-from finforce_ifea.fem.elements import to_tet4, to_tet10
 from finforce_ifea.fem.model import SparseFactor, factorise_banded
-from finforce_ifea.jaw.mesh import build_volume_mesh, check_connection
+from finforce_ifea.jaw.mesh import build_volume_mesh, check_connection, to_tet4, to_tet10
 from finforce_ifea.mechanics import LockingWarning, build_mechanics, measure_locking, warn_of_locking
 from finforce_ifea.settings import EstimatorSettings
 from lab.forward_press import RigidCylinder, press_jaw
