@@ -99,10 +99,8 @@ class BenchPart:
 
 PARTS = (
     BenchPart(name="solvers", title="Run time against force error of the solver tiers", usual=True),
-    BenchPart(name="detection", title="Run time against pixel error of the key points", usual=True),
     BenchPart(name="chain", title="Latency against force error of the whole chain", usual=True),
     BenchPart(name="start", title="From a node's start until it is ready, and its memory"),
-    BenchPart(name="mechanics", title="Mechanics against an independent program, and the shipped fingers"),
     BenchPart(name="images", title="From images to forces on unseen scenes, beside true key points"),
     BenchPart(name="reconstruction", title="Reconstructed meshes: distance from the true ones"),
     BenchPart(name="driver_faults", title="Random faults between the gripper driver and an emulated gripper"),

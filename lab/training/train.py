@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from math import cos, pi
 from pathlib import Path
@@ -38,8 +38,8 @@ FINETUNING_DIM = 0.15  # probability of little light: less than in the first tra
 
 
 @dataclass(frozen=True, kw_only=True)
-class Schedule:
-    """How long and how fast a network is trained; a run ends after its minutes, whatever it has seen by then."""
+class Recipe:
+    """How long and how fast the network is trained; a run ends after its minutes, whatever it has seen by then."""
 
     minutes: float = setting(80.0, "time that training may take, evaluation included", "min", 0.01, 10_000.0)
     steps: int = setting(0, "batches until the end; 0: until the minutes are over, not repeatable", "", 0, 10**9)
@@ -51,76 +51,15 @@ class Schedule:
     clip: float = setting(5.0, "largest norm of the gradient", "", 1e-3, 1e6)
     threads: int = setting(1, "threads of the network's arithmetic", "", 1, 256)
     evaluate_every: float = setting(5.0, "time between evaluations and checkpoints", "min", 0.01, 10_000.0)
+    average: float = setting(0.998, "part of the averaged weights that stays in each step", "", 0.0, 0.99999)
+    workers: int = setting(1, "processes that make batches", "", 0, 256)
+    validation: int = setting(1000, "pictures that an evaluation uses", "", 1, 1_000_000)
 
     def __post_init__(self) -> None:
         check_bounds(self, RecipeError)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Recipe(Schedule):
-    """How the network of key points is trained."""
-
-    average: float = setting(0.998, "part of the averaged weights that stays in each step", "", 0.0, 0.99999)
-    workers: int = setting(1, "processes that make batches", "", 0, 256)
-    validation: int = setting(1000, "pictures that an evaluation uses", "", 1, 1_000_000)
-
-
-class Training:
-    """A network, its optimiser, and how far they are.
-
-    Args:
-        recipe: how to train.
-        network: that is trained.
-        about: what network it is, as a checkpoint says it.
-    """
-
-    def __init__(self, recipe: Schedule, network: Any, about: Mapping[str, Any]) -> None:
-        torch.set_num_threads(recipe.threads)
-        self.recipe, self.about = recipe, about
-        self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-        self.network = network.to(self.device, memory_format=torch.channels_last)
-        self.optimizer = torch.optim.AdamW(self.network.parameters(), lr=recipe.rate, weight_decay=recipe.decay)
-        self.parts = {"network": self.network, "optimizer": self.optimizer}
-        self.step, self.elapsed = 0, 0.0
-
-    @property
-    def progress(self) -> float:
-        """How much is done, 0 to 1: by steps where the recipe counts them."""
-        recipe = self.recipe
-        return min(self.step / recipe.steps if recipe.steps else self.elapsed / (60.0 * recipe.minutes), 1.0)
-
-    def descend(self, loss: Callable[[], torch.Tensor]) -> None:
-        """Take one step down a loss of the network in training mode, at the rate of the recipe."""
-        self.network.train()
-        for group in self.optimizer.param_groups:
-            group["lr"] = compute_rate(self.progress, self.recipe)
-        total = loss()
-        self.optimizer.zero_grad(set_to_none=True)
-        total.backward()
-        torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.recipe.clip)
-        self.optimizer.step()
-        self.step += 1
-
-    def save(self, folder: Path) -> None:
-        """Write the checkpoint of a run."""
-        states = {name: part.state_dict() for name, part in self.parts.items()}
-        save_checkpoint(folder / CHECKPOINT, {**self.about, "step": self.step, "elapsed": self.elapsed, **states})
-
-    def resume(self, checkpoint: Mapping[str, Any]) -> None:
-        """Go on from a checkpoint.
-
-        Raises:
-            CheckpointError: it is of another network.
-        """
-        told = {name: checkpoint.get(name) for name in self.about}
-        if told != self.about:
-            raise CheckpointError(f"got a checkpoint of {told}, expected one of {dict(self.about)}")
-        for name, part in self.parts.items():
-            part.load_state_dict(checkpoint[name])
-        self.step, self.elapsed = int(checkpoint["step"]), float(checkpoint["elapsed"])
-
-
-def compute_rate(progress: float, recipe: Schedule) -> float:
+def compute_rate(progress: float, recipe: Recipe) -> float:
     """Return the learning rate at a progress from 0 to 1: a linear rise, then half a cosine down to a hundredth."""
     if progress < recipe.warm_up:
         return recipe.rate * (0.02 + 0.98 * progress / recipe.warm_up)
@@ -135,54 +74,8 @@ def has_bfloat16(device: torch.device) -> bool:
     return bool(getattr(torch.cpu, "_is_amx_tile_supported", lambda: False)())
 
 
-def train(
-    training: Training,
-    learning: Iterator[Mapping[str, float]],
-    score: Callable[[], Mapping[str, float]],
-    folder: Path,
-) -> Mapping[str, float]:
-    """Train until the recipe's end, with a log of losses and scores and a checkpoint beside it.
-
-    Args:
-        training: of which `learning` takes one step after the other.
-        learning: losses of the steps by name.
-        score: measures how good the network is.
-        folder: of log and checkpoint.
-
-    Returns:
-        The score at the end.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    every = 60.0 * training.recipe.evaluate_every
-    began, due = time.monotonic() - training.elapsed, training.elapsed + every
-    shown: dict[str, float] = {}
-    with tqdm(total=100.0, desc="train", unit="%", bar_format="{l_bar}{bar}|{postfix}", disable=None) as bar:
-        while training.progress < 1.0:
-            for name, value in next(learning).items():
-                shown[name] = SMOOTHING * shown.get(name, value) + (1.0 - SMOOTHING) * value
-            training.elapsed = time.monotonic() - began
-            bar.update(100.0 * training.progress - bar.n)
-            bar.set_postfix({"step": training.step, **{name: f"{value:.3f}" for name, value in shown.items()}})
-            if training.elapsed >= due and training.progress < 1.0:
-                due += every
-                _report(training, shown, score(), folder)
-    final = score()
-    _report(training, shown, final, folder)
-    return final
-
-
-def _report(training: Training, shown: Mapping[str, float], score: Mapping[str, float], folder: Path) -> None:
-    """Add a line to the log, write the checkpoint."""
-    line: dict[str, float] = {"step": training.step, "minutes": round(training.elapsed / 60.0, 2)}
-    line |= {name: round(value, 5) for name, value in shown.items()} | dict(score)
-    with (folder / LOG).open("a", encoding="utf-8") as log:
-        log.write(json.dumps(line) + "\n")
-    tqdm.write(json.dumps(line))
-    training.save(folder)
-
-
-class FingerTraining(Training):
-    """The training of the network of key points, of which the averaged weights are kept.
+class FingerTraining:
+    """A network, its optimiser, its averaged weights, which are those that are kept, and how far they are.
 
     Args:
         recipe: how to train.
@@ -191,27 +84,49 @@ class FingerTraining(Training):
 
     def __init__(self, recipe: Recipe, network: FingerNetwork | None = None) -> None:
         torch.manual_seed(recipe.seed)
-        network = network or FingerNetwork()
-        super().__init__(recipe, network, {"shape": asdict(network.shape)})
+        torch.set_num_threads(recipe.threads)
+        self.recipe = recipe
+        self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        self.network = (network or FingerNetwork()).to(self.device, memory_format=torch.channels_last)
+        self.optimizer = torch.optim.AdamW(self.network.parameters(), lr=recipe.rate, weight_decay=recipe.decay)
         averaging = torch.optim.swa_utils
         self._averaging = averaging.AveragedModel(self.network, avg_fn=self._average, use_buffers=True)
-        self.averaged = self.parts["averaged"] = self._averaging.module
+        self.averaged = self._averaging.module
+        self.parts = {"network": self.network, "optimizer": self.optimizer, "averaged": self.averaged}
+        self.step, self.elapsed = 0, 0.0
+
+    @property
+    def progress(self) -> float:
+        """How much is done, 0 to 1: by steps where the recipe counts them."""
+        recipe = self.recipe
+        return min(self.step / recipe.steps if recipe.steps else self.elapsed / (60.0 * recipe.minutes), 1.0)
 
     def learn(self, batch: Batch) -> dict[str, float]:
         """Take one step on a batch and return its losses by name."""
-        losses = []
-
-        def measure() -> torch.Tensor:
-            losses.append(compute_losses(self.network, batch.to(self.device), low=has_bfloat16(self.device)))
-            return losses[0].total
-
-        self.descend(measure)
+        self.network.train()
+        for group in self.optimizer.param_groups:
+            group["lr"] = compute_rate(self.progress, self.recipe)
+        losses = compute_losses(self.network, batch.to(self.device), low=has_bfloat16(self.device))
+        self.optimizer.zero_grad(set_to_none=True)
+        losses.total.backward()
+        torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.recipe.clip)
+        self.optimizer.step()
         self._averaging.update_parameters(self.network)
-        return {name: float(getattr(losses[0], name).detach()) for name in losses[0].__dataclass_fields__}
+        self.step += 1
+        return {name: float(getattr(losses, name).detach()) for name in losses.__dataclass_fields__}
 
     def resume(self, checkpoint: Mapping[str, Any]) -> None:
-        """Go on from a checkpoint; see `Training`."""
-        super().resume(checkpoint | {"shape": asdict(shape_from(checkpoint["shape"]))})
+        """Go on from a checkpoint.
+
+        Raises:
+            CheckpointError: it is of another network.
+        """
+        told = shape_from(checkpoint["shape"])
+        if told != self.network.shape:
+            raise CheckpointError(f"got a checkpoint of {told}, expected one of {self.network.shape}")
+        for name, part in self.parts.items():
+            part.load_state_dict(checkpoint[name])
+        self.step, self.elapsed = int(checkpoint["step"]), float(checkpoint["elapsed"])
         self._averaging.n_averaged.fill_(self.step)
 
     def score(self, pictures: FingerPictures) -> Score:
@@ -220,13 +135,50 @@ class FingerTraining(Training):
 
     def train(
         self, pictures: FingerPictures, judging: FingerPictures, augmentation: AugmentSettings, folder: Path
-    ) -> None:
-        """Train on some pictures and be judged by others, which share no finger with them; see `train`."""
+    ) -> Score:
+        """Train until the recipe's end, with a log of losses and scores and a checkpoint beside it.
+
+        Args:
+            pictures: to learn from.
+            judging: by which it is judged; no finger is in both.
+            augmentation: of the pictures.
+            folder: of log and checkpoint.
+
+        Returns:
+            The score at the end.
+        """
+        folder.mkdir(parents=True, exist_ok=True)
         recipe = self.recipe
         batches = load_batches(
             pictures, augmentation, recipe.batch, workers=recipe.workers, seed=recipe.seed, first=self.step
         )
-        train(self, map(self.learn, batches), lambda: self.score(judging).as_row(), folder)
+        every = 60.0 * recipe.evaluate_every
+        began, due = time.monotonic() - self.elapsed, self.elapsed + every
+        shown: dict[str, float] = {}
+        with tqdm(total=100.0, desc="train", unit="%", bar_format="{l_bar}{bar}|{postfix}", disable=None) as bar:
+            while self.progress < 1.0:
+                for name, value in self.learn(next(batches)).items():
+                    shown[name] = SMOOTHING * shown.get(name, value) + (1.0 - SMOOTHING) * value
+                self.elapsed = time.monotonic() - began
+                bar.update(100.0 * self.progress - bar.n)
+                bar.set_postfix({"step": self.step, **{name: f"{value:.3f}" for name, value in shown.items()}})
+                if self.elapsed >= due and self.progress < 1.0:
+                    due += every
+                    self._report(shown, self.score(judging), folder)
+        final = self.score(judging)
+        self._report(shown, final, folder)
+        return final
+
+    def _report(self, shown: Mapping[str, float], score: Score, folder: Path) -> None:
+        """Add a line to the log, write the checkpoint."""
+        line: dict[str, float] = {"step": self.step, "minutes": round(self.elapsed / 60.0, 2)}
+        line |= {name: round(value, 5) for name, value in shown.items()} | score.as_row()
+        with (folder / LOG).open("a", encoding="utf-8") as log:
+            log.write(json.dumps(line) + "\n")
+        tqdm.write(json.dumps(line))
+        states = {name: part.state_dict() for name, part in self.parts.items()}
+        about = {"shape": asdict(self.network.shape), "step": self.step, "elapsed": self.elapsed}
+        save_checkpoint(folder / CHECKPOINT, about | states)
 
     def _average(self, kept: torch.Tensor, new: torch.Tensor, count: torch.Tensor) -> torch.Tensor:
         """Return the running average of a tensor; the first steps, of hardly trained weights, are forgotten fast."""

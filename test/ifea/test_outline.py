@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from box_fakes import RigidBox
 from estimator_fakes import (
     SHAPES,
     STDDEV,
@@ -32,7 +33,7 @@ from finforce_ifea.contact_mechanics.indenter import (
 )
 from finforce_ifea.errors import ContactError
 from finforce_ifea.observation import ObjectOutline
-from lab.forward_press import RigidBox, RigidCylinder, press_jaw
+from lab.forward_press import RigidCylinder, press_jaw
 
 FACE = BENCH.inner_face_x
 

@@ -1,40 +1,11 @@
-"""Claims about what further parts of the benchmark count: mechanics, meshes, faults."""
+"""Claims about what further parts of the benchmark count: meshes, faults."""
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from lab.bench import driver_faults, grasp_faults, images, mechanics, reconstruction
-from lab.bench.cases import load_cases
+from lab.bench import driver_faults, grasp_faults, images, reconstruction
 from lab.harness import format_figures
-
-
-def test_the_frame_is_as_stiff_as_the_independent_program():
-    case = next(case for case in load_cases() if case.name == "Ø25 middle")
-    model = next(model for model in mechanics.MODELS if model.solver == "frame")
-    (row,) = mechanics.press_model(model, [case])
-    assert abs(row["force, worst/%"]) < 1.0 and row["key points, worst/mm"] < 0.15
-    assert row["turn/mrad"] == pytest.approx(row["true turn/mrad"], rel=0.03)
-
-
-def test_the_summary_holds_the_largest_error_at_each_height():
-    rows = pd.DataFrame(
-        {
-            "model": ["a", "a", "b"],
-            "case": ["Ø15 lower", "Ø25 upper", "Ø15 lower"],
-            "force, worst/%": [-3.0, 2.0, 1.0],
-            "key points, worst/mm": [0.1, 0.4, 0.2],
-        }
-    )
-    a, b = mechanics.summarise(rows).to_dict("records")
-    assert (a["force, all/%"], a["force, upper/%"], a["key points, all/mm"]) == (3.0, 2.0, 0.4)
-    assert b["force, lower/%"] == 1.0 and np.isnan(b["force, upper/%"])
-
-
-def test_a_shipped_finger_is_described():
-    row = mechanics.describe_finger("bench")
-    assert row["size/mm"] == "28.0 x 20.0 x 80.0"
-    assert row["at half/N/mm"] == pytest.approx(0.29, abs=0.01)  # docs/fingers.md
 
 
 def test_a_method_that_gave_up_is_in_no_distance():
