@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,9 +15,9 @@ from finforce.camera import CameraIntrinsics
 from finforce.gripper_frames import BENCH_CAMERA, FRONT_CAMERA, HALF_TURN, ROBOT_CAMERA
 from finforce.stamps import NANOSECONDS
 from finforce.transforms import invert_pose
-from finforce_sim.gripper import FINGER, TwinGripper, TwinState
+from finforce_sim.gripper import FINGER, TwinGripper
 from finforce_sim.mechanics import Assembly
-from finforce_sim.photographer import DrawnJaw, Photographer, SceneSetting, Shot
+from finforce_sim.photographer import DrawnJaw, Photographer, SceneSetting, Shot, TrueJaw
 from finforce_sim.scenarios import Scenario, ScenarioError
 from finforce_sim.sensor import D405, LENSES, build_d405_vga
 
@@ -35,44 +35,17 @@ LEAST_SIZE, LARGEST_SIZE = 16, 4096  # [px]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class TrueJaw:
-    """The truth about one jaw in one image.
-
-    Attributes:
-        T_camera_jaw: (4, 4).
-        points: key points (K, 3) [m], jaw frame.
-        pixels: (K, 2) column and row in the raw image [px].
-        visible: (K,) bool.
-        force: (3,) [N] that the object applies to the jaw, jaw frame.
-        torque: (3,) [N m] about the origin of the jaw frame.
-    """
-
-    T_camera_jaw: NDArray
-    points: NDArray
-    pixels: NDArray
-    visible: NDArray
-    force: NDArray
-    torque: NDArray
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class TwinFrame:
+class TwinFrame(Shot):
     """One image and all that is recorded with it.
 
     Attributes:
         stamp: image time [ns].
         phase: as in `/bench/phase`.
-        color: (h, w, 3) uint8 RGB.
-        depth: (h, w) float32 [m], NaN invalid.
-        jaws: by side.
         T_camera_object: (4, 4) as a tracker measures it; None where it did not, or without an object.
     """
 
     stamp: int
     phase: str
-    color: NDArray
-    depth: NDArray
-    jaws: Mapping[str, TrueJaw]
     T_camera_object: NDArray | None
 
 
@@ -108,13 +81,10 @@ class Footage:
             period = int(state.stamp / TRACKING_PERIOD + 1e-5)
             tracked = state.T_gripper_object is not None and period > last
             last = period if tracked else last
-            shot = self._photographer.shoot(state)
             yield TwinFrame(
+                **vars(self._photographer.shoot(state)),
                 stamp=START + round(state.stamp * NANOSECONDS),
                 phase=state.phase,
-                color=shot.color,
-                depth=shot.depth,
-                jaws={side: true_jaw(state, shot, side) for side in state.jaws},
                 T_camera_object=disturb_pose(T_camera_gripper @ state.T_gripper_object, rng) if tracked else None,
             )
 
@@ -186,19 +156,6 @@ def parse_size(text: str, lens: str = D405) -> CameraIntrinsics:
         fy=scale * plain.fy,
         cx=scale * (plain.cx + 0.5) - 0.5,
         cy=scale * (plain.cy + 0.5) - 0.5 + shift,
-    )
-
-
-def true_jaw(state: TwinState, shot: Shot, side: str) -> TrueJaw:
-    """Return the truth about a jaw, without its reference point."""
-    truth, jaw = shot.truth[side], state.jaws[side]
-    return TrueJaw(
-        T_camera_jaw=truth.T_camera_jaw,
-        points=truth.points[:-1],
-        pixels=truth.pixels[:-1],
-        visible=truth.visible[:-1],
-        force=jaw.force,
-        torque=jaw.torque,
     )
 
 

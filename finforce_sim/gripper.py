@@ -123,9 +123,9 @@ class TwinGripper(Assembly):
             )
 
     def _jaw_state(self, side: str, posture: Posture, shape: JawShape, wrench: RelaxedWrench) -> JawState:
-        force, torque = wrench.update(shape.force, shape.torque, 1.0 / self.scenario.rate)
+        relaxed = wrench.update(Wrench(shape.force, shape.torque), 1.0 / self.scenario.rate)
         place = {"origin_x": self.origin_x(side, posture), "reference": self._jaws[side].jaw.reference_point}
-        return JawState(**vars(replace(shape, force=force, torque=torque)), **place)
+        return JawState(**vars(shape) | relaxed._asdict() | place)
 
 
 STEP = 1e-4  # [m] of each jaw from one solved grasp to the next
@@ -159,15 +159,32 @@ class PressedGrasp:
         """
         self.assembly = assembly = Assembly(scenario, seed, density)
         self._reach = assembly.touch_origin - assembly.inner_face_x  # of each jaw, from touch to closed
-        solved = _solve_grasps(assembly, step)
-        self._closings = np.array([one.closing for one in solved])
-        self._places = np.array([one.x for one in solved])
-        self._tables = {side: _stack_shapes([one.shapes[side] for one in solved]) for side in assembly.jaws}
+        self._solve(step)
         sizes = np.array([np.linalg.norm(table.force, axis=1) for table in self._tables.values()])
         self._forces = sizes.min(axis=0)
         is_empty = assembly.object_mesh is None
         self.touch_opening = -np.inf if is_empty else 2.0 * self._reach
         self.least_opening = 0.0 if is_empty else float(2.0 * (self._reach - self._closings[-1]))
+
+    def _solve(self, step: float) -> None:
+        """Solve grasps from first touch on, at most `step` [m] of closing apart; without an object the jaws at rest."""
+        held, solved, places = self.assembly.hold_object(), [], []
+        closings = np.linspace(0.0, self._reach, int(np.ceil(self._reach / step)) + 1) if held else np.zeros(1)
+        for closing in closings:
+            try:
+                setting = self.assembly.setting_of(Posture(closing=float(closing)))
+                solved.append(held.follow(setting) if held else self.assembly.rest_shapes())
+            except BalanceError:
+                if len(solved) < 2:
+                    raise
+                break
+            places.append(held.x if held else 0.0)
+        self._closings, self._places = closings[: len(solved)], np.array(places)
+        self._tables = {side: _stack_shapes([shapes[side] for shapes in solved]) for side in self.assembly.jaws}
+
+    def relaxation(self) -> dict[str, RelaxedWrench]:
+        """Return by side what makes of a jaw's elastic wrenches those of its material, which begins relaxed."""
+        return {side: RelaxedWrench(self.assembly.material.terms) for side in self.assembly.jaws}
 
     def closing_at(self, opening: float) -> float:
         """Return how far each jaw is beyond first touch [m] at an opening [m], negative before."""
@@ -240,61 +257,6 @@ class PressedGrasp:
         low = min(int(place), max(len(rows) - 2, 0))
         share, high = place - low, min(low + 1, len(rows) - 1)
         return (1.0 - share) * rows[low] + share * rows[high]
-
-
-class RelaxedGrasp:
-    """The wrenches of a grasp as the jaws' material gives way in time."""
-
-    def __init__(self, grasp: PressedGrasp) -> None:
-        """Start relaxed and without load."""
-        self._grasp = grasp
-        terms = grasp.assembly.material.terms
-        self._filters = {side: RelaxedWrench(terms) for side in grasp.assembly.jaws}
-        self.wrenches: Mapping[str, Wrench] = {
-            side: Wrench(force=np.zeros(3), torque=np.zeros(3)) for side in self._filters
-        }
-
-    def update(self, opening: float, dt: float) -> Mapping[str, Wrench]:
-        """Return the wrench on each jaw at an opening [m], reached on a straight way in dt [s]."""
-        elastic = self._grasp.wrenches(opening)
-        relaxed = {}
-        for side, wrench in elastic.items():
-            force, torque = self._filters[side].update(wrench.force, wrench.torque, dt)
-            relaxed[side] = Wrench(force=force, torque=torque)
-        self.wrenches = relaxed
-        return relaxed
-
-    @property
-    def force(self) -> float:
-        """The grasp force [N] of the last update: that of the jaw pressed less."""
-        return float(min(np.linalg.norm(wrench.force) for wrench in self.wrenches.values()))
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _SolvedGrasp:
-    """A closing beyond touch [m], the object's x [m] and the jaws' shapes there."""
-
-    closing: float
-    x: float
-    shapes: Mapping[str, JawShape]
-
-
-def _solve_grasps(assembly: Assembly, step: float) -> list[_SolvedGrasp]:
-    """Return grasps from first touch on, at most `step` [m] of closing apart; the jaws at rest without an object."""
-    held, solved = assembly.hold_object(), []
-    if held is None:
-        return [_SolvedGrasp(closing=0.0, x=0.0, shapes=assembly.rest_shapes())]
-    reach = assembly.touch_origin - assembly.inner_face_x
-    for closing in np.linspace(0.0, reach, int(np.ceil(reach / step)) + 1):
-        posture = Posture(closing=float(closing))
-        try:
-            shapes = held.follow(assembly.setting_of(posture))
-        except BalanceError:
-            if len(solved) < 2:
-                raise
-            break
-        solved.append(_SolvedGrasp(closing=float(closing), x=held.x, shapes=shapes))
-    return solved
 
 
 def _stack_shapes(shapes: Sequence[JawShape]) -> JawShape:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import partial
-from typing import Generic, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,23 +14,18 @@ from numpy.typing import NDArray
 from finforce.camera import CameraIntrinsics
 from finforce.transforms import invert_pose
 from finforce_ifea.grasp_force import Wrench
-from finforce_sim.emulator.adapter import EmulatedAdapter
-from finforce_sim.emulator.firmware import EmulatedGripper
 from finforce_sim.emulator.mechanism import STROKE
-from finforce_sim.emulator.pty_port import PtyPort
-from finforce_sim.footage import FINGER, TwinFrame, disturb_pose, set_stage, true_jaw
-from finforce_sim.gripper import PressedGrasp, RelaxedGrasp
-from finforce_sim.photographer import Photographer
+from finforce_sim.footage import FINGER, disturb_pose, set_stage
+from finforce_sim.gripper import PressedGrasp
+from finforce_sim.photographer import Photographer, Shot
 from finforce_sim.scenarios import Scenario, ScenarioError
 from finforce_sim.sensor import build_d405_vga
 
-T = TypeVar("T")
 LEAST_CLEARANCE = 2e-3  # [m] of opening that the open gripper leaves around the object
 TRACKED_EVERY = 3  # images: the object is tracked at 10 Hz
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Moment(Generic[T]):
+class Moment(NamedTuple):
     """What is seen and what is true when an image is taken.
 
     Attributes:
@@ -40,19 +34,19 @@ class Moment(Generic[T]):
         T_camera_object: (4, 4) as a tracker measures it; None where it did not, or without an object.
     """
 
-    picture: T
+    picture: Any
     wrenches: Mapping[str, Wrench]
     T_camera_object: NDArray | None
 
 
-class LiveScene(Generic[T]):
+class LiveScene:
     """A grasp that follows a gripper's opening.
 
     Attributes:
         grasp: what is rendered.
         camera: intrinsics.
         depth_step: of the depth images [m].
-        table: the images that were rendered; None before.
+        openings: (n,) at which images were rendered, growing [m]; none before.
 
     Args:
         grasp: what is rendered.
@@ -71,24 +65,30 @@ class LiveScene(Generic[T]):
             )
         self.grasp = grasp
         self.camera, self.depth_step = photographer.setting.camera, photographer.setting.depth_step
-        self.table: ImageTable[T] | None = None
+        self.openings, self._takes = np.zeros(0), []
         self._photographer = photographer
-        self._relaxed = RelaxedGrasp(grasp)
+        self._relaxation = grasp.relaxation()
         self._T_camera_gripper = invert_pose(photographer.setting.T_gripper_camera)
         self._rng = np.random.default_rng((seed, 3))
         self._count, self._last = 0, None
 
-    def render(self, keep: Callable[[TwinFrame], T], tell: Callable[[int, int], None]) -> None:
+    def render(self, keep: Callable[[Shot], Any], tell: Callable[[int, int], None]) -> None:
         """Take the images at all openings of the gripper; see `render_openings`."""
         openings = choose_openings(self.grasp, 0.0, STROKE)
-        self.table = render_openings(self.grasp, self._photographer, openings, keep, tell)
+        self._takes = render_openings(self.grasp, self._photographer, openings, keep, tell)
+        self.openings = openings
 
-    def take(self, opening: float, now: float) -> Moment[T]:
+    def find(self, opening: float) -> int:
+        """Return the place of the image that was taken nearest to an opening [m]."""
+        return int(np.abs(self.openings - opening).argmin())
+
+    def take(self, opening: float, now: float) -> Moment:
         """Return the moment at an opening [m], at a time [s] that never goes back; `render` comes first."""
-        place = self.table.find(opening)
-        takes = self.table.takes[place]
-        wrenches = self._relaxed.update(opening, 0.0 if self._last is None else now - self._last)
-        T_gripper_object = self.grasp.object_pose(float(self.table.openings[place]))
+        place = self.find(opening)
+        takes, dt = self._takes[place], 0.0 if self._last is None else now - self._last
+        wrenches = self.grasp.wrenches(opening)
+        wrenches = {side: self._relaxation[side].update(wrench, dt) for side, wrench in wrenches.items()}
+        T_gripper_object = self.grasp.object_pose(float(self.openings[place]))
         tracked = T_gripper_object is not None and self._count % TRACKED_EVERY == 0
         picture = takes[self._count % len(takes)]
         self._count, self._last = self._count + 1, now
@@ -125,23 +125,6 @@ MOST_WORKERS = 4  # threads, of which each renders an image
 _APART = 10.0  # [s] between the stamps that seed the noise, too far for motion blur
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ImageTable(Generic[T]):
-    """Images by opening, in whatever form they were kept.
-
-    Attributes:
-        openings: (n,) [m], growing.
-        takes: n lists of the same opening's images.
-    """
-
-    openings: NDArray
-    takes: Sequence[Sequence[T]]
-
-    def find(self, opening: float) -> int:
-        """Return the place of the image that was taken nearest to an opening [m]."""
-        return int(np.abs(self.openings - opening).argmin())
-
-
 def choose_openings(grasp: PressedGrasp, low: float, high: float) -> NDArray:
     """Return the openings (n,) [m] between two of a gripper's [m] that deserve an image.
 
@@ -157,71 +140,30 @@ def render_openings(
     grasp: PressedGrasp,
     photographer: Photographer,
     openings: NDArray,
-    keep: Callable[[TwinFrame], T],
+    keep: Callable[[Shot], Any],
     tell: Callable[[int, int], None] = lambda done, count: None,
-) -> ImageTable[T]:
-    """Return the images of a grasp.
+) -> list[list[Any]]:
+    """Return for each opening what is kept of its images.
 
     Args:
         grasp: what is rendered.
         photographer: that renders it.
         openings: (n,) [m], growing.
-        keep: makes of an image what is kept of it; its wrenches are elastic, and it has no stamp and no object's pose.
+        keep: makes of an image what is kept of it; its wrenches are elastic.
         tell: hears how many openings of how many are done; what it raises ends the rendering.
     """
     render = partial(_render_opening, grasp, photographer)
     takes, pool = [], ThreadPoolExecutor(min(os.cpu_count() or 1, MOST_WORKERS))
     try:
-        for frames in pool.map(render, openings.tolist(), range(len(openings))):
+        for shots in pool.map(render, openings.tolist(), range(len(openings))):
             tell(len(takes) + 1, len(openings))
-            takes.append([keep(frame) for frame in frames])
+            takes.append([keep(shot) for shot in shots])
     finally:
         pool.shutdown(cancel_futures=True)
-    return ImageTable(openings=openings, takes=takes)
+    return takes
 
 
-def _render_opening(grasp: PressedGrasp, photographer: Photographer, opening: float, index: int) -> list[TwinFrame]:
+def _render_opening(grasp: PressedGrasp, photographer: Photographer, opening: float, index: int) -> list[Shot]:
     """Return all takes at one opening [m]."""
-    state = grasp.state(opening)
-    view, frames = photographer.look(state), []
-    for take in range(TAKES):
-        shot = photographer.develop(view, _APART * (TAKES * index + take))
-        jaws = {side: true_jaw(state, shot, side) for side in state.jaws}
-        frames.append(TwinFrame(stamp=0, phase="", color=shot.color, depth=shot.depth, jaws=jaws, T_camera_object=None))
-    return frames
-
-
-class CoupledGripper:
-    """A gripper that any driver can open by a link, and that closes on the object of a grasp.
-
-    Args:
-        grasp: what its jaws press on, before anything relaxes.
-        link: path of a symbolic link to the port; empty: none, the port has a name of its own.
-        variant: of the firmware, "new" or "old".
-    """
-
-    def __init__(self, grasp: PressedGrasp, link: str, variant: str = "new") -> None:
-        self.gripper = EmulatedGripper(variant, load=grasp.elastic_force)
-        self._port = PtyPort(EmulatedAdapter(self.gripper), link or None)
-
-    @property
-    def opening(self) -> float:
-        """The true opening between the undeformed inner faces [m]."""
-        return self.gripper.jaws.opening
-
-    @property
-    def path(self) -> str:
-        """What a driver opens."""
-        return self._port.path
-
-    def open(self) -> None:
-        """Make the port and start the gripper.
-
-        Raises:
-            LinkError: something that is no link lies where the link should be.
-        """
-        self._port.open()
-
-    def close(self) -> None:
-        """Stop the gripper and remove the port; may be called again."""
-        self._port.close()
+    view = photographer.look(grasp.state(opening))
+    return [photographer.develop(view, _APART * (TAKES * index + take)) for take in range(TAKES)]

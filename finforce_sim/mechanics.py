@@ -15,7 +15,7 @@ from finforce_ifea.contact_mechanics.indenter import OutlineIndenter, PenaltyCon
 from finforce_ifea.contact_mechanics.pressed_jaw import build_contact_surface, limit_step, profile_surface
 from finforce_ifea.fem.model import JawModel
 from finforce_ifea.fem.solid import SolidModel
-from finforce_ifea.grasp_force import R_GRIPPER_JAW
+from finforce_ifea.grasp_force import R_GRIPPER_JAW, Wrench
 from finforce_ifea.jaw.drawing import MeshDensity
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE, Jaw, load_jaw
 from finforce_ifea.jaw.jaw_file import Material
@@ -554,7 +554,7 @@ class RelaxedWrench:
         """Start relaxed."""
         self._force, self._torque = Relaxation(terms), Relaxation(terms)
 
-    def update(self, force: NDArray, torque: NDArray, dt: float) -> tuple[NDArray, NDArray]:
-        """Return force (3,) [N] and torque (3,) [N m] for the elastic ones, dt [s] later; no torque without force."""
-        relaxed, turned = self._force.update(force, dt), self._torque.update(torque, dt)
-        return relaxed, turned if relaxed.any() else np.zeros(3)
+    def update(self, elastic: Wrench, dt: float) -> Wrench:
+        """Return the wrench for an elastic one, dt [s] later; no torque without force."""
+        force, torque = self._force.update(elastic.force, dt), self._torque.update(elastic.torque, dt)
+        return Wrench(force=force, torque=torque if force.any() else np.zeros(3))

@@ -20,6 +20,9 @@ from finforce.ros import node as ros
 from finforce.settings import setting
 from finforce.transforms import pose_numbers
 from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
+from finforce_sim.emulator.adapter import EmulatedAdapter
+from finforce_sim.emulator.firmware import EmulatedGripper
+from finforce_sim.emulator.pty_port import PtyPort
 from finforce_sim.footage import (
     Footage,
     TwinFrame,
@@ -29,7 +32,8 @@ from finforce_sim.footage import (
     info_fields,
     parse_size,
 )
-from finforce_sim.live import CoupledGripper, LiveScene, build_live_scene
+from finforce_sim.live import LiveScene, build_live_scene
+from finforce_sim.photographer import Shot
 from finforce_sim.scenarios import RATE, Scenario, build_scenario
 from finforce_sim.sensor import Flicker
 
@@ -63,7 +67,7 @@ class TwinCameraNode(Node):
         self.parameters = parameters = ros.declare_record(self, TwinParameters)
         ros.name_unknown_parameters(self)
         ros.warn_first_start(self)
-        self.gripper: CoupledGripper | None = None
+        self.gripper: EmulatedGripper | None = None
         self.scene = (build_live if parameters.gripper_link else build)(
             parameters.scenario,
             parameters.seed,
@@ -72,7 +76,8 @@ class TwinCameraNode(Node):
             depth_step=parameters.depth_step,
         )
         if parameters.gripper_link:
-            self.gripper = CoupledGripper(self.scene.grasp, parameters.gripper_link, parameters.gripper_firmware)
+            self.gripper = EmulatedGripper(parameters.gripper_firmware, load=self.scene.grasp.elastic_force)
+            self.port = PtyPort(EmulatedAdapter(self.gripper), parameters.gripper_link)
         self.images: list[list[Output]] = []
         self.is_over = False
         self._next, self._phase, self._told = 0, "", monotonic()
@@ -84,8 +89,8 @@ class TwinCameraNode(Node):
         name = self.parameters.scene
         if self.gripper is not None:
             self.scene.render(lambda frame: list(self._seen(frame)), self._tell)
-            self.gripper.open()
-            self.get_logger().info(f"{name}: playing as the gripper at {self.gripper.path} moves")
+            self.port.open()
+            self.get_logger().info(f"{name}: playing as the gripper at {self.port.path} moves")
         else:
             for frame in self.scene:
                 self._tell(len(self.images) + 1, len(self.scene))
@@ -105,7 +110,7 @@ class TwinCameraNode(Node):
     def destroy_node(self) -> None:
         """Remove the gripper's port, and the node."""
         if self.gripper is not None:
-            self.gripper.close()
+            self.port.close()
         super().destroy_node()
 
     def _follow_script(self) -> Iterable[Output]:
@@ -119,7 +124,7 @@ class TwinCameraNode(Node):
 
     def _follow_gripper(self) -> Iterable[Output]:
         """Return the image of the gripper as it is now."""
-        moment = self.scene.take(self.gripper.opening, monotonic())
+        moment = self.scene.take(self.gripper.jaws.opening, monotonic())
         for _, message in moment.picture:
             if isinstance(message, Image):
                 self._flicker.lay(np.frombuffer(message.data, PIXEL_TYPES[message.encoding]), id(message))
@@ -149,7 +154,7 @@ class TwinCameraNode(Node):
             header = Header(frame_id=self.parameters.camera_frame)
             yield self._output(PoseStamped, "object_pose"), ros.pose_message(header, pose_numbers(T_camera_object))
 
-    def _seen(self, frame: TwinFrame) -> Iterable[Output]:
+    def _seen(self, frame: Shot) -> Iterable[Output]:
         """Yield publishers and messages of an image, after the key points in it."""
         for side, jaw in frame.jaws.items():
             cloud = ros.cloud_message(Header(frame_id=f"{side}_jaw"), detection_truth_columns(jaw))
@@ -161,7 +166,7 @@ class TwinCameraNode(Node):
         yield self._output(Image, DEPTH_TOPIC), ros.image_message(header, depth, "16UC1")
         yield self._output(Image, COLOR_TOPIC), ros.image_message(header, frame.color)
 
-    def _detected(self, frame: TwinFrame) -> Iterable[Output]:
+    def _detected(self, frame: Shot) -> Iterable[Output]:
         """Yield publishers and messages of what a detector without errors finds."""
         for side, jaw in frame.jaws.items():
             header = Header(frame_id=self.parameters.camera_frame)

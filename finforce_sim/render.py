@@ -293,20 +293,12 @@ class Picture:
     Attributes:
         color: (h, w, 3) linear light.
         depth: (h, w) true depth of the pixels' centres [m].
-        owner: (h, w) int16 index of the body seen at the pixels' centres, -1 for the background.
+        owner: (h, w) index of the body seen at the pixels' centres, -1 for the background.
     """
 
     color: NDArray
     depth: NDArray
     owner: NDArray
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Window:
-    """Rows and columns of an image that are rendered; the rest stays black and at FAR."""
-
-    rows: slice
-    columns: slice
 
 
 class RenderedScene:
@@ -338,10 +330,9 @@ class RenderedScene:
             self._tensor(vertices.astype(np.float32)), self._tensor(self._triangles.astype(np.uint32))
         )
 
-    def render(self, camera: CameraIntrinsics, window: Window | None = None) -> Picture:
-        """Return the image of a camera; pixels with an edge in them are the mean of four rays."""
-        rows, columns = (window.rows, window.columns) if window else (slice(None), slice(None))
-        rays = compute_rays(camera)[rows, columns]
+    def render(self, camera: CameraIntrinsics, rows: slice = slice(None)) -> Picture:
+        """Return some rows of the image of a camera; pixels with an edge in them are the mean of four rays."""
+        rays = compute_rays(camera)[rows]
         shape = rays.shape[:2]
         flat = rays.reshape(-1, 3)
         blind = np.isnan(flat).any(axis=1)  # beyond what a fisheye can show
@@ -351,19 +342,11 @@ class RenderedScene:
         rough = _find_edges(hits.depth.reshape(shape), hits.surface.reshape(shape), hits.owner.reshape(shape))
         at = np.flatnonzero(rough)
         row, column = np.divmod(at, shape[1])
-        pixels = np.column_stack((column + (columns.start or 0), row + (rows.start or 0)))
+        pixels = np.column_stack((column, row + (rows.start or 0)))
         fine = np.nan_to_num(rays_from_pixels((pixels[:, None] + SUBPIXELS).reshape(-1, 2), camera), nan=1.0)
         color[at] = self._shade(fine, self._cast(fine)).reshape(-1, len(SUBPIXELS), 3).mean(axis=1)
         color[blind], hits.depth[blind], hits.owner[blind] = 0.0, FAR, -1
-        picture = Picture(
-            color=np.zeros((camera.height, camera.width, 3)),
-            depth=np.full((camera.height, camera.width), FAR),
-            owner=np.full((camera.height, camera.width), -1, dtype=np.int16),
-        )
-        picture.color[rows, columns] = color.reshape(*shape, 3)
-        picture.depth[rows, columns] = hits.depth.reshape(shape)
-        picture.owner[rows, columns] = hits.owner.reshape(shape)
-        return picture
+        return Picture(color=color.reshape(*shape, 3), depth=hits.depth.reshape(shape), owner=hits.owner.reshape(shape))
 
     def sees(self, points: NDArray, tolerance: float = 0.5e-3) -> NDArray:
         """Say of which points (n, 3) [m], camera frame, nothing stands before them by more than a tolerance [m]."""

@@ -1,4 +1,4 @@
-"""The subcommands `twin list` and `twin record`: a synthetic scene as a recording with its truth, and a preview."""
+"""The subcommands `twin list` and `twin record`: a synthetic scene as a recording with its truth."""
 
 from __future__ import annotations
 
@@ -14,17 +14,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce.optional import import_cv2, import_trimesh
+from finforce.optional import import_trimesh
 from finforce.transforms import pose_numbers, quaternion_from_pose
 from finforce_eval.cli.parser import Parser, whole_number
-from finforce_eval.errors import OptionError, RecordingError
+from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.keypoint_source import parse_changes
 from finforce_eval.recordings.images import (
     CAMERA_INFO,
     COMPRESSED,
     DEPTH_FORMAT,
     IMAGE,
-    QUALITY,
     compress_depth,
     encode_color,
 )
@@ -42,7 +41,6 @@ from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 from finforce_sim.footage import (
     FINGER,
     Footage,
-    TrueJaw,
     TwinFrame,
     build_footage,
     detection_truth_columns,
@@ -50,6 +48,7 @@ from finforce_sim.footage import (
     info_fields,
     parse_size,
 )
+from finforce_sim.photographer import TrueJaw
 from finforce_sim.scenarios import SCENARIOS, Scenario, build_scenario, write_script
 
 
@@ -75,12 +74,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     record.add_argument("--size", default="640x480", metavar="WxH", help="of the images (640x480)")
     text = "change a number of the scene, may be repeated; an unknown NAME lists them"
     record.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help=text)
-    kind = record.add_mutually_exclusive_group()
-    kind.add_argument("--compressed", action="store_true", help="jpeg colour and png depth (as it is without --raw)")
-    kind.add_argument("--raw", action="store_true", help="plain images, 46 MB a second")
-    record.add_argument("--quality", type=int, default=90, metavar="N", help="of the jpegs, 1 to 95 (90)")
-    text = "leave depth beyond so many metres away, which makes a recording smaller"
-    record.add_argument("--farthest", type=float, default=float("inf"), metavar="M", help=text)
+    text = "write plain images, 46 MB a second; without it jpeg colour and png depth"
+    record.add_argument("--raw", action="store_true", help=text)
     record.add_argument("--storage", default="mcap", choices=("mcap", "sqlite3"), help="format of the recording")
     record.set_defaults(run=run_record)
 
@@ -106,7 +101,7 @@ def _short(value: Any) -> str:
 
 
 def run_record(options: argparse.Namespace) -> None:
-    """Render a scene and write the recording, its mesh, its `case.json` and a preview.
+    """Render a scene and write the recording, its mesh and its `case.json`.
 
     Raises:
         FinforceError: an option or the scene cannot be used, or the folder exists.
@@ -115,22 +110,10 @@ def run_record(options: argparse.Namespace) -> None:
     check_new(folder)
     scenario = scenario_from_options(options)
     camera = parse_size(options.size, options.lens)
-    if min(options.seed, options.finger) < 0:
-        raise OptionError(f"--seed {options.seed} --finger {options.finger}: expected numbers from 0")
-    if not 1 <= options.quality <= 95:
-        raise OptionError(f"--quality {options.quality}: expected 1 to 95")
-    if not options.farthest > 0.0:
-        raise OptionError(f"--farthest {options.farthest:g}: expected a distance above 0 [m]")
-    form = RecordingForm(
-        compressed=not options.raw,
-        quality=options.quality,
-        farthest=options.farthest,
-        storage=options.storage,
-        depth_step=1e-3 * options.depth_step,
-    )
+    form = RecordingForm(compressed=not options.raw, storage=options.storage, depth_step=1e-3 * options.depth_step)
     record_scene(scenario, options.seed, folder, camera=camera, form=form, finger=options.finger)
     size = sum(path.stat().st_size for path in folder.iterdir()) / 1e6
-    print(f"Recording: {folder} ({size:.1f} MB), preview: {folder / PREVIEW}")
+    print(f"Recording: {folder} ({size:.1f} MB)")
     print(f"Score it with: finforce evaluate {folder} --from images")
 
 
@@ -182,14 +165,12 @@ class RecordingForm:
 
     Attributes:
         compressed: jpeg colour and png depth; else plain images.
-        quality: of a jpeg, 1 to 95.
-        farthest: depth beyond it is left away, which makes a recording smaller [m].
+        farthest: depth beyond it is left out, which makes a recording smaller [m].
         storage: "mcap" or "sqlite3".
         depth_step: of the depth image [m], that of the footage.
     """
 
     compressed: bool = True
-    quality: int = QUALITY
     farthest: float = math.inf
     storage: str = "mcap"
     depth_step: float = 1e-3
@@ -274,7 +255,7 @@ def _image_entries(frame: TwinFrame, footage: Footage, form: RecordingForm) -> I
     yield Entry(stamp, INFO_TOPIC, make_message(CAMERA_INFO, **told, **info_fields(footage.camera)))
     steps = encode_depth(np.where(frame.depth <= form.farthest, frame.depth, np.nan), footage.depth_step)
     if form.compressed:
-        color = encode_color(frame.color, quality=form.quality)
+        color = encode_color(frame.color)
         yield Entry(stamp, f"{COLOR_TOPIC}/compressed", _packed(told, "rgb8; jpeg compressed bgr8", color))
         yield Entry(stamp, f"{DEPTH_TOPIC}/compressedDepth", _packed(told, DEPTH_FORMAT, compress_depth(steps)))
     else:
@@ -293,9 +274,6 @@ def _plain(told: Mapping[str, Any], encoding: str, pixels: NDArray) -> Any:
     return make_message(IMAGE, **told, **size, encoding=encoding, data=pixels.reshape(-1).view(np.uint8))
 
 
-PREVIEW = "preview.jpg"
-
-
 def record_scene(
     scenario: Scenario, seed: int, folder: Path, *, camera: Any, form: RecordingForm, finger: int = FINGER
 ) -> None:
@@ -303,7 +281,6 @@ def record_scene(
     from tqdm import tqdm
 
     footage = build_footage(scenario, seed, camera, finger=finger, depth_step=form.depth_step)
-    preview = Preview(len(footage))
     case = {
         "scene": scenario.name,
         "seed": seed,
@@ -312,72 +289,4 @@ def record_scene(
         "object": {"kind": scenario.object},
     }
     with tqdm(total=len(footage), unit="image", desc=scenario.name, disable=None, leave=False) as bar:
-
-        def seen(frame: Any) -> None:
-            preview.take(frame)
-            bar.update()
-
-        write_footage(footage, folder, form=form, case=case, seen=seen)
-    preview.save(folder / PREVIEW)
-
-
-COUNT, COLUMNS = 6, 2
-WIDEST = 320  # [px] of an image in the picture
-VISIBLE, HIDDEN = (60, 230, 90), (235, 60, 60)
-ARM = 3  # [px] of the cross at a key point
-NEAR, FAR = 0.07, 0.25  # [m] of the depth that is drawn from bright to dark
-
-
-class Preview:
-    """Keeps a few images, evenly spread, and draws them with their depth.
-
-    Args:
-        frames: how many images there will be.
-    """
-
-    def __init__(self, frames: int) -> None:
-        self._wanted = set(np.linspace(0, frames - 1, min(COUNT, frames)).round().astype(int).tolist())
-        self._next, self._tiles = 0, []
-
-    def take(self, frame: TwinFrame) -> None:
-        """Take the next image."""
-        if self._next in self._wanted:
-            step = -(-frame.color.shape[1] // WIDEST)
-            tile = np.hstack((draw_keypoints(frame, step), draw_depth(frame.depth[::step, ::step])))
-            self._tiles.append(tile)
-        self._next += 1
-
-    def save(self, path: Path) -> None:
-        """Write what was kept; nothing without images."""
-        from PIL import Image
-
-        if not self._tiles:
-            return
-        missing = -len(self._tiles) % COLUMNS if len(self._tiles) > COLUMNS else 0
-        tiles = [*self._tiles, *[np.zeros_like(self._tiles[0])] * missing]
-        columns = min(COLUMNS, len(tiles))
-        rows = [np.hstack(tiles[begin : begin + columns]) for begin in range(0, len(tiles), columns)]
-        Image.fromarray(np.vstack(rows)).save(path)
-
-
-def draw_keypoints(frame: TwinFrame, step: int = 1) -> NDArray[np.uint8]:
-    """Return the image with a cross at each true key point, green where it is visible, else red.
-
-    Args:
-        frame: with an image (h, w, 3).
-        step: every how many of its pixels are drawn.
-    """
-    cv2, picture = import_cv2(), np.array(frame.color[::step, ::step])
-    for jaw in frame.jaws.values():
-        for pixel, visible in zip(jaw.pixels, jaw.visible, strict=True):
-            if np.isfinite(pixel).all():
-                place, color = np.round(pixel / step).astype(int).tolist(), VISIBLE if visible else HIDDEN
-                cv2.drawMarker(picture, place, color, cv2.MARKER_CROSS, 2 * ARM + 1)
-    return picture
-
-
-def draw_depth(depth: NDArray) -> NDArray[np.uint8]:
-    """Return a depth image (h, w) [m] in grey (h, w, 3), bright where it is near, black where there is none."""
-    share = (FAR - np.nan_to_num(depth, nan=FAR)) / (FAR - NEAR)
-    grey = (40.0 + 215.0 * np.clip(share, 0.0, 1.0)) * np.isfinite(depth)
-    return np.repeat(grey.astype(np.uint8)[:, :, None], 3, axis=2)
+        write_footage(footage, folder, form=form, case=case, seen=lambda _: bar.update())

@@ -264,11 +264,10 @@ def depth_steps(message: Any) -> NDArray[np.uint16]:
     return np.clip(image, 0, 65535).astype(np.uint16)
 
 
-def encode_color(color: NDArray[np.uint8], kind: str = "jpeg", quality: int = QUALITY) -> bytes:
-    """Return a colour image (h, w, 3) RGB as the bytes of a "jpeg" of some quality (1 to 95), or of a "png"."""
+def encode_color(color: NDArray[np.uint8]) -> bytes:
+    """Return a colour image (h, w, 3) RGB as the bytes of a jpeg."""
     buffer = io.BytesIO()
-    options = {"quality": quality} if kind == "jpeg" else {"compress_level": LEVEL}
-    Image.fromarray(color).save(buffer, format=kind, **options)
+    Image.fromarray(color).save(buffer, format="jpeg", quality=QUALITY)
     return buffer.getvalue()
 
 

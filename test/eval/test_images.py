@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from finforce.camera import ImageError
 from finforce_eval.cli.twin import RecordingForm, footage_entries, write_footage
 from finforce_eval.errors import RecordingError
-from finforce_eval.recordings.images import compress_depth, depth_from_message, depth_steps, encode_color
+from finforce_eval.recordings.images import DEPTH_HEADER, compress_depth, depth_from_message, depth_steps
 from finforce_eval.recordings.objects import find_mesh
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.writer import write_entries
@@ -215,7 +215,7 @@ def test_depth_images_survive_packing_and_others_are_refused():
     np.testing.assert_array_equal(depth_steps(packed), steps)
     bare = Message(format="png", data=compress_depth(steps)[12:])
     np.testing.assert_allclose(depth_from_message(bare), [[0.07, 0.5, np.nan], [65.535, np.nan, np.nan]])
-    grey = Message(format="png", data=encode_color(np.zeros((2, 2, 3), np.uint8), "png"))
+    grey = Message(format="png", data=compress_depth(np.zeros((2, 2, 3), np.uint8))[DEPTH_HEADER:])
     with pytest.raises(ImageError, match="16 bits"):
         depth_from_message(grey)
     with pytest.raises(ImageError, match="no png"):

@@ -13,7 +13,7 @@ from finforce_keypoints.errors import DetectionError
 from finforce_keypoints.images import ImageWatch
 from finforce_sim.footage import Footage
 from finforce_sim.gripper import JawState, TwinState
-from finforce_sim.photographer import SceneSetting, Shot, TrueKeypoints, WristView
+from finforce_sim.photographer import SceneSetting, Shot, TrueJaw, WristView
 
 CAMERA = CameraIntrinsics(width=64, height=48, fx=43.0, fy=43.0, cx=31.5, cy=23.5, distortion=np.full(5, 0.01))
 KEYPOINTS = 4
@@ -79,16 +79,18 @@ class FakePhotographer:
         self.shots += 1
         depth = rng.uniform(0.1, 0.2, size).astype(np.float32)
         depth[:4] = np.nan
-        return Shot(color=color, depth=depth, truth={side: true_keypoints(state, side) for side in state.jaws})
+        return Shot(color=color, depth=depth, jaws={side: true_jaw(state, side) for side in state.jaws})
 
 
-def true_keypoints(state, side):
-    """Where the key points are in the picture."""
-    T = jaw_in_camera(BENCH_CAMERA, side, state.jaws[side].origin_x)
-    points = np.vstack((state.jaws[side].keypoints, state.jaws[side].reference))
-    visible = np.array([True] * (KEYPOINTS - 1) + [False, True])
-    pixels = project(points @ T[:3, :3].T + T[:3, 3], CAMERA)
-    return TrueKeypoints(T_camera_jaw=T, points=points, pixels=pixels, visible=visible)
+def true_jaw(state, side, T_gripper_camera=BENCH_CAMERA, hidden=1):
+    """Where the key points are in the picture; the last ones are hidden."""
+    jaw = state.jaws[side]
+    T = jaw_in_camera(T_gripper_camera, side, jaw.origin_x)
+    pixels = project(jaw.keypoints @ T[:3, :3].T + T[:3, 3], CAMERA)
+    visible = np.arange(len(pixels)) < len(pixels) - hidden
+    return TrueJaw(
+        T_camera_jaw=T, points=jaw.keypoints, pixels=pixels, visible=visible, force=jaw.force, torque=jaw.torque
+    )
 
 
 def make_footage(gripper=None, photographer=None, seed=0):
@@ -161,17 +163,10 @@ class FakeLens:
     def look(self, state):
         with self._lock:
             self.looks += 1
-        return WristView(picture=None, truth={side: self._find(state, side) for side in state.jaws})
+        return WristView(picture=None, jaws={side: true_jaw(state, side, CAMERA_POSE, 0) for side in state.jaws})
 
     def develop(self, view, stamp):
         rng = np.random.default_rng(round(stamp * 1e6))
         size = (CAMERA.height, CAMERA.width)
         depth = rng.uniform(0.1, 0.2, size).astype(np.float32)
-        return Shot(color=rng.integers(0, 255, (*size, 3), dtype=np.uint8), depth=depth, truth=view.truth)
-
-    def _find(self, state, side):
-        jaw = state.jaws[side]
-        T = jaw_in_camera(CAMERA_POSE, side, jaw.origin_x)
-        points = np.vstack((jaw.keypoints, jaw.reference))
-        pixels = project(points @ T[:3, :3].T + T[:3, 3], CAMERA)
-        return TrueKeypoints(T_camera_jaw=T, points=points, pixels=pixels, visible=np.ones(len(points), bool))
+        return Shot(color=rng.integers(0, 255, (*size, 3), dtype=np.uint8), depth=depth, jaws=view.jaws)

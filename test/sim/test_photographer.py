@@ -39,13 +39,13 @@ def shot(setting, pressed):
 
 
 def test_true_pixels_are_the_projected_key_points(shot, setting):
-    for truth in shot.truth.values():
+    for truth in shot.jaws.values():
         points = truth.points @ truth.T_camera_jaw[:3, :3].T + truth.T_camera_jaw[:3, 3]
         np.testing.assert_allclose(truth.pixels, project(points, setting.camera), atol=1e-9)
 
 
 def test_depth_at_visible_key_points_is_that_of_the_finger(shot):
-    for truth in shot.truth.values():
+    for truth in shot.jaws.values():
         points = truth.points @ truth.T_camera_jaw[:3, :3].T + truth.T_camera_jaw[:3, 3]
         at = np.round(truth.pixels).astype(int)
         error = shot.depth[at[:, 1], at[:, 0]] - points[:, 2]
@@ -54,10 +54,10 @@ def test_depth_at_visible_key_points_is_that_of_the_finger(shot):
 
 def test_what_the_object_covers_is_not_visible(shot, setting, pressed):
     bare = Photographer(replace(setting, mesh=None), 3).shoot(pressed)
-    for side, truth in bare.truth.items():
+    for side, truth in bare.jaws.items():
         assert truth.visible.all()
-        assert not shot.truth[side].visible.all()
-        assert shot.truth[side].visible.sum() >= 10
+        assert not shot.jaws[side].visible.all()
+        assert shot.jaws[side].visible.sum() >= 10
 
 
 def test_the_same_seed_gives_the_same_image_and_another_one_another(shot, setting, pressed):
@@ -67,9 +67,10 @@ def test_the_same_seed_gives_the_same_image_and_another_one_another(shot, settin
     assert (Photographer(setting, 4).shoot(pressed).color != shot.color).mean() > 0.5
 
 
-def test_the_dot_on_the_holder_is_where_the_reference_point_is(shot):
-    for truth in shot.truth.values():
-        column, row = np.round(truth.pixels[-1]).astype(int)
+def test_the_dot_on_the_holder_is_where_the_reference_point_is(shot, setting, pressed):
+    for side, truth in shot.jaws.items():
+        reference = pressed.jaws[side].reference[None] @ truth.T_camera_jaw[:3, :3].T + truth.T_camera_jaw[:3, 3]
+        column, row = np.round(project(reference, setting.camera)[0]).astype(int)
         dot = shot.color[row - 1 : row + 2, column - 1 : column + 2].mean()
         around = shot.color[row - 14 : row + 15, column - 14 : column + 15].astype(float)
         assert abs(dot - np.median(around)) > 20.0  # grey levels
@@ -98,8 +99,8 @@ def test_rows_of_a_rolling_shutter_are_of_their_own_time(setting, gripper):
         inner = slice(rows.start + 1, rows.stop - 1)  # a band's edge has no neighbours that show an edge in its pixels
         np.testing.assert_allclose(rolled.picture.color[inner], then.picture.color[inner], atol=1e-6)
     # a point is where the jaw was when the point's own row was exposed
-    now, past = (flat.look(some).truth["left"].pixels for some in (state, before))
-    seen = rolled.truth["left"].pixels
+    now, past = (flat.look(some).jaws["left"].pixels for some in (state, before))
+    seen = rolled.jaws["left"].pixels
     ago = readout * (1.0 - seen[:, 1] / (height - 1)) / (state.stamp - before.stamp)
     np.testing.assert_allclose(seen[:, 0], now[:, 0] + ago * (past - now)[:, 0], atol=0.02)
     assert np.ptp((seen - now)[:, 0]) > 0.5

@@ -7,19 +7,8 @@ import pytest
 from rgbd_fakes import CAMERA_POSE, FakeLens
 
 from finforce.transforms import invert_pose
-from finforce_driver.errors import LinkError
-from finforce_sim.gripper import PressedGrasp, RelaxedGrasp
-from finforce_sim.live import (
-    BEFORE_TOUCH,
-    COUNTS,
-    OPEN_STRIDE,
-    TAKES,
-    CoupledGripper,
-    ImageTable,
-    LiveScene,
-    choose_openings,
-    render_openings,
-)
+from finforce_sim.gripper import PressedGrasp
+from finforce_sim.live import BEFORE_TOUCH, COUNTS, OPEN_STRIDE, TAKES, LiveScene, choose_openings, render_openings
 from finforce_sim.scenarios import ScenarioError, build_scenario
 
 STROKE = 0.048
@@ -72,19 +61,20 @@ def test_no_image_is_taken_of_jaws_that_jam(grasp, monkeypatch):
     ("opening", "place"),
     [(-0.1, 0), (0.0, 0), (0.0014, 0), (0.0016, 1), (0.003, 1), (0.0074, 1), (0.0076, 2), (1.0, 2)],
 )
-def test_the_nearest_image_is_shown(opening, place):
-    table = ImageTable(openings=np.array([0.0, 0.003, 0.012]), takes=[[0], [1], [2]])
-    assert table.find(opening) == place
+def test_the_nearest_image_is_shown(grasp, opening, place):
+    scene = LiveScene(grasp, FakeLens(), 5)
+    scene.openings = np.array([0.0, 0.003, 0.012])
+    assert scene.find(opening) == place
 
 
 def test_images_are_of_their_openings_and_no_two_takes_are_alike(grasp):
     openings = np.array([0.0, 0.010, 0.030])
     teller = Teller()
-    table = render_openings(grasp, FakeLens(), openings, lambda frame: frame, teller)
+    rendered = render_openings(grasp, FakeLens(), openings, lambda frame: frame, teller)
     assert teller.heard == [(1, 3), (2, 3), (3, 3)]
-    pictures = [frame.color.tobytes() for takes in table.takes for frame in takes]
+    pictures = [frame.color.tobytes() for takes in rendered for frame in takes]
     assert len(pictures) == len(set(pictures)) == TAKES * 3
-    for opening, takes in zip(openings, table.takes, strict=True):
+    for opening, takes in zip(openings, rendered, strict=True):
         state = grasp.state(opening)
         for frame in takes:
             np.testing.assert_array_equal(frame.jaws["left"].points, state.jaws["left"].keypoints)
@@ -97,7 +87,7 @@ def test_the_same_seed_gives_the_same_images_whatever_the_threads(grasp, monkeyp
     for workers in (1, 4):
         monkeypatch.setattr("finforce_sim.live.MOST_WORKERS", workers)
         reels.append(render_openings(grasp, FakeLens(), openings, lambda frame: frame.color))
-    np.testing.assert_array_equal(reels[0].takes, reels[1].takes)
+    np.testing.assert_array_equal(reels[0], reels[1])
 
 
 def test_filming_that_is_ended_does_not_go_on(grasp):
@@ -111,20 +101,21 @@ def test_filming_that_is_ended_does_not_go_on(grasp):
 def test_a_gripper_that_stands_still_is_never_shown_twice_by_the_same_image(scene):
     pictures = [scene.take(HELD, 0.033 * k).picture for k in range(6)]
     assert all(a is not b for a, b in zip(pictures[:-1], pictures[1:], strict=True))
-    shown = scene.grasp.state(scene.table.openings[scene.table.find(HELD)])
+    shown = scene.grasp.state(scene.openings[scene.find(HELD)])
     for picture in pictures:
         np.testing.assert_array_equal(picture.jaws["left"].points, shown.jaws["left"].keypoints)
 
 
 def test_true_forces_follow_the_true_opening_and_relax_in_time(scene):
-    expected = RelaxedGrasp(scene.grasp)
+    relaxation = scene.grasp.relaxation()
     stamps = 0.1 * np.arange(60)
     openings = np.interp(stamps, [0.0, 1.0, 2.0], [0.03, 0.03, HELD])
     for count, (stamp, opening) in enumerate(zip(stamps, openings, strict=True)):
         wrenches = scene.take(float(opening), float(stamp)).wrenches
-        wanted = expected.update(float(opening), 0.1 if count else 0.0)
+        elastic = scene.grasp.wrenches(float(opening))
         for side, wrench in wrenches.items():
-            np.testing.assert_allclose(wrench.force, wanted[side].force, atol=1e-9)
+            wanted = relaxation[side].update(elastic[side], 0.1 if count else 0.0)
+            np.testing.assert_allclose(wrench.force, wanted.force, atol=1e-9)
     assert np.linalg.norm(wrenches["left"].force) > 1.0
 
 
@@ -134,7 +125,7 @@ def test_the_object_is_tracked_at_a_third_of_the_images_where_it_is_seen():
     scene.render(lambda frame: frame, lambda done, count: None)
     poses = [scene.take(HELD, 0.033 * k).T_camera_object for k in range(9)]
     assert [pose is not None for pose in poses] == [True, False, False] * 3
-    seen = scene.table.openings[scene.table.find(HELD)]
+    seen = scene.openings[scene.find(HELD)]
     true = invert_pose(CAMERA_POSE) @ scene.grasp.object_pose(seen)
     tracked = [pose for pose in poses if pose is not None]
     for pose in tracked:
@@ -146,27 +137,3 @@ def test_an_object_that_fills_the_gripper_is_refused():
     grasp = PressedGrasp(build_scenario("grasp_cylinder", object="cylinder"), 3, "coarse", step=5e-4)
     with pytest.raises(ScenarioError, match="50 mm wide.*expected at most 46 mm"):
         LiveScene(grasp, FakeLens(), 0)
-
-
-def test_a_coupled_gripper_waits_at_its_link_with_open_jaws(grasp, tmp_path):
-    gripper = CoupledGripper(grasp, str(tmp_path / "gripper"), "old")
-    assert gripper.opening == pytest.approx(STROKE, abs=1e-5)
-    assert gripper.gripper.variant == "old"
-    gripper.open()
-    try:
-        assert gripper.path == str(tmp_path / "gripper")
-        assert (tmp_path / "gripper").is_char_device()
-        gripper.gripper.jaws.ticks = gripper.gripper.jaws.ticks_at(HELD)
-        assert gripper.opening == pytest.approx(HELD, abs=5e-6)
-        assert gripper.gripper.jaws.force == pytest.approx(grasp.elastic_force(gripper.opening), rel=1e-9)
-    finally:
-        gripper.close()
-        gripper.close()
-    assert not (tmp_path / "gripper").is_symlink()
-
-
-def test_a_file_in_place_of_the_link_is_left_alone(grasp, tmp_path):
-    (tmp_path / "gripper").write_text("mine")
-    with pytest.raises(LinkError, match="expected nothing or a link"):
-        CoupledGripper(grasp, str(tmp_path / "gripper")).open()
-    assert (tmp_path / "gripper").read_text() == "mine"

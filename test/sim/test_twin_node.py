@@ -130,7 +130,7 @@ def test_images_and_forces_are_those_of_the_gripper_at_the_link(probe, grasp, tm
     assert (tmp_path / "gripper").is_char_device()
     probe.wait_for(lambda: len(probe.got[COLOR]) > 3)
     assert {message.wrench.force.x for message in probe.got["/left/ground_truth_wrench"]} == {0.0}
-    jaws = node.gripper.gripper.jaws
+    jaws = node.gripper.jaws
     jaws.load = None  # which would push limp jaws open
     jaws.ticks = jaws.ticks_at(0.013)
     probe.wait_for(lambda: probe.got["/left/ground_truth_wrench"][-1].wrench.force.x < -1.0)
@@ -139,7 +139,7 @@ def test_images_and_forces_are_those_of_the_gripper_at_the_link(probe, grasp, tm
     forces = [-message.wrench.force.x for message in probe.got["/left/ground_truth_wrench"][held:]]
     assert forces[-1] < forces[0] and forces[-1] > grasp.elastic_force(0.013)  # it relaxes, and takes seconds
     shown = decode_columns(probe.got["/left/ground_truth_keypoints"][-1], ("x", "z"))
-    state = grasp.state(node.scene.table.openings[node.scene.table.find(jaws.opening)])
+    state = grasp.state(node.scene.openings[node.scene.find(jaws.opening)])
     np.testing.assert_allclose(shown["x"], state.jaws["left"].keypoints[:, 0], atol=1e-6)
     assert probe.got["/bench/phase"] == []
 
