@@ -65,13 +65,13 @@ def describe_sources(file: Path) -> str:
         ["git", "diff", "HEAD", "--binary"],
     )
     try:
-        _, said, changes = (
+        _, described, changes = (
             subprocess.run(command, cwd=file.parent, capture_output=True, check=True).stdout for command in commands
         )
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
     mark = f"-{hashlib.sha256(changes).hexdigest()[:8]}" if changes else ""
-    return said.decode().strip() + mark
+    return described.decode().strip() + mark
 
 
 def without_nan(content: Any) -> Any:

@@ -49,7 +49,7 @@ UNITS = {
     "contact_source": "",  # what gave the contact
     "contact_height": "m",  # weighted mean on the undeformed surface of the contact that the image was solved with
     "true_height": "m",  # of the pressure centre of the measured force
-    "touching": "",  # whether object and jaw were said to touch once the image was solved
+    "touching": "",  # whether object and jaw were reported as touching once the image was solved
     "contact_status": "",  # the contact estimator's own word
     "contact_ms": "ms",  # of the contact estimator
     "points_x": "m, each contact point",
@@ -236,6 +236,13 @@ class ForceSeries:
     def counted(self) -> NDArray[np.bool_]:
         """Images that enter the score (n,): scored, solved, and with a truth."""
         return self.scored & np.isfinite(self.error)
+
+
+def stddev_along(force: NDArray[np.float64], stddev: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the standard deviation along each force (n,) [N] of forces and deviations along the axes (n, 3) [N]."""
+    norm = np.linalg.norm(force, axis=1, keepdims=True)
+    along = np.divide(force, norm, out=np.zeros_like(force), where=norm > 0.0)
+    return np.linalg.norm(along * stddev, axis=1)
 
 
 def write_table(path: Path, series: Sequence[ForceSeries], about: Mapping[str, Any]) -> None:

@@ -494,7 +494,7 @@ class Assembly:
             R = R_GRIPPER_JAW[side].T
             polygons = cut_outline(self._object.centred, R, pressed.half_width, float(R[1, 1]) * scenario.shift)
             if not polygons:
-                raise ScenarioError(f"{scenario.name}: the object lies beside the jaws; set shift nearer to 0")
+                raise ScenarioError(f"{scenario.name}: the object lies out of reach of the jaws; set shift nearer to 0")
             pressed.meet(polygons)
             touches.append(pressed.find_touch(scenario.height, 0.0))
         origin = float(np.mean(touches))

@@ -139,7 +139,7 @@ class TwinCameraNode(Node):
             self.get_logger().info(f"rendering {self.parameters.scene}: {done} of {count} images")
 
     def _scripted(self, frame: TwinFrame) -> Iterable[Output]:
-        """Yield publishers and messages of what a script's image has beside what is seen."""
+        """Yield publishers and messages of what a script's image has in addition to what is seen."""
         if frame.phase != self._phase:
             self._phase = frame.phase
             yield self._output(String, "/bench/phase"), String(data=frame.phase)

@@ -58,7 +58,7 @@ class Exposure:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Lighting:
-    """How a scene looks, beside its bodies' materials.
+    """How a scene looks, apart from its bodies' materials.
 
     Attributes:
         ambient: (3,) linear light from everywhere.
@@ -448,7 +448,7 @@ class _Hits:
 
 
 def _find_edges(depth: NDArray, surface: NDArray, owner: NDArray) -> NDArray:
-    """Return the pixels (h, w) beside which another body, or the same at another depth, begins."""
+    """Return the pixels (h, w) next to which another body, or the same at another depth, begins."""
     rough = np.zeros(depth.shape, dtype=bool)
     for axis in (0, 1):
         other = np.diff(owner, axis=axis) != 0

@@ -31,7 +31,7 @@ HELD = 1e-6  # [kg] of mass from which on an object is lifted
 
 @dataclass(frozen=True, kw_only=True)
 class Scenario:
-    """A course of one or two jaws and an object, every number of which can be overridden.
+    """A sequence of motions of one or two jaws and an object, every number of which can be overridden.
 
     The robot's two jaws close alike on an object that is free along x; the bench's left jaw stays where it is and the
     object comes to it. The object lies with the middle of its bounding box at (offset, shift, height).
@@ -201,7 +201,7 @@ class ScriptStep:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Script:
-    """The course at every image, n of them.
+    """The motions at every image, n of them.
 
     Attributes:
         stamps: (n,) [s], from 0 on.
@@ -219,16 +219,16 @@ class Script:
 
 
 def write_script(scenario: Scenario) -> Script:
-    """Return the course of a scenario, sampled at its `rate`."""
+    """Return the motions of a scenario, sampled at its `rate`."""
     start = Posture(closing=-scenario.clearance)
     steps = list(_plan_steps(scenario, start))
     ends = np.concatenate([[0.0], np.cumsum([step.duration for step in steps])])
     stamps = np.arange(int(round(ends[-1] * scenario.rate)) + 1) / scenario.rate
     corners = np.array([list(vars(posture).values()) for posture in (start, *(step.end for step in steps))])
-    courses = [np.interp(stamps, ends, column) for column in corners.T]
+    columns = [np.interp(stamps, ends, column) for column in corners.T]
     # an image between two steps belongs to the later one, whatever the rounding
     running = np.clip(np.searchsorted(ends, stamps + 1e-9) - 1, 0, len(steps) - 1)
-    postures = tuple(Posture(**dict(zip(vars(start), row, strict=True))) for row in np.stack(courses, axis=1).tolist())
+    postures = tuple(Posture(**dict(zip(vars(start), row, strict=True))) for row in np.stack(columns, axis=1).tolist())
     heading, tilt = scenario.turn_heading, scenario.turn_tilt
     axis = np.array([np.cos(tilt) * np.cos(heading), np.cos(tilt) * np.sin(heading), np.sin(tilt)])
     begin = Rotation.from_rotvec([scenario.pitch, 0.0, 0.0]).apply(_DOWN)

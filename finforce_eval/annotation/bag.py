@@ -61,7 +61,7 @@ def annotate_bag(source: Path, target: Path, options: argparse.Namespace, settin
         target: the new folder.
         options: of the command `annotate`.
         settings: hash of them and of the files that they name.
-        key: of the task, which is kept beside what was written.
+        key: of the task, which is kept next to what was written.
 
     Raises:
         FinforceError: the recording cannot be read, or no forces be found in it.
@@ -85,7 +85,7 @@ def annotate_bag(source: Path, target: Path, options: argparse.Namespace, settin
 
 
 def _describe(jaws: Mapping[str, ForceSeries]) -> dict[str, Any]:
-    """Return what is said of the forces in the manifest."""
+    """Return what the manifest tells of the forces."""
     sides = {}
     for side, forces in jaws.items():
         words, counts = np.unique(forces.column("status")[~forces.solved], return_counts=True)
@@ -100,7 +100,7 @@ def _describe(jaws: Mapping[str, ForceSeries]) -> dict[str, Any]:
 
 
 class ForceMessages:
-    """Makes the messages of one image after the other; what is not known is NaN, and its reason said.
+    """Makes the messages of one image after the other; what is not known is NaN, with its reason.
 
     Args:
         jaws: forces by side.
@@ -178,7 +178,7 @@ def write_annotated(
     """Write the messages of a bag and those of the forces, or the latter alone, as a new rosbag2 folder.
 
     New messages follow the first message with their stamp that is of an image or of key points, at its time of receipt.
-    Files beside the bag in its own folder, as a `case.json` or the object's mesh, are copied, too.
+    Files next to the bag in its own folder, as a `case.json` or the object's mesh, are copied, too.
 
     Args:
         recording: what was read of the bag.
@@ -248,7 +248,7 @@ def _copy_connection(writer: Any, connection: Any) -> Any:
 
 
 def _copy_others(source: Path, folder: Path) -> None:
-    """Copy what lies beside the bag files in their folder."""
+    """Copy what lies next to the bag files in their folder."""
     for path in source.iterdir():
         if path.is_file() and path.suffix not in (".mcap", ".db3", ".zstd") and path.name != "metadata.yaml":
             shutil.copy2(path, folder / path.name)

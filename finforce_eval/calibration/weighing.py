@@ -1,4 +1,4 @@
-"""The stiffness of a finger from a kitchen scale: held forces against what the scale said, in their order.
+"""The stiffness of a finger from a kitchen scale: held forces against the readings of the scale, in their order.
 
 For a given shape the force is proportional to the modulus; one factor is all that a scale can tell. Shape, relaxation
 and clamp stay as they were. Knows no files and no options.
@@ -46,7 +46,7 @@ class Weighing:
         factor: by which the modulus has to be multiplied [-].
         stddev: of the factor [-].
         holds: what was held, in time.
-        weights: what the scale said [N].
+        weights: readings of the scale [N].
         misfit: root mean square of what is left, relative to each weight [-].
     """
 

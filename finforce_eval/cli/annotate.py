@@ -25,7 +25,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("bags", nargs="+", metavar="BAG", help=text)
     text = "folder of what is written: one folder per recording, and manifest.jsonl (annotated)"
     parser.add_argument("--out", default="annotated", metavar="DIR", help=text)
-    text = "of bags: write the new messages alone, beside the recording instead of a copy of it"
+    text = "of bags: write the new messages alone instead of a copy of the recording with them"
     parser.add_argument("--side-file", action="store_true", help=text)
     text = "jaws that are in the images, where no topic tells; of datasets both by default"
     parser.add_argument("--jaws", choices=JAWS_CHOICES, help=text)
@@ -105,9 +105,9 @@ def _run_dataset(name: str, path: Path, options: argparse.Namespace, manifest: M
 
 def _print_outcome(line: dict[str, Any]) -> None:
     """Print what became of a recording."""
-    name, said = line["name"], line["error"]
+    name, error = line["name"], line["error"]
     if line["status"] != OK:
-        print(said if said.startswith(f"{name}: ") else f"{name}: {said}", file=sys.stderr)
+        print(error if error.startswith(f"{name}: ") else f"{name}: {error}", file=sys.stderr)
         return
     print_notes(name, line["figures"].get("notes", ()))
     words = [

@@ -106,11 +106,12 @@ def _check(options: argparse.Namespace) -> int:
         source = replace(source, parameters={**source.parameters, "depth": "none"})
     with progress_bar(ROUNDS * len(recording.images), "image") as bar:
         check = check_recording(recording, source, bar.update)
-    for line in check.said:
-        print(f"{line.level:<8}{line.text}")
+    for line in check.findings:
+        print(f"{line.severity:<8}{line.text}")
     folder = Path(options.report)
     folder.mkdir(parents=True, exist_ok=True)
     import_cv2().imwrite(str(folder / PICTURE), check.picture[..., ::-1])
-    verdict = "everything fits" if check.is_good else f"{sum(line.level == FAULT for line in check.said)} to be changed"
-    print(f"{verdict}; {folder / PICTURE}: grey as given, orange as fitted, green key points")
-    return 0 if check.is_good else 1
+    faults = sum(line.severity == FAULT for line in check.findings)
+    outcome = f"{faults} to be changed" if faults else "everything fits"
+    print(f"{outcome}; {folder / PICTURE}: grey as given, orange as fitted, green key points")
+    return 1 if faults else 0

@@ -24,7 +24,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--face-x", type=float, metavar="X", help="x [m] of the inner face in the jaw frame")
     parser.add_argument("--flip", action="store_true", help="base and tip are the other way round")
     parser.add_argument("--other-face", action="store_true", help="the other side is the one that touches objects")
-    text = "the picture to draw (default: beside the jaw file, .png)"
+    text = "the picture to draw (default: next to the jaw file, .png)"
     parser.add_argument("--picture", type=lambda name: Path(picture_file(name)), help=text)
 
 

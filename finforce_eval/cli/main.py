@@ -32,7 +32,7 @@ COMMANDS = {
     "twin": "make RGB-D recordings of a synthetic gripper, with the truth about everything in them",
     "demo": "play a recording through the real nodes, from images to force, and write a report",
     "bench": "measure run time against error of every solver tier and of what comes before it, and how cost grows",
-    "experiment": "run one of the paper's experiments on the twin or on recordings, with a page beside its figures",
+    "experiment": "run one of the paper's experiments on the twin or on recordings, with a page of its figures",
     "stress": "give the estimators what no bench does: every answer is right within what it states, or not sure",
     "report": "put forces over time on one HTML page with plots that zoom",
     "convert-steel": "convert the pictures of the measured steel finger into a recording",

@@ -18,7 +18,7 @@ JAWS_CHOICES = ("left", "right", "both")
 BAG_HELP = "rosbag2 folder, .mcap or .db3 file"
 CONTACT_HELP = (
     "contact: estimate, closest or paper, from the object's mesh and pose; fixed:Z_MM, the height of first touch above "
-    "the clamped base; fixed:case takes it from the case.json beside each recording; NAME=Z_MM gives it for one "
+    "the clamped base; fixed:case takes it from the case.json next to each recording; NAME=Z_MM gives it for one "
     "recording and may be repeated. Without it estimate for a recording with mesh and poses, else fixed:case"
 )
 PICTURES = (".png", ".jpg", ".svg", ".pdf")

@@ -109,7 +109,7 @@ def read_generated(options: argparse.Namespace) -> GeneratedMesh:
 
 
 def write_result(result: Reconstruction, output: Path) -> None:
-    """Write the mesh in metres, and beside it the pose with all that is known of its quality, as JSON."""
+    """Write the mesh in metres, and next to it the pose with all that is known of its quality, as JSON."""
     output.parent.mkdir(parents=True, exist_ok=True)
     trimesh = import_trimesh()
     mesh = trimesh.Trimesh(result.mesh.vertices, result.mesh.triangles, process=False)

@@ -126,18 +126,11 @@ def check_new(folder: Path) -> None:
     try:
         folder.mkdir(parents=True)
         folder.rmdir()
-    except FileExistsError as error:
-        if folder.exists():
-            raise RecordingError(f"{folder}: exists already; a recording is written to a new folder") from error
-        raise _not_made(folder, error) from error
     except OSError as error:
-        raise _not_made(folder, error) from error
-
-
-def _not_made(folder: Path, error: OSError) -> RecordingError:
-    return RecordingError(
-        f"-o {folder}: cannot be made ({error.strerror}); expected a new folder where one may be written"
-    )
+        if isinstance(error, FileExistsError) and folder.exists():
+            raise RecordingError(f"{folder}: exists already; a recording is written to a new folder") from error
+        what = f"cannot be made ({error.strerror}); expected a new folder where one may be written"
+        raise RecordingError(f"-o {folder}: {what}") from error
 
 
 def scenario_from_options(options: argparse.Namespace) -> Scenario:

@@ -27,7 +27,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Find the holds of a recording, and scale the stiffness by what a scale said of them."""
+    """Find the holds of a recording, and scale the stiffness by the readings of a scale."""
     if options.output and not options.grams:
         raise OptionError("-o needs --grams: the readings of the scale, one for each hold")
     setup = make_setup(options).side(options.side)

@@ -35,16 +35,16 @@ def first_images(recording: Recording, count: int) -> Recording:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class RestLook:
+class JawsAtRest:
     """What a detector saw: the jaws, and where it took them to be, T_camera_jaw (4, 4) of every image by side."""
 
     jaws: Mapping[str, SeenJaw]
     poses: Mapping[str, Sequence[NDArray]]
 
 
-def look_at_rest(
+def average_at_rest(
     recording: Recording, detector: KeypointDetector, jaws: Mapping[str, Jaw], progress: Callable[[int], Any]
-) -> RestLook:
+) -> JawsAtRest:
     """Average the pixels of the key points over the images.
 
     Raises:
@@ -65,7 +65,7 @@ def look_at_rest(
                 "jaws in view and is the guess, --extrinsics, within some 10 mm and 5 degrees?"
             )
     averaged = {side: _average(np.array(seen)) for side, seen in pixels.items()}
-    return RestLook(
+    return JawsAtRest(
         jaws={side: SeenJaw(points=jaws[side].keypoints, pixels=averaged[side]) for side in jaws}, poses=poses
     )
 
@@ -84,7 +84,7 @@ def approach(
     jaws: Mapping[str, Jaw],
     guess: NDArray,
     progress: Callable[[int], Any] = lambda images: None,
-) -> tuple[Extrinsics, RestLook]:
+) -> tuple[Extrinsics, JawsAtRest]:
     """Find the key points, with these the camera's place, and again with that place, until nothing moves.
 
     Args:
@@ -100,7 +100,7 @@ def approach(
     T = guess
     for _ in range(ROUNDS):
         here = replace(source, parameters={**LOOSE, **source.parameters, "T_gripper_camera": list(pose_numbers(T))})
-        look = look_at_rest(recording, here.build(recording), jaws, progress)
+        look = average_at_rest(recording, here.build(recording), jaws, progress)
         origins = [abs(float((T @ pose)[0, 3])) for poses in look.poses.values() for pose in poses]
         found = find_extrinsics(look.jaws, recording.images.camera, T, float(np.median(origins)))
         moved = float(np.linalg.norm(found.T_gripper_camera[:3, 3] - T[:3, 3]))

@@ -17,7 +17,7 @@ from finforce.gripper_frames import HALF_TURN, OpeningRange, jaw_in_camera
 from finforce.optional import import_cv2
 from finforce.transforms import invert_pose, move_pose, pose_numbers, rotation_between
 from finforce_eval.errors import RecordingError
-from finforce_eval.evaluation.at_rest import RestLook, approach
+from finforce_eval.evaluation.at_rest import JawsAtRest, approach
 from finforce_eval.evaluation.keypoint_source import KeypointSource, build_records, choose_images
 from finforce_eval.recordings.tracks import Recording
 from finforce_ifea.jaw.jaw import Jaw, list_shipped_jaws, load_jaw
@@ -34,15 +34,15 @@ BLURRED = 0.16  # share of the finest detail in that of the next scale, of a pic
 COVERED = 0.30  # share of the picture's parts without any detail, from which on something may cover the lens
 FLAT, TILES = 1.5, 12  # of 255: contrast of such a part; parts each way
 GOOD_RESIDUAL = 1.0  # [px] left over when jaws at rest are laid on what is seen
-FAR, TURNED = 3e-3, np.radians(1.5)  # [m], [rad] by which the camera may be elsewhere than it is said to be
+FAR, TURNED = 3e-3, np.radians(1.5)  # [m], [rad] by which the camera may be elsewhere than it is stated to be
 FOCAL_ERROR = 0.03  # of the focal length, from which on it is named
 BETTER, ENOUGH = 0.2, 0.5  # by which another reading has to be likelier, and how likely, to be named
 
 
-class Said(NamedTuple):
-    """One thing that a check says: how bad it is, and what it is."""
+class Finding(NamedTuple):
+    """One thing that a check found: how bad it is, and what it is."""
 
-    level: str
+    severity: str
     text: str
 
 
@@ -51,19 +51,14 @@ class Check:
     """What a check found.
 
     Attributes:
-        said: line by line.
+        findings: line by line.
         picture: (h, w, 3) uint8, the mean image with what was expected (grey) and what was found.
         extrinsics: where the camera is by the jaws at rest; None where they were not found.
     """
 
-    said: Sequence[Said]
+    findings: Sequence[Finding]
     picture: NDArray
     extrinsics: Extrinsics | None = None
-
-    @property
-    def is_good(self) -> bool:
-        """Whether there is no fault."""
-        return all(line.level != FAULT for line in self.said)
 
 
 def check_recording(
@@ -82,43 +77,44 @@ def check_recording(
     parameters = build_records(source.node_parameters(recording)).parameters
     recording = replace(recording, images=choose_images(recording, parameters.depth))
     mean = _mean_image(recording)
-    said = [*_describe_camera(recording, parameters.depth), *judge_picture(mean.color)]
+    findings = [*_describe_camera(recording, parameters.depth), *judge_picture(mean.color)]
     jaws = {side: load_jaw(source.jaw_file, side) for side in recording.jaws}
     try:
         found, look = approach(recording, source, jaws, parameters.camera_pose, progress)
     except (RecordingError, KeypointError, ImageError) as error:
-        said.append(Said(FAULT, f"no jaw to rely on: {one_line(error)}"))
-        said += _find_reasons(mean, source, recording, parameters.camera_pose)
-        return Check(said=said, picture=_draw(mean, jaws, parameters.camera_pose, None, None))
+        findings.append(Finding(FAULT, f"no jaw to rely on: {one_line(error)}"))
+        findings += _find_reasons(mean, source, recording, parameters.camera_pose)
+        return Check(findings=findings, picture=_draw(mean, jaws, parameters.camera_pose, None, None))
     for side, jaw in look.jaws.items():
         seen = np.isfinite(jaw.pixels).all(axis=1)
-        said.append(Said(OK, f"{side} jaw: {seen.sum()} of {len(seen)} key points seen"))
-    said += _judge_place(found, look, recording, parameters.camera_pose)
+        findings.append(Finding(OK, f"{side} jaw: {seen.sum()} of {len(seen)} key points seen"))
+    findings += _judge_place(found, look, recording, parameters.camera_pose)
     if found.residual > GOOD_RESIDUAL:
-        said += _find_reasons(mean, source, recording, parameters.camera_pose)
+        findings += _find_reasons(mean, source, recording, parameters.camera_pose)
     picture = _draw(mean, jaws, parameters.camera_pose, found, look)
-    return Check(said=said, picture=picture, extrinsics=found)
+    return Check(findings=findings, picture=picture, extrinsics=found)
 
 
-def judge_picture(color: NDArray) -> list[Said]:
+def judge_picture(color: NDArray) -> list[Finding]:
     """Return what speaks against a picture (h, w, 3) uint8, best a mean of many: light, focus, something before it."""
     grey = import_cv2().cvtColor(color, import_cv2().COLOR_RGB2GRAY).astype(np.float32)
-    said, level, sharpness = [], float(grey.mean()), measure_sharpness(grey)
+    findings, level, sharpness = [], float(grey.mean()), measure_sharpness(grey)
     if not DARK <= level <= BRIGHT:
         text = f"mean brightness {level:.0f} of 255; expected {DARK:g} to {BRIGHT:g}: more or less light"
-        said.append(Said(WARNING, text))
+        findings.append(Finding(WARNING, text))
     if sharpness < BLURRED:
         text = f"out of focus: fine detail {sharpness:.2f} of coarse; expected {BLURRED:g}: focus the lens"
-        said.append(Said(FAULT, text))
+        findings.append(Finding(FAULT, text))
     tiles = [part for row in np.array_split(grey, TILES) for part in np.array_split(row, TILES, axis=1)]
     flat = 100.0 * np.mean([part.std() < FLAT for part in tiles])
     if flat > 100.0 * COVERED:
-        said.append(Said(WARNING, f"{flat:.0f} % of the picture show nothing at all: is the lens partly covered?"))
-    return said or [Said(OK, f"brightness {level:.0f} of 255, fine detail {sharpness:.2f} of coarse")]
+        text = f"{flat:.0f} % of the picture show nothing at all: is the lens partly covered?"
+        findings.append(Finding(WARNING, text))
+    return findings or [Finding(OK, f"brightness {level:.0f} of 255, fine detail {sharpness:.2f} of coarse")]
 
 
 def measure_sharpness(grey: NDArray) -> float:
-    """Return the finest detail of a picture (h, w) float32 beside that of the next scale [-], where there is some."""
+    """Return the finest detail of a picture (h, w) float32 over that of the next scale [-], where there is some."""
     cv2 = import_cv2()
     first, second = (cv2.GaussianBlur(grey, (0, 0), sigma) for sigma in (0.8, 2.4))
     fine, coarse = np.abs(grey - first), np.abs(first - second)
@@ -135,7 +131,7 @@ def _mean_image(recording: Recording) -> RgbdImage:
     return replace(last, color=np.round(total / count).astype(np.uint8), depth=None)
 
 
-def _describe_camera(recording: Recording, depth: str) -> Iterator[Said]:
+def _describe_camera(recording: Recording, depth: str) -> Iterator[Finding]:
     """Yield what the camera is."""
     camera, images = recording.images.camera, recording.images
     across = 2.0 * np.degrees(np.arctan(0.5 * camera.width / camera.fx))
@@ -143,48 +139,50 @@ def _describe_camera(recording: Recording, depth: str) -> Iterator[Said]:
         across = np.degrees(camera.width / camera.fx)
     rate = (len(images) - 1) / max(1e-9 * float(images.stamps[-1] - images.stamps[0]), 1e-6)
     kind = "with depth" if images.has_depth and depth == ALIGNED else "colour alone"
-    yield Said(
+    yield Finding(
         OK, f"camera {camera.width}x{camera.height}, {camera.model}, {across:.0f} degrees, {rate:.0f} Hz, {kind}"
     )
     aspect = camera.fx / camera.fy
     if not 0.97 < aspect < 1.03:
-        yield Said(
+        yield Finding(
             WARNING, f"fx / fy is {aspect:.3f}; expected 1: are the intrinsics those of a picture of another size?"
         )
     aside = np.hypot(camera.cx - 0.5 * (camera.width - 1), camera.cy - 0.5 * (camera.height - 1))
     if aside > 0.1 * camera.width:
-        yield Said(
+        yield Finding(
             WARNING, f"principal point {aside:.0f} px off the middle: was the picture cut, and the intrinsics not?"
         )
 
 
-def _judge_place(found: Extrinsics, look: RestLook, recording: Recording, guess: NDArray) -> list[Said]:
+def _judge_place(found: Extrinsics, look: JawsAtRest, recording: Recording, guess: NDArray) -> list[Finding]:
     """Return what the camera's place by what is seen says of what was given."""
-    said = []
+    findings = []
     moved = float(np.linalg.norm(found.T_gripper_camera[:3, 3] - guess[:3, 3]))
     turned = rotation_between(guess, found.T_gripper_camera)
     shown = f"{1e3 * moved:.1f} mm and {np.degrees(turned):.2f} degrees"
     if found.residual > GOOD_RESIDUAL:
-        said.append(
-            Said(
+        findings.append(
+            Finding(
                 FAULT,
-                f"key points lie {found.residual:.2f} px beside the jaw file, wherever the camera is; expected at most "
+                f"key points lie {found.residual:.2f} px off the jaw file, wherever the camera is; expected at most "
                 f"{GOOD_RESIDUAL:g} px: another finger, a bent one, or other intrinsics",
             )
         )
     elif moved > FAR or turned > TURNED:
         numbers = ", ".join(f"{number:.6f}" for number in pose_numbers(found.T_gripper_camera))
-        said.append(
-            Said(FAULT, f"the camera is {shown} from where T_gripper_camera says; set T_gripper_camera: [{numbers}]")
+        findings.append(
+            Finding(FAULT, f"the camera is {shown} from where T_gripper_camera says; set T_gripper_camera: [{numbers}]")
         )
     else:
-        said.append(Said(OK, f"extrinsics within {shown}, {found.residual:.2f} px left over"))
+        findings.append(Finding(OK, f"extrinsics within {shown}, {found.residual:.2f} px left over"))
     focal = fit_focal(look.jaws, recording.images.camera, found)
     if found.residual > 0.5 * GOOD_RESIDUAL and abs(focal) > FOCAL_ERROR:
-        said.append(
-            Said(FAULT, f"a focal length {100 * focal:+.0f} % from that of camera_info fits better: wrong intrinsics?")
+        findings.append(
+            Finding(
+                FAULT, f"a focal length {100 * focal:+.0f} % from that of camera_info fits better: wrong intrinsics?"
+            )
         )
-    return said
+    return findings
 
 
 def fit_focal(jaws: Mapping[str, SeenJaw], camera: CameraIntrinsics, found: Extrinsics) -> float:
@@ -194,8 +192,8 @@ def fit_focal(jaws: Mapping[str, SeenJaw], camera: CameraIntrinsics, found: Extr
     def misses(x: NDArray) -> NDArray:
         lens = replace(camera, fx=camera.fx * np.exp(x[6]), fy=camera.fy * np.exp(x[6]))
         T = move_pose(found.T_gripper_camera, x[:6])
-        away = [measure_misses(side, jaw, lens, T, half + x[7]) for side, jaw in jaws.items()]
-        return np.nan_to_num(np.concatenate(away), nan=1e3)
+        pixels = [measure_misses(side, jaw, lens, T, half + x[7]) for side, jaw in jaws.items()]
+        return np.nan_to_num(np.concatenate(pixels), nan=1e3)
 
     scale = np.r_[np.full(3, 5e-3), np.full(3, 0.05), 0.1, 5e-3]
     fit = least_squares(misses, np.zeros(8), x_scale=scale, loss="soft_l1", f_scale=2.0)
@@ -203,7 +201,7 @@ def fit_focal(jaws: Mapping[str, SeenJaw], camera: CameraIntrinsics, found: Extr
     return float(np.expm1(fit.x[6])) if after < 0.6 * before else 0.0
 
 
-def _find_reasons(mean: RgbdImage, source: KeypointSource, recording: Recording, guess: NDArray) -> list[Said]:
+def _find_reasons(mean: RgbdImage, source: KeypointSource, recording: Recording, guess: NDArray) -> list[Finding]:
     """Return which other reading of picture, extrinsics or jaw file shows the jaws better."""
     own = _score(mean, source, recording, guess)
     best, words = own, ""
@@ -211,9 +209,9 @@ def _find_reasons(mean: RgbdImage, source: KeypointSource, recording: Recording,
         likelihood = _score(image, replace(source, jaw_file=jaw_file), recording, pose)
         best, words = max((best, words), (likelihood, text), key=lambda entry: entry[0])
     if best > max(own + BETTER, ENOUGH):
-        return [Said(FAULT, f"the jaws show (likelihood {best:.2f} instead of {own:.2f}) if {words}")]
+        return [Finding(FAULT, f"the jaws show (likelihood {best:.2f} instead of {own:.2f}) if {words}")]
     return [
-        Said(
+        Finding(
             WARNING,
             f"likelihood {own:.2f}, no better upside down, mirrored, with other conventions of the extrinsics or with "
             "another shipped finger: are the jaws in view, lit, and within some 15 mm of where the extrinsics say?",
@@ -284,7 +282,7 @@ GIVEN, SEEN, FITTED = (150, 150, 150), (60, 230, 90), (255, 170, 40)
 
 
 def _draw(
-    mean: RgbdImage, jaws: Mapping[str, Jaw], given: NDArray, found: Extrinsics | None, look: RestLook | None
+    mean: RgbdImage, jaws: Mapping[str, Jaw], given: NDArray, found: Extrinsics | None, look: JawsAtRest | None
 ) -> NDArray:
     """Return the mean image with the jaws as given in grey, as fitted in orange, and the key points seen in green."""
     cv2, picture, camera = import_cv2(), mean.color.copy(), mean.camera

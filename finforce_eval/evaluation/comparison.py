@@ -23,7 +23,7 @@ from finforce_eval.table import ForceSeries
 BETTER, WORSE, SAME, UNSURE, GAINED, LOST = "better", "worse", "same", "unsure", "new", "gone"
 # A difference smaller than this [N] matters to nobody, however sure it is; a surer one than so many deviations counts.
 LEAST, SIGMAS = 0.002, 3.0
-# Seconds that err alike, and blocks without which nothing can be said of chance.
+# Seconds that err alike, and blocks without which nothing is known of chance.
 _BLOCK, _FEWEST = 4, 4
 _SECOND = 1_000_000_000
 

@@ -213,7 +213,7 @@ class ContactChoice:
         z = case_object.get("z") if isinstance(case_object, Mapping) else None
         if isinstance(z, bool) or not isinstance(z, int | float) or not math.isfinite(z):
             raise OptionError(
-                f"{recording.name}: no contact height: no object.z in a case.json beside it; give --contact fixed:Z_MM"
+                f"{recording.name}: no contact height: no object.z in a case.json next to it; give --contact fixed:Z_MM"
             )
         return float(z) * 1e-3
 

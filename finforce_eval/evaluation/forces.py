@@ -13,7 +13,7 @@ from finforce.stamps import Idling
 from finforce_contact.loop import ContactSource, ForceLoop
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.gripper import with_distances
-from finforce_eval.evaluation.places import InnerSurface, true_lines
+from finforce_eval.evaluation.pressure_centre import InnerSurface, true_lines
 from finforce_eval.evaluation.scoring import compare_detection, match_samples, match_truth
 from finforce_eval.recordings.tracks import JAWS, Recording
 from finforce_eval.table import AXES, ForceSeries, Snapshot
@@ -126,7 +126,7 @@ def check_keypoint_count(recording: Recording, side: str, jaw: Any) -> None:
     """
     track, expected = recording.jaw(side), len(jaw.keypoint_names)
     counts = {f"key points in /{side}/keypoints": track.keypoints.count}
-    if track.sight is not None:  # beside points that were found with that jaw in the images
+    if track.sight is not None:  # in addition to points that were found with that jaw in the images
         counts[f"true key points of the {side} jaw"] = track.sight.points.shape[1]
     for what, count in counts.items():
         if count != expected:
@@ -136,7 +136,7 @@ def check_keypoint_count(recording: Recording, side: str, jaw: Any) -> None:
 
 
 def check_solved(result: ForceSeries, recording: Recording) -> None:
-    """Refuse a recording of which nothing can be said.
+    """Refuse a recording of which nothing is known.
 
     Raises:
         RecordingError: no frame that is to be scored was solved, and why.
@@ -196,7 +196,7 @@ def find_forces(
         ObservationError: the estimator refuses an image.
     """
     track = recording.jaw(side).keypoints
-    stamps, phases = track.stamps, recording.phases_at(track.stamps)
+    stamps = track.stamps
     run, rows = _JawRun(recording, side, jaw, ForceLoop(source, estimator)), []
     idling, answered = Idling(), np.ones(len(stamps), dtype=bool)
     for index, stamp in enumerate(stamps.tolist()):
@@ -224,8 +224,8 @@ def find_forces(
         columns["touching"] = np.array([row["touching"] for row in rows], dtype=bool)
     else:
         del columns["contact_ms"]
-    columns |= {"cycle": phases.cycle, "direction": phases.direction, "scored": phases.scored}
-    columns |= truth_columns(recording, side) | sight_columns(recording, side) | {"contact_source": source.name}
+    columns |= recording.phases_at(stamps) | truth_columns(recording, side) | sight_columns(recording, side)
+    columns["contact_source"] = source.name
     if "detector_ms" in columns:
         columns["latency_ms"] = columns["step_ms"] + columns["detector_ms"]
     series = ForceSeries.build(recording.name, side, stamps, **columns).with_snapshot(run.snapshot)
@@ -247,7 +247,7 @@ class _JawRun:
 
     def __init__(self, recording: Recording, side: str, jaw: Any, loop: ForceLoop) -> None:
         self._jaw, self._loop, self._track = jaw, loop, recording.jaw(side).keypoints
-        self._scored = recording.phases_at(self._track.stamps).scored
+        self._scored = recording.phases_at(self._track.stamps)["scored"]
         self._surface0 = np.array(loop.force.surface())
         self._lines = None
         if recording.jaw(side).truth is not None:

@@ -188,7 +188,7 @@ def _fields_of(prefix: str, given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _true_track(track: JawTrack) -> JawTrack:
-    """Return the track of a jaw with its true key points and poses; what the camera did not see stays away."""
+    """Return the track of a jaw with its true key points and poses; what the camera did not see is left out."""
     sight = track.sight
     points = np.where(sight.visible[:, :, None], sight.points, np.nan)
     keypoints = KeypointTrack(stamps=sight.stamps, points=points, likelihood=sight.visible.astype(np.float64))

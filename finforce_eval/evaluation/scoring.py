@@ -381,18 +381,18 @@ def onset_stats(results: Sequence[ForceSeries]) -> Numbers:
 
     `n` cycles in which both are known, and `missed`, in which `touching` did not come within a second; `median_frames`,
     `earliest_frames` and `max_frames`, negative is early; `false_pct`, the share of the frames without true force that
-    were said to touch.
+    were reported as touching.
     """
     delays = [delay for result in results for delay in onset_delays(result)]
     known = [delay for delay in delays if delay is not None]
-    said = [each.column("touching")[~_loaded(each)].astype(float) for each in results if each.has("touching")]
+    touches = [each.column("touching")[~_loaded(each)].astype(float) for each in results if each.has("touching")]
     return {
         "n": len(known),
         "missed": len(delays) - len(known),
         "median_frames": float(np.median(known)) if known else None,
         "earliest_frames": min(known, default=None),
         "max_frames": max(known, default=None),
-        "false_pct": _share(np.concatenate([np.zeros(0), *said])),
+        "false_pct": _share(np.concatenate([np.zeros(0), *touches])),
     }
 
 
@@ -581,7 +581,7 @@ def score_grasp(recording: Recording, grasp: Mapping[int, float], lag: Mapping[i
     forces = [np.linalg.norm(match_truth(recording.truth(side), stamps), axis=1) for side in recording.jaws]
     found, late = (pd.Series(values, dtype=float).reindex(stamps).to_numpy() for values in (grasp, lag))
     truth = np.min(forces, axis=0)
-    scored = recording.phases_at(stamps).scored & np.isfinite(truth)
+    scored = recording.phases_at(stamps)["scored"] & np.isfinite(truth)
     error = (found - truth)[scored]
     known = truth[np.isfinite(truth)]
     return GraspScore(

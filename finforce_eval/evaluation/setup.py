@@ -1,4 +1,4 @@
-"""What an offline run needs beside the recordings: jaw, settings, calibration, contact; by the command's options."""
+"""The set-up of an offline run by the command's options: jaw, settings, calibration, contact."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _OUTSIDE = ("bags", "out", "engine", "workers", "memory", "address", "shard", "r
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluationSetup:
-    """What an offline run needs beside the recordings; its estimators are built and compiled once for all of them.
+    """The set-up of an offline run; its estimators are built and compiled once for all recordings.
 
     With `as_live` the images are left out that the nodes of contact and force leave out.
     """
@@ -193,7 +193,7 @@ def read_recordings(
 
 
 def print_notes(name: str, notes: Iterable[str]) -> None:
-    """Print what is to be said of a recording."""
+    """Print notes on a recording."""
     for note in notes:
         print(f"note: {name}: {note}", file=sys.stderr)
 

@@ -15,7 +15,7 @@ _CONTACT = (
     "Contact: distance along the undeformed surface between the true pressure centre and the contact that the "
     "solver was given (given) and that it found (solved), above 0.2 N; onset: frames from 0.02 N of true force to "
     "the `touching` that stays, one per loading cycle, negative is early; false: share of the frames without true "
-    "force that were said to touch; ms: a step of the contact estimator alone."
+    "force that were reported as touching; ms: a step of the contact estimator alone."
 )
 _VECTOR = (
     "Force as a vector, over the record phases (record) and over all other images with a truth (moving): RMSE as a "

@@ -1,4 +1,4 @@
-"""Where the contact was said to be over time, against the pressure centre of the measured force."""
+"""The stated contact location over time, against the pressure centre of the measured force."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def _draw_places(place: Any, error: Any, result: ForceSeries) -> None:
 
 
 def _draw_touching(axes: Any, result: ForceSeries) -> None:
-    """Draw bars for the true contact and for the one said."""
+    """Draw bars for the true contact and for the one reported."""
     rows = [("measured", np.nan_to_num(result.true_magnitude) > ONSET_FORCE, BLACK)]
     if result.has("touching"):
         rows.append(("touching", result.column("touching").astype(bool), BLUE))

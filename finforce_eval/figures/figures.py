@@ -126,36 +126,21 @@ def _phase_legend(figure: Figure, results: Sequence[ForceSeries]) -> None:
         figure.legend(handles=patches, loc="outside upper right", ncols=2, frameon=False, fontsize=9)
 
 
-def draw_violins(results: Sequence[ForceSeries]) -> Figure:
-    """Draw the distribution of the error per case: loading to the left, unloading to the right."""
+def draw_errors(results: Sequence[ForceSeries]) -> Figure:
+    """Draw quartiles and the 5th and 95th percentile of the error per case, loading and unloading apart."""
     figure = new_figure(max(4.2, 1.15 * len(results) + 1.4), 4.4)
     axes = figure.subplots()
     style_axes(axes)
     axes.axhline(0.0, color=BLACK, linewidth=0.8)
-    for place, result in enumerate(results):
-        for direction, colour in [*COLOURS.items(), ("", BLUE)]:
-            errors = result.error[result.counted & (result.column("direction") == direction)]
-            if errors.size > 1 and np.ptp(errors) > 0:
-                _draw_violin(axes, errors, place, direction, colour)
+    for direction, colour, offset in (("load", BLUE, -0.2), ("unload", ORANGE, 0.2), ("", BLUE, 0.0)):
+        errors = [each.error[each.counted & (each.column("direction") == direction)] for each in results]
+        style = {"whis": (5, 95), "widths": 0.3, "showfliers": False, "manage_ticks": False}
+        lines = {part: {"color": colour} for part in ("boxprops", "medianprops", "whiskerprops", "capprops")}
+        axes.boxplot(errors, positions=np.arange(len(results)) + offset, **style, **lines)
     axes.set(ylabel="estimate - measured [N]", xlim=(-0.6, len(results) - 0.4))
     axes.set_xticks(range(len(results)), [result.name.replace("_", "\n") for result in results], fontsize=8)
     _phase_legend(figure, results)
     return figure
-
-
-def _draw_violin(axes: Any, errors: NDArray, place: int, direction: str, colour: str) -> None:
-    """Draw one half of a violin, or a whole one without direction, with its quartiles."""
-    body = axes.violinplot(errors, [place], widths=0.85, showextrema=False, points=120)["bodies"][0]
-    body.set(facecolor=colour, alpha=0.55, edgecolor="none")
-    sign = {"load": -1, "unload": 1, "": 0}[direction]
-    vertices = body.get_paths()[0].vertices
-    if sign:
-        inner, outer = sorted((place, place + sign))
-        vertices[:, 0] = np.clip(vertices[:, 0], inner, outer)
-    low, middle, high = np.percentile(errors, [25, 50, 75])
-    x = place + 0.05 * sign
-    axes.plot([x, x], [low, high], color=colour, linewidth=3, solid_capstyle="butt")
-    axes.plot([x], [middle], "o", color="white", markeredgecolor=colour, markersize=4)
 
 
 def draw_keypoints(result: ForceSeries, names: Sequence[str]) -> Figure:

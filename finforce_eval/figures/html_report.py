@@ -1,4 +1,4 @@
-"""Forces over time on one HTML page that needs nothing beside itself: its plots zoom, and it loads nothing."""
+"""Forces over time on one HTML page that needs no other file: its plots zoom."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _MOST_WORDS = 255
 
 
 def write_html(
-    courses: Sequence[ForceSeries],
+    series: Sequence[ForceSeries],
     path: Path,
     *,
     title: str,
@@ -31,12 +31,12 @@ def write_html(
     """Write the page.
 
     Args:
-        courses: one plot each.
+        series: one plot each.
         path: of the page.
         title: its heading.
         about: what was run, name by name.
         columns: of a table above the plots; the first holds names.
-        rows: of the table: one for each course, in their order, and any after them; without one, images and answers.
+        rows: of the table: one for each series, in their order, and any after them; without one, images and answers.
 
     Returns:
         The page.
@@ -45,13 +45,13 @@ def write_html(
         OSError: it cannot be written.
     """
     if not rows:
-        columns, rows = _count_answers(courses)
+        columns, rows = _count_answers(series)
     content = {
         "title": title,
         "about": dict(about),
         "columns": list(columns),
         "rows": [list(row) for row in rows],
-        "items": [_describe(course) for course in courses],
+        "items": [_describe(each) for each in series],
     }
     # no text in it can end the script that holds it
     data = json.dumps(content).replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
@@ -60,45 +60,45 @@ def write_html(
     return path
 
 
-def _count_answers(courses: Sequence[ForceSeries]) -> tuple[list[str], list[list[str]]]:
+def _count_answers(series: Sequence[ForceSeries]) -> tuple[list[str], list[list[str]]]:
     """Return columns and rows that tell of images, answers and the largest force."""
     rows = []
-    for course in courses:
-        known = course.magnitude[course.solved]
-        answered = f"{100.0 * len(known) / max(len(course), 1):.1f}"
+    for each in series:
+        known = each.magnitude[each.solved]
+        answered = f"{100.0 * len(known) / max(len(each), 1):.1f}"
         largest = f"{known.max():.2f}" if len(known) else "-"
-        rows.append([course.name, str(len(course)), answered, largest])
+        rows.append([each.name, str(len(each)), answered, largest])
     return ["recording", "images", "answered/%", "largest force/N"], rows
 
 
-def _describe(course: ForceSeries) -> dict[str, Any]:
+def _describe(series: ForceSeries) -> dict[str, Any]:
     """Return what the page's script reads of a series."""
-    words, status = np.unique(course.column("status"), return_inverse=True)
+    words, status = np.unique(series.column("status"), return_inverse=True)
     columns = {
-        "time": course.seconds if len(course) else np.zeros(0),
-        "found": course.magnitude,
-        "stddev": np.where(course.solved, course.column("magnitude_stddev"), np.nan),
-        **dict(zip("xyz", course.force.T, strict=True)),
+        "time": series.seconds if len(series) else np.zeros(0),
+        "found": series.magnitude,
+        "stddev": np.where(series.solved, series.column("magnitude_stddev"), np.nan),
+        **dict(zip("xyz", series.force.T, strict=True)),
     }
-    if course.has("true_force"):
-        columns["truth"] = course.true_magnitude
+    if series.has("true_force"):
+        columns["truth"] = series.true_magnitude
     return {
-        "name": course.name,
-        "images": len(course),
-        "lost": int((~course.solved).sum()),
+        "name": series.name,
+        "images": len(series),
+        "lost": int((~series.solved).sum()),
         "words": words[:_MOST_WORDS].tolist(),
         "status": _encode(np.minimum(status, _MOST_WORDS - 1), np.uint8),
-        "phase": _encode(_phase(course), np.uint8),
+        "phase": _encode(_phase(series), np.uint8),
         **{name: _encode(values, np.float32) for name, values in columns.items()},
     }
 
 
-def _phase(course: ForceSeries) -> NDArray[np.uint8]:
+def _phase(series: ForceSeries) -> NDArray[np.uint8]:
     """Return 0, in a record phase of loading (or without direction) 1, of unloading 2, of each image (n,)."""
-    if not course.has("direction"):
-        return np.zeros(len(course), np.uint8)
-    load, unload = (course.column("direction") == direction for direction in DIRECTIONS)
-    return np.where(course.scored, np.where(unload, 2, np.where(load, 1, 0)), 0).astype(np.uint8)
+    if not series.has("direction"):
+        return np.zeros(len(series), np.uint8)
+    load, unload = (series.column("direction") == direction for direction in DIRECTIONS)
+    return np.where(series.scored, np.where(unload, 2, np.where(load, 1, 0)), 0).astype(np.uint8)
 
 
 def _encode(values: ArrayLike, kind: type) -> str:

@@ -182,9 +182,9 @@ def _describe_force(result: ForceSeries, stamp: int, is_named: bool) -> str:
     if not rows.size:
         return ""
     force, truth = float(result.magnitude[rows[0]]), float(result.true_magnitude[rows[0]])
-    said = f"{force:.2f} N" if np.isfinite(force) else "no estimate"
+    estimate = f"{force:.2f} N" if np.isfinite(force) else "no estimate"
     known = f" (true {truth:.2f} N)" if np.isfinite(truth) else ""
-    return f"{result.side} {said}{known}" if is_named else said + known
+    return f"{result.side} {estimate}{known}" if is_named else estimate + known
 
 
 def _explain(figure: Any, reasons: Iterable[str], *, has_truth: bool) -> None:

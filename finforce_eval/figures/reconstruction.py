@@ -77,7 +77,7 @@ def _as_picture(evidence: ImageEvidence, color: NDArray | None) -> NDArray:
 
 
 def _shade(view: RenderedMesh) -> NDArray:
-    """Return a picture (h, w, 4) of the mesh, brighter where it faces the camera, clear beside it."""
+    """Return a picture (h, w, 4) of the mesh, brighter where it faces the camera, clear elsewhere."""
     picture = np.zeros((*view.depth.shape, 4))
     facing = -np.einsum("ij,ij->i", view.normals, view.points) / np.linalg.norm(view.points, axis=1)
     colour = np.array([0.95, 0.55, 0.2])

@@ -7,16 +7,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from finforce.messages import stamp_of
 from finforce_eval.errors import RecordingError
-from finforce_eval.evaluation.scoring import match_samples, match_truth
+from finforce_eval.evaluation.scoring import match_truth
 from finforce_eval.recordings.bags import bag_source, check_types, open_bag
 from finforce_eval.recordings.recording import WRENCH
 from finforce_eval.recordings.tracks import JAWS, WrenchTrack
-from finforce_eval.table import ForceSeries
+from finforce_eval.recordings.writer import STATUS
+from finforce_eval.table import AXES, ForceSeries, stddev_along
 
-STATUS = "diagnostic_msgs/msg/DiagnosticArray"
 _FORCE, _STDDEV, _STATUS, _TRUTH = KINDS = ("wrench", "wrench_stddev", "wrench_status", "ground_truth_wrench")
 
 
@@ -45,12 +45,8 @@ def read_forces(path: Path) -> list[ForceSeries]:
 def _make_series(name: str, side: str, samples: Mapping[str, list[Any]]) -> ForceSeries:
     """Return the series of one jaw."""
     found, stated, true = (_stack(samples.get(f"/{side}/{kind}", [])) for kind in (_FORCE, _STDDEV, _TRUTH))
-    stddev = match_samples(stated.stamps, stated.force, found.stamps) if len(stated.stamps) else np.nan
-    magnitude = np.linalg.norm(found.force, axis=1)
-    with np.errstate(invalid="ignore"):
-        direction = found.force / np.maximum(magnitude, 1e-9)[:, None]
-    along = np.sqrt(np.sum((direction * stddev) ** 2, axis=1))
-    words = {_stamp(each): each.status[0].values[0].value for each in samples.get(f"/{side}/{_STATUS}", [])}
+    stddev = match_truth(stated, found.stamps) if len(stated.stamps) else np.full_like(found.force, np.nan)
+    words = {stamp_of(each): each.status[0].values[0].value for each in samples.get(f"/{side}/{_STATUS}", [])}
     status = [words.get(stamp, "") for stamp in found.stamps.tolist()]
     return ForceSeries.build(
         name,
@@ -58,7 +54,7 @@ def _make_series(name: str, side: str, samples: Mapping[str, list[Any]]) -> Forc
         found.stamps,
         force=found.force,
         torque=found.torque,
-        magnitude_stddev=along,
+        magnitude_stddev=stddev_along(found.force, stddev),
         true_force=match_truth(true, found.stamps) if len(true.stamps) else None,
         status=np.array(status, dtype="U32"),
     )
@@ -66,15 +62,9 @@ def _make_series(name: str, side: str, samples: Mapping[str, list[Any]]) -> Forc
 
 def _stack(messages: list[Any]) -> WrenchTrack:
     """Return wrenches as arrays, in the order of their stamps."""
-    rows = sorted((_stamp(each), *_vector(each.wrench.force), *_vector(each.wrench.torque)) for each in messages)
-    values: NDArray[np.float64] = np.array([row[1:] for row in rows], dtype=np.float64).reshape(-1, 6)
-    stamps = np.array([row[0] for row in rows], dtype=np.int64)
-    return WrenchTrack(stamps=stamps, force=values[:, :3], torque=values[:, 3:])
-
-
-def _stamp(message: Any) -> int:
-    return message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
-
-
-def _vector(vector: Any) -> tuple[float, float, float]:
-    return vector.x, vector.y, vector.z
+    messages = sorted(messages, key=stamp_of)
+    force, torque = (
+        np.array([[getattr(part, axis) for axis in AXES] for part in parts], dtype=np.float64).reshape(-1, 3)
+        for parts in ([each.wrench.force for each in messages], [each.wrench.torque for each in messages])
+    )
+    return WrenchTrack(stamps=np.array([stamp_of(each) for each in messages], np.int64), force=force, torque=torque)

@@ -74,13 +74,13 @@ def write_overview(evaluation: Evaluation, folder: str | Path, *, about: Mapping
     Returns:
         README.md, which shows the pictures.
     """
-    from finforce_eval.figures.figures import draw_unity, draw_violins
+    from finforce_eval.figures.figures import draw_errors, draw_unity
 
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     results = list(evaluation.results.values())
     draw_unity(results).savefig(folder / "unity.png")
-    draw_violins(results).savefig(folder / "violins.png")
+    draw_errors(results).savefig(folder / "errors.png")
     page = folder / "README.md"
     zooming = ["The same over time, to zoom: [report.html](report.html)", ""]
     head = [f"# {title}", "", *(f"- {key}: {value}" for key, value in about.items()), "", *zooming]
@@ -116,7 +116,7 @@ def _recording_of(result: ForceSeries) -> str:
 
 
 def write_page(evaluation: Evaluation, path: Path, *, about: Mapping[str, str], title: str) -> Path:
-    """Write one HTML page with the scores and plots that zoom; it needs nothing beside itself.
+    """Write one HTML page with the scores and plots that zoom; it needs no other file.
 
     Args:
         evaluation: scores and time series.
@@ -139,7 +139,7 @@ def _overview(evaluation: Evaluation) -> list[str]:
         "Errors are norm of the estimate minus norm of the measured force, over the record phases.",
         "",
         "![Estimated against measured force](unity.png)",
-        "![Distribution of the error per case](violins.png)",
+        "![Distribution of the error per case](errors.png)",
     ]
 
 

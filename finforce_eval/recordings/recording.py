@@ -60,7 +60,7 @@ class _Content(NamedTuple):
 def read_recording(
     path: str | Path, pairing: int = PAIRED, sides: Sequence[str] = (), *, strict: bool = False
 ) -> Recording:
-    """Read a rosbag2 folder or a single .mcap / .db3 file, with the `case.json` beside it.
+    """Read a rosbag2 folder or a single .mcap / .db3 file, with the `case.json` next to it.
 
     Topics that are not ours are not decoded; those of unknown type are named in `notes`. Images are not read yet; a
     recording with images may do without key points, its tracks of them are empty then. One that is damaged is read as

@@ -1,4 +1,4 @@
-"""Recordings as frozen records of NumPy arrays, with what a camera truly saw and what a detector said of it."""
+"""Recordings as frozen records of NumPy arrays, with what a camera truly saw and what a detector reported."""
 
 from __future__ import annotations
 
@@ -130,21 +130,6 @@ class PhaseTrack:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FramePhases:
-    """The phases of the bench image by image.
-
-    Attributes:
-        cycle: (n,) loading cycle, 0 without phases.
-        direction: (n,) "load", "unload", or "" without phases.
-        scored: (n,) in a `record` phase; every frame without phases.
-    """
-
-    cycle: NDArray[np.int64]
-    direction: NDArray[np.str_]
-    scored: NDArray[np.bool_]
-
-
-@dataclass(frozen=True, kw_only=True)
 class JawTrack:
     """What a recording holds of one jaw.
 
@@ -153,7 +138,7 @@ class JawTrack:
         truth: measured wrenches.
         pose: T_camera_jaw over time, of the key point detector.
         sight: true key points, `true_pose` the true T_camera_jaw: of a synthetic recording.
-        detection: what the detector said, where this call found the key points in images.
+        detection: what the detector reported, where this call found the key points in images.
     """
 
     keypoints: KeypointTrack
@@ -223,18 +208,18 @@ class Recording:
             raise RecordingError(f"{self.name}: no ground truth: {topic} is absent or has no messages")
         return truth
 
-    def phases_at(self, stamps: NDArray[np.int64]) -> FramePhases:
-        """Return the phase of each stamp [ns]."""
+    def phases_at(self, stamps: NDArray[np.int64]) -> dict[str, NDArray]:
+        """Return `cycle`, `direction` and `scored` of the table of forces for each stamp (n,) [ns]."""
         frames, phases = len(stamps), self.phases
         if phases is None:
             nothing, every = np.full(frames, "", dtype="U6"), np.ones(frames, dtype=bool)
-            return FramePhases(cycle=np.zeros(frames, dtype=np.int64), direction=nothing, scored=every)
+            return {"cycle": np.zeros(frames, dtype=np.int64), "direction": nothing, "scored": every}
         row = phases.index_at(stamps)
-        return FramePhases(
-            cycle=np.where(row >= 0, phases.cycle[row], 0),
-            direction=np.where(row >= 0, phases.direction[row], ""),
-            scored=(row >= 0) & (phases.stage[row] == "record"),
-        )
+        return {
+            "cycle": np.where(row >= 0, phases.cycle[row], 0),
+            "direction": np.where(row >= 0, phases.direction[row], ""),
+            "scored": (row >= 0) & (phases.stage[row] == "record"),
+        }
 
     def between(self, start: int, stop: int) -> Recording:
         """Return the part with start <= stamp < stop [ns]; a phase under way at start begins there."""
@@ -322,7 +307,7 @@ class DetectionTruth:
 
 @dataclass(frozen=True, kw_only=True)
 class DetectionTrack:
-    """What the key point detector said of one jaw beside the key points themselves, image by image.
+    """What the key point detector reported of one jaw in addition to the key points, image by image.
 
     Attributes:
         stamps: (n,) image time [ns], strictly increasing.

@@ -13,9 +13,9 @@ from finforce.messages import decode_columns, decode_keypoints, pose_from_messag
 from finforce.stamps import NANOSECONDS
 from finforce_eval.evaluation.forces import sight_columns, truth_columns
 from finforce_eval.evaluation.keypoint_source import with_detections
-from finforce_eval.evaluation.places import InnerSurface, true_lines
+from finforce_eval.evaluation.pressure_centre import InnerSurface, true_lines
 from finforce_eval.recordings.tracks import Recording
-from finforce_eval.table import ForceSeries, Snapshot
+from finforce_eval.table import ForceSeries, Snapshot, stddev_along
 from finforce_ifea.messages import contact_from_cloud, outline_from_cloud
 from finforce_keypoints.geometry.jaw_localizer import REASONS, JawKeypoints
 from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC
@@ -82,7 +82,7 @@ class ReplayLog:
         self.rows[side][self._stamp(message)] |= found
 
     def take_contact(self, side: str, message: Any) -> None:
-        """Keep where the object was said to touch."""
+        """Keep the reported contact."""
         contact, row = contact_from_cloud(message, f"{side}_jaw", free=False), self.rows[side][self._stamp(message)]
         if len(contact.points):
             row["contact_height"] = float(np.average(contact.points[:, 2], weights=contact.weights))
@@ -162,24 +162,19 @@ def live_result(
     track, nothing = recording.jaw(side).keypoints, np.full(3, np.nan)
     rows = [log.rows[side].get(stamp, {}) for stamp in track.stamps.tolist()]
     force, stddev = (np.array([row.get(name, nothing) for row in rows]) for name in ("force", "force_stddev"))
-    norm = np.linalg.norm(force, axis=1, keepdims=True)
-    along = np.divide(force, norm, out=np.zeros_like(force), where=norm > 0.0)
-    phases = recording.phases_at(track.stamps)
     seen = np.isfinite(track.points).all(axis=2) & (track.likelihood >= likelihood_threshold)
     return ForceSeries.build(
         recording.name,
         side,
         track.stamps,
         force=force,
-        magnitude_stddev=np.linalg.norm(along * stddev, axis=1),
+        magnitude_stddev=stddev_along(force, stddev),
         force_stddev=stddev if np.isfinite(stddev).any() else None,
         used=seen,
         status=np.where(np.isfinite(force).all(axis=1), "ok", "no wrench"),
         message="",
         step_ms=np.array([row.get("step_ms", np.nan) for row in rows]),
-        cycle=phases.cycle,
-        direction=phases.direction,
-        scored=phases.scored,
+        **recording.phases_at(track.stamps),
         **(_contact_columns(recording, side, rows, estimator) if any("touching" in row for row in rows) else {}),
         true_force=truth_columns(recording, side)["true_force"],
         **sight_columns(recording, side),
@@ -187,7 +182,7 @@ def live_result(
 
 
 def _contact_columns(recording: Recording, side: str, rows: list[dict[str, Any]], estimator: Any) -> dict[str, Any]:
-    """Return where the contact was said to be, and where it was."""
+    """Return the reported contact and the true one."""
     surface = InnerSurface(np.array(estimator.surface()), estimator.jaw.face)
     lines = true_lines(recording, side, recording.jaw(side).keypoints.stamps, surface.face_x)
     truth = [

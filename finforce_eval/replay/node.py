@@ -68,7 +68,7 @@ class PlayerNode(Node):
         return all(self._count_others(topic) > 0 for topic in topics)
 
     def _count_others(self, topic: str) -> int:
-        """Return how many listen to a topic beside this node."""
+        """Return how many listen to a topic other than this node."""
         own = sum(subscription.topic_name == topic for subscription in self.subscriptions)
         if topic in self._outputs:
             return self._outputs[topic].get_subscription_count() - own

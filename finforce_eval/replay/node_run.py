@@ -74,7 +74,7 @@ def awaited_topics(processes: Sequence[Process], sides: Sequence[str]) -> list[s
 
 
 def _await_listeners(player: PlayerNode, nodes: ProcessGroup, topics: Collection[str]) -> None:
-    """Wait until somebody beside the player listens to each of the topics.
+    """Wait until somebody other than the player listens to each of the topics.
 
     Raises:
         ProcessError: a process ended, or nobody listens after three minutes.
@@ -108,7 +108,7 @@ def run_nodes(
         messages: what is played.
         sides: jaws that are played.
         awaited: topics that somebody has to listen to before it begins; without any those of our own nodes.
-        heard: jaws whose own results are heard beside the grasp force, which makes them work for it; all without.
+        heard: jaws whose own results are heard in addition to the grasp force, at a cost to the nodes; all without.
         detector: whether the results of a key point detector are heard, too.
         watch: called with the process ids, by label, before each message leaves.
         rate: speed.

@@ -29,7 +29,7 @@ class ProcessGroup:
 
     Args:
         processes: what to run, with this Python.
-        environment: variables beside those of this process.
+        environment: variables in addition to those of this process.
     """
 
     def __init__(self, processes: Sequence[Process], environment: Mapping[str, str]) -> None:

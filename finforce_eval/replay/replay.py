@@ -260,9 +260,9 @@ def _score(recording: Recording, setup: EvaluationSetup, log: ReplayLog) -> Eval
 
 
 def _words(log: ReplayLog, side: str) -> str:
-    """Return what the diagnostics of a jaw said last, those of the key point detector first, where it runs."""
-    said = [log.health[name]["message"] for name in _sources(side) if name in log.health]
-    return "; ".join(said) or "no diagnostics either"
+    """Return the last diagnostics of a jaw, those of the key point detector first, where it runs."""
+    messages = [log.health[name]["message"] for name in _sources(side) if name in log.health]
+    return "; ".join(messages) or "no diagnostics either"
 
 
 def _sources(side: str) -> tuple[str, str]:

@@ -138,7 +138,7 @@ def draw_way(trace: Trace, path: Path | str) -> None:
     way.invert_yaxis()
     way.axvline(trace.late[stamp], color=ORANGE, linewidth=1.2)
     way.text(trace.late[stamp], -0.9, "grasp force", color=ORANGE, ha="center", fontsize=8)
-    way.set_xlabel("after the image left [ms]; beside each bar what the stage itself took")
+    way.set_xlabel("after the image left [ms]; next to each bar the time of the stage itself")
     way.set_xlim(left=0.0, right=1.15 * max(trace.late[stamp], spans["end"].max()))
     late = np.array(list(trace.late.values()))
     all_of_them.hist(late, bins=np.linspace(0.0, max(40.0, float(late.max())), 80), color=GREY)

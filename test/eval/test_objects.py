@@ -164,7 +164,7 @@ def test_absent_mesh_is_refused_with_what_would_do(recorded):
     assert find_mesh(recording) is None
     with pytest.raises(RecordingError, match=r"'objects/thing.stl' of its case.json is not there; give --object MESH"):
         require_mesh(recording)
-    with pytest.raises(RecordingError, match="no mesh in a case.json beside it"):
+    with pytest.raises(RecordingError, match="no mesh in a case.json next to it"):
         require_mesh(replace(recording, case={}))
 
 

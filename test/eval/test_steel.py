@@ -42,7 +42,7 @@ def test_truth_has_the_measured_magnitude_along_minus_x(measurement):
 def test_every_level_settles_and_is_recorded_as_long_as_the_others(measurement):
     recording = recording_from_measurement(measurement)
     stamps = recording.jaws["left"].keypoints.stamps
-    rows = recording.phases.index_at(stamps)[recording.phases_at(stamps).scored]
+    rows = recording.phases.index_at(stamps)[recording.phases_at(stamps)["scored"]]
     levels = recording.phases.displacement_mm[rows]
     assert levels.tolist() == np.repeat([5, 10, 15, 20, 25, 30], 30).tolist()
 

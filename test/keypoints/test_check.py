@@ -136,7 +136,7 @@ def test_jaws_that_are_nowhere_are_said_to_be_so(record, capsys, tmp_path):
 def test_a_picture_is_judged_by_light_focus_and_what_it_shows(footage, change, level, words):
     mean = np.mean([frame.color for frame in footage[1]], axis=0).astype(np.uint8)
     said = judge_picture(change(mean))
-    assert any(line.level == level and words in line.text for line in said)
+    assert any(line.severity == level and words in line.text for line in said)
 
 
 def test_too_few_images_are_refused(still, capsys):

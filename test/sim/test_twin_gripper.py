@@ -302,7 +302,7 @@ def test_mesh_file_lies_with_the_middle_of_its_box_where_the_scenario_says(tmp_p
 def test_too_wide_an_object_and_bad_fields_are_refused():
     with pytest.raises(ScenarioError, match="wide"):
         TwinGripper(build_scenario("grasp_cylinder", object="cylinder", scale=2.0), 0, "coarse")
-    with pytest.raises(ScenarioError, match="beside"):
+    with pytest.raises(ScenarioError, match="out of reach"):
         TwinGripper(build_scenario("grasp_cylinder", shift=0.045), 0, "coarse")
     with pytest.raises(ScenarioError, match="expected one of"):
         build_scenario("nothing")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from eval_fakes import BOX, PERIOD, START, make_recording
 
-from finforce_eval.evaluation.places import InnerSurface, true_lines
+from finforce_eval.evaluation.pressure_centre import InnerSurface, true_lines
 from finforce_eval.recordings.tracks import parse_phases
 from finforce_ifea.jaw.section import FaceLine
 

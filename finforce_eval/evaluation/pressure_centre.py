@@ -69,13 +69,13 @@ class InnerSurface:
         """
         if not np.isfinite([*point, *direction]).all():
             return float("nan")
-        away = self.middle_line(surface) - point
-        side = direction[0] * away[:, 1] - direction[1] * away[:, 0]
+        offset = self.middle_line(surface) - point
+        side = direction[0] * offset[:, 1] - direction[1] * offset[:, 0]
         crossed = np.flatnonzero((side[:-1] <= 0) != (side[1:] <= 0))
         if not crossed.size:
             return float("nan")
         share = side[crossed] / (side[crossed] - side[crossed + 1])
-        along = away @ direction
+        along = offset @ direction
         first = int(np.argmin(along[crossed] + share * (along[crossed + 1] - along[crossed])))
         low, high = self.heights[crossed[first]], self.heights[crossed[first] + 1]
         return float(low + share[first] * (high - low))
