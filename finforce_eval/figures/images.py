@@ -27,7 +27,8 @@ MEANING = {
     "workspace": "outside the workspace",
     "image": "outside the image",
 }
-HIGHEST = 20.0  # [px] of error that is drawn
+# what is drawn over time, with the largest value that is shown
+LIMITS = {"pixel error [px]": 20.0, "key points": None, "likelihood": 1.05}
 WHITE, BLACK = "white", "black"
 
 
@@ -215,55 +216,40 @@ def draw_detection(recording: Recording) -> Any:
         A matplotlib figure.
     """
     jaws = detected_jaws(recording)
-    drawn = [_draw_counts, _draw_likelihood]
-    if any(track.sight is not None for track in jaws.values()):
-        drawn.insert(0, _draw_pixel_error)
+    curves = {side: _detection_curves(track) for side, track in jaws.items()}
+    drawn = [what for what in LIMITS if any(own[what] for own in curves.values())]
     figure = new_figure(WIDTH, 1.8 * len(drawn) + 0.8)
     panels = figure.subplots(len(drawn), len(jaws), sharex=True, sharey="row", squeeze=False)
     begin = int(recording.images.stamps[0])
-    for column, (side, track) in enumerate(jaws.items()):
-        for axes, draw in zip(panels[:, column], drawn, strict=True):
+    for column, side in zip(panels.T, jaws, strict=True):
+        for axes, what in zip(column, drawn, strict=True):
             style_axes(axes)
-            draw(axes, track, begin)
-        panels[0, column].set_title(f"{recording.name}, {side} jaw", loc="left", fontsize=10)
-        panels[-1, column].set_xlabel("time [s]")
-    for axes in panels.ravel():
-        axes.label_outer()
-    if len(drawn) > 2:
-        panels[0, 0].set_ylim(0.0, min(panels[0, 0].get_ylim()[1], HIGHEST))
+            for stamps, values, color, label in curves[side][what]:
+                axes.plot((stamps - begin) * 1e-9, values, color=color, linewidth=1.1, label=label)
+            axes.set(ylabel=what, ylim=(0.0, LIMITS[what]))
+            axes.label_outer()
+        column[0].set_title(f"{recording.name}, {side} jaw", loc="left", fontsize=10)
+        column[-1].set_xlabel("time [s]")
     for axes in panels[:, 0]:
         axes.legend(loc="best", ncols=2, frameon=False, fontsize=8)
     return figure
 
 
-def _draw_pixel_error(axes: Any, track: JawTrack, begin: int) -> None:
-    """Draw the distance of what was found from the truth, over the key points that were visible."""
-    axes.set(ylabel="pixel error [px]")
-    if track.sight is None:
-        return
-    times = np.intersect1d(track.detection.stamps, track.sight.stamps)
-    error = np.stack(compare_detection(track.detection, track.sight)["pixel_error"])
-    for percent, color, label in ((95, ORANGE, "95th percentile"), (50, BLUE, "median of the visible")):
-        axes.plot((times - begin) * 1e-9, _percentile(error, percent), color=color, linewidth=1.0, label=label)
-
-
-def _draw_counts(axes: Any, track: JawTrack, begin: int) -> None:
-    """Draw how many key points were used, and how many could be seen."""
-    if track.sight is not None:
-        seconds = (track.sight.stamps - begin) * 1e-9
-        axes.plot(seconds, track.sight.visible.sum(axis=1), color=GREY, linewidth=2.2, label="visible")
-    seconds = (track.detection.stamps - begin) * 1e-9
-    axes.plot(seconds, track.detection.accepted.sum(axis=1), color=GREEN, linewidth=1.1, label="used")
-    axes.set(ylabel="key points", ylim=(0, track.keypoints.count + 1))
-
-
-def _draw_likelihood(axes: Any, track: JawTrack, begin: int) -> None:
-    """Draw the likelihood of the key points that were used."""
-    seconds = (track.keypoints.stamps - begin) * 1e-9
-    likelihood = np.where(track.detection.accepted, track.keypoints.likelihood, np.nan)
-    for percent, color, label in ((50, BLUE, "median of the used"), (0, GREY, "lowest")):
-        axes.plot(seconds, _percentile(likelihood, percent), color=color, linewidth=1.0, label=label)
-    axes.set(ylabel="likelihood", ylim=(0, 1.05))
+def _detection_curves(track: JawTrack) -> dict[str, list[tuple[NDArray, NDArray, str, str]]]:
+    """Return by the panels of `LIMITS` the curves of a jaw: stamps [ns], values, colour and label."""
+    detection, sight = track.detection, track.sight
+    errors, counts = [], []
+    if sight is not None:
+        times = np.intersect1d(detection.stamps, sight.stamps)
+        pixels = np.stack(compare_detection(detection, sight)["pixel_error"])
+        errors.append((times, _percentile(pixels, 95), ORANGE, "95th percentile"))
+        errors.append((times, _percentile(pixels, 50), BLUE, "median of the visible"))
+        counts.append((sight.stamps, sight.visible.sum(axis=1), GREY, "visible"))
+    counts.append((detection.stamps, detection.accepted.sum(axis=1), GREEN, "used"))
+    likelihood = np.where(detection.accepted, track.keypoints.likelihood, np.nan)
+    used = [(50, BLUE, "median of the used"), (0, GREY, "lowest")]
+    likelihoods = [(detection.stamps, _percentile(likelihood, part), color, label) for part, color, label in used]
+    return dict(zip(LIMITS, (errors, counts, likelihoods), strict=True))
 
 
 def _percentile(values: NDArray[np.float64], percent: float) -> NDArray[np.float64]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from finforce.errors import ObservationError
 from finforce.files import FileError, read_json
-from finforce.messages import Keypoints, decode_columns, decode_keypoints
+from finforce.messages import Keypoints, decode_columns, decode_keypoints, stamp_of
 from finforce.stamps import NANOSECONDS
 from finforce_eval.errors import DamagedError, RecordingError
 from finforce_eval.recordings.bags import BagMessage, bag_source, check_messages, check_types, open_bag
@@ -144,15 +144,9 @@ def _read_samples(source: Path, name: str, pairing: int) -> _Content:
         return _Content(samples, images, notes)
 
 
-def _stamp(sample: BagMessage) -> int:
-    """Return the header stamp [ns]."""
-    stamp = sample.message.header.stamp
-    return stamp.sec * NANOSECONDS + stamp.nanosec
-
-
 def _stamps(samples: Sequence[BagMessage], topic: str, name: str, *, strict: bool) -> np.ndarray:
     """Return the header stamps (n,) [ns] and check their order."""
-    stamps = np.array([_stamp(sample) for sample in samples], dtype=np.int64)
+    stamps = np.array([stamp_of(sample.message) for sample in samples], dtype=np.int64)
     steps = np.diff(stamps)
     wrong = np.flatnonzero(steps <= 0 if strict else steps < 0)
     if wrong.size:
@@ -255,7 +249,7 @@ def _pose_track(samples: Sequence[BagMessage], topic: str, name: str) -> PoseTra
         raise RecordingError(f"{name}: {topic} {what}; expected one frame")
     poses = [sample.message.pose for sample in samples]
     return PoseTrack(
-        stamps=np.array([_stamp(sample) for sample in samples], dtype=np.int64),
+        stamps=np.array([stamp_of(sample.message) for sample in samples], dtype=np.int64),
         position=np.array([[p.position.x, p.position.y, p.position.z] for p in poses]),
         quaternion=np.array([[getattr(p.orientation, axis) for axis in "xyzw"] for p in poses]),
         frame_id=frames[0],

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce.messages import decode_columns, decode_keypoints, pose_from_message
+from finforce.messages import decode_columns, decode_keypoints, pose_from_message, stamp_of
 from finforce.stamps import NANOSECONDS
 from finforce_eval.evaluation.forces import sight_columns, truth_columns
 from finforce_eval.evaluation.keypoint_source import with_detections
@@ -56,8 +56,7 @@ class ReplayLog:
 
     def _stamp(self, message: Any) -> int:
         """Return a stamp as it was recorded [ns]."""
-        stamp = message.header.stamp
-        return stamp.sec * NANOSECONDS + stamp.nanosec - self.offset
+        return stamp_of(message) - self.offset
 
     def take_sent(self, topic: str, stamp: int, time: float) -> None:
         """Note when a message left [s, monotonic]; those count that a run begins with: key points, or an image."""
@@ -133,7 +132,7 @@ def heard_keypoints(cloud: Any, T_camera_jaw: NDArray[np.float64]) -> JawKeypoin
     seen = decode_keypoints(cloud)
     columns = decode_columns(cloud, ("u", "v", "reason"))
     return JawKeypoints(
-        stamp=cloud.header.stamp.sec + cloud.header.stamp.nanosec / NANOSECONDS,
+        stamp=stamp_of(cloud) / NANOSECONDS,
         points=seen.points,
         likelihood=seen.likelihood,
         pixels=np.stack([columns["u"], columns["v"]], axis=1).astype(np.float64),
