@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 from finforce.files import FileError, read_yaml
 from finforce.gripper_frames import ROBOT_CAMERA
+from finforce.ros.transport import CHOICES, PROFILES, TRANSPORT
 from finforce.systems.processes import (
     BenchOptions,
     GripperOptions,
@@ -28,13 +29,6 @@ from finforce.systems.processes import (
 )
 from finforce.transforms import pose_numbers
 
-# Fast DDS loses most images without it; as finforce.ros.node gives it to our own nodes
-TRANSPORT = Path(__file__).parents[1] / "ros" / "fastdds.xml"
-TRANSPORT_CHOICES = (
-    "FASTRTPS_DEFAULT_PROFILES_FILE",
-    "FASTDDS_DEFAULT_PROFILES_FILE",
-    "FASTDDS_BUILTIN_TRANSPORTS",
-)
 SIM_OBJECT = Path(__file__).parents[2] / "finforce_eval" / "data" / "objects" / "cylinder_25.stl"  # in metres
 SIM_CALIBRATION, SIM_JAWS = "twin", ("", "bench")
 # of a camera, behind its name; a D405 had the other colour topic before realsense2_camera 4.57.4
@@ -183,13 +177,13 @@ def camera_includes(options: RobotOptions, share: Path) -> list[Include]:
         "config_file": options.camera_config or str(share / "config" / "d405.yaml"),
         **serial,
     }
-    chosen = any(os.environ.get(name) for name in TRANSPORT_CHOICES)
+    chosen = any(os.environ.get(name) for name in CHOICES)
     return [
         Include(
             package="realsense2_camera",
             file="rs_launch.py",
             arguments=arguments,
-            environment={} if chosen else {TRANSPORT_CHOICES[0]: str(TRANSPORT)},
+            environment={} if chosen else {PROFILES: str(TRANSPORT)},
             advice="or say camera:=false and start a camera yourself",
         )
     ]

@@ -8,10 +8,9 @@ import pytest
 import yaml
 
 from finforce.gripper_frames import ROBOT_CAMERA
+from finforce.ros.transport import CHOICES, PROFILES, TRANSPORT
 from finforce.systems.live import (
     SIM_OBJECT,
-    TRANSPORT,
-    TRANSPORT_CHOICES,
     bench_processes,
     camera_pose,
     robot_processes,
@@ -117,16 +116,11 @@ def test_the_camera_of_a_serial_number_is_text_for_its_launch_file():
 
 
 def test_the_camera_gets_the_transport_of_our_nodes_unless_somebody_chose_one(monkeypatch):
-    for name in TRANSPORT_CHOICES:
+    for name in CHOICES:
         monkeypatch.delenv(name, raising=False)
-    assert robot()["realsense2_camera"].environment == {TRANSPORT_CHOICES[0]: str(TRANSPORT)}
-    monkeypatch.setenv(TRANSPORT_CHOICES[2], "UDPv4")
+    assert robot()["realsense2_camera"].environment == {PROFILES: str(TRANSPORT)}
+    monkeypatch.setenv(CHOICES[2], "UDPv4")
     assert not robot()["realsense2_camera"].environment
-
-
-def test_the_transport_is_that_of_our_nodes():
-    ros = pytest.importorskip("finforce.ros.node")
-    assert (TRANSPORT, TRANSPORT_CHOICES) == (ros.TRANSPORT, ros.CHOICES)
 
 
 def test_the_camera_is_a_d405_whose_images_belong_together():

@@ -1,5 +1,7 @@
 """What a section shows of a fin-ray finger: its frame, cells, bands, ribs, bolt holes and clamp."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
@@ -47,6 +49,10 @@ class Wall:
         """The median thickness [m]."""
         return float(np.median(self.thickness))
 
+    def moved(self, move: NDArray) -> Wall:
+        """Return the wall elsewhere, by x and z (2,) [m]."""
+        return Wall(line=self.line + move, thickness=self.thickness)
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RecognizedRib:
@@ -61,6 +67,10 @@ class RecognizedRib:
     wall: Wall
     inner: NDArray
     outer: NDArray
+
+    def moved(self, move: NDArray) -> RecognizedRib:
+        """Return the rib elsewhere, by x and z (2,) [m]."""
+        return RecognizedRib(wall=self.wall.moved(move), inner=self.inner + move, outer=self.outer + move)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -117,9 +127,7 @@ def recognize(
     Raises:
         JawFileError: The section shows no fin-ray finger; the message says what it shows and what to do.
     """
-    holes = [np.array(ring.coords)[:-1] for ring in polygon.interiors]
-    bolts = [hole for hole in holes if _is_round(hole)]
-    cells = [hole for hole in holes if not _is_round(hole)]
+    bolts, cells = _split_holes(polygon)
     if len(cells) < 2:
         raise JawFileError(
             f"its section has {len(cells)} cells between ribs and {len(bolts)} round holes, expected at least two "
@@ -129,11 +137,9 @@ def recognize(
     notes: list[str] = []
     turned, frame = _turn_upright(polygon, cells, overrides, notes)
     turned = turned.simplify(_CHORD)
-    holes = [np.array(ring.coords)[:-1] for ring in turned.interiors]
-    bolts = _fit_bolts([hole for hole in holes if _is_round(hole)])
-    cells = _order_cells([hole for hole in holes if not _is_round(hole)])
-    walls = _measure_walls(turned, cells)
-    inner, outer, ribs = walls
+    bolts, cells = _split_holes(turned)
+    bolts, cells = _fit_bolts(bolts), _order_cells(cells)
+    inner, outer, ribs = _measure_walls(turned, cells)
     clamped_z, circles = _propose_clamp(cells, bolts, inner, overrides, notes)
     face_x, deviation = _measure_face(turned, cells, clamped_z)
     if deviation > _FLAT:
@@ -153,16 +159,9 @@ def recognize(
         width=width,
         taper=taper,
         bolts=bolts + [shift, 0.0, 0.0],
-        inner=Wall(line=inner.line + move, thickness=inner.thickness),
-        outer=Wall(line=outer.line + move, thickness=outer.thickness),
-        ribs=[
-            RecognizedRib(
-                wall=Wall(line=rib.wall.line + move, thickness=rib.wall.thickness),
-                inner=rib.inner + move,
-                outer=rib.outer + move,
-            )
-            for rib in ribs
-        ],
+        inner=inner.moved(move),
+        outer=outer.moved(move),
+        ribs=[rib.moved(move) for rib in ribs],
         clamped_z=clamped_z,
         clamped_circles=circles + [shift, 0.0, 0.0],
         face_x=face_x + shift,
@@ -175,6 +174,12 @@ def _say_range(values) -> str:
     """Return the middle of some lengths [m] in millimetres, with their range where they differ."""
     low, middle, high = 1e3 * np.percentile(values, [5, 50, 95]) if len(values) else (np.nan,) * 3
     return f"{middle:.2f}" if high - low < 0.15 * middle else f"{middle:.2f} ({low:.2f} to {high:.2f})"
+
+
+def _split_holes(polygon: shapely.Polygon) -> tuple[list[NDArray], list[NDArray]]:
+    """Return the holes (n, 2) of a section: the round ones, and the others, which are cells."""
+    holes = [np.array(ring.coords)[:-1] for ring in polygon.interiors]
+    return [hole for hole in holes if _is_round(hole)], [hole for hole in holes if not _is_round(hole)]
 
 
 def _is_round(hole: NDArray) -> bool:
