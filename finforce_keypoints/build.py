@@ -5,15 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from finforce_ifea.jaw.jaw import Jaw
-    from finforce_keypoints.detector import KeypointDetector
-    from finforce_keypoints.detectors.dots import DotSettings
-    from finforce_keypoints.detectors.side_plane import SideLocator
-    from finforce_keypoints.images import PixelDetector
-    from finforce_keypoints.parameters import DetectorParameters, DetectorSettings
+from finforce.gripper_frames import OpeningRange
+from finforce_ifea.jaw.jaw import Jaw, load_jaw
+from finforce_keypoints.detector import KeypointDetector
+from finforce_keypoints.detectors.dots import DotDetector, DotSettings
+from finforce_keypoints.detectors.side_plane import AnyFinger, OneFinger, SidePlaneDetector
+from finforce_keypoints.detectors.whole_image import WholeImageDetector
+from finforce_keypoints.errors import ModelError
+from finforce_keypoints.images import ImageWatch, PixelDetector
+from finforce_keypoints.networks.metadata import build_name_map, parse_mapping
+from finforce_keypoints.networks.model import KeypointModel
+from finforce_keypoints.networks.side_network import COARSE, SideNetwork
+from finforce_keypoints.parameters import ALIGNED, DetectorParameters, DetectorSettings
 
 MODELS = Path(__file__).parent / "models"
 ANY_FINGER, BENCH = MODELS / "side_plane", MODELS / "plane"
@@ -40,10 +44,6 @@ def build_detector(
         KeypointError: the network, its names or a setting cannot be used.
         MissingDependencyError: a library that the method needs is not installed.
     """
-    from finforce_keypoints.detector import KeypointDetector
-    from finforce_keypoints.images import ImageWatch
-    from finforce_keypoints.parameters import ALIGNED, DetectorSettings
-
     settings = settings or DetectorSettings()
     if parameters.depth != ALIGNED:
         settings = replace(settings, plane_depth=True)
@@ -55,22 +55,15 @@ def build_pixel_detector(
     jaws: Mapping[str, Jaw], parameters: DetectorParameters, settings: DetectorSettings, dots: DotSettings | None = None
 ) -> PixelDetector:
     """Return what finds the pixels of key points; see `build_detector`."""
-    from finforce.gripper_frames import OpeningRange
-
     opening = OpeningRange(nearest=settings.opening_min, farthest=settings.opening_max)
     if parameters.detection_method == "dots":
-        from finforce_keypoints.detectors.dots import DotDetector
-
         return DotDetector(jaws, dots, parameters.camera_pose, opening)
     if parameters.detection_method == "frame":
         return _build_whole_image_detector(jaws, parameters)
-    from finforce_keypoints.detectors.side_plane import AnyFinger, OneFinger, SidePlaneDetector
-    from finforce_keypoints.networks.model import KeypointModel
-    from finforce_keypoints.networks.side_network import COARSE, SideNetwork
 
     folder = Path(parameters.model) if parameters.model else choose_network(jaws)
     if (folder / COARSE).is_file():
-        locator: SideLocator = AnyFinger(SideNetwork(folder, threads=parameters.threads), jaws)
+        locator: AnyFinger | OneFinger = AnyFinger(SideNetwork(folder, threads=parameters.threads), jaws)
     else:
         locator = OneFinger(KeypointModel(folder, threads=parameters.threads), jaws)
     return SidePlaneDetector(locator, jaws, parameters.camera_pose, opening)
@@ -78,8 +71,6 @@ def build_pixel_detector(
 
 def choose_network(jaws: Mapping[str, Jaw]) -> Path:
     """Return the folder of the shipped network for some jaws: the finger `bench` with its points has one of its own."""
-    from finforce_ifea.jaw.jaw import load_jaw
-
     bench = load_jaw("bench")
     own = [(jaw.digest, jaw.keypoint_names) == (bench.digest, bench.keypoint_names) for jaw in jaws.values()]
     return BENCH if all(own) else ANY_FINGER
@@ -91,11 +82,6 @@ def _build_whole_image_detector(jaws: Mapping[str, Jaw], parameters: DetectorPar
     Raises:
         ModelError: no network is named, or one of side planes.
     """
-    from finforce_keypoints.detectors.whole_image import WholeImageDetector
-    from finforce_keypoints.errors import ModelError
-    from finforce_keypoints.networks.metadata import build_name_map, parse_mapping
-    from finforce_keypoints.networks.model import KeypointModel
-
     if not parameters.model:
         raise ModelError(
             "detection_method frame: got no model, and the shipped network sees rectified side planes; expected the "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,32 +30,6 @@ LEAST_SCORE = 0.35  # mean likelihood of a jaw's points, below which it is not t
 STRAIGHT = np.zeros((1, 2))  # pictures of a locator's own grid alone
 
 
-class SideLocator(Protocol):
-    """A network that finds the points of jaws in pictures of their sides.
-
-    Attributes:
-        name: of the network's folder.
-        sha256: of its files.
-        grids: of its pictures, by side.
-        shifts: of the grids from picture to picture (n, 2) [px], over and over again.
-    """
-
-    name: str
-    sha256: str
-    grids: Mapping[str, PlaneGrid]
-    shifts: NDArray
-
-    def locate(self, pictures: NDArray, sides: Sequence[str], starts: Sequence[NDArray | None] = ()) -> Places:
-        """Return where the points are: of each picture the jaw's key points, then its reference point.
-
-        Args:
-            pictures: (B, h, w, 3) uint8 RGB, on the grids of the sides.
-            sides: B, the jaw that each shows.
-            starts: B, how its points had moved in the picture before; None where nobody knows.
-        """
-        ...
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _View:
     """One picture to be looked at: its jaw, where that is taken to be, its grid, and the map that makes the picture.
@@ -76,7 +50,7 @@ class SidePlaneDetector:
     A jaw that was lost is looked for along the closing axis.
 
     Args:
-        locator: of these jaws.
+        locator: network that finds the points of these jaws in pictures of their sides.
         jaws: by side.
         T_gripper_camera: (4, 4).
         opening: where a jaw can be.
@@ -87,7 +61,7 @@ class SidePlaneDetector:
 
     def __init__(
         self,
-        locator: SideLocator,
+        locator: AnyFinger | OneFinger,
         jaws: Mapping[str, Jaw],
         T_gripper_camera: NDArray,
         opening: OpeningRange | None = None,
@@ -209,6 +183,12 @@ SHIFTS = 6.0 * (np.outer(np.arange(8), [0.7549, 0.5698]) % 1.0) - 3.0  # [px]
 class AnyFinger:
     """The network of any finger, which is told what a finger looks like at rest.
 
+    Attributes:
+        name: of the network's folder.
+        sha256: of its files.
+        grids: of its pictures, by side.
+        shifts: of the grids from picture to picture (n, 2) [px], over and over again.
+
     Args:
         network: that compares pictures with templates.
         jaws: by side.
@@ -227,12 +207,18 @@ class AnyFinger:
             self._templates[side] = network.prepare(draw_template(shapes[side], grid), points, together)
 
     def locate(self, pictures: NDArray, sides: Sequence[str], starts: Sequence[NDArray | None] = ()) -> Places:
-        """Return where the points are; see `SideLocator`."""
+        """Return where the points are: of each picture the jaw's key points, then its reference point.
+
+        Args:
+            pictures: (B, h, w, 3) uint8 RGB, on the grids of the sides.
+            sides: B, the jaw that each shows.
+            starts: B, how its points had moved in the picture before; None where nobody knows.
+        """
         return self._network.locate(pictures, [self._templates[side] for side in sides], starts)
 
 
 class OneFinger:
-    """A network with a heat map for each point of one finger.
+    """A network with a heat map for each point of one finger; with the attributes of `AnyFinger`.
 
     Args:
         model: whose body parts are the jaw file's key points and "reference", with `finforce: plane` in its metadata.
@@ -250,7 +236,7 @@ class OneFinger:
         self._rows = {side: _order_names(model, jaw) for side, jaw in jaws.items()}
 
     def locate(self, pictures: NDArray, sides: Sequence[str], starts: Sequence[NDArray | None] = ()) -> Places:
-        """Return where the points are, wherever they were before; see `SideLocator`."""
+        """Return where the points are, wherever they were before; see `AnyFinger`."""
         peaks = self._model.locate(pictures)
         rows = np.stack([self._rows[side] for side in sides])
         return Places(
