@@ -102,7 +102,6 @@ PARTS = (
     BenchPart(name="chain", title="Latency against force error of the whole chain", usual=True),
     BenchPart(name="start", title="From a node's start until it is ready, and its memory"),
     BenchPart(name="images", title="From images to forces on unseen scenes, beside true key points"),
-    BenchPart(name="reconstruction", title="Reconstructed meshes: distance from the true ones"),
     BenchPart(name="driver_faults", title="Random faults between the gripper driver and an emulated gripper"),
     BenchPart(name="grasp_faults", title="Grasps by force in which something goes wrong"),
 )

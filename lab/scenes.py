@@ -57,10 +57,8 @@ class TwinScene:
 
 
 # [s] of rest at each level and of its record: a grasp of five seconds
-_SHORT = {"settle": 0.3, "record": 0.8}
-GRASP = TwinScene(scenario="grasp_cylinder", seed=101, changes=_SHORT)
+GRASP = TwinScene(scenario="grasp_cylinder", seed=101, changes={"settle": 0.3, "record": 0.8})
 GRASP_FAST = replace(GRASP, slots=EVERY_RATE)
-DIM = TwinScene(scenario="grasp_asymmetric", seed=102, changes={**_SHORT, "light": "dim"})
 
 
 class SmoothGripper:

@@ -488,8 +488,28 @@ class Guard:
 
 
 @dataclass(kw_only=True)
-class FaultTally:
-    """What came out of some runs."""
+class Tally:
+    """What came out of some runs: counters, counts and lists that add up, and largest values by name."""
+
+    def add(self, other: Tally) -> None:
+        """Add another tally of the same kind."""
+        for name, value in vars(other).items():
+            own = getattr(self, name)
+            if isinstance(value, Counter):
+                own.update(value)
+            elif isinstance(value, dict):
+                own |= {key: max(own.get(key, 0.0), largest) for key, largest in value.items()}
+            else:
+                setattr(self, name, own + value)
+
+    def plain(self) -> dict[str, Any]:
+        """Return counts, or counts by what they count, by name."""
+        return {name: dict(value) if isinstance(value, Counter) else value for name, value in vars(self).items()}
+
+
+@dataclass(kw_only=True)
+class FaultTally(Tally):
+    """What came out of runs with faults."""
 
     faults: Counter[str] = field(default_factory=Counter)
     wrong: Counter[str] = field(default_factory=Counter)
@@ -503,17 +523,3 @@ class FaultTally:
     outcomes: Counter[str] = field(default_factory=Counter)
     worst: dict[str, float] = field(default_factory=dict)
     violations: Counter[str] = field(default_factory=Counter)
-
-    def add(self, other: FaultTally) -> None:
-        """Add another tally."""
-        for name, value in vars(other).items():
-            if isinstance(value, Counter):
-                getattr(self, name).update(value)
-            elif isinstance(value, int):
-                setattr(self, name, getattr(self, name) + value)
-        for name, value in other.worst.items():
-            self.worst[name] = max(self.worst.get(name, 0.0), value)
-
-    def plain(self) -> dict[str, Any]:
-        """Return counts, or counts by what they count, by name."""
-        return {name: dict(value) if isinstance(value, Counter) else value for name, value in vars(self).items()}

@@ -33,6 +33,7 @@ from finforce_driver.settings import GraspGoal, GraspSettings
 from finforce_driver.state import GraspPhase, GraspStatus, GripperState, MoveOutcome, Phase
 from finforce_sim.emulator.control import Mode
 from finforce_sim.emulator.faults import FaultKind, PlannedFault
+from lab.bench.driver_faults import Tally
 from lab.experiments.grasp_world import GraspCase, NoisySensor, Plant, World, build_spring
 from lab.harness import Figures
 
@@ -119,7 +120,7 @@ class FaultyCamera:
 
 
 @dataclass(kw_only=True)
-class GraspTally:
+class GraspTally(Tally):
     """What came of grasps.
 
     Attributes:
@@ -140,19 +141,10 @@ class GraspTally:
     wrong: list[int] = field(default_factory=list)
     excess: list[float] = field(default_factory=list)
 
-    def add(self, other: GraspTally) -> None:
-        """Add another one."""
-        self.cases += other.cases
-        for name in ("faults", "cameras", "ends", "complaints"):
-            getattr(self, name).update(getattr(other, name))
-        self.wrong += other.wrong
-        self.excess += other.excess
-
     def plain(self) -> dict[str, Any]:
         """Return counts by what they count, and percentiles of the excess [N]."""
-        found = {name: dict(value) if isinstance(value, Counter) else value for name, value in vars(self).items()}
         values = np.quantile(self.excess, (0.5, 0.95, 0.99, 1.0)).tolist()
-        return {**found, "excess": dict(zip(("median", "p95", "p99", "max"), values, strict=True))}
+        return {**super().plain(), "excess": dict(zip(("median", "p95", "p99", "max"), values, strict=True))}
 
 
 class FaultyGrasp(World):
@@ -232,11 +224,9 @@ class FaultyGrasp(World):
         """Return the forces that have arrived; those of a slow camera come late."""
         samples = super().take()
         slow = self._camera.kind == "slow" and not self._camera.is_sound(self.clock.now())
-        late = [
-            ForceSample(stamp=sample.stamp - 0.4, arrived=sample.arrived, force=sample.force) if slow else sample
-            for sample in samples
-        ]
-        return late
+        if not slow:
+            return samples
+        return [ForceSample(stamp=one.stamp - 0.4, arrived=one.arrived, force=one.force) for one in samples]
 
     def _is_over(self, status: GraspStatus) -> bool:
         """Do what the user does, and check what the grasp reports."""

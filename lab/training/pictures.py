@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,7 +18,7 @@ from lab.training.commands import DatasetError
 
 MARGIN = 28  # px of padding all round, room for shifting and turning a picture
 TRAIN, VALIDATION = "train", "val"  # how the names of shards begin
-_SHAPES = {"picture": 4, "rest": 3, "place": 3, "visible": 2, "template": 4, "finger": 1, "keypoints": 1}
+_COLUMNS = ("picture", "rest", "place", "visible", "template", "finger", "keypoints")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -43,24 +43,6 @@ class FingerPictures:
     template: NDArray
     finger: NDArray
 
-    def __post_init__(self) -> None:
-        for name, axes in _SHAPES.items():
-            if getattr(self, name).ndim != axes:
-                raise DatasetError(f"{name}: got shape {getattr(self, name).shape}, expected {axes} axes")
-        count, points = self.visible.shape
-        lengths = {len(self.picture), len(self.rest), len(self.place), len(self.finger), len(self.keypoints), count}
-        if lengths != {count} or self.rest.shape[1:] != (points, 2) or self.place.shape[1:] != (points, 2):
-            raise DatasetError(
-                f"picture {self.picture.shape}, rest {self.rest.shape}, place {self.place.shape}, visible "
-                f"{self.visible.shape}; expected (n, h, w, 3), (n, P, 2), (n, P, 2), (n, P)"
-            )
-        if self.picture.dtype != np.uint8 or self.template.dtype != np.uint8 or self.visible.dtype != bool:
-            raise DatasetError("picture and template are to be uint8, visible bool")
-        if not np.isfinite(self.place[self.visible]).all():
-            raise DatasetError("place: a visible point has no place; mark it as not visible")
-        if count and not 0 <= self.finger.min() <= self.finger.max() < len(self.template):
-            raise DatasetError(f"finger: {self.finger.min()} to {self.finger.max()}, of {len(self.template)} templates")
-
     def __len__(self) -> int:
         return len(self.picture)
 
@@ -71,7 +53,7 @@ class FingerPictures:
 
     def take(self, indices: NDArray) -> FingerPictures:
         """Return the pictures of some indices (m,), or of a mask (n,)."""
-        columns = {name: getattr(self, name)[indices] for name in _SHAPES if name != "template"}
+        columns = {name: getattr(self, name)[indices] for name in _COLUMNS if name != "template"}
         return FingerPictures(**columns, template=self.template)
 
     def widened(self, points: int) -> FingerPictures:
@@ -81,7 +63,7 @@ class FingerPictures:
             raise DatasetError(f"{have} points a picture; expected at most {points}")
         own = np.arange(points) % have
         columns = {name: getattr(self, name)[:, own] for name in ("rest", "place", "visible")}
-        others = {name: getattr(self, name) for name in _SHAPES if name not in columns}
+        others = {name: getattr(self, name) for name in _COLUMNS if name not in columns}
         return FingerPictures(**columns, **others)
 
     def mixed_with(self, many: FingerPictures) -> FingerPictures:
@@ -106,21 +88,16 @@ class FingerPictures:
         starts = np.cumsum([0, *(len(part.template) for part in parts[:-1])])
         fingers = [part.finger + start for part, start in zip(parts, starts, strict=True)]
         columns = {"finger": np.concatenate(fingers)} | ({} if picture is None else {"picture": picture})
-        for name in _SHAPES.keys() - columns.keys():
+        for name in set(_COLUMNS) - columns.keys():
             columns[name] = np.concatenate([getattr(part, name) for part in parts])
         return FingerPictures(**columns)
 
 
 def save_shard(path: Path, pictures: FingerPictures) -> None:
     """Write one shard, `train_*.npz` or `val_*.npz`; it appears whole or not at all."""
-    save_arrays(path, {name: getattr(pictures, name) for name in _SHAPES})
-
-
-def save_arrays(path: Path, arrays: Mapping[str, NDArray]) -> None:
-    """Write arrays by name as a .npz file, which appears whole or not at all."""
     unfinished = path.with_suffix(".part")
     with unfinished.open("wb") as file:
-        np.savez(file, **arrays)
+        np.savez(file, **{name: getattr(pictures, name) for name in _COLUMNS})
     unfinished.replace(path)
 
 
@@ -128,10 +105,10 @@ def load_shard(path: Path) -> FingerPictures:
     """Read one shard.
 
     Raises:
-        DatasetError: the file cannot be read, or lacks an array, or its arrays do not fit each other.
+        DatasetError: the file cannot be read, or lacks an array.
     """
     with _reading(path), np.load(path, allow_pickle=False) as content:
-        return FingerPictures(**{name: content[name] for name in _SHAPES})
+        return FingerPictures(**{name: content[name] for name in _COLUMNS})
 
 
 @contextmanager
@@ -140,7 +117,7 @@ def _reading(path: Path) -> Iterator[None]:
     try:
         yield
     except (OSError, EOFError, ValueError, KeyError, BadZipFile) as error:
-        raise DatasetError(f"{path}: {error}; expected a shard with {', '.join(_SHAPES)}") from error
+        raise DatasetError(f"{path}: {error}; expected a shard with {', '.join(_COLUMNS)}") from error
 
 
 def load_pictures(folder: Path, part: str, limit: int | None = None) -> FingerPictures:

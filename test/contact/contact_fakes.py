@@ -5,6 +5,7 @@ from functools import lru_cache
 
 import manifold3d
 import numpy as np
+from guess_fakes import GuessError, draw_guess, place_mesh
 from scipy.spatial.transform import Rotation
 
 from finforce_contact.mesh.object_mesh import ObjectMesh, prepare_object_mesh
@@ -13,7 +14,7 @@ from finforce_contact.reconstruction.evidence import collect_evidence
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_sim.objects import build_object
 from finforce_sim.sensor import build_d405
-from lab.table_scenes import GuessError, draw_guess, draw_scene, place_mesh
+from lab.table_scenes import draw_scene
 
 JAW = load_jaw("bench")
 FACE = JAW.inner_face_x

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from guess_fakes import place_mesh
 from scipy.spatial.transform import Rotation
 
 from finforce.transforms import pose_from_quaternion
@@ -16,7 +17,6 @@ from finforce_contact.reconstruction.evidence import GeneratedMesh
 from finforce_contact.reconstruction.generated import CAMERA_FROM_PYTORCH3D, CANONICAL_FROM_GLB, read_generated
 from finforce_eval.recordings.image_files import read_generated_pose
 from finforce_sim.objects import build_object
-from lab.table_scenes import place_mesh
 
 SPLATS, SPREAD, STRAYS = 20000, 3e-3, 300  # count, of the mesh's size, count of faint ones
 

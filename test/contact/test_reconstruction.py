@@ -3,6 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from contact_fakes import bare_mesh, distance_mm, make_case
+from guess_fakes import place_mesh
 from scipy.spatial.transform import Rotation
 
 from finforce.camera import ImageError, deproject
@@ -26,7 +27,6 @@ from finforce_contact.reconstruction.generated import (
 from finforce_contact.reconstruction.reconstruction import reconstruct
 from finforce_contact.reconstruction.shape_search import Placement
 from finforce_sim.objects import build_object
-from lab.table_scenes import place_mesh
 
 # at a quarter of the pixels the robust way stays below 0.4 mm; the aim at full size is 1 mm
 NEAR_MM = 0.6

@@ -85,6 +85,5 @@ def test_another_scene_or_rate_has_another_name():
 
 
 def test_every_scene_of_the_benchmarks_can_be_built():
-    for scene in (scenes.GRASP, scenes.GRASP_FAST, scenes.DIM):
+    for scene in (scenes.GRASP, scenes.GRASP_FAST):
         assert scene.build().name == scene.scenario
-    assert len({scene.seed for scene in (scenes.GRASP, scenes.DIM)}) == 2
