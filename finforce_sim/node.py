@@ -66,7 +66,7 @@ class TwinCameraNode(Node):
         super().__init__("twin_camera", **options)
         self.parameters = parameters = ros.declare_record(self, TwinParameters)
         ros.name_unknown_parameters(self)
-        ros.warn_first_start(self)
+        ros.warn_first_start()
         self.gripper: EmulatedGripper | None = None
         self.scene = (build_live if parameters.gripper_link else build)(
             parameters.scenario,
