@@ -286,17 +286,6 @@ PRESETS: dict[str, MeshDensity] = {
 }
 
 
-def density_from_name(name: str) -> MeshDensity:
-    """Return the preset called `name`.
-
-    Raises:
-        MeshError: There is no such preset.
-    """
-    if name not in PRESETS:
-        raise MeshError(f"mesh density: got {name!r}, expected one of {', '.join(PRESETS)} or a MeshDensity")
-    return PRESETS[name]
-
-
 def mesh_drawing(drawing: Drawing, density: MeshDensity | str = "default") -> VolumeMesh:
     """Divide a drawing into hexahedra.
 
@@ -315,7 +304,9 @@ def mesh_drawing(drawing: Drawing, density: MeshDensity | str = "default") -> Vo
         MeshError: The density is unknown, or an element comes out inverted.
     """
     if isinstance(density, str):
-        density = density_from_name(density)
+        if density not in PRESETS:
+            raise MeshError(f"mesh density: got {density!r}, expected one of {', '.join(PRESETS)} or a MeshDensity")
+        density = PRESETS[density]
     if drawing.tip_z is None:
         # the centre lines of the bands meet in a rigid tip: nodes on them would coincide
         density = replace(density, through_band=1)

@@ -126,9 +126,9 @@ def build_volume_mesh(
     _check_nodes(nodes)
     _check_elements(elements, len(nodes), (4, 10) if hexes is None else (8,))
     _check_numbering(nodes, elements)
-    check_jacobians(nodes, elements)
+    _check_jacobians(nodes, elements)
     _check_clamped(clamped, len(nodes))
-    check_overlaps(elements, elements[:, _faces_of(elements)])
+    _check_overlaps(elements, elements[:, _faces_of(elements)])
     return VolumeMesh(
         nodes=nodes,
         hexes=None if hexes is None else elements,
@@ -136,16 +136,6 @@ def build_volume_mesh(
         clamped=clamped,
         surface=surface_triangles(elements),
     )
-
-
-def check_connection(mesh: VolumeMesh) -> None:
-    """Refuse a mesh that is not one piece, or of which a part can turn freely.
-
-    Raises:
-        MeshError: Parts share no node, or hang together by nodes on one line; or the clamped nodes lie on one.
-    """
-    elements = mesh.elements
-    check_pieces(mesh.nodes, elements, elements[:, _faces_of(elements)], mesh.clamped)
 
 
 def surface_triangles(elements: NDArray) -> NDArray:
@@ -237,12 +227,8 @@ def to_tet10(mesh: VolumeMesh) -> VolumeMesh:
     return build_volume_mesh(nodes=nodes, tets=np.hstack([tets, middles]), clamped=np.concatenate([mesh.clamped, held]))
 
 
-def check_jacobians(nodes: NDArray, elements: NDArray) -> None:
-    """Refuse elements whose Jacobian is not positive at every corner, in the middle of edges and faces, and inside.
-
-    Raises:
-        MeshError: Elements are inverted; the message says how many and names the first.
-    """
+def _check_jacobians(nodes: NDArray, elements: NDArray) -> None:
+    """Refuse elements whose Jacobian is not positive at every corner, in the middle of edges and faces, and inside."""
     local = _PLACES_HEX if elements.shape[1] == 8 else _PLACES_TET
     gradients = shape_gradients(elements.shape[1], local)
     jacobians = np.einsum("mni,pnj->mpij", nodes[elements], gradients)
@@ -331,16 +317,8 @@ def _check_clamped(clamped: NDArray, node_count: int) -> None:
 _ON_LINE = 1e-6
 
 
-def check_overlaps(elements: NDArray, faces: NDArray) -> None:
-    """Refuse elements that lie on each other.
-
-    Args:
-        elements: (m, 4 | 8 | 10) node indices.
-        faces: (m, f, 3 | 4) node indices of the corners of each element's faces.
-
-    Raises:
-        MeshError: Elements occur twice, or a face belongs to more than two; the message names the first of them.
-    """
+def _check_overlaps(elements: NDArray, faces: NDArray) -> None:
+    """Refuse elements that occur twice, and faces (m, f, 3 | 4) of more than two."""
     _check_repeats(elements[:, : 8 if elements.shape[1] == 8 else 4])
     face = _number_faces(faces)
     crowded = np.flatnonzero(np.bincount(face.ravel()) > 2)
@@ -352,23 +330,17 @@ def check_overlaps(elements: NDArray, faces: NDArray) -> None:
         )
 
 
-def check_pieces(nodes: NDArray, elements: NDArray, faces: NDArray, clamped: NDArray) -> None:
+def check_connection(mesh: VolumeMesh) -> None:
     """Refuse a mesh that is not one piece, or of which a part can turn freely.
 
-    Args:
-        nodes: (n, 3) [m].
-        elements: (m, 4 | 8 | 10) node indices.
-        faces: (m, f, 3 | 4) node indices of the corners of each element's faces.
-        clamped: (c,) node indices.
-
     Raises:
-        MeshError: Elements hang together with the rest by nodes on one line or by none, or the clamped nodes lie on
-            one line; the message names the first of them.
+        MeshError: Parts share no node, or hang together by nodes on one line; or the clamped nodes lie on one.
     """
+    nodes, elements, clamped = mesh.nodes, mesh.elements, mesh.clamped
     _check_one_piece(nodes, elements)
     if _on_one_line(nodes[clamped], nodes):
         raise MeshError(f"the {len(clamped)} clamped nodes lie on one line: the mesh can turn about it")
-    _check_hinges(nodes, elements, _number_faces(faces), clamped)
+    _check_hinges(nodes, elements, _number_faces(elements[:, _faces_of(elements)]), clamped)
 
 
 def _number_faces(faces: NDArray) -> NDArray:

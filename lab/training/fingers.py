@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from finforce_ifea.fem.frame import BeamPoints, add_beams, build_beams, point_positions, shape_weights
 from finforce_ifea.fem.model import factorise_banded
-from finforce_ifea.jaw.cad.proposal import FEW
+from finforce_ifea.jaw.cad.make_jaw import FEW
 from finforce_ifea.jaw.jaw_file import Material
 from finforce_ifea.jaw.section import order_rings
 

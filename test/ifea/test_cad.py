@@ -15,7 +15,7 @@ from section_fakes import BASE, LENGTH, MILLIMETRE, WIDTH, draw_polygon, make_se
 from finforce_eval.cli.main import main
 from finforce_ifea.errors import JawFileError
 from finforce_ifea.jaw.cad.cad_file import read_section
-from finforce_ifea.jaw.cad.proposal import propose
+from finforce_ifea.jaw.cad.make_jaw import choose_keypoints
 from finforce_ifea.jaw.cad.recognition import Overrides, recognize
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.jaw.section import order_rings
@@ -208,7 +208,7 @@ def test_the_command_writes_a_jaw_that_loads(tmp_path, capsys, surface):
 def test_of_few_key_points_those_between_are_taken_too(tmp_path, surface):
     polygon = shapely.affinity.scale(draw_polygon(), MILLIMETRE, MILLIMETRE, origin=(0, 0))
     finger = recognize(polygon, WIDTH * MILLIMETRE, Overrides())
-    points = propose(finger, "few", "tpu95a").keypoints
+    points = choose_keypoints(finger)
     assert list(points)[9:14] == ["inner_clamp_1", "inner_1_2", "inner_2_3", "inner_3_4", "inner_4_tip"]
     for name, (x, _, z) in list(points.items())[9:]:
         band, below, above = name.split("_")
@@ -216,7 +216,7 @@ def test_of_few_key_points_those_between_are_taken_too(tmp_path, surface):
         assert z == pytest.approx(np.mean([*ends, finger.clamped_z][:2]))
         assert finger.polygon.contains(shapely.Point(x, z))
     many = replace(finger, ribs=finger.ribs * 2)
-    assert len(propose(many, "many", "tpu95a").keypoints) == 17
+    assert len(choose_keypoints(many)) == 17
 
 
 def test_a_curved_inner_face_is_taken(tmp_path, capsys):

@@ -1,13 +1,30 @@
-"""From the file of a finger to its jaw file, section and picture."""
+"""A jaw file from the file of a finger: key points, contact candidates, reference point, its section and a picture."""
 
+import json
+from collections.abc import Mapping
+from itertools import pairwise
 from pathlib import Path
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
 
 from finforce_ifea.errors import JawFileError
 from finforce_ifea.jaw.cad.cad_file import read_section
 from finforce_ifea.jaw.cad.picture import draw_finger
-from finforce_ifea.jaw.cad.proposal import propose, write_jaw
-from finforce_ifea.jaw.cad.recognition import Overrides, recognize
+from finforce_ifea.jaw.cad.recognition import Overrides, RecognizedFinger, recognize
 from finforce_ifea.jaw.jaw import load_jaw
+from finforce_ifea.jaw.jaw_file import MATERIALS
+
+# Key points [m] above the clamp at least; candidates so far from either end of the inner face, and from each other.
+_ABOVE, _AWAY, _STEP = 1e-3, 4e-3, 4e-3
+_FEWEST, _MOST = 6, 30
+_TIP = 2.5e-3
+# With fewer key points where ribs meet bands, those between them are taken, too: an object hides some.
+FEW = 12
+BANDS = ("inner", "outer")
+# A reference point [m] below a clamp that the section does not show.
+_BELOW = -6e-3
 
 
 def make_jaw(
@@ -47,15 +64,119 @@ def make_jaw(
         finger = recognize(raw.polygon, width, overrides, raw.taper)
     except JawFileError as error:
         raise JawFileError(f"{file.name}: {error}") from error
-    proposal = propose(finger, name, material)
+    reference, place = _choose_reference(finger)
+    section = output.with_suffix(".section.json")
     output.parent.mkdir(parents=True, exist_ok=True)
-    section = write_jaw(finger, proposal, output, file.name)
+    section.write_text(_describe_section(finger, file.name), encoding="utf-8")
+    heading = f"# {name}, from {file.name}. Lengths in metres, jaw frame (x closing, y width, z base to tip)."
+    lines = [heading, f"name: {name}", *_describe_finger(finger, section.name, material)]
+    lines.append(f"reference_point: {_list(_put_on_side(finger, *reference))}  # {place}")
+    output.write_text("\n".join(lines) + "\n", encoding="utf-8")
     jaw = load_jaw(output)
     picture = picture or output.with_suffix(".png")
-    draw_finger(finger, proposal, jaw.build_mesh("coarse"), picture)
-    notes = [*raw.notes, *finger.notes]
+    draw_finger(finger, jaw, picture)
     spread = f"{1e-6 * jaw.material.young_modulus:.3g} MPa +- {jaw.material.spread:.0%}"
-    notes.append(f"{len(proposal.keypoints)} key points, {proposal.candidates[2]} contact candidates")
-    notes.append(f"reference point {proposal.reference_note}")
-    notes.append(f"{material}: {spread}, until `finforce calibrate` has measured it (--material)")
+    notes = [
+        *raw.notes,
+        *finger.notes,
+        f"{len(jaw.keypoints)} key points, {len(jaw.candidates)} contact candidates",
+        f"reference point {place}",
+        f"{material}: {spread}, until `finforce calibrate` has measured it (--material)",
+    ]
     return [output, section, picture], notes
+
+
+def choose_keypoints(finger: RecognizedFinger) -> dict[str, NDArray]:
+    """Return what a camera can see by name: (3,) [m], jaw frame.
+
+    Key points are where the ribs meet the bands, on the side face towards the camera, inner band first, base to tip,
+    and the tip; what the clamp holds is left out, since it does not move. Where these are few, points of the bands half
+    way between them come behind.
+    """
+    places = {}
+    for band in BANDS:
+        for number, rib in enumerate(finger.ribs, start=1):
+            x, z = getattr(rib, band)
+            if z > finger.clamped_z + _ABOVE and not finger.find_clamped(np.array([[x, z]])).any():
+                places[f"{band}_{number}"] = (x, z)
+    top = finger.polygon.intersection(shapely.box(-1.0, finger.length - _TIP, 1.0, 1.0)).centroid
+    places["tip"] = (top.x, top.y)
+    if len(places) < FEW:
+        places |= _find_middles(finger, places)
+    return {name: _put_on_side(finger, *place) for name, place in places.items()}
+
+
+def _find_middles(
+    finger: RecognizedFinger, places: Mapping[str, tuple[float, float]]
+) -> dict[str, tuple[float, float]]:
+    """Return points (x, z) [m] of each band half way between clamp, key points on it, and tip, by the names of both."""
+    found = {}
+    for band in BANDS:
+        line = getattr(finger, band).line
+        ends = {name: z for name, (_, z) in places.items() if name.startswith(band)}
+        ends = {"clamp": finger.clamped_z, **ends, "tip": places["tip"][1]}
+        for (below, low), (above, high) in pairwise(ends.items()):
+            z = 0.5 * (low + high)
+            x = float(np.interp(z, line[:, 1], line[:, 0]))
+            if not finger.find_clamped(np.array([[x, z]])).any():
+                found[f"{band}_{below.removeprefix(f'{band}_')}_{above.removeprefix(f'{band}_')}"] = (x, z)
+    return found
+
+
+def _put_on_side(finger: RecognizedFinger, x: float, z: float) -> NDArray:
+    """Return a place of the section on the side that the camera sees (3,) [m]."""
+    return np.array([x, 0.5 * float(finger.read_width(np.array([x, z]))), z])
+
+
+def _find_face_end(finger: RecognizedFinger) -> float:
+    """Return the highest z [m] at which the outline is on the plane of the inner face."""
+    ring = np.array(finger.polygon.exterior.coords)
+    return float(ring[np.abs(ring[:, 0] - finger.face_x) < max(1e-4, 1.1 * finger.face_deviation), 1].max())
+
+
+def _choose_reference(finger: RecognizedFinger) -> tuple[NDArray, str]:
+    """Return a point (2,) [m] that never bends: in the middle of the largest flat patch of what is clamped."""
+    held = finger.polygon.intersection(shapely.box(-1.0, -1.0, 1.0, finger.clamped_z))
+    circle = shapely.maximum_inscribed_circle(held) if held.area > 0.0 else None
+    if circle is None or circle.length < 1.5e-3:
+        return np.array([0.0, _BELOW]), "on the holder, below the finger: mark it there with a dot"
+    place = np.array(circle.coords[0])
+    return place, f"on the clamped part, a patch of {1e3 * circle.length:.1f} mm around it: mark it with a dot"
+
+
+def _describe_section(finger: RecognizedFinger, source: str) -> str:
+    """Return the text of a section file; `source` is the name of the file that it comes from."""
+    loops = [np.round(1e3 * ring, 4).tolist() for ring in finger.rings]
+    width = round(1e3 * finger.width, 4)
+    return json.dumps({"source": source, "unit": "mm", "axes": ["x", "z"], "width": width, "loops": loops}) + "\n"
+
+
+def _describe_finger(finger: RecognizedFinger, section: str, name: str) -> list[str]:
+    """Return the lines of a jaw file on section, material, key points and candidates.
+
+    Args:
+        finger: what was recognized.
+        section: name of its file.
+        name: of its material.
+    """
+    material, tapers = MATERIALS[name], bool(finger.taper.any())
+    low, high = finger.clamped_z + _AWAY, _find_face_end(finger) - _AWAY
+    count = int(np.clip(round((high - low) / _STEP) + 1, _FEWEST, _MOST))
+    circles = ", ".join(f"[{x:.5f}, {z:.5f}, {radius:.5f}]" for x, z, radius in finger.clamped_circles)
+    clamped = f"z_below: {finger.clamped_z:.5g}" + (f", circles: [{circles}]" if circles else "")
+    return [
+        "section:",
+        f"  file: {section}  # polygons in the x-z plane",
+        f"  width: {finger.width:.5g}" + ("  # at x = z = 0" if tapers else ""),
+        *([f"  taper: [{finger.taper[0]:.5f}, {finger.taper[1]:.5f}]  # of the width, by x and z"] if tapers else []),
+        f"  clamped: {{{clamped}}}  # what the holder keeps from moving; circles: [x, z, radius] about bolts",
+        f"inner_face_x: {finger.face_x:.5g}",
+        f"material: {name}  # {1e-6 * material.young_modulus:.3g} MPa +- {material.spread:.0%}, until it is calibrated",
+        "keypoints:  # on the side that the camera sees: where ribs meet bands, of few also between, and the tip",
+        *(f"  {place}: {_list(point)}" for place, point in choose_keypoints(finger).items()),
+        f"candidates: {{first_z: {low:.5g}, step_z: {(high - low) / (count - 1):.5g}, count: {count}}}",
+    ]
+
+
+def _list(point: NDArray) -> str:
+    return "[" + ", ".join(f"{value:.5f}" for value in point) + "]"

@@ -3,24 +3,21 @@
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from finforce_ifea.jaw.cad.proposal import Proposal
 from finforce_ifea.jaw.cad.recognition import RecognizedFinger
+from finforce_ifea.jaw.jaw import Jaw
 from finforce_ifea.jaw.mesh import VolumeMesh
-from finforce_ifea.jaw.section import find_reach
 
 _VIEW = {"elev": 16.0, "azim": 53.0}  # [deg], from the side that the camera sees
 _MATERIAL, _HELD, _INNER, _OUTER, _RIB = "#d9dee6", "#8a93a3", "#c0392b", "#2d6cb5", "#3a8f4d"
 
 
-def draw_finger(finger: RecognizedFinger, proposal: Proposal, mesh: VolumeMesh, path: Path) -> None:
+def draw_finger(finger: RecognizedFinger, jaw: Jaw, path: Path) -> None:
     """Draw a finger into a PNG file.
 
     Args:
         finger: what was recognized.
-        proposal: key points, candidates, reference point.
-        mesh: of the jaw, for the preview.
+        jaw: that was made of it.
         path: of the picture.
     """
     from matplotlib.figure import Figure
@@ -31,12 +28,12 @@ def draw_finger(finger: RecognizedFinger, proposal: Proposal, mesh: VolumeMesh, 
     solid = figure.add_subplot(1, 2, 2, projection="3d", proj_type="ortho")
     _draw_section(flat, finger)
     _draw_walls(flat, finger)
-    _draw_points(flat, finger, proposal, size)
+    _draw_points(flat, finger, jaw)
     flat.set(xlabel="x / mm, towards the object", ylabel="z / mm, base to tip", aspect="equal")
     widths = finger.read_width(finger.rings[0])
-    flat.set_title(f"{proposal.name}: {1e3 * size[0]:.1f} x {_say(widths)} x {1e3 * size[1]:.1f} mm")
+    flat.set_title(f"{jaw.name}: {1e3 * size[0]:.1f} x {_say(widths)} x {1e3 * size[1]:.1f} mm")
     flat.legend(loc="upper left", fontsize=8, framealpha=0.9)
-    _draw_solid(solid, mesh)
+    _draw_solid(solid, jaw.build_mesh("coarse"))
     figure.savefig(path, dpi=110)
 
 
@@ -80,12 +77,12 @@ def _say(values) -> str:
     return f"{low:.2f}" if high - low < 0.1 else f"{low:.2f} to {high:.2f}"
 
 
-def _draw_points(axes, finger: RecognizedFinger, proposal: Proposal, size: NDArray) -> None:
+def _draw_points(axes, finger: RecognizedFinger, jaw: Jaw) -> None:
     """Draw key points with their names, candidates, reference point and bolts."""
-    points = 1e3 * np.array(list(proposal.keypoints.values()))
+    points = 1e3 * jaw.keypoints
     axes.plot(points[:, 0], points[:, 2], "o", color="black", markersize=5, label=f"{len(points)} key points")
     middle = float(np.mean(points[:, 0]))
-    for name, (x, _, z) in zip(proposal.keypoints, points, strict=True):
+    for name, (x, _, z) in zip(jaw.keypoint_names, points, strict=True):
         right = name.startswith("inner") or (name == "tip" and x >= middle)
         axes.annotate(
             name,
@@ -96,17 +93,9 @@ def _draw_points(axes, finger: RecognizedFinger, proposal: Proposal, size: NDArr
             va="center",
             fontsize=7,
         )
-    first, step, count = proposal.candidates
-    heights = 1e3 * (first + step * np.arange(count))
-    axes.plot(
-        1e3 * find_reach(finger.polygon, 1e-3 * heights),
-        heights,
-        "<",
-        color=_INNER,
-        markersize=4,
-        label=f"{count} contact candidates",
-    )
-    axes.plot(*(1e3 * proposal.reference[[0, 2]]), "+", color="black", markersize=11, label="reference point")
+    x, _, z = 1e3 * jaw.candidates.T
+    axes.plot(x, z, "<", color=_INNER, markersize=4, label=f"{len(x)} contact candidates")
+    axes.plot(*(1e3 * jaw.reference_point[[0, 2]]), "+", color="black", markersize=11, label="reference point")
     for x, z, radius in 1e3 * finger.bolts:
         axes.annotate(f"Ø{2.0 * radius:.2f}", (x, z), ha="center", va="center", fontsize=6)
 
