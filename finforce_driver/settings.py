@@ -40,7 +40,16 @@ def check_numbers(**values: object) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class GripperSettings:
+class _Bounded:
+    """Settings whose values have bounds."""
+
+    def __post_init__(self) -> None:
+        """Reject values out of bounds by raising TargetError; NaN is out of all."""
+        check_bounds(self, TargetError)
+
+
+@dataclass(frozen=True, kw_only=True)
+class GripperSettings(_Bounded):
     """Settings of `Gripper`; each field's metadata says unit, bounds and meaning.
 
     Attributes:
@@ -68,7 +77,7 @@ class GripperSettings:
             TargetError: a value is out of its bounds, the watchdog too short, or the default current lies outside the
                 currents' range.
         """
-        check_bounds(self, TargetError)
+        super().__post_init__()
         if 0.0 < self.watchdog < LEAST_WATCHDOG:
             raise TargetError(
                 f"watchdog: got {self.watchdog:g} s, expected 0 for none, or {LEAST_WATCHDOG:g} s at least: a computer "
@@ -172,7 +181,7 @@ class GripperSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class JointSettings:
+class JointSettings(_Bounded):
     """How a joint's value goes with the opening, and how it follows its commands; units stand in the metadata.
 
     The opening is linear between the two ends: `gripper.closed_opening` at `closed`, that and `gripper.stroke` at
@@ -198,7 +207,7 @@ class JointSettings:
         Raises:
             TargetError: a value is out of bounds, there is no joint, or both ends are the same.
         """
-        check_bounds(self, TargetError)
+        super().__post_init__()
         if not self.names or not all(self.names) or len(set(self.names)) != len(self.names):
             raise TargetError(f"joint.names: got {self.names!r}, expected one name or more, each once")
         if self.closed == self.open:
@@ -206,32 +215,17 @@ class JointSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class GraspGoal:
-    """One grasp.
-
-    Attributes:
-        force: to be reached and held, by vision [N].
-        speed: greatest of the opening while closing [m/s].
-        least_opening: below which the jaws never go [m].
-        time_limit: to reach the force in [s]; holding has none.
-    """
+class GraspGoal(_Bounded):
+    """One grasp by vision; each field's metadata says unit, bounds and meaning. Holding has no time limit."""
 
     force: float = setting(description="Set force", unit="N", low=0.1, high=30.0)
     speed: float = setting(0.004, "Maximum speed of the opening while closing", "m/s", 1e-4, 0.1)
     least_opening: float = setting(0.0, "Minimum opening of the jaws", "m", 0.0, 0.5)
     time_limit: float = setting(20.0, "Maximum time to reach the set force", "s", 0.1, 3600.0)
 
-    def __post_init__(self) -> None:
-        """Reject what no grasp can be.
-
-        Raises:
-            TargetError: a value is no number or out of bounds.
-        """
-        check_bounds(self, TargetError)
-
 
 @dataclass(frozen=True, kw_only=True)
-class GraspSettings:
+class GraspSettings(_Bounded):
     """Settings of `ForceGrasp`; each field's metadata says unit, bounds and meaning."""
 
     force_limit: float = setting(8.0, "Grasp force that ends a grasp, and maximum set force", "N", 0.2, 30.0)
@@ -255,14 +249,6 @@ class GraspSettings:
     motor_force: float = setting(
         7.5, "Motor limit as grip force by the maker's curve; 2.5 times the set force if that is more", "N", 7.0, 62.0
     )
-
-    def __post_init__(self) -> None:
-        """Reject values out of bounds.
-
-        Raises:
-            TargetError: a value is out of its bounds.
-        """
-        check_bounds(self, TargetError)
 
     def check_force(self, force: float) -> float:
         """Return a set force [N] that may be held.

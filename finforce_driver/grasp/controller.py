@@ -9,7 +9,7 @@ from dataclasses import replace
 
 from finforce_driver.errors import BackOffError, GraspError, UnseenForceError
 from finforce_driver.grasp.load_watch import NOISE, ForceFeed, ForceSample, JawPosition, LoadWatch, TouchSample
-from finforce_driver.grasp.plan import MOTOR_MARGIN, GraspPlan, JawHistory
+from finforce_driver.grasp.plan import MOTOR_MARGIN, GraspPlan
 from finforce_driver.settings import GraspGoal, GraspSettings
 from finforce_driver.state import GraspPhase, GraspStatus, GripperState, MoveRequest, Phase
 
@@ -49,11 +49,16 @@ class ForceGrasp:
         self.set_force = self.settings.check_force(goal.force)
         self._feed = ForceFeed(self.settings.stale_after)
         self._load = LoadWatch(self.settings, min(_ONSET_FORCE, 0.5 * goal.force))
-        self._jaws = JawHistory(
-            resolution=resolution, closed_opening=closed_opening, stroke=stroke, reaction=self.settings.reaction
-        )
         self._position = JawPosition(opening=math.nan, resting=False)
-        self._plan = GraspPlan(goal, self.settings, self._load, self._jaws, self._feed)
+        self._plan = GraspPlan(
+            goal,
+            self.settings,
+            self._load,
+            self._feed,
+            step=resolution,
+            closed_opening=closed_opening,
+            stroke=stroke,
+        )
         self._pending: deque[ForceSample | TouchSample] = deque()
         self.phase, self._reason = GraspPhase.APPROACH, "waits for the first force"
         self._began = self._held_at = self._reserve = self._saturated = math.nan
@@ -108,7 +113,7 @@ class ForceGrasp:
             self._start = state.opening
         try:
             check_gripper(state, now)
-            self._jaws.check_power(state)
+            self._plan.check_power(state)
             fresh = self._drain(state, now, opening_at)
             self._check_witness(state, now)
             self._check_limits(state, now)
@@ -137,7 +142,7 @@ class ForceGrasp:
                 sample = replace(sample, force=check_force_value(sample.force, sample.stddev))
                 counts = self._feed.admit(sample)
             if counts:
-                here = self._jaws.locate(sample.stamp, state, opening_at)
+                here = self._plan.locate(sample.stamp, state, opening_at)
                 fresh |= not math.isnan(here.opening)
                 if not math.isnan(here.opening):
                     self._take(sample, here)
@@ -145,11 +150,11 @@ class ForceGrasp:
 
     def _take(self, sample: ForceSample, here: JawPosition) -> None:
         """Take a force and where the jaws were at its image."""
-        passing = self._jaws.stepping and not here.resting and self._load.loaded
+        passing = self._plan.stepping and not here.resting and self._load.loaded
         self._load.take(
             sample,
             here,
-            travel_stddev=self._jaws.travel_stddev(self._position, here),
+            travel_stddev=self._plan.travel_stddev(self._position, here),
             passing=passing,
             touching=self._feed.is_touching(sample.stamp),
         )
@@ -186,7 +191,7 @@ class ForceGrasp:
             UnseenForceError: that has been so for a while.
         """
         seen = 0.0 if math.isnan(self._load.force) else max(0.0, self._load.pressing)
-        moved = not math.isnan(self._jaws.target)  # else it was not this grasp that presses
+        moved = not math.isnan(self._plan.target)  # else it was not this grasp that presses
         if not (moved and state.force - seen > MOTOR_MARGIN):
             self._excess_since = math.nan
             return
@@ -200,7 +205,7 @@ class ForceGrasp:
 
     def _back_off(self, state: GripperState, now: float) -> MoveRequest:
         """Return the move to where the grasp began: how soft what the motor presses on is, nobody knows."""
-        target = self._jaws.nearest(min(max(self._start, state.opening), self._jaws.widest))
+        target = self._plan.nearest(min(max(self._start, state.opening), self._plan.widest))
         return self._move(target, self.goal.speed, state, now)
 
     def _check_limits(self, state: GripperState, now: float) -> None:
@@ -210,19 +215,19 @@ class ForceGrasp:
             GraspError: forces are late, time is up, or the jaws do not follow, slip, or may not close further.
         """
         self._feed.check_silence(now, self._began, self.settings.force_timeout)
-        jaws, pressing = self._jaws, 0.0 if math.isnan(self._load.force) else self._load.pressing
+        plan, pressing = self._plan, 0.0 if math.isnan(self._load.force) else self._load.pressing
         got = f"{pressing:.2f} N of {self.set_force:g} N"
         if self.phase is not GraspPhase.HOLDING and now - self._began > self.goal.time_limit:
             raise GraspError(f"{got} within the time limit of {self.goal.time_limit:g} s")
         if now - self._saturated > _SATURATED_AFTER:
-            raise GraspError(f"{got} with the jaws at their least opening, {1e3 * jaws.target:.1f} mm")
-        if jaws.is_late(now, state.opening):
+            raise GraspError(f"{got} with the jaws at their least opening, {1e3 * plan.target:.1f} mm")
+        if plan.is_late(now, state.opening):
             raise GraspError(
-                f"{got}: the jaws stay at {1e3 * state.opening:.1f} mm on their way to {1e3 * jaws.target:.1f} mm; "
+                f"{got}: the jaws stay at {1e3 * state.opening:.1f} mm on their way to {1e3 * plan.target:.1f} mm; "
                 f"is something in the way, or the motor's limit of {self._motor_force:g} N too low?"
             )
-        if self._held_at - jaws.target > self._reserve:
-            way = 1e3 * (self._held_at - jaws.target)
+        if self._held_at - plan.target > self._reserve:
+            way = 1e3 * (self._held_at - plan.target)
             raise GraspError(
                 f"{got} although the jaws closed by {way:.1f} mm while holding: the object slips or yields"
             )
@@ -240,8 +245,8 @@ class ForceGrasp:
 
     def _watch(self, ideal: float, target: float, now: float) -> None:
         """See whether the force is held, and whether the least opening keeps it from being reached."""
-        near = 0.5 * self._jaws.resolution  # openings are multiples of it, but for rounding
-        settled = self._load.resting and abs(target - self._jaws.target) < near
+        near = 0.5 * self._plan.step  # openings are multiples of it, but for rounding
+        settled = self._load.resting and abs(target - self._plan.target) < near
         if not (settled and ideal < target - near):
             self._saturated = math.nan
         elif math.isnan(self._saturated):
@@ -252,17 +257,17 @@ class ForceGrasp:
             self.phase, self._reason, self._held_at = GraspPhase.HOLDING, "holds the set force", target
             # as it is now: a force that drifts while the jaws close looks like something that gets softer
             yielded = _RELAXATION * self.set_force / self._load.model.stiffness
-            self._reserve = yielded + _RESERVE_STEPS * self._jaws.resolution
+            self._reserve = yielded + _RESERVE_STEPS * self._plan.step
 
     def _pause(self, state: GripperState, now: float) -> MoveRequest | None:
         """Return a move that keeps the jaws where they are until the next image says what to think of this one."""
-        here = self._jaws.nearest(state.opening)
-        is_closing = here - self._jaws.target > 0.5 * self._jaws.resolution
-        return self._move(here, self._jaws.speed, state, now) if is_closing else None
+        here = self._plan.nearest(state.opening)
+        is_closing = here - self._plan.target > 0.5 * self._plan.step
+        return self._move(here, self._plan.speed, state, now) if is_closing else None
 
     def _move(self, target: float, speed: float, state: GripperState, now: float) -> MoveRequest:
-        target = min(target, self._jaws.widest)
-        self._jaws.command(target, speed, now, self._jaws.locate(now, state, lambda _: state.opening))
+        target = min(target, self._plan.widest)
+        self._plan.command(target, speed, now, self._plan.locate(now, state, lambda _: state.opening))
         return MoveRequest(opening=target, speed=speed, force=self._motor_force)
 
     @property
@@ -273,7 +278,7 @@ class ForceGrasp:
     def status(self, state: GripperState, now: float) -> GraspStatus:
         """Return the grasp as it is, after an `update` with the same state and time."""
         load, model, feed = self._load, self._load.model, self._feed
-        here = self._jaws.locate(now, state, lambda _: state.opening).opening
+        here = self._plan.locate(now, state, lambda _: state.opening).opening
         return GraspStatus(
             phase=self.phase,
             reason=self._reason,
@@ -285,8 +290,8 @@ class ForceGrasp:
             period=feed.period,
             overshoot_bound=self._plan.overshoot_bound(self.set_force),
             peak=load.peak,
-            resolution=self._plan.resolution,
-            target=self._jaws.target,
+            resolution=self._plan.force_per_step,
+            target=self._plan.target,
             stddev=load.stddev,
             failure=self._failure,
             rejected=dict(feed.rejected),

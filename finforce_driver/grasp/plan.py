@@ -33,25 +33,54 @@ _FRICTION = 1.0  # [N] by which the motor's current may tell too little
 _BEYOND_NOISE = 4.0  # deviations of one force, beyond which a step's change of it is no chance
 _DEVIATIONS = 2.0  # stated deviations of the force within which it is reckoned with
 _HYSTERESIS = 0.3  # [steps] of force beyond the tolerance before jaws at rest open again
+SETTLING = 0.03  # [s] beside the reaction: the jaws come to rest, and the driver may step them one by one
+_NEAR = 2.0  # steps between target and reported opening at rest: the byte is truncated, and flickers by one
+_SMALL = 2.5  # steps: fewer are not planned anew on the way
+_POWERED_AFTER = 0.3  # [s] of the first command, which switches the power stage on
+_LATE = 1.0  # [s] after which jaws that have not come do not follow
+# A byte says the opening to a step; between two bytes it is interpolated. At rest the jaws are within 4 ticks.
+_MOVING_STDDEV, _RESTING_STDDEV = 0.35, 0.1  # [steps]
 
 
 class GraspPlan:
-    """The next target, its speed and what it may do to the force.
+    """The gripper's steps, the last command and the openings that follow from it; the next target and its speed.
+
+    At rest the commanded opening says more than the reported byte, which is truncated and flickers.
+
+    Attributes:
+        step: of the gripper [m].
+        widest: opening at the last step [m].
+        target: commanded opening [m]; NaN before the first command.
+        speed: commanded [m/s].
+        stepping: the last command was a few steps from rest, whose effect is to be seen at rest again.
 
     Args:
         goal: speed and least opening.
         settings: limits and expectations.
         load: force, stiffness, contact.
-        jaws: steps and commands of the jaws.
         feed: latency and period.
+        step: of the gripper [m].
+        closed_opening: of the closed gripper [m].
+        stroke: of the gripper [m].
     """
 
     def __init__(
-        self, goal: GraspGoal, settings: GraspSettings, load: LoadWatch, jaws: JawHistory, feed: ForceFeed
+        self,
+        goal: GraspGoal,
+        settings: GraspSettings,
+        load: LoadWatch,
+        feed: ForceFeed,
+        *,
+        step: float,
+        closed_opening: float,
+        stroke: float,
     ) -> None:
-        self._goal, self._settings = goal, settings
-        self._load, self._jaws, self._feed = load, jaws, feed
-        self._least = max(jaws.snap(goal.least_opening), jaws.closed)
+        self.step, self._closed, self.widest = step, closed_opening, closed_opening + stroke
+        self.target, self.speed, self.stepping = math.nan, 0.0, False
+        self._goal, self._settings, self._load, self._feed = goal, settings, load, feed
+        self._settling = settings.reaction + SETTLING
+        self._arrives = self._powered_from = math.inf
+        self._least = max(self.snap(goal.least_opening), closed_opening)
         self._rest = (math.nan, math.nan)  # target [m] and force [N] of the last image at rest
         self._step_force = 0.0  # [N] that a step of the jaws was seen to change, where that was beyond expectation
 
@@ -61,38 +90,38 @@ class GraspPlan:
         return self._load.model.safe_stiffness if self._load.loaded else self._settings.largest_stiffness
 
     @property
-    def resolution(self) -> float:
+    def force_per_step(self) -> float:
         """Change of the force with one step of the gripper [N]."""
-        return self._load.model.stiffness * self._jaws.resolution
+        return self._load.model.stiffness * self.step
 
     def ideal_target(self, set_force: float) -> float:
         """Return the opening [m] to go to, on a step of the gripper; it may lie below the least opening."""
-        load, jaws = self._load, self._jaws
+        load = self._load
         if not self._load.resting:
-            return jaws.snap(load.opening - self._allowed(set_force) / self.stiffness)
-        allowed = self._allowed(set_force, min(0.5 * self.resolution, _TOLERANCE))
+            return self.snap(load.opening - self._allowed(set_force) / self.stiffness)
+        allowed = self._allowed(set_force, min(0.5 * self.force_per_step, _TOLERANCE))
         if allowed < 0.0:
-            return jaws.target + self._steps_back(-allowed) * jaws.resolution
+            return self.target + self._steps_back(-allowed) * self.step
         reach = allowed / self.stiffness
         if self._may_step(allowed):
-            reach = max(reach, jaws.resolution)
-        return jaws.snap(jaws.target - reach)
+            reach = max(reach, self.step)
+        return self.snap(self.target - reach)
 
     def note_rest(self) -> None:
         """Look at what a step between two rests did to the force: of stiff things it may be more than was learnt."""
-        load, jaws = self._load, self._jaws
+        load = self._load
         if not (load.loaded and load.resting):
             return
-        before, self._rest = self._rest, (jaws.target, load.force)
-        steps = abs(before[0] - jaws.target) / jaws.resolution
+        before, self._rest = self._rest, (self.target, load.force)
+        steps = abs(before[0] - self.target) / self.step
         if 0.5 < steps < 1.5:
             change = abs(load.force - before[1])
-            expected = load.model.likely_stiffness * jaws.resolution + _BEYOND_NOISE * load.model.noise
+            expected = load.model.likely_stiffness * self.step + _BEYOND_NOISE * load.model.noise
             self._step_force = change if change > expected else 0.0
 
     def limit(self, target: float) -> float:
         """Return a target [m] within the least opening and what the gripper can open."""
-        return min(max(target, self._least), self._jaws.widest)
+        return min(max(target, self._least), self.widest)
 
     def choose_speed(self, target: float) -> float:
         """Return the speed [m/s] at which the next image comes before the jaws are at `target` [m].
@@ -124,19 +153,18 @@ class GraspPlan:
 
     def is_worth(self, target: float, speed: float, opening: float) -> bool:
         """Whether a target [m] with a speed [m/s] is worth a command to jaws that are at `opening` [m] now."""
-        jaws = self._jaws
-        if math.isnan(jaws.target):
+        if math.isnan(self.target):
             return True
-        steps = (jaws.target - target) / jaws.resolution
+        steps = (self.target - target) / self.step
         if self._load.resting:
             return abs(steps) > 0.5
-        if jaws.stepping and self._load.loaded:
+        if self.stepping and self._load.loaded:
             return False
         if steps < 0.5:
             return steps < -_BACK_STEPS
-        left = opening - jaws.target
-        slower, faster = jaws.speed / _SPEED_CHANGE, jaws.speed * _SPEED_CHANGE
-        is_due = left < 2.0 * jaws.speed * (self._feed.period + self._settings.reaction)
+        left = opening - self.target
+        slower, faster = self.speed / _SPEED_CHANGE, self.speed * _SPEED_CHANGE
+        is_due = left < 2.0 * self.speed * (self._feed.period + self._settings.reaction)
         return is_due or steps > _FEW_STEPS or not slower < speed < faster
 
     def overshoot_bound(self, set_force: float) -> float:
@@ -146,8 +174,8 @@ class GraspPlan:
         stiffness holds on it, later twice the learnt one, or the one that is reckoned with if that is more. The force
         may be off by two of the deviations that its source states.
         """
-        load, jaws = self._load, self._jaws
-        unseen = min(load.opening - jaws.target, jaws.speed * (self._feed.latency + self._feed.period))
+        load = self._load
+        unseen = min(load.opening - self.target, self.speed * (self._feed.latency + self._feed.period))
         unseen = unseen if unseen > 0.0 else 0.0  # also where nothing is known yet
         if not load.loaded:
             return max(0.0, self.stiffness * unseen - set_force)
@@ -170,64 +198,25 @@ class GraspPlan:
         if not load.loaded:
             return load.force < load.onset
         largest = max(self._settings.largest_stiffness, 1.05 * load.model.stiffness)
-        return allowed > max(min(load.model.likely_stiffness, largest) * self._jaws.resolution, self._step_force)
+        return allowed > max(min(load.model.likely_stiffness, largest) * self.step, self._step_force)
 
     def _steps_back(self, excess: float) -> int:
         """Return by how many steps jaws at rest are to open for an excess of force [N]."""
-        if excess < _HYSTERESIS * self.resolution + self._load.model.force_stddev:
+        if excess < _HYSTERESIS * self.force_per_step + self._load.model.force_stddev:
             return 0
-        return max(1, round(excess / (self.stiffness * self._jaws.resolution)))
-
-
-SETTLING = 0.03  # [s] beside the reaction: the jaws come to rest, and the driver may step them one by one
-_NEAR = 2.0  # steps between target and reported opening at rest: the byte is truncated, and flickers by one
-_SMALL = 2.5  # steps: fewer are not planned anew on the way
-_POWERED_AFTER = 0.3  # [s] of the first command, which switches the power stage on
-_LATE = 1.0  # [s] after which jaws that have not come do not follow
-# A byte says the opening to a step; between two bytes it is interpolated. At rest the jaws are within 4 ticks.
-_MOVING_STDDEV, _RESTING_STDDEV = 0.35, 0.1  # [steps]
-
-
-class JawHistory:
-    """The gripper's steps, the last command, and the openings that follow from it.
-
-    At rest the commanded opening says more than the reported byte, which is truncated and flickers.
-
-    Args:
-        resolution: a step of the gripper [m].
-        closed_opening: of the closed gripper [m].
-        stroke: of the gripper [m].
-        reaction: from a command to the motion it asks for [s].
-
-    Attributes:
-        closed: the same.
-        widest: opening at the last step [m].
-        target: commanded opening [m]; NaN before the first command.
-        speed: commanded [m/s].
-        stepping: the last command was a few steps from rest, whose effect is to be seen at rest again.
-    """
-
-    def __init__(self, *, resolution: float, closed_opening: float, stroke: float, reaction: float) -> None:
-        self.resolution = resolution
-        self._settling = reaction + SETTLING
-        self.closed, self.widest = closed_opening, closed_opening + stroke
-        self.target = math.nan
-        self.speed = 0.0
-        self.stepping = False
-        self._arrives = math.inf
-        self._powered_from = math.inf
+        return max(1, round(excess / (self.stiffness * self.step)))
 
     def snap(self, opening: float) -> float:
         """Return the nearest step [m] that is not more closed than `opening` [m]."""
-        return self.closed + math.ceil((opening - self.closed) / self.resolution - 1e-6) * self.resolution
+        return self._closed + math.ceil((opening - self._closed) / self.step - 1e-6) * self.step
 
     def nearest(self, opening: float) -> float:
         """Return the step [m] nearest to a reported opening [m]."""
-        return self.snap(opening - 0.5 * self.resolution)
+        return self.snap(opening - 0.5 * self.step)
 
     def command(self, target: float, speed: float, now: float, here: JawPosition) -> None:
         """Remember a command and when the jaws, now at `here`, will have followed it."""
-        self.stepping = here.resting and abs(target - here.opening) < _SMALL * self.resolution
+        self.stepping = here.resting and abs(target - here.opening) < _SMALL * self.step
         if math.isnan(self.target):
             self._powered_from = now + _POWERED_AFTER
         self.target, self.speed = target, speed
@@ -244,11 +233,11 @@ class JawHistory:
 
     def rests_at(self, stamp: float, reported: float) -> bool:
         """Whether the jaws stood at their target at the time `stamp` [s], when `reported` [m] was their opening."""
-        return stamp >= self._arrives and abs(reported - self.target) <= _NEAR * self.resolution
+        return stamp >= self._arrives and abs(reported - self.target) <= _NEAR * self.step
 
     def is_late(self, now: float, reported: float) -> bool:
         """Whether the jaws should have been at their target for long and are not there."""
-        return now > self._arrives + _LATE and abs(reported - self.target) > (_NEAR + 1.0) * self.resolution
+        return now > self._arrives + _LATE and abs(reported - self.target) > (_NEAR + 1.0) * self.step
 
     def locate(self, stamp: float, state: GripperState, opening_at: Callable[[float], float]) -> JawPosition:
         """Return where the jaws were at a past time [s]; NaN when it is not known."""
@@ -262,4 +251,4 @@ class JawHistory:
         if before == after:
             return 0.0
         is_exact = before.resting and after.resting
-        return (_RESTING_STDDEV if is_exact else _MOVING_STDDEV) * self.resolution
+        return (_RESTING_STDDEV if is_exact else _MOVING_STDDEV) * self.step

@@ -23,6 +23,7 @@ from finforce_ifea.fem.model import (
     factorise_banded,
     sparse_from_banded,
 )
+from finforce_ifea.jaw.attachment import check_distances
 from finforce_ifea.jaw.drawing import Drawing, Rib
 from finforce_ifea.jaw.jaw_file import Material
 from finforce_ifea.jaw.mesh import VolumeMesh
@@ -376,14 +377,7 @@ class FrameModel:
     def attach(self, points: NDArray, max_distance: float = 1e-3) -> BeamPoints:
         """Return a probe of undeformed points (p, 3) [m]; raises MeshError when one is off the finger."""
         points = np.array(points, float)
-        distances = self.drawing.distance_to(points)
-        away = np.flatnonzero(~(distances <= max_distance))
-        if len(away):
-            row = away[distances[away].argmax()]
-            raise MeshError(
-                f"point {row} at {np.round(1e3 * points[row], 3).tolist()} mm is {1e3 * distances[row]:.3g} "
-                f"mm away from the finger, expected at most {1e3 * max_distance:.3g} mm"
-            )
+        check_distances(points, self.drawing.distance_to(points), max_distance, "finger")
         return _attach_to_beams(self.beams, self._parts, points)
 
     def positions(self, probe: BeamPoints, q: NDArray) -> NDArray:

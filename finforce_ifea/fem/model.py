@@ -13,23 +13,6 @@ LARGEST_MOVE, LARGEST_TURN = 2e-3, 0.3
 Across = Literal["middle", "half", "both"]
 
 
-class Factor(Protocol):
-    """A factorised symmetric matrix.
-
-    Attributes:
-        positive: whether the matrix is positive definite, and the state that it belongs to stable.
-    """
-
-    @property
-    def positive(self) -> bool:
-        """Whether the matrix is positive definite."""
-        ...
-
-    def solve(self, b: NDArray) -> NDArray:
-        """Return K^-1 b for b of shape (n,) or (n, k)."""
-        ...
-
-
 class BandedFactor:
     """Cholesky factor of a positive definite banded matrix."""
 
@@ -64,6 +47,9 @@ class SparseFactor:
     def solve(self, b: NDArray) -> NDArray:
         """Return K^-1 b for b of shape (n,) or (n, k)."""
         return self._lu.solve(np.asarray(b))
+
+
+Factor = BandedFactor | SparseFactor  # of a symmetric matrix; `positive` when the state that it belongs to is stable
 
 
 def _factorise_sparse(matrix: sparse.csc_matrix, pivoting: float, ordered: bool) -> SuperLU:

@@ -137,10 +137,6 @@ class SolidModel:
         """Return the displacements (nodes, 3) [m] of all mesh nodes for unknowns q (size,)."""
         return self.sign * np.append(q, 0.0)[self.dof]
 
-    def gather(self, forces: NDArray) -> NDArray:
-        """Return the generalised load (size,) [N] of nodal forces (nodes, 3) [N]."""
-        return np.bincount(self.dof.ravel(), (self.sign * forces).ravel(), self.size + 1)[: self.size]
-
     def vertices(self, q: NDArray) -> NDArray:
         """Return the deformed mesh vertices (v, 3) [m], in mesh order."""
         return self.mesh.nodes + self.expand(q)

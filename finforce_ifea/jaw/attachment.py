@@ -58,7 +58,7 @@ def attach_points(
     outside = np.flatnonzero(location.excess > _INSIDE)
     if len(outside):
         closest, distances = find_closest(mesh, points[outside])
-        _check_distances(points[outside], distances, [names[row] for row in outside], max_distance, "mesh")
+        check_distances(points[outside], distances, max_distance, "mesh", [names[row] for row in outside])
         points = points.copy()
         points[outside] = closest
         location = _locate(mesh, points)
@@ -85,9 +85,8 @@ def attach_surface_points(
         MeshError: A point is not finite or farther than `max_distance` from the surface.
     """
     points = _check_points(points)
-    names = names or [f"point {row}" for row in range(len(points))]
     closest, distances = find_closest(mesh, points)
-    _check_distances(points, distances, names, max_distance, "surface")
+    check_distances(points, distances, max_distance, "surface", names)
     return attach_points(mesh, closest, max(max_distance, 1e-6))
 
 
@@ -184,13 +183,19 @@ def _check_points(points: NDArray) -> NDArray:
     return points
 
 
-def _check_distances(points: NDArray, distances: NDArray, names: Sequence[str], max_distance: float, part: str) -> None:
-    """Refuse points (p, 3) that are too far away, naming the farthest."""
-    if len(distances) == 0 or distances.max() <= max_distance:
+def check_distances(
+    points: NDArray, distances: NDArray, max_distance: float, part: str, names: Sequence[str] | None = None
+) -> None:
+    """Refuse points (p, 3) [m] that are farther than allowed from a part, naming the farthest.
+
+    Raises:
+        MeshError: A distance (p,) [m] is above the largest, or no number.
+    """
+    if (distances <= max_distance).all():
         return
     worst = int(distances.argmax())
-    at = np.round(1e3 * points[worst], 3).tolist()
+    name, at = names[worst] if names else f"point {worst}", np.round(1e3 * points[worst], 3).tolist()
     raise MeshError(
-        f"{names[worst]} at {at} mm is {1e3 * distances[worst]:.3g} mm away from the {part}, "
+        f"{name} at {at} mm is {1e3 * distances[worst]:.3g} mm away from the {part}, "
         f"expected at most {1e3 * max_distance:.3g} mm"
     )

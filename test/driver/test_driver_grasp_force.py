@@ -20,7 +20,7 @@ from finforce_driver.grasp.load_watch import (
     LoadWatch,
     TouchSample,
 )
-from finforce_driver.grasp.plan import JawHistory
+from finforce_driver.grasp.plan import GraspPlan
 from finforce_driver.settings import GraspGoal, GraspSettings
 from finforce_driver.state import GraspPhase, GripperState, Phase
 
@@ -199,8 +199,15 @@ def test_a_force_that_noise_makes_negative_is_none():
     assert check_force_value(1.5, 0.05) == 1.5
 
 
-def test_course_snaps_towards_open():
-    course = JawHistory(resolution=STEP, closed_opening=0.01, stroke=0.048, reaction=0.05)
+def plan(closed_opening=0.0):
+    """A plan for jaws that have had no command yet."""
+    limits = GraspSettings()
+    watch, feed = LoadWatch(limits, 0.25), ForceFeed(limits.stale_after)
+    return GraspPlan(GraspGoal(force=1.0), limits, watch, feed, step=STEP, closed_opening=closed_opening, stroke=0.048)
+
+
+def test_openings_snap_towards_open():
+    course = plan(closed_opening=0.01)
     assert course.snap(0.01) == pytest.approx(0.01)
     assert course.snap(0.01 + 0.1 * STEP) == pytest.approx(0.01 + STEP)
     assert course.nearest(0.01 + 0.6 * STEP) == pytest.approx(0.01 + STEP)
@@ -209,7 +216,7 @@ def test_course_snaps_towards_open():
 
 
 def test_jaws_rest_after_their_way_and_not_before():
-    course = JawHistory(resolution=STEP, closed_opening=0.0, stroke=0.048, reaction=0.05)
+    course = plan()
     course.command(10 * STEP, 0.004, 1.0, JawPosition(opening=31 * STEP, resting=False))  # 4 mm: one second
     assert not course.rests_at(1.9, 10 * STEP)
     assert course.rests_at(2.1, 11 * STEP)
