@@ -67,10 +67,10 @@ def build_nodes(parts: Sequence[Part]) -> list[Node]:
 
 def spin(parts: Sequence[Part], nodes: Sequence[Node], executor: Executor) -> None:
     """Let the nodes work until the process is told to end."""
-    aside = [node for part, node in zip(parts, nodes, strict=True) if part.executable in APART]
-    for node in aside:
+    apart = [node for part, node in zip(parts, nodes, strict=True) if part.executable in APART]
+    for node in apart:
         Thread(target=_spin_apart, args=(node,), daemon=True).start()
-    together = [node for node in nodes if node not in aside]
+    together = [node for node in nodes if node not in apart]
     bind_caller(max((getattr(node.parameters, "threads", 1) for node in together), default=1))
     ros.spin(together, executor)
 

@@ -72,7 +72,7 @@ from finforce.ros.transport import CHOICES, PROFILES, TRANSPORT, provide_transpo
 from finforce.settings import ParameterError, RecordT, bounds_of, check_value, constraints, describe, is_parameter
 from finforce.stamps import NANOSECONDS
 
-_GLANCE = 0.1  # [s] between looks at whether a node that is being built is still wanted
+_POLL_PERIOD = 0.1  # [s] of asking whether a node that is being built is still wanted
 STEADY_CLOCK = Clock(clock_type=ClockType.STEADY_TIME)
 
 provide_transport()  # read when the first context is made, whoever makes it
@@ -302,7 +302,7 @@ def _ending_with_context() -> Iterator[None]:
     built = Event()
 
     def watch() -> None:
-        while not built.wait(_GLANCE):
+        while not built.wait(_POLL_PERIOD):
             if not rclpy.ok() and not built.is_set():
                 sys.stdout.flush()
                 sys.stderr.flush()

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
+from finforce.optional import import_trimesh
 from finforce_ifea.errors import MeshError
 from finforce_ifea.jaw.mesh import VolumeMesh, shape_gradients, shape_values
 
@@ -92,6 +92,7 @@ def attach_surface_points(
 
 def find_closest(mesh: VolumeMesh, points: NDArray) -> tuple[NDArray, NDArray]:
     """Return the closest points (p, 3) [m] of the surface to points (p, 3) [m], and how far they are (p,) [m]."""
+    trimesh = import_trimesh()  # which loads for half a second, and most points lie in the mesh
     surface = trimesh.Trimesh(mesh.nodes, mesh.surface, process=False)
     closest, distances, _ = trimesh.proximity.closest_point_naive(surface, points)
     return closest, distances

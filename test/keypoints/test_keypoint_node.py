@@ -177,7 +177,7 @@ def test_names_are_a_parameter_that_nobody_changes(probe):
 
 
 def test_an_annotated_image_is_made_only_for_those_who_listen(probe, monkeypatch):
-    from finforce_keypoints import publishers as outputs
+    from finforce_keypoints import node as outputs
 
     drawn = []
     draw = outputs.draw_keypoints
