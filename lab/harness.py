@@ -161,9 +161,9 @@ def measure_sharpness(stated: NDArray, errors: NDArray) -> NDArray:
         One number for each column (k,); NaN where there is no error.
     """
     known = np.isfinite(stated).all(axis=1) & np.isfinite(errors).all(axis=1)
-    sums = np.square(stated[known]).sum(axis=0), np.square(errors[known]).sum(axis=0)
+    squares = [np.square(values[known]).sum(axis=0) / max(known.sum(), 1) for values in (stated, errors)]
     ratio = np.full(stated.shape[1], np.nan)
-    return np.sqrt(np.divide(*sums, out=ratio, where=sums[1] > NO_ERROR))
+    return np.sqrt(np.divide(*squares, out=ratio, where=squares[1] > NO_ERROR**2))
 
 
 def format_figures(figures: Figures) -> str:
@@ -200,7 +200,7 @@ def figures_json(figures: Figures) -> dict[str, Any]:
     return without_nan({"rows": rows, "tables": text, "notes": list(figures.notes), **figures.more})
 
 
-NO_ERROR = 1e-12  # sum of squared errors that are rounding
+NO_ERROR = 1e-5  # root mean square of errors that are none [N, N m]: rounding
 
 
 MARKS = (

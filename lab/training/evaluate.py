@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from finforce.optional import import_cv2
+from finforce_eval.figures.figures import new_figure
 from finforce_keypoints.networks.side_network import SideNetwork
 from lab.training.commands import CheckpointError, one_line_errors
 from lab.training.pictures import MARGIN, VALIDATION, FingerPictures, load_pictures
@@ -26,7 +26,6 @@ THRESHOLDS = (0.2, 0.4, 0.6, 0.8, 0.9)
 # mean of all colours; a D405 in its own exposure is near 100
 LIGHT_LEVELS = {"dark (below 15)": (0.0, 15.0), "dim (15 to 50)": (15.0, 50.0), "bright (above 50)": (50.0, 256.0)}
 WORST, COLUMNS = 20, 5  # pictures of a sheet, and in a row of it
-TRUE, HIDDEN, FOUND, REFUSED = (0, 255, 0), (110, 110, 110), (255, 40, 40), (60, 120, 255)  # RGB
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -208,28 +207,24 @@ def _mean(values: NDArray) -> float:
 
 
 def draw_sheet(path: Path, pictures: NDArray, detections: Detections, threshold: float) -> None:
-    """Write pictures (n, h, w, 3) uint8 side by side with their points.
+    """Draw pictures (n, h, w, 3) uint8 side by side, dark ones brightened, with their points.
 
     True points are green circles, hidden ones grey, accepted ones red crosses, refused ones blue.
     """
-    cv2 = import_cv2()
-    tiles = [_draw_points(picture, detections.take([i]), threshold) for i, picture in enumerate(pictures)]
-    tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % COLUMNS)
-    rows = [np.hstack(tiles[i : i + COLUMNS]) for i in range(0, len(tiles), COLUMNS)]
-    cv2.imwrite(str(path), cv2.cvtColor(np.vstack(rows), cv2.COLOR_RGB2BGR))
-
-
-def _draw_points(picture: NDArray, found: Detections, threshold: float) -> NDArray:
-    """Return a picture (2 h, 2 w, 3) uint8, brightened where it is dark, with its points and the found ones."""
-    cv2 = import_cv2()
-    gain = max(1.0, 90.0 / max(float(picture.mean()), 1.0))
-    tile = cv2.resize(np.clip(picture * gain, 0, 255).astype(np.uint8), None, fx=2, fy=2)
-    for k in np.flatnonzero(found.counts[0] & np.isfinite(found.points[0]).all(axis=1)):
-        circle, cross = (np.round(2.0 * places[0, k] + 0.5).astype(int) for places in (found.points, found.pixels))
-        cv2.circle(tile, tuple(circle.tolist()), 5, TRUE if found.visible[0, k] else HIDDEN, 1)
-        color = FOUND if found.likelihood[0, k] >= threshold else REFUSED
-        cv2.drawMarker(tile, tuple(cross.tolist()), color, cv2.MARKER_CROSS, 7, 1)
-    return tile
+    rows = -(-len(pictures) // COLUMNS)
+    figure = new_figure(3.0 * COLUMNS, 3.8 * rows)
+    for number, axes in enumerate(figure.subplots(rows, COLUMNS, squeeze=False).flat):
+        axes.set_axis_off()
+        if number >= len(pictures):
+            continue
+        picture, found = pictures[number], detections.take([number])
+        axes.imshow(np.clip(picture * max(1.0, 90.0 / max(float(picture.mean()), 1.0)), 0, 255).astype(np.uint8))
+        known = found.counts[0] & np.isfinite(found.points[0]).all(axis=1)
+        seen, accepted = found.visible[0], found.likelihood[0] >= threshold
+        rings = {"edgecolors": np.where(seen, "lime", "grey")[known], "facecolors": "none", "s": 30}
+        axes.scatter(*found.points[0, known].T, **rings)
+        axes.scatter(*found.pixels[0, known].T, marker="x", c=np.where(accepted, "red", "dodgerblue")[known], s=20)
+    figure.savefig(path)
 
 
 if __name__ == "__main__":

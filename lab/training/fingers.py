@@ -88,54 +88,27 @@ def _try_finger(rng: np.random.Generator) -> Finger | None:
     clamped = float(rng.choice([0.0, rng.uniform(0.02, 0.22) * length]))
     solid = length * rng.uniform(0.86, 0.97)
     tip = rng.uniform(2.0, 8.0) * 1e-3 * scale * (1.0 if not steel else 0.4)
-    lean = 0.0 if rng.random() < 0.6 else rng.uniform(-0.25, 0.25)
-    bulge = 0.0 if rng.random() < 0.6 else rng.uniform(-0.06, 0.06) * length
-    back_bulge = 0.0 if rng.random() < 0.5 else rng.uniform(-0.05, 0.18) * length * min(base / (0.5 * length), 1.0)
-    share = np.linspace(0.0, 1.0, 81)
-    front_x = 0.5 * base + lean * length * share + bulge * 4.0 * share * (1.0 - share)
-    end_x = front_x[-1] - tip
-    back_x = -0.5 * base + (end_x + 0.5 * base) * share - back_bulge * 4.0 * share * (1.0 - share)
-    thick = rng.uniform(0.9, 2.6, 2) * 1e-3 * scale if not steel else np.full(2, rng.uniform(0.25, 1.0) * 1e-3)
-    taper = rng.uniform(0.65, 1.3, 2)
-    z = share * length
-    thickness = [t * (1.0 + (k - 1.0) * share) for t, k in zip(thick, taper, strict=True)]
-    front = Member(line=np.column_stack((front_x - 0.5 * thickness[0], z)), thickness=thickness[0])
-    back = Member(line=np.column_stack((back_x + 0.5 * thickness[1], z)), thickness=thickness[1])
+    front, back = _draw_bands(rng, length, base, tip, scale, steel)
     ribs = _draw_ribs(rng, front, back, clamped, solid, scale, steel)
     if ribs is None:
         return None
-    parts = [front.polygon, back.polygon, *(rib.polygon for rib in ribs)]
-    if not steel or rng.random() < 0.5:
-        parts.append(_between(front, back, solid, length))
-    if clamped > 0.0:
-        parts.append(_between(front, back, 0.0, clamped))
-    if rng.random() < 0.1:  # a boss on the back
-        at = rng.uniform(0.1, 0.5) * length
-        parts.append(shapely.Point(np.interp(at, z, back.line[:, 0]), at).buffer(rng.uniform(0.025, 0.05) * length))
-    polygon = shapely.union_all([part.buffer(2e-5) for part in parts])
-    holes = _draw_discs(rng, base, clamped) if clamped > 0.08 * length and rng.random() < 0.4 else np.zeros((0, 3))
-    if len(holes):
-        discs = [shapely.Point(x, height).buffer(radius) for x, height, radius in holes]
-        polygon = polygon.difference(shapely.union_all(discs))
-    rounding = rng.uniform(0.0, 0.5) * 1e-3 * scale
-    if not steel and rounding > 1e-4:
-        polygon = polygon.buffer(rounding, quad_segs=3).buffer(-rounding, quad_segs=3)  # fillets
+    polygon = _draw_section(rng, (front, back, *ribs), base, (clamped, solid), scale, steel)
     if not isinstance(polygon, shapely.Polygon):
         return None
     junctions = [rib.line[0] for rib in ribs] + [rib.line[-1] for rib in ribs]
-    top = np.array([front_x[-1] - 0.5 * tip, length - rng.uniform(0.0, 0.04) * length])
+    middle = 0.5 * (front.line[:, 0] + 0.5 * front.thickness + back.line[:, 0] - 0.5 * back.thickness)
+    front_x = front.line[-1, 0] + 0.5 * front.thickness[-1]
+    top = np.array([front_x - 0.5 * tip, length - rng.uniform(0.0, 0.04) * length])
     few = len(junctions) + 1 < FEW and not steel
     keypoints = np.array([*junctions, *(_find_middles(front, back, ribs, clamped, top[1]) if few else ()), top])
-    low = max(clamped, 0.0)
-    reference_z = rng.uniform(0.15, 0.85) * low if low > 0.06 * length else -rng.uniform(0.04, 0.13) * length
-    at = np.interp(max(reference_z, 0.0), z, 0.5 * (front_x + back_x))
+    reference_z = rng.uniform(0.15, 0.85) * clamped if clamped > 0.06 * length else -rng.uniform(0.04, 0.13) * length
+    at = np.interp(max(reference_z, 0.0), front.line[:, 1], middle)
     reference = np.array([at + rng.uniform(-0.3, 0.3) * base * 0.8, reference_z])
     bolts = np.zeros((0, 3))
     if steel:
-        radius = rng.uniform(0.9, 1.8) * 1e-3
-        bolts = np.column_stack((np.array(junctions), np.full(len(junctions), radius)))
-    elif low > 0.08 * length and rng.random() < 0.4:
-        bolts = _draw_discs(rng, base, low)
+        bolts = np.column_stack((np.array(junctions), np.full(len(junctions), rng.uniform(0.9, 1.8) * 1e-3)))
+    elif clamped > 0.08 * length and rng.random() < 0.4:
+        bolts = _draw_discs(rng, base, clamped)
     return Finger(
         polygon=shapely.Polygon(polygon.exterior, polygon.interiors),
         members=(front, back, *ribs),
@@ -149,6 +122,53 @@ def _try_finger(rng: np.random.Generator) -> Finger | None:
         bolts=bolts,
         has_hinges=steel,
     )
+
+
+def _draw_bands(
+    rng: np.random.Generator, length: float, base: float, tip: float, scale: float, steel: bool
+) -> tuple[Member, Member]:
+    """Return the front and the back band, straight, slanted or curved, of a finger this wide at base and tip [m]."""
+    lean = 0.0 if rng.random() < 0.6 else rng.uniform(-0.25, 0.25)
+    bulge = 0.0 if rng.random() < 0.6 else rng.uniform(-0.06, 0.06) * length
+    back_bulge = 0.0 if rng.random() < 0.5 else rng.uniform(-0.05, 0.18) * length * min(base / (0.5 * length), 1.0)
+    share = np.linspace(0.0, 1.0, 81)
+    front_x = 0.5 * base + lean * length * share + bulge * 4.0 * share * (1.0 - share)
+    back_x = -0.5 * base + (front_x[-1] - tip + 0.5 * base) * share - back_bulge * 4.0 * share * (1.0 - share)
+    thick = rng.uniform(0.9, 2.6, 2) * 1e-3 * scale if not steel else np.full(2, rng.uniform(0.25, 1.0) * 1e-3)
+    front, back = (t * (1.0 + (k - 1.0) * share) for t, k in zip(thick, rng.uniform(0.65, 1.3, 2), strict=True))
+    return (
+        Member(line=np.column_stack((front_x - 0.5 * front, share * length)), thickness=front),
+        Member(line=np.column_stack((back_x + 0.5 * back, share * length)), thickness=back),
+    )
+
+
+def _draw_section(
+    rng: np.random.Generator,
+    members: tuple[Member, ...],
+    base: float,
+    ends: tuple[float, float],
+    scale: float,
+    steel: bool,
+) -> shapely.Geometry:
+    """Return what members cover, with the solid parts at both ends [m], a boss, holes and fillets by chance."""
+    front, back, (clamped, solid), length = *members[:2], ends, members[0].line[-1, 1]
+    parts = [member.polygon for member in members]
+    if not steel or rng.random() < 0.5:
+        parts.append(_between(front, back, solid, length))
+    if clamped > 0.0:
+        parts.append(_between(front, back, 0.0, clamped))
+    if rng.random() < 0.1:  # a boss on the back
+        at = rng.uniform(0.1, 0.5) * length
+        x = np.interp(at, back.line[:, 1], back.line[:, 0])
+        parts.append(shapely.Point(x, at).buffer(rng.uniform(0.025, 0.05) * length))
+    polygon = shapely.union_all([part.buffer(2e-5) for part in parts])
+    if clamped > 0.08 * length and rng.random() < 0.4:
+        discs = [shapely.Point(x, height).buffer(radius) for x, height, radius in _draw_discs(rng, base, clamped)]
+        polygon = polygon.difference(shapely.union_all(discs))
+    rounding = rng.uniform(0.0, 0.5) * 1e-3 * scale
+    if not steel and rounding > 1e-4:
+        polygon = polygon.buffer(rounding, quad_segs=3).buffer(-rounding, quad_segs=3)  # fillets
+    return polygon
 
 
 def _draw_ribs(

@@ -248,7 +248,7 @@ class FingerScenes:
         side_y = float(finger.half_width(finger.keypoints[:, 1]).mean())
         held = self._held > 0.0 and bool(rng.random() < self._held)
         camera, centre = self._draw_camera(grid, side_y, held=held)
-        bodies, look, R = self._build(section, state, side_y, held=held)
+        bodies, look, R = self._build(section, side_y, held=held)
         moved = [replace(body, vertices=(body.vertices - centre) @ R_CAMERA_JAW.T) for body in bodies]
         scene = RenderedScene(moved, look, R, R_CAMERA_JAW @ -centre)
         color = expose(scene.render(camera).color, look.exposure, rng)
@@ -287,11 +287,35 @@ class FingerScenes:
         camera = CameraIntrinsics(width=grid.width, height=grid.height, fx=f, fy=f, cx=float(at[0]), cy=float(at[1]))
         return camera, centre
 
-    def _build(
-        self, section: NDArray, state: NDArray | None, side_y: float, *, held: bool
-    ) -> tuple[list[Body], Lighting, NDArray]:
+    def _build(self, section: NDArray, side_y: float, *, held: bool) -> tuple[list[Body], Lighting, NDArray]:
         """Return the bodies of a scene in the jaw frame, its look, and the rotation of the look's directions."""
-        rng, finger = self._rng, self._finger
+        rng = self._rng
+        look, R = self._light(side_y, held=held)
+        paint = _draw_finger_paint(rng, steel=self._finger.has_hinges)
+        jaw, holder = self._mount(section, paint)
+        bodies = [jaw, holder]
+        if self._finger.reference[1] > 0.0 and rng.random() < 0.3:
+            bodies = [jaw]
+        mirrored = len(bodies)
+        if rng.random() < 0.7:
+            palm = draw_paint(rng, ("plain", "noise"))
+            corner = (0.1, side_y + rng.uniform(-0.01, 0.01), -rng.uniform(0.02, 0.05))
+            bodies.append(_box((-0.1, -0.04, -0.12), corner, palm))
+        thing = None if not held and rng.random() < 0.15 else self._thing(section, side_y, paint, held=held)
+        if thing is not None:
+            bodies.append(thing)
+        if held or rng.random() < 0.55:  # the other jaw, closing from the other side
+            front = section[:, 0].max()
+            face = front if thing is None else thing.vertices[:, 0].max()
+            middle = 0.5 * (front + max(face, front + 1e-3)) + rng.uniform(0.0, 0.01)
+            bodies += [_mirror(body, middle) for body in bodies[:mirrored]]
+        if rng.random() < BARS:
+            bodies.append(self._bar(side_y, self._solid.section.min(axis=0), self._solid.section.max(axis=0)))
+        return bodies, look, R
+
+    def _light(self, side_y: float, *, held: bool) -> tuple[Lighting, NDArray]:
+        """Return lights and background, and the rotation of their directions."""
+        rng = self._rng
         look = draw_look(rng, "dim" if rng.random() < (0.5 if held else 0.2) else "any")
         if rng.random() < 0.6:
             look = replace(look, background=_fill_square(_draw_texture(rng)))
@@ -301,7 +325,11 @@ class FingerScenes:
         if rng.random() < 0.5:  # a table behind, square to the camera or nearly
             R = Rotation.from_euler("xyz", rng.normal(0.0, 0.25, 3)).as_matrix()
             look = replace(look, background_distance=float(rng.uniform(0.02, 0.2) + side_y))
-        paint = _draw_finger_paint(rng, steel=finger.has_hinges)
+        return look, R
+
+    def _mount(self, section: NDArray, paint: Paint) -> tuple[Body, Body]:
+        """Return the bent finger and what holds it; one of them has the mark."""
+        rng, finger, solid = self._rng, self._finger, self._solid
         bolts = draw_color(rng, 0.2, 0.9)
         sides = finger.half_width(finger.bolts[:, 1])
         decals = [
@@ -313,51 +341,21 @@ class FingerScenes:
         own = finger.reference[1] > 0.0
         under = (paint if own else holder_paint).color
         dot = draw_color(rng, 0.6, 0.95) ** 0.3 if float(np.max(under)) < 0.2 else draw_color(rng, 0.005, 0.03)
-        mark = Decal(
-            place=np.array([finger.reference[0], base_y, finger.reference[1]]),
-            radius=MARK_RADIUS * rng.uniform(0.75, 1.25),
-            color=dot,
-        )
+        place = np.array([finger.reference[0], base_y, finger.reference[1]])
+        mark = Decal(place=place, radius=MARK_RADIUS * rng.uniform(0.75, 1.25), color=dot)
         marks = (mark,) if self._marked else ()
-        vertices = self._solid.raise_vertices(section)
         jaw = Body(
-            vertices=vertices,
-            triangles=self._solid.triangles,
-            rest=self._solid.rest(),
+            vertices=solid.raise_vertices(section),
+            triangles=solid.triangles,
+            rest=solid.rest(),
             paint=paint,
             decals=(*decals, *(marks if own else ())),
         )
-        low, high = self._solid.section.min(axis=0), self._solid.section.max(axis=0)
-        base = self._solid.section[self._solid.section[:, 1] < 0.02 * finger.length]
+        base, lowest = solid.section[solid.section[:, 1] < 0.02 * finger.length], solid.section[:, 1].min()
         reach = rng.uniform(-0.002, 0.006, 2)
-        holder = _box(
-            (
-                base[:, 0].min() - reach[0],
-                -base_y - rng.uniform(0.0, 0.01),
-                min(low[1], 0.0) - rng.uniform(0.012, 0.05),
-            ),
-            (base[:, 0].max() + reach[1], base_y, 0.0),
-            holder_paint,
-            () if own else marks,
-        )
-        bodies = [jaw, holder]
-        if own and rng.random() < 0.3:
-            bodies = [jaw]
-        if rng.random() < 0.7:
-            palm = draw_paint(rng, ("plain", "noise"))
-            bodies.append(
-                _box((-0.1, -0.04, -0.12), (0.1, side_y + rng.uniform(-0.01, 0.01), -rng.uniform(0.02, 0.05)), palm)
-            )
-        thing = None if not held and rng.random() < 0.15 else self._thing(section, side_y, paint, held=held)
-        if thing is not None:
-            bodies.append(thing)
-        if held or rng.random() < 0.55:  # the other jaw, closing from the other side
-            face = section[:, 0].max() if thing is None else thing.vertices[:, 0].max()
-            middle = 0.5 * (section[:, 0].max() + max(face, section[:, 0].max() + 1e-3)) + rng.uniform(0.0, 0.01)
-            bodies += [_mirror(body, middle) for body in bodies[: 2 if holder in bodies else 1]]
-        if rng.random() < BARS:
-            bodies.append(self._bar(side_y, low, high))
-        return bodies, look, R
+        deep = -base_y - rng.uniform(0.0, 0.01)
+        low = (base[:, 0].min() - reach[0], deep, min(lowest, 0.0) - rng.uniform(0.012, 0.05))
+        return jaw, _box(low, (base[:, 0].max() + reach[1], base_y, 0.0), holder_paint, () if own else marks)
 
     def _thing(self, section: NDArray, side_y: float, paint: Paint, *, held: bool) -> Body:
         """Return an object that touches the finger, or stands before it; some of those held look like its paint."""
