@@ -133,11 +133,10 @@ JAMMED = 5e4  # [N/m] of opening, by which the force grows where jaws find no eq
 _DOWN = np.array([0.0, 0.0, 1.0])
 
 
-class PressedGrasp:
+class PressedGrasp(Assembly):
     """A scenario's jaws and object, shut as far as one likes; no weight is lifted and nothing slides.
 
     Attributes:
-        assembly: the jaws and the object.
         touch_opening: at which the object just fits [m]; -inf without an object.
         least_opening: down to which the grasp is solved [m]; below it the jaws jam.
     """
@@ -157,34 +156,34 @@ class PressedGrasp:
             FinforceError: The scenario's object or jaw cannot be used.
             BalanceError: The jaws cannot shut on the object at all.
         """
-        self.assembly = assembly = Assembly(scenario, seed, density)
-        self._reach = assembly.touch_origin - assembly.inner_face_x  # of each jaw, from touch to closed
+        super().__init__(scenario, seed, density)
+        self._reach = self.touch_origin - self.inner_face_x  # of each jaw, from touch to closed
         self._solve(step)
         sizes = np.array([np.linalg.norm(table.force, axis=1) for table in self._tables.values()])
         self._forces = sizes.min(axis=0)
-        is_empty = assembly.object_mesh is None
+        is_empty = self.object_mesh is None
         self.touch_opening = -np.inf if is_empty else 2.0 * self._reach
         self.least_opening = 0.0 if is_empty else float(2.0 * (self._reach - self._closings[-1]))
 
     def _solve(self, step: float) -> None:
         """Solve grasps from first touch on, at most `step` [m] of closing apart; without an object the jaws at rest."""
-        held, solved, places = self.assembly.hold_object(), [], []
+        held, solved, places = self.hold_object(), [], []
         closings = np.linspace(0.0, self._reach, int(np.ceil(self._reach / step)) + 1) if held else np.zeros(1)
         for closing in closings:
             try:
-                setting = self.assembly.setting_of(Posture(closing=float(closing)))
-                solved.append(held.follow(setting) if held else self.assembly.rest_shapes())
+                setting = self.setting_of(Posture(closing=float(closing)))
+                solved.append(held.follow(setting) if held else self.rest_shapes())
             except BalanceError:
                 if len(solved) < 2:
                     raise
                 break
             places.append(held.x if held else 0.0)
         self._closings, self._places = closings[: len(solved)], np.array(places)
-        self._tables = {side: _stack_shapes([shapes[side] for shapes in solved]) for side in self.assembly.jaws}
+        self._tables = {side: _stack_shapes([shapes[side] for shapes in solved]) for side in self.jaws}
 
     def relaxation(self) -> dict[str, RelaxedWrench]:
         """Return by side what makes of a jaw's elastic wrenches those of its material, which begins relaxed."""
-        return {side: RelaxedWrench(self.assembly.material.terms) for side in self.assembly.jaws}
+        return {side: RelaxedWrench(self.material.terms) for side in self.jaws}
 
     def closing_at(self, opening: float) -> float:
         """Return how far each jaw is beyond first touch [m] at an opening [m], negative before."""
@@ -204,7 +203,7 @@ class PressedGrasp:
             ScenarioError: The jaws meet before they press that hard.
         """
         if not force <= self._forces[-1]:
-            name, most = self.assembly.scenario.name, self._forces[-1]
+            name, most = self.scenario.name, self._forces[-1]
             raise ScenarioError(f"{name}: {force:g} N, expected at most {most:.1f} N, with which the jaws have met")
         return float(np.interp(force, np.maximum.accumulate(self._forces), self._closings))
 
@@ -223,20 +222,20 @@ class PressedGrasp:
         wrenches, posture = self.wrenches(opening), Posture(closing=self.closing_at(opening))
         jaws = {
             side: JawState(
-                origin_x=self.assembly.origin_x(side, posture),
-                reference=self.assembly.jaws[side].reference_point,
+                origin_x=self.origin_x(side, posture),
+                reference=self.jaws[side].reference_point,
                 vertices=self._read(table.vertices, opening),
                 keypoints=self._read(table.keypoints, opening),
                 **wrenches[side]._asdict(),
             )
             for side, table in self._tables.items()
         }
-        return TwinState(stamp=stamp, phase="", jaws=jaws, T_gripper_object=self.object_pose(opening), gravity=_DOWN)
+        return TwinState(stamp=stamp, phase="", jaws=jaws, T_gripper_object=self.pose_at(opening), gravity=_DOWN)
 
-    def object_pose(self, opening: float) -> NDArray | None:
+    def pose_at(self, opening: float) -> NDArray | None:
         """Return T_gripper_object (4, 4) at an opening [m]; None without an object."""
         closing = self.closing_at(opening)
-        return self.assembly.object_pose(Posture(closing=closing), self._place_object(closing))
+        return self.object_pose(Posture(closing=closing), self._place_object(closing))
 
     def _find_growth(self, opening: float) -> float:
         """Return by which factor forces exceed the table's last ones; 0 without contact, for that has no force."""
@@ -249,7 +248,7 @@ class PressedGrasp:
         if closing >= 0.0:
             return float(np.interp(closing, self._closings, self._places))
         pushed = self._places[0]
-        return float(np.clip(self.assembly.scenario.offset, pushed + closing, pushed - closing))
+        return float(np.clip(self.scenario.offset, pushed + closing, pushed - closing))
 
     def _read(self, rows: NDArray, opening: float) -> NDArray:
         """Return what lies between two rows of a table (m, ...) at an opening [m]."""

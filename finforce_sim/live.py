@@ -60,7 +60,7 @@ class LiveScene:
     def __init__(self, grasp: PressedGrasp, photographer: Photographer, seed: int) -> None:
         if grasp.touch_opening + LEAST_CLEARANCE > STROKE:
             raise ScenarioError(
-                f"{grasp.assembly.scenario.name}: the object is {1e3 * grasp.touch_opening:.0f} mm wide between the "
+                f"{grasp.scenario.name}: the object is {1e3 * grasp.touch_opening:.0f} mm wide between the "
                 f"jaws, expected at most {1e3 * (STROKE - LEAST_CLEARANCE):.0f} mm; give another object or scene"
             )
         self.grasp = grasp
@@ -88,7 +88,7 @@ class LiveScene:
         takes, dt = self._takes[place], 0.0 if self._last is None else now - self._last
         wrenches = self.grasp.wrenches(opening)
         wrenches = {side: self._relaxation[side].update(wrench, dt) for side, wrench in wrenches.items()}
-        T_gripper_object = self.grasp.object_pose(float(self.openings[place]))
+        T_gripper_object = self.grasp.pose_at(float(self.openings[place]))
         tracked = T_gripper_object is not None and self._count % TRACKED_EVERY == 0
         picture = takes[self._count % len(takes)]
         self._count, self._last = self._count + 1, now
@@ -113,7 +113,7 @@ def build_live_scene(
         FinforceError: the scenario's object or jaw cannot be used, or a library is missing.
     """
     grasp = PressedGrasp(scenario, finger)
-    setting = set_stage(grasp.assembly, camera or build_d405_vga(), depth_step)
+    setting = set_stage(grasp, camera or build_d405_vga(), depth_step)
     return LiveScene(grasp, Photographer(setting, seed), seed)
 
 

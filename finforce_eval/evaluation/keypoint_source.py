@@ -402,7 +402,6 @@ def _with_detection(
         points=points,
         accepted=accepted,
         reasons=np.array(reasons, dtype="U16").reshape(-1, count),
-        found=np.array([each is not None for each in seen]),
         step_ms=np.array([step_ms.get(stamp, np.nan) for stamp in stamps.tolist()]),
     )
     return replace(track, keypoints=keypoints, pose=_pose_track(found, stamps, frame_id), detection=detection)

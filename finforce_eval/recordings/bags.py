@@ -28,13 +28,6 @@ SECONDS, BYTES_PER_SECOND = 20, 5 * MEGABYTE  # of work on a recording in a proc
 _HINT = f"{BUDGET}=10 would allow ten times as much"
 
 
-class BagMessage(NamedTuple):
-    """A message and the time [ns] at which the bag received it."""
-
-    time: int
-    message: Any
-
-
 class RawSample(NamedTuple):
     """An undecoded message: its topic, the time of receipt [ns] and its CDR bytes."""
 

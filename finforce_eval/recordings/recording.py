@@ -13,7 +13,7 @@ from finforce.files import FileError, read_json
 from finforce.messages import Keypoints, decode_columns, decode_keypoints, stamp_of
 from finforce.stamps import NANOSECONDS
 from finforce_eval.errors import DamagedError, RecordingError
-from finforce_eval.recordings.bags import BagMessage, bag_source, check_messages, check_types, open_bag
+from finforce_eval.recordings.bags import bag_source, check_messages, check_types, open_bag
 from finforce_eval.recordings.images import PAIRED, ImageTrack, find_images
 from finforce_eval.recordings.salvage import SalvagedCopy
 from finforce_eval.recordings.tracks import (
@@ -33,7 +33,8 @@ POSE = "geometry_msgs/msg/PoseStamped"
 STRING = "std_msgs/msg/String"
 TRUTH_COLUMNS = ("x", "y", "z", "u", "v", "visible")
 TRUE_KEYPOINTS, TRUE_POSE = "ground_truth_keypoints", "ground_truth_jaw_pose"
-TOPICS = {"/object_pose": POSE, "/bench/phase": STRING}
+PHASE = "/bench/phase"
+TOPICS = {"/object_pose": POSE, PHASE: STRING}
 for _side in JAWS:
     TOPICS |= {
         f"/{_side}/keypoints": CLOUD,
@@ -50,9 +51,10 @@ _CHECKED = 10_000  # messages after which their number is looked at
 
 
 class _Content(NamedTuple):
-    """What lies in a bag: messages by topic, images, and notes on what was left aside."""
+    """What lies in a bag: messages by topic, phases by their time of receipt [ns], images, and notes."""
 
-    samples: Mapping[str, list[BagMessage]]
+    samples: Mapping[str, list[Any]]
+    phases: Sequence[tuple[int, str]]
     images: ImageTrack | None
     notes: list[str]
 
@@ -82,25 +84,24 @@ def read_recording(
     name = source.name if source.is_dir() else source.stem
     copy = None
     try:
-        samples, images, notes = _read_samples(source, name, pairing)
+        samples, phases, images, notes = _read_samples(source, name, pairing)
     except DamagedError as error:
         if strict:
             raise
         copy = SalvagedCopy(source, str(error))
-        samples, images, notes = _read_samples(copy.path, name, pairing)
+        samples, phases, images, notes = _read_samples(copy.path, name, pairing)
         notes.append(copy.note.removeprefix(f"{name}: "))
     known = [side for side in JAWS if _has_jaw(samples, side, images is not None) or (images and side in sides)]
     jaws = {side: _jaw_track(samples, side, name) for side in known}
     if not jaws:
         raise RecordingError(f"{name}: {_no_jaw(has_images=images is not None)}")
-    phases = samples.get("/bench/phase")
     poses = samples.get("/object_pose")
     return Recording(
         name=name,
         path=Path(path),
         jaws=jaws,
         object_pose=_pose_track(poses, "/object_pose", name) if poses else None,
-        phases=_phases(phases, name) if phases else None,
+        phases=parse_phases(*zip(*phases, strict=True), name) if phases else None,
         case=_read_case(folder / "case.json"),
         notes=tuple(notes),
         images=images,
@@ -119,7 +120,7 @@ def _no_jaw(*, has_images: bool) -> str:
     )
 
 
-def _has_jaw(samples: Mapping[str, list[BagMessage]], side: str, has_images: bool) -> bool:
+def _has_jaw(samples: Mapping[str, list[Any]], side: str, has_images: bool) -> bool:
     """Say whether a recording tells of a jaw: by its key points, or with images by anything that is the jaw's own."""
     topics = [topic for topic in samples if topic.startswith(f"/{side}/")]
     return f"/{side}/keypoints" in topics or (has_images and bool(topics))
@@ -127,13 +128,18 @@ def _has_jaw(samples: Mapping[str, list[BagMessage]], side: str, has_images: boo
 
 def _read_samples(source: Path, name: str, pairing: int) -> _Content:
     """Decode the messages of our topics, by topic, and find the images."""
-    samples: dict[str, list[BagMessage]] = {}
+    samples: dict[str, list[Any]] = {}
+    phases: list[tuple[int, str]] = []
     with open_bag(source, name) as bag:
         check_types(bag.connections, {topic: (kind,) for topic, kind in TOPICS.items()}, name)
         for number, raw in enumerate(bag.raw(TOPICS)):
             if not number % _CHECKED:
                 check_messages(number, source)
-            samples.setdefault(raw.topic, []).append(BagMessage(raw.time, bag.decode(raw)))
+            message = bag.decode(raw)
+            if raw.topic == PHASE:  # without a stamp of its own
+                phases.append((raw.time, message.data))
+            else:
+                samples.setdefault(raw.topic, []).append(message)
         notes = bag.foreign_notes()
         try:
             images = find_images(bag, source, pairing)
@@ -141,12 +147,12 @@ def _read_samples(source: Path, name: str, pairing: int) -> _Content:
             if not any(topic.endswith("/keypoints") for topic in samples):
                 raise
             images, notes = None, [*notes, str(error)]
-        return _Content(samples, images, notes)
+        return _Content(samples, phases, images, notes)
 
 
-def _stamps(samples: Sequence[BagMessage], topic: str, name: str, *, strict: bool) -> np.ndarray:
+def _stamps(samples: Sequence[Any], topic: str, name: str, *, strict: bool) -> np.ndarray:
     """Return the header stamps (n,) [ns] and check their order."""
-    stamps = np.array([stamp_of(sample.message) for sample in samples], dtype=np.int64)
+    stamps = np.array([stamp_of(sample) for sample in samples], dtype=np.int64)
     steps = np.diff(stamps)
     wrong = np.flatnonzero(steps <= 0 if strict else steps < 0)
     if wrong.size:
@@ -157,7 +163,7 @@ def _stamps(samples: Sequence[BagMessage], topic: str, name: str, *, strict: boo
     return stamps
 
 
-def _jaw_track(samples: Mapping[str, list[BagMessage]], side: str, name: str) -> JawTrack:
+def _jaw_track(samples: Mapping[str, list[Any]], side: str, name: str) -> JawTrack:
     """Gather what was recorded of one jaw."""
     truth = samples.get(f"/{side}/ground_truth_wrench")
     pose = samples.get(f"/{side}/jaw_pose")
@@ -172,15 +178,15 @@ def _jaw_track(samples: Mapping[str, list[BagMessage]], side: str, name: str) ->
     )
 
 
-def _check_frame(samples: Sequence[BagMessage], topic: str, side: str, name: str) -> None:
+def _check_frame(samples: Sequence[Any], topic: str, side: str, name: str) -> None:
     """Refuse messages of a jaw that are not in its frame."""
     for sample in samples:
-        frame = sample.message.header.frame_id
+        frame = sample.header.frame_id
         if frame.lstrip("/") != f"{side}_jaw":
             raise RecordingError(f"{name}: {topic} is in the frame '{frame}'; expected '{side}_jaw'")
 
 
-def _keypoint_track(samples: Sequence[BagMessage], side: str, name: str) -> KeypointTrack:
+def _keypoint_track(samples: Sequence[Any], side: str, name: str) -> KeypointTrack:
     """Stack the key point clouds of one jaw."""
     topic = f"/{side}/keypoints"
     _check_frame(samples, topic, side, name)
@@ -204,13 +210,13 @@ def _keypoint_track(samples: Sequence[BagMessage], side: str, name: str) -> Keyp
     return KeypointTrack(stamps=stamps, points=points, likelihood=likelihood, stddev=stddev)
 
 
-def _detection_truth(samples: Sequence[BagMessage], side: str, name: str) -> DetectionTruth:
+def _detection_truth(samples: Sequence[Any], side: str, name: str) -> DetectionTruth:
     """Stack the true key points of one jaw."""
     topic = f"/{side}/{TRUE_KEYPOINTS}"
     _check_frame(samples, topic, side, name)
     stamps = _stamps(samples, topic, name, strict=True)
     try:
-        clouds = [decode_columns(sample.message, TRUTH_COLUMNS) for sample in samples]
+        clouds = [decode_columns(sample, TRUTH_COLUMNS) for sample in samples]
         columns = ([cloud[name] for cloud in clouds] for name in TRUTH_COLUMNS)
         x, y, z, u, v, visible = (np.array(column, dtype=np.float64) for column in columns)
     except (ObservationError, ValueError) as error:
@@ -219,20 +225,20 @@ def _detection_truth(samples: Sequence[BagMessage], side: str, name: str) -> Det
     return DetectionTruth(stamps=stamps, points=points, pixels=pixels, visible=visible > 0)
 
 
-def _cloud(sample: BagMessage, index: int, topic: str, name: str) -> Keypoints:
+def _cloud(sample: Any, index: int, topic: str, name: str) -> Keypoints:
     """Decode one key point cloud."""
     try:
-        return decode_keypoints(sample.message)
+        return decode_keypoints(sample)
     except ObservationError as error:
         raise RecordingError(f"{name}: {topic} message {index}: {error}") from error
 
 
-def _wrench_track(samples: Sequence[BagMessage], side: str, name: str) -> WrenchTrack:
+def _wrench_track(samples: Sequence[Any], side: str, name: str) -> WrenchTrack:
     """Stack the ground truth of one jaw."""
     topic = f"/{side}/ground_truth_wrench"
     _check_frame(samples, topic, side, name)
     stamps = _stamps(samples, topic, name, strict=False)
-    wrenches = [sample.message.wrench for sample in samples]
+    wrenches = [sample.wrench for sample in samples]
     force = np.array([[w.force.x, w.force.y, w.force.z] for w in wrenches])
     torque = np.array([[w.torque.x, w.torque.y, w.torque.z] for w in wrenches])
     if not np.isfinite(force).all():
@@ -240,25 +246,20 @@ def _wrench_track(samples: Sequence[BagMessage], side: str, name: str) -> Wrench
     return WrenchTrack(stamps=stamps, force=force, torque=torque)
 
 
-def _pose_track(samples: Sequence[BagMessage], topic: str, name: str) -> PoseTrack:
+def _pose_track(samples: Sequence[Any], topic: str, name: str) -> PoseTrack:
     """Stack poses of one frame; the order of their stamps is not checked, trackers publish late results."""
-    frames = [sample.message.header.frame_id for sample in samples]
+    frames = [sample.header.frame_id for sample in samples]
     odd = next((index for index, frame in enumerate(frames) if frame != frames[0]), None)
     if odd is not None:
         what = f"message {odd} is in the frame '{frames[odd]}', the first in '{frames[0]}'"
         raise RecordingError(f"{name}: {topic} {what}; expected one frame")
-    poses = [sample.message.pose for sample in samples]
+    poses = [sample.pose for sample in samples]
     return PoseTrack(
-        stamps=np.array([stamp_of(sample.message) for sample in samples], dtype=np.int64),
+        stamps=np.array([stamp_of(sample) for sample in samples], dtype=np.int64),
         position=np.array([[p.position.x, p.position.y, p.position.z] for p in poses]),
         quaternion=np.array([[getattr(p.orientation, axis) for axis in "xyzw"] for p in poses]),
         frame_id=frames[0],
     )
-
-
-def _phases(samples: Sequence[BagMessage], name: str) -> Any:
-    """Read the phases; strings carry no stamp, the time of receipt stands for it."""
-    return parse_phases([s.time for s in samples], [s.message.data for s in samples], name)
 
 
 def _read_case(path: Path) -> dict[str, Any]:

@@ -315,7 +315,6 @@ class DetectionTrack:
         points: (n, K, 3) [m], jaw frame, NaN = no depth.
         accepted: (n, K) handed on to the solver.
         reasons: (n, K) why a point was not, one word; "" where it was, or where the jaw was not found.
-        found: (n,) the jaw was found in the image.
         step_ms: (n,) wall time from image to key points of all jaws [ms], NaN where it was not timed.
     """
 
@@ -324,5 +323,4 @@ class DetectionTrack:
     points: NDArray[np.float64]
     accepted: NDArray[np.bool_]
     reasons: NDArray[np.str_]
-    found: NDArray[np.bool_]
     step_ms: NDArray[np.float64]

@@ -49,7 +49,6 @@ class NodeRun:
         log: the answers, by recorded stamp.
         cpu: of each process while the stream was played, all its threads [% of a core].
         memory: resident at the stream's end [bytes].
-        player: CPU use of this process, which plays [% of a core].
         others: CPU use of everything else on the machine meanwhile [% of a core]; it should be small.
         seconds: for which it was played.
     """
@@ -57,7 +56,6 @@ class NodeRun:
     log: ReplayLog
     cpu: Mapping[str, float]
     memory: Mapping[str, int]
-    player: float
     others: float
     seconds: float
 
@@ -156,7 +154,6 @@ def run_nodes(
         log=log,
         cpu={name: shares[name] for name in pids},
         memory=memory,
-        player=shares[PLAYER],
         others=max(0.0, busy - sum(shares.values())),
         seconds=seconds,
     )

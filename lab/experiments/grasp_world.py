@@ -254,7 +254,7 @@ def build_plant(name: str, pressed: PressedGrasp) -> Plant:
         name=name,
         force_at=pressed.elastic_force,
         touch_opening=pressed.touch_opening,
-        terms=pressed.assembly.material.terms,
+        terms=pressed.material.terms,
     )
 
 
@@ -270,12 +270,12 @@ class JawSensor:
     def __init__(self, pressed: PressedGrasp, side: str) -> None:
         self._side = side
         solver = JawEstimator(
-            pressed.assembly.jaws[side],
+            pressed.jaws[side],
             settings=EstimatorSettings(held="yes"),  # as the nodes have it for two jaws
             calibration=load_calibration("twin"),
         )
         solver.warm_up()
-        self._loop = ForceLoop(ContactEstimator(solver.jaw, mesh=pressed.assembly.object_mesh), solver)
+        self._loop = ForceLoop(ContactEstimator(solver.jaw, mesh=pressed.object_mesh), solver)
 
     @property
     def touching(self) -> bool:
@@ -306,7 +306,7 @@ class EstimatorSensor:
 
     def __init__(self, pressed: PressedGrasp, seed: int) -> None:
         self._pressed, self._random = pressed, np.random.default_rng(seed)
-        self._jaws = {side: JawSensor(pressed, side) for side in pressed.assembly.jaws}
+        self._jaws = {side: JawSensor(pressed, side) for side in pressed.jaws}
         self._next_pose = 0.0
         self.touching: bool | None = None
         self.stddev = 0.0
@@ -351,7 +351,7 @@ class ImageSensor(EstimatorSensor):
     def __init__(self, pressed: PressedGrasp, seed: int, size: str = "640x480") -> None:
         super().__init__(pressed, seed)
         self._camera, depth_step = parse_size(size), 1e-3
-        self._photographer = Photographer(set_stage(pressed.assembly, self._camera, depth_step), seed)
+        self._photographer = Photographer(set_stage(pressed, self._camera, depth_step), seed)
         parameters = DetectorParameters()
         settings = DetectorSettings(quantum=depth_step)
         self._detector = build_detector(load_jaws(parameters), parameters, settings, DotSettings())

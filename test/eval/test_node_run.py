@@ -64,7 +64,7 @@ def test_a_listener_is_played_to_measured_and_ended():
     assert run.seconds == pytest.approx(29 / 30, abs=0.5)  # a busy machine is late
     assert 0.0 <= run.cpu["listener"] < 200.0
     assert 20e6 < run.memory["listener"] < 400e6  # a Python with rclpy
-    assert run.player > 0.0 and run.others >= 0.0
+    assert run.others >= 0.0
 
 
 def test_a_process_that_ends_early_is_said_with_its_last_words():

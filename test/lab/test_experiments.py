@@ -269,7 +269,7 @@ def test_images_without_a_force_are_told_with_what_the_jaws_said(monkeypatch):
     seen = SimpleNamespace(origin_x=0.0, keypoints=np.zeros((8, 3)))
     jaws = [{"left": seen, "right": seen}] * 3 + [{"left": seen}]
     states = iter(SimpleNamespace(stamp=0.1 * n, jaws=each, T_gripper_object=np.eye(4)) for n, each in enumerate(jaws))
-    pressed = SimpleNamespace(script=script, assembly=SimpleNamespace(jaws=script), state=lambda *_: next(states))
+    pressed = SimpleNamespace(script=script, jaws=script, state=lambda *_: next(states))
     sensor = grasp_world.EstimatorSensor(pressed, 0)
     sensor._next_pose = np.inf
     assert [sensor.measure(0.1 * n, 3.0, 0.02) for n in range(4)] == [None, 3.0, None, None]

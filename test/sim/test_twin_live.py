@@ -126,7 +126,7 @@ def test_the_object_is_tracked_at_a_third_of_the_images_where_it_is_seen():
     poses = [scene.take(HELD, 0.033 * k).T_camera_object for k in range(9)]
     assert [pose is not None for pose in poses] == [True, False, False] * 3
     seen = scene.openings[scene.find(HELD)]
-    true = invert_pose(CAMERA_POSE) @ scene.grasp.object_pose(seen)
+    true = invert_pose(CAMERA_POSE) @ scene.grasp.pose_at(seen)
     tracked = [pose for pose in poses if pose is not None]
     for pose in tracked:
         assert 0.0 < np.abs(pose[:3, 3] - true[:3, 3]).max() < 1.5e-3  # five standard deviations

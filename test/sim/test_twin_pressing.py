@@ -81,10 +81,10 @@ def test_what_is_read_off_is_what_the_script_plays(grasp):
 
 def test_between_two_solved_grasps_the_interpolated_one_is_the_solved_one(grasp):
     closing = 0.5 * (grasp._closings[60] + grasp._closings[61])
-    held = grasp.assembly.hold_object()
+    held = grasp.hold_object()
     for before in grasp._closings[:61]:
-        held.follow(grasp.assembly.setting_of(Posture(closing=float(before))))
-    shapes = held.follow(grasp.assembly.setting_of(Posture(closing=float(closing))))
+        held.follow(grasp.setting_of(Posture(closing=float(before))))
+    shapes = held.follow(grasp.setting_of(Posture(closing=float(closing))))
     opening = grasp.touch_opening - 2.0 * closing
     read = grasp.state(opening)
     for side, shape in shapes.items():
@@ -106,7 +106,7 @@ def test_forces_of_both_jaws_cancel_and_pass_through_the_object(grasp):
 
 def test_an_object_off_the_middle_is_pushed_by_the_jaw_that_meets_it_first():
     grasp = PressedGrasp(build_scenario("grasp_cylinder", offset=0.004), SEED, "coarse", step=5e-4)
-    places = [grasp.object_pose(opening)[0, 3] for opening in (0.048, 0.035, 0.029, 0.02)]
+    places = [grasp.pose_at(opening)[0, 3] for opening in (0.048, 0.035, 0.029, 0.02)]
     assert places[0] == places[1] == pytest.approx(0.004)
     assert places[2] == pytest.approx(0.5 * (0.029 - grasp.touch_opening), abs=1e-4)
     assert abs(places[3]) < 2e-4
@@ -189,7 +189,7 @@ def test_a_held_force_relaxes_by_the_material_s_terms(grasp):
     for opening in openings:
         relaxed.update(opening, dt)
         measured.append(relaxed.force)
-    wanted = apply_relaxation(elastic, stamps, grasp.assembly.material.terms)
+    wanted = apply_relaxation(elastic, stamps, grasp.material.terms)
     # the direction of the force turns a little with the shape, which the scalar filter does not know
     np.testing.assert_allclose(measured, wanted, rtol=2e-3)
     held = measured[int(3.0 * 30) :]
