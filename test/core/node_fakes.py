@@ -6,6 +6,7 @@ import sys
 import threading
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib import import_module
 from time import monotonic, time_ns
 
 import numpy as np
@@ -21,6 +22,7 @@ from std_msgs.msg import Header
 from finforce.errors import ObservationError
 from finforce.ros import node as ros
 from finforce.ros.node import TolerantExecutor
+from finforce.ros.start import NODES
 from finforce.ros.transport import free_domain
 from finforce_ifea.errors import UnderLoadError
 from finforce_ifea.jaw.jaw import load_jaw
@@ -194,6 +196,12 @@ def environment():
 def run_node(command):
     """What came of a node that ends by itself."""
     return subprocess.run(command, capture_output=True, text=True, timeout=START_PATIENCE, env=environment())
+
+
+def run_here(name, *parameters):
+    """The exit status of a node of this very process that ends by itself."""
+    module = import_module(NODES[name])
+    return module.main(command_of(name, *parameters)[4:])
 
 
 def stop_when_ready(command, number):

@@ -6,7 +6,7 @@ import sys
 from time import monotonic, sleep
 
 import pytest
-from node_fakes import START_PATIENCE, command_of, run_node, stop_when_ready
+from node_fakes import START_PATIENCE, command_of, run_here, stop_when_ready
 
 from finforce_sim.emulator.adapter import EmulatedAdapter
 from finforce_sim.emulator.firmware import EmulatedGripper
@@ -47,11 +47,11 @@ def test_a_signal_ends_a_node_that_has_no_port():
         ("port", "parse parameter override rule: '-p port'"),
     ],
 )
-def test_what_cannot_be_set_up_ends_with_two_and_one_line(given, reason):
-    done = run_node(command_of("gripper_driver", given))
-    assert done.returncode == 2
-    said = done.stderr.strip().splitlines()
-    assert reason in said[-1] and "Traceback" not in done.stderr
+def test_what_cannot_be_set_up_ends_with_two_and_one_line(given, reason, capfd):
+    assert run_here("gripper_driver", given) == 2
+    text = capfd.readouterr().err
+    said = text.strip().splitlines()
+    assert reason in said[-1] and "Traceback" not in text
     assert sum(line.startswith("gripper_driver: ") for line in said) == 1
 
 

@@ -5,7 +5,7 @@ import subprocess
 import sys
 
 import pytest
-from node_fakes import START_PATIENCE, command_of, run_node, stop_when_ready
+from node_fakes import START_PATIENCE, command_of, run_here, stop_when_ready
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -29,10 +29,10 @@ def test_a_signal_ends_the_node_cleanly(number):
         ("estimator.likelihood_threshold:=2.0", "likelihood_threshold"),
     ],
 )
-def test_what_cannot_be_set_up_ends_with_two_and_one_line(given, reason):
-    done = run_node(command_of("ifea_solver", given))
-    assert done.returncode == 2
-    assert reason in done.stderr and len(done.stderr.strip().splitlines()) == 1
+def test_what_cannot_be_set_up_ends_with_two_and_one_line(given, reason, capfd):
+    assert run_here("ifea_solver", given) == 2
+    text = capfd.readouterr().err
+    assert reason in text and len(text.strip().splitlines()) == 1
 
 
 def test_a_signal_while_the_node_loads_ends_it_without_a_word():

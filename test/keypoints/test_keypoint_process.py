@@ -5,7 +5,7 @@ import subprocess
 import sys
 
 import pytest
-from node_fakes import START_PATIENCE, command_of, run_node, stop_when_ready
+from node_fakes import START_PATIENCE, command_of, run_here, stop_when_ready
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -36,11 +36,11 @@ def test_a_signal_ends_the_node_cleanly(number):
         ("depth_topic:=/{camera}/depth", "parameter depth_topic is '/{camera}/depth'; expected the name of a topic"),
     ],
 )
-def test_what_cannot_be_set_up_ends_with_two_and_one_reason(given, reason):
-    done = run_node(command_of("keypoint_detector", given))
-    assert done.returncode == 2
-    said = done.stderr.strip().splitlines()
-    assert reason in said[-1] and "Traceback" not in done.stderr
+def test_what_cannot_be_set_up_ends_with_two_and_one_reason(given, reason, capfd):
+    assert run_here("keypoint_detector", given) == 2
+    text = capfd.readouterr().err
+    said = text.strip().splitlines()
+    assert reason in said[-1] and "Traceback" not in text
     assert sum(line.startswith("keypoint_detector: ") for line in said) == 1
 
 
