@@ -6,10 +6,10 @@ units, so that one function prints them, one writes them and one draws them.
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
+from inspect import signature
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -71,62 +71,43 @@ class Figures:
     more: Mapping[str, Any] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, kw_only=True)
-class BenchPart:
-    """A part of the benchmark: its name on the command line, its title, and whether it is run when none is named."""
-
-    name: str
-    title: str
-    usual: bool = False
-
-    def measure(self, quick: bool, **options: Any) -> Figures:
-        """Return its figures.
-
-        Raises:
-            OptionError: the part does not take one of the options.
-            FinforceError: it cannot be measured here.
-        """
-        measure = self._measure
-        for name in options:
-            if name not in inspect.signature(measure).parameters:
-                raise OptionError(f"the part {self.name} takes no {name}; {takers(name)} do")
-        return measure(quick, **options)
-
-    @property
-    def _measure(self) -> Callable[..., Figures]:
-        return import_module(f"lab.bench.{self.name}").measure
+# title of each part, a module of `lab.bench`
+PARTS = {
+    "solvers": "Run time against force error of the solver tiers",
+    "chain": "Latency against force error of the whole chain",
+    "start": "From a node's start until it is ready, and its memory",
+    "images": "From images to forces on unseen scenes, beside true key points",
+    "driver_faults": "Random faults between the gripper driver and an emulated gripper",
+    "grasp_faults": "Grasps by force in which something goes wrong",
+}
+USUAL = ("solvers", "chain")  # measured when none is named
 
 
-PARTS = (
-    BenchPart(name="solvers", title="Run time against force error of the solver tiers", usual=True),
-    BenchPart(name="chain", title="Latency against force error of the whole chain", usual=True),
-    BenchPart(name="start", title="From a node's start until it is ready, and its memory"),
-    BenchPart(name="images", title="From images to forces on unseen scenes, beside true key points"),
-    BenchPart(name="driver_faults", title="Random faults between the gripper driver and an emulated gripper"),
-    BenchPart(name="grasp_faults", title="Grasps by force in which something goes wrong"),
-)
+def measure_part(name: str, quick: bool, **options: Any) -> Figures:
+    """Return the figures of a part.
+
+    Raises:
+        OptionError: the part does not take one of the options.
+        FinforceError: it cannot be measured here.
+    """
+    taken = {part: signature(import_module(f"lab.bench.{part}").measure).parameters for part in PARTS}
+    for option in options.keys() - taken[name].keys():
+        able = ", ".join(part for part in PARTS if option in taken[part]) or "none"
+        raise OptionError(f"the part {name} takes no {option}; {able} do")
+    return import_module(f"lab.bench.{name}").measure(quick, **options)
 
 
-def takers(option: str) -> str:
-    """Return the names of the parts that take an option."""
-    able = [part.name for part in PARTS if option in inspect.signature(part._measure).parameters]
-    return ", ".join(able) or "none"
-
-
-def select_parts(names: str | None) -> tuple[BenchPart, ...]:
+def select_parts(names: str | None) -> tuple[str, ...]:
     """Return the parts of a comma-separated list, the usual ones without a list.
 
     Raises:
         OptionError: a name is none of a part.
     """
-    if not names:
-        return tuple(part for part in PARTS if part.usual)
-    known = {part.name: part for part in PARTS}
-    wanted = [name.strip() for name in names.split(",") if name.strip()]
+    wanted = [name.strip() for name in names.split(",") if name.strip()] if names else USUAL
     for name in wanted:
-        if name not in known:
-            raise OptionError(f"--parts: there is no part {name!r}, expected some of {', '.join(known)}")
-    return tuple(known[name] for name in dict.fromkeys(wanted))
+        if name not in PARTS:
+            raise OptionError(f"--parts: there is no part {name!r}, expected some of {', '.join(PARTS)}")
+    return tuple(dict.fromkeys(wanted))
 
 
 def percentiles(seconds: Sequence[float] | NDArray, label: str = "") -> dict[str, float]:

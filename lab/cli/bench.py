@@ -11,7 +11,7 @@ from finforce.errors import FinforceError
 from finforce_eval.cli.parser import picture_file
 from finforce_eval.errors import OptionError
 from finforce_eval.machine import describe_machine, write_figures
-from lab.harness import PARTS, BenchPart, draw_tradeoff, figures_json, format_figures, select_parts
+from lab.harness import PARTS, draw_tradeoff, figures_json, format_figures, measure_part, select_parts
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -24,7 +24,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     text = "seeds of each scene of the part images; faults or grasps of others"
     parser.add_argument("--count", type=int, metavar="N", help=text)
     parser.add_argument("--model", metavar="FOLDER", help="network of the part images, in place of the shipped one")
-    text = f"parts to measure: {', '.join(part.name for part in PARTS)}; without it those of `make bench`"
+    text = f"parts to measure: {', '.join(PARTS)}; without it those of `make bench`"
     parser.add_argument("--parts", metavar="A,B", help=text)
     parser.add_argument("--json", metavar="OUT", help="write the figures as JSON")
     text = "picture of the first part; those of further parts get the part's name added"
@@ -40,19 +40,19 @@ def run(options: argparse.Namespace) -> None:
     for number, part in enumerate(select_parts(options.parts)):
         picture = Path(options.figure) if options.figure else None
         if picture and number:
-            picture = picture.with_stem(f"{picture.stem}_{part.name}")
-        content[part.name] = _run_part(part, options.quick, given, picture)
+            picture = picture.with_stem(f"{picture.stem}_{part}")
+        content[part] = _run_part(part, options.quick, given, picture)
         if options.json:
             write_figures(options.json, content)
     print(f"\n{machine['processor']}, {machine['cores']} cores, Python {machine['python']}, {machine['commit']}")
 
 
-def _run_part(part: BenchPart, quick: bool, given: dict[str, Any], picture: Path | None) -> dict[str, Any]:
+def _run_part(part: str, quick: bool, given: dict[str, Any], picture: Path | None) -> dict[str, Any]:
     """Measure one part, print and draw it; return it as plain values."""
-    print(f"\n{part.title}\n")
+    print(f"\n{PARTS[part]}\n")
     begin = perf_counter()
     try:
-        figures = part.measure(quick, **given)
+        figures = measure_part(part, quick, **given)
     except OptionError:
         raise
     except FinforceError as error:

@@ -4,6 +4,7 @@ import inspect
 import json
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -21,7 +22,8 @@ from finforce_eval.recordings.recording import read_recording
 from finforce_eval.replay.processes import resident_bytes
 from finforce_ifea.jaw.jaw import load_jaw
 from lab import harness
-from lab.harness import PARTS, BenchPart, Figures, Tradeoff, percentiles, select_parts, time_calls
+from lab.cli import bench
+from lab.harness import PARTS, Figures, Tradeoff, percentiles, select_parts, time_calls
 
 ROOT = Path(__file__).parents[2]
 
@@ -46,7 +48,7 @@ def two_parts(monkeypatch):
     """Replace the parts by some that measure nothing; return what they were asked for."""
     asked = []
 
-    def make(name, takes_folder=False, **options):
+    def make(name, takes_folder=False):
         def measure(quick):
             asked.append((name, quick, None))
             return figures_of(name)
@@ -57,10 +59,12 @@ def two_parts(monkeypatch):
 
         module = SimpleNamespace(measure=measure_folder if takes_folder else measure)
         monkeypatch.setitem(sys.modules, f"lab.bench.{name}", module)
-        return BenchPart(name=name, title=f"Title of {name}", **options)
+        return f"Title of {name}"
 
-    parts = (make("first", takes_folder=True, usual=True), make("second", usual=True), make("third"))
+    parts = {"first": make("first", takes_folder=True), "second": make("second"), "third": make("third")}
+    monkeypatch.setattr(harness, "USUAL", ("first", "second"))
     monkeypatch.setattr(harness, "PARTS", parts)
+    monkeypatch.setattr(bench, "PARTS", parts)
     return asked
 
 
@@ -111,15 +115,15 @@ def test_a_process_takes_memory_until_it_has_gone():
 
 
 def test_usual_parts_are_measured_unless_others_are_named(two_parts):
-    assert [part.name for part in select_parts(None)] == ["first", "second"]
-    assert [part.name for part in select_parts("third, first,third")] == ["third", "first"]
+    assert select_parts(None) == ("first", "second")
+    assert select_parts("third, first,third") == ("third", "first")
     with pytest.raises(OptionError, match="no part 'fourth', expected some of first, second, third"):
         select_parts("fourth")
 
 
 def test_every_listed_part_can_be_measured():
     for part in PARTS:
-        assert "quick" in inspect.signature(part._measure).parameters, part
+        assert "quick" in inspect.signature(import_module(f"lab.bench.{part}").measure).parameters, part
 
 
 def test_command_prints_tables_and_writes_json_and_a_picture_for_each_part(two_parts, tmp_path, capsys):
