@@ -68,7 +68,7 @@ def _blend(value: Any, other: Any, share: float) -> Any:
 
 
 def _blend_jaws(jaw: JawState, other: JawState, share: float) -> JawState:
-    """Return a jaw between two states: place, shape and wrench."""
+    """Return a jaw between two states: position, shape and wrench."""
     return replace(jaw, **{name: _blend(value, vars(other)[name], share) for name, value in vars(jaw).items()})
 
 
@@ -124,8 +124,8 @@ class TwinGripper(Assembly):
 
     def _jaw_state(self, side: str, posture: Posture, shape: JawShape, wrench: RelaxedWrench) -> JawState:
         relaxed = wrench.update(Wrench(shape.force, shape.torque), 1.0 / self.scenario.rate)
-        place = {"origin_x": self.origin_x(side, posture), "reference": self._jaws[side].jaw.reference_point}
-        return JawState(**vars(shape) | relaxed._asdict() | place)
+        rigid = {"origin_x": self.origin_x(side, posture), "reference": self._jaws[side].jaw.reference_point}
+        return JawState(**vars(shape) | relaxed._asdict() | rigid)
 
 
 STEP = 1e-4  # [m] of each jaw from one solved grasp to the next
@@ -167,7 +167,7 @@ class PressedGrasp(Assembly):
 
     def _solve(self, step: float) -> None:
         """Solve grasps from first touch on, at most `step` [m] of closing apart; without an object the jaws at rest."""
-        held, solved, places = self.hold_object(), [], []
+        held, solved, centres = self.hold_object(), [], []
         closings = np.linspace(0.0, self._reach, int(np.ceil(self._reach / step)) + 1) if held else np.zeros(1)
         for closing in closings:
             try:
@@ -177,8 +177,8 @@ class PressedGrasp(Assembly):
                 if len(solved) < 2:
                     raise
                 break
-            places.append(held.x if held else 0.0)
-        self._closings, self._places = closings[: len(solved)], np.array(places)
+            centres.append(held.x if held else 0.0)
+        self._closings, self._centres = closings[: len(solved)], np.array(centres)
         self._tables = {side: _stack_shapes([shapes[side] for shapes in solved]) for side in self.jaws}
 
     def relaxation(self) -> dict[str, RelaxedWrench]:
@@ -246,15 +246,15 @@ class PressedGrasp(Assembly):
     def _place_object(self, closing: float) -> float:
         """Return the object's x [m]: solved in contact; before, where it lay unless a jaw has pushed it."""
         if closing >= 0.0:
-            return float(np.interp(closing, self._closings, self._places))
-        pushed = self._places[0]
+            return float(np.interp(closing, self._closings, self._centres))
+        pushed = self._centres[0]
         return float(np.clip(self.scenario.offset, pushed + closing, pushed - closing))
 
     def _read(self, rows: NDArray, opening: float) -> NDArray:
         """Return what lies between two rows of a table (m, ...) at an opening [m]."""
-        place = np.interp(self.closing_at(opening), self._closings, np.arange(len(self._closings)))
-        low = min(int(place), max(len(rows) - 2, 0))
-        share, high = place - low, min(low + 1, len(rows) - 1)
+        row = np.interp(self.closing_at(opening), self._closings, np.arange(len(self._closings)))
+        low = min(int(row), max(len(rows) - 2, 0))
+        share, high = row - low, min(low + 1, len(rows) - 1)
         return (1.0 - share) * rows[low] + share * rows[high]
 
 

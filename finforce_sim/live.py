@@ -79,16 +79,16 @@ class LiveScene:
         self.openings = openings
 
     def find(self, opening: float) -> int:
-        """Return the place of the image that was taken nearest to an opening [m]."""
+        """Return the index of the image that was taken nearest to an opening [m]."""
         return int(np.abs(self.openings - opening).argmin())
 
     def take(self, opening: float, now: float) -> Moment:
         """Return the moment at an opening [m], at a time [s] that never goes back; `render` comes first."""
-        place = self.find(opening)
-        takes, dt = self._takes[place], 0.0 if self._last is None else now - self._last
+        index = self.find(opening)
+        takes, dt = self._takes[index], 0.0 if self._last is None else now - self._last
         wrenches = self.grasp.wrenches(opening)
         wrenches = {side: self._relaxation[side].update(wrench, dt) for side, wrench in wrenches.items()}
-        T_gripper_object = self.grasp.pose_at(float(self.openings[place]))
+        T_gripper_object = self.grasp.pose_at(float(self.openings[index]))
         tracked = T_gripper_object is not None and self._count % TRACKED_EVERY == 0
         picture = takes[self._count % len(takes)]
         self._count, self._last = self._count + 1, now

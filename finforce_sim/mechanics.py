@@ -107,12 +107,12 @@ class PressedJaw:
 
     def find_touch(self, height: float, tilt: float) -> float:
         """Return the x [m] of an outline's origin at the given height [m] where it first touches the jaw at rest."""
-        place = np.array([0.0, tilt, height])
+        pose = np.array([0.0, tilt, height])
         if self.jaw.face.is_flat:
             profile = flat_profile(float(self.surface.low[1]), float(self.surface.high[1]), self.jaw.inner_face_x)
         else:
             profile = profile_surface(self.surface, self.jaw.face)
-        depth = self._indenter.find_touch(place, profile)
+        depth = self._indenter.find_touch(pose, profile)
         return self.jaw.inner_face_x + self._indenter.pressed.front - depth
 
     def find_pressure(self, q: NDArray, load: Load) -> NDArray:
@@ -163,8 +163,8 @@ class PressedJaw:
 
     def _press(self, q: NDArray, load: Load) -> PenaltyContact:
         points = self.model.positions(self.surface.probe, q)
-        place = np.array([self._indenter.pressed.front - load.origin[0], load.tilt, load.origin[1]])
-        return self._indenter.press(points, self.surface.stiffness, 0.0, place)
+        pose = np.array([self._indenter.pressed.front - load.origin[0], load.tilt, load.origin[1]])
+        return self._indenter.press(points, self.surface.stiffness, 0.0, pose)
 
 
 def _share_pull(forces: NDArray, pull: NDArray) -> NDArray:
@@ -190,7 +190,7 @@ _LEAST_PULL = 0.02  # [N] that sticks anyhow
 _ITERATIONS = 40
 _SHORTEST = 1.0 / 128.0  # of the way from one image to the next
 _LARGEST_SHIFT = 1e-3  # [m] of the object in one Newton step
-_SOFTEST = 1e-3  # [N/m] of both jaws together, below which a balance tells nothing of the object's place
+_SOFTEST = 1e-3  # [N/m] of both jaws together, below which a balance tells nothing of the object's position
 _STRONGEST = 50.0  # [N]; fingers that bend give way far below
 
 
@@ -315,7 +315,7 @@ class HeldObject:
         return {side: 2.0 * last.q[side] - self._before.q[side] for side in last.q}, 2.0 * last.x - self._before.x
 
     def _find_loads(self, q: Mapping[str, NDArray], x: float, setting: GraspSetting) -> dict[str, Load]:
-        """Return each jaw's load: the object's place, and as pull what pressures leave of the weight in y and z."""
+        """Return each jaw's load: the object's position, and as pull what pressures leave of the weight in y and z."""
         loads = {
             side: Load(
                 origin=np.array([setting.opening + _along(side) * x, setting.height]),
@@ -477,8 +477,8 @@ class Assembly:
             return None
         if self.scenario.camera == "bench":
             x = BENCH_ORIGIN_X + self.touch_origin - posture.closing
-        place = np.array([x, self.scenario.shift, self.scenario.height + posture.slide])
-        return self._object.pose_at(place, posture.rock)
+        position = np.array([x, self.scenario.shift, self.scenario.height + posture.slide])
+        return self._object.pose_at(position, posture.rock)
 
     def _meet_object(self) -> float:
         """Show each jaw the object's outline; return the origins' distance [m] at which the object just fits.

@@ -75,7 +75,7 @@ class Wardrobe:
 
 def dress_jaw(shape: DrawnJaw, vertices: NDArray, T_camera_jaw: NDArray, wardrobe: Wardrobe) -> list[Body]:
     """Return a jaw with deformed vertices (n, 3) [m], jaw frame, and its holder with the reference dot."""
-    dot = Decal(place=shape.jaw.reference_point, radius=wardrobe.dot_radius, color=wardrobe.dot_color)
+    dot = Decal(centre=shape.jaw.reference_point, radius=wardrobe.dot_radius, color=wardrobe.dot_color)
     # a finger whose clamped part is in view carries the dot itself
     own = (dot,) if shape.jaw.reference_point[2] > 0.0 else ()
     moved = _move(vertices, T_camera_jaw)

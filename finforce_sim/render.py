@@ -162,27 +162,27 @@ class Paint:
     grain: float = 0.05
     offset: NDArray = field(default_factory=lambda: np.zeros(3))
 
-    def colors_at(self, places: NDArray) -> NDArray:
-        """Return the colours (n, 3) at places (n, 3) [m] of the body at rest."""
-        places = places + self.offset
-        share = self._mix(places)[:, None]
+    def colors_at(self, points: NDArray) -> NDArray:
+        """Return the colours (n, 3) at points (n, 3) [m] of the body at rest."""
+        points = points + self.offset
+        share = self._mix(points)[:, None]
         color = self.color * (1.0 - share) + self.second * share
-        return color * (1.0 + self.grain * (_look_up(places, 0.4e-3) - 0.5))[:, None]
+        return color * (1.0 + self.grain * (_look_up(points, 0.4e-3) - 0.5))[:, None]
 
-    def _mix(self, places: NDArray) -> NDArray:
+    def _mix(self, points: NDArray) -> NDArray:
         """Return the share (n,) of the second colour."""
-        cells = places / self.size
+        cells = points / self.size
         if self.pattern == "noise":
-            return np.clip(_look_up(places, self.size / 6.0) * 2.0 - 0.5, 0.0, 1.0)
+            return np.clip(_look_up(points, self.size / 6.0) * 2.0 - 0.5, 0.0, 1.0)
         if self.pattern == "stripes":
             return (np.mod(cells @ np.array([0.8, 0.1, 0.59]), 1.0) < 0.5).astype(float)
         if self.pattern == "checks":
             return np.mod(np.floor(cells + 1e-6).sum(axis=1), 2.0)
         if self.pattern == "speckles":
-            return (_look_up(places, self.size / 12.0) > 0.72).astype(float)
+            return (_look_up(points, self.size / 12.0) > 0.72).astype(float)
         if self.pattern == "layers":
-            return 0.5 + 0.5 * np.sin(2.0 * np.pi * places[:, 2] / 0.4e-3)
-        return np.zeros(len(places))
+            return 0.5 + 0.5 * np.sin(2.0 * np.pi * points[:, 2] / 0.4e-3)
+        return np.zeros(len(points))
 
 
 @lru_cache(maxsize=1)
@@ -196,9 +196,9 @@ def _noise_volume() -> NDArray:
     return ranks.reshape(shape)
 
 
-def _look_up(places: NDArray, cell: float) -> NDArray:
-    """Return noise (n,) in [0, 1] at places (n, 3) [m], in cells of a size [m]."""
-    index = np.floor(places / cell).astype(np.int64) % VOLUME_SIZE
+def _look_up(points: NDArray, cell: float) -> NDArray:
+    """Return noise (n,) in [0, 1] at points (n, 3) [m], in cells of a size [m]."""
+    index = np.floor(points / cell).astype(np.int64) % VOLUME_SIZE
     return _noise_volume()[index[:, 0], index[:, 1], index[:, 2]]
 
 
@@ -260,9 +260,9 @@ FAR = 3.0  # [m] where rays end that meet neither bodies nor the background's pl
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Decal:
-    """A round spot painted on a body: its place (3,) [m] at rest, radius [m] and colour (3,)."""
+    """A round spot painted on a body: its centre (3,) [m] at rest, radius [m] and colour (3,)."""
 
-    place: NDArray
+    centre: NDArray
     radius: float
     color: NDArray
 
@@ -274,7 +274,7 @@ class Body:
     Attributes:
         vertices: (n, 3) [m], camera frame.
         triangles: (m, 3) int, counterclockwise seen from outside.
-        rest: (n, 3) [m], the places of the vertices to which the pattern sticks.
+        rest: (n, 3) [m], the positions of the vertices to which the pattern sticks.
         paint: of its surface.
         decals: spots painted on it.
     """
@@ -407,13 +407,13 @@ class RenderedScene:
         """Return the colours (n, 3), gloss (n,) and sharpness (n,) of the bodies' surfaces at some hits."""
         owner, corners = hits.owner[on], self._rest[self._triangles[hits.surface[on]]]
         u, v = hits.weights[on].T[..., None]
-        places = (1.0 - u - v) * corners[:, 0] + u * corners[:, 1] + v * corners[:, 2]
+        points = (1.0 - u - v) * corners[:, 0] + u * corners[:, 1] + v * corners[:, 2]
         color = np.empty((len(on), 3))
         for index, body in enumerate(self._bodies):
             mine = owner == index
-            color[mine] = body.paint.colors_at(places[mine])
+            color[mine] = body.paint.colors_at(points[mine])
             for decal in body.decals:
-                near = mine & (((places - decal.place) ** 2).sum(axis=1) < decal.radius**2)
+                near = mine & (((points - decal.centre) ** 2).sum(axis=1) < decal.radius**2)
                 color[near] = decal.color
         gloss = np.array([body.paint.gloss for body in self._bodies])[owner]
         sharpness = np.array([body.paint.sharpness for body in self._bodies])[owner]
@@ -438,7 +438,7 @@ class RenderedScene:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Hits:
-    """What rays met: depth (n,) [m], body (n,), triangle (n,), place in it (n, 2), its normal (n, 3)."""
+    """What rays met: depth (n,) [m], body (n,), triangle (n,), weights in it (n, 2), its normal (n, 3)."""
 
     depth: NDArray
     owner: NDArray

@@ -38,44 +38,49 @@ class Scenario:
     """
 
     name: str
-    jaw: str = setting("bench", "a shipped jaw's name or a jaw file", "")
-    object: str = setting("rod25", "a name of finforce_sim.objects or a mesh file; empty for none", "")
-    unit: str = setting("m", "of the coordinates of a mesh file", choices=("m", "mm", "cm", "inch"))
-    scale: float = setting(1.0, "by which the object is enlarged", "", 0.05, 20.0)
-    turn_x: float = setting(0.0, "turn of the object about the gripper's x, before y and z", "rad", -np.pi, np.pi)
-    turn_y: float = setting(0.0, "turn of the object about the gripper's y", "rad", -np.pi, np.pi)
-    turn_z: float = setting(0.0, "turn of the object about the gripper's z", "rad", -np.pi, np.pi)
-    height: float = setting(0.042, "z of the object's middle at first", "m", 0.0, 0.2)
-    offset: float = setting(0.0, "x of the object's middle at first, between two jaws", "m", -0.05, 0.05)
+    jaw: str = setting("bench", "Jaw, by the name of a shipped one or a jaw file", "")
+    object: str = setting("rod25", "Object, by a name of finforce_sim.objects or a mesh file; empty for none", "")
+    unit: str = setting("m", "Unit of a mesh file", choices=("m", "mm", "cm", "inch"))
+    scale: float = setting(1.0, "Scale of the object", "", 0.05, 20.0)
+    turn_x: float = setting(0.0, "Rotation of the object about the gripper's x, before y and z", "rad", -np.pi, np.pi)
+    turn_y: float = setting(0.0, "Rotation of the object about the gripper's y", "rad", -np.pi, np.pi)
+    turn_z: float = setting(0.0, "Rotation of the object about the gripper's z", "rad", -np.pi, np.pi)
+    height: float = setting(0.042, "Initial z of the object's middle", "m", 0.0, 0.2)
+    offset: float = setting(0.0, "Initial x of the object's middle between two jaws", "m", -0.05, 0.05)
     shift: float = setting(0.0, "y of the object's middle", "m", -0.05, 0.05)
     camera: str = setting(
         "robot",
-        "two jaws before the wrist camera, that one upside down, or one beyond the tips, or one jaw before that of the "
-        "bench",
+        "Camera: on the wrist, the same upside down, beyond the tips, or of the bench before a single jaw",
         choices=CAMERAS,
     )
-    light: str = setting("bright", "how the scene is lit", choices=LIGHTS)
-    rate: float = setting(RATE, "of the images", "Hz", 1.0, 240.0)
-    readout: float = setting(0.0, "from an image's first row to its last one, which the stamp is of", "s", 0.0, 0.1)
-    clearance: float = setting(0.008, "from each jaw to first touch while open", "m", 5e-4, 0.06)
-    closing_speed: float = setting(0.020, "of each jaw", "m/s", 5e-4, 0.3)
-    displacement: float = setting(0.006, "of each jaw beyond first touch, at most", "m", 0.0, 0.02)
-    levels: int = setting(1, "equal steps up to the displacement, and down again", "", 1, 20)
-    cycles: int = setting(1, "how often the object is grasped", "", 1, 20)
-    tare: float = setting(1.7, "of stillness without load at the beginning", "s", 1.7, 60.0)
-    settle: float = setting(0.5, "of rest at each level before it is recorded", "s", 0.0, 60.0)
-    record: float = setting(0.7, "of record at each level", "s", 0.1, 60.0)
-    mass: float = setting(0.0, "of the object that is lifted", "kg", 0.0, 2.0)
-    friction: float = setting(0.9, "share of the pressure that the jaws hold without a slip", "", 0.05, 2.0)
-    drag: float = setting(0.0, "of an object that slides all the same; 0: an error", "N s/m", 0.0, 1e4)
-    turn_angle: float = setting(0.0, "by which the wrist turns with the object", "rad", -2.0 * np.pi, 2.0 * np.pi)
-    turn_rate: float = setting(0.8, "at which it does", "rad/s", 0.05, 10.0)
-    turn_heading: float = setting(0.0, "of the wrist's axis in the x-y plane, from x to y", "rad", -np.pi, np.pi)
-    turn_tilt: float = setting(0.0, "of the wrist's axis out of that plane, to z", "rad", -0.5 * np.pi, 0.5 * np.pi)
-    pitch: float = setting(0.0, "of a gripper that does not look down, about its x", "rad", -np.pi, np.pi)
-    slide: float = setting(0.0, "by which a hand draws the held object along z, and back", "m", -0.03, 0.03)
-    rock: float = setting(0.0, "by which a hand tilts the held object from x to z, and back", "rad", -0.4, 0.4)
-    shift_time: float = setting(1.5, "which each way of that takes", "s", 0.1, 60.0)
+    light: str = setting("bright", "Light", choices=LIGHTS)
+    rate: float = setting(RATE, "Image rate", "Hz", 1.0, 240.0)
+    readout: float = setting(
+        0.0, "Readout time from the first row of an image to the last one, which the stamp is of", "s", 0.0, 0.1
+    )
+    clearance: float = setting(0.008, "Distance of each open jaw from first touch", "m", 5e-4, 0.06)
+    closing_speed: float = setting(0.020, "Speed of each jaw", "m/s", 5e-4, 0.3)
+    displacement: float = setting(0.006, "Maximum displacement of each jaw beyond first touch", "m", 0.0, 0.02)
+    levels: int = setting(1, "Number of equal steps up to the displacement", "", 1, 20)
+    cycles: int = setting(1, "Number of grasps", "", 1, 20)
+    tare: float = setting(1.7, "Unloaded time at the beginning", "s", 1.7, 60.0)
+    settle: float = setting(0.5, "Settling time at each step", "s", 0.0, 60.0)
+    record: float = setting(0.7, "Recorded time at each step", "s", 0.1, 60.0)
+    mass: float = setting(0.0, "Mass of the object that is lifted", "kg", 0.0, 2.0)
+    friction: float = setting(0.9, "Friction coefficient, up to which the object does not slip", "", 0.05, 2.0)
+    drag: float = setting(0.0, "Drag of an object that slips; 0: slipping is an error", "N s/m", 0.0, 1e4)
+    turn_angle: float = setting(0.0, "Rotation of the wrist with the object", "rad", -2.0 * np.pi, 2.0 * np.pi)
+    turn_rate: float = setting(0.8, "Rate of that rotation", "rad/s", 0.05, 10.0)
+    turn_heading: float = setting(
+        0.0, "Direction of the rotation axis in the x-y plane, from x to y", "rad", -np.pi, np.pi
+    )
+    turn_tilt: float = setting(
+        0.0, "Angle of the rotation axis out of that plane, to z", "rad", -0.5 * np.pi, 0.5 * np.pi
+    )
+    pitch: float = setting(0.0, "Pitch of the gripper about its x; 0: it looks down", "rad", -np.pi, np.pi)
+    slide: float = setting(0.0, "Distance by which a hand moves the held object along z, and back", "m", -0.03, 0.03)
+    rock: float = setting(0.0, "Angle by which a hand tilts the held object from x to z, and back", "rad", -0.4, 0.4)
+    shift_time: float = setting(1.5, "Time of each of these motions", "s", 0.1, 60.0)
 
     def __post_init__(self) -> None:
         """Refuse numbers beyond their bounds, and what cannot be together.

@@ -101,7 +101,7 @@ def _is_hard_to_match(color: NDArray) -> NDArray:
 
 
 DENSITY = 0.005  # share of the numbers that differ by one
-_ROOM = 4096  # places at which the pattern may begin
+_SHIFTS = 4096  # at which the pattern may begin
 
 
 class Flicker:
@@ -127,14 +127,14 @@ class Flicker:
         """
         if name in self._last:
             numbers ^= self._pattern(numbers, self._last[name])
-        self._last[name] = int(self._rng.integers(_ROOM))
+        self._last[name] = int(self._rng.integers(_SHIFTS))
         numbers ^= self._pattern(numbers, self._last[name])
 
     def _pattern(self, numbers: NDArray, start: int) -> NDArray:
         """Return the bits (n,) that change; a zero or a one may say that there is nothing."""
         pattern = self._patterns.get(numbers.size)
         if pattern is None:
-            pattern = (self._rng.random(numbers.size + _ROOM) < DENSITY).astype(np.uint8)
+            pattern = (self._rng.random(numbers.size + _SHIFTS) < DENSITY).astype(np.uint8)
             self._patterns[numbers.size] = pattern
         return pattern[start : start + numbers.size].astype(numbers.dtype) * (numbers > 1)
 

@@ -44,7 +44,7 @@ _OK, _WARN = 0, 1
 
 
 def bag_task(name: str, source: Path, target: Path, options: argparse.Namespace, settings: Mapping[str, Any]) -> Task:
-    """Return the task of annotating a bag; nothing of it is read yet but its place.
+    """Return the task of annotating a bag; only its path is known yet.
 
     `settings` are what `describe_options` says of the options. Where there is no such recording, the task says so.
     """

@@ -1,4 +1,4 @@
-"""The subcommand `extrinsics`: images of jaws at rest in, the camera's place in the gripper out."""
+"""The subcommand `extrinsics`: images of jaws at rest in, the camera's pose in the gripper out."""
 
 from __future__ import annotations
 
@@ -26,15 +26,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
     text = "rosbag2 folder, .mcap or .db3 file with images; with --grid a picture"
     parser.add_argument("bags", nargs=1, metavar="BAG", help=text)
-    text = (
-        "the picture shows a table with holes this far apart [m]: find the camera's intrinsics and its place above it"
-    )
+    text = "the picture shows a table with holes this far apart [m]: find the camera's intrinsics and its pose above it"
     parser.add_argument("--grid", type=float, metavar="PITCH", help=text)
     add_rest_options(parser, images=45)
 
 
 def run(options: argparse.Namespace) -> None:
-    """Find the camera's place from the first images of a recording, and print it as the nodes take it."""
+    """Find the camera's pose from the first images of a recording, and print it as the nodes take it."""
     if options.grid is not None:
         print(format_grid_camera(find_grid_camera(read_picture(Path(options.bags[0])), options.grid)))
         return
@@ -78,7 +76,7 @@ def read_picture(path: Path) -> NDArray[np.uint8]:
 
 
 def format_grid_camera(found: GridCamera) -> str:
-    """Return a camera above a table, as a file of intrinsics has it, and its place."""
+    """Return a camera above a table, as a file of intrinsics has it, and its pose."""
     camera, pose = found.camera, ", ".join(f"{number:.6f}" for number in pose_numbers(found.T_camera_table))
     lens = ", ".join(f"{number:.5f}" for number in camera.distortion)
     return (
@@ -90,7 +88,7 @@ def format_grid_camera(found: GridCamera) -> str:
 
 
 def format_extrinsics(found: Extrinsics, guess: NDArray) -> str:
-    """Return the place as a parameter of the nodes, how good it is, and how far from the guess (4, 4)."""
+    """Return the pose as a parameter of the nodes, how good it is, and how far from the guess (4, 4)."""
     T = found.T_gripper_camera
     numbers = ", ".join(f"{number:.6f}" for number in pose_numbers(T))
     millimetres = ", ".join(f"{1e3 * spread:.2f}" for spread in found.stddev[:3])

@@ -33,7 +33,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--mesh", metavar="FILE", help="generated mesh (STL, OBJ, PLY, GLB), or splats (PLY), in any unit"
     )
-    pose = "JSON of its place: rotation (w x y z), translation, scale as SAM-3D gives them, or a 4x4 matrix"
+    pose = "JSON of its pose: rotation (w x y z), translation, scale as SAM-3D gives them, or a 4x4 matrix"
     parser.add_argument("--pose", metavar="FILE", help=pose)
     method = "default: robust with a generated mesh; without, a primitive where one fits, else a completion"
     parser.add_argument("--method", choices=("robust", "paper", "primitive", "completion"), help=method)
@@ -98,7 +98,7 @@ def read_evidence(options: argparse.Namespace) -> tuple[ImageEvidence, NDArray |
 
 
 def read_generated(options: argparse.Namespace) -> GeneratedMesh:
-    """Return the generated mesh with its guessed place.
+    """Return the generated mesh with its guessed pose.
 
     Raises:
         FinforceError: mesh or pose cannot be used.

@@ -17,7 +17,7 @@ from finforce_ifea.jaw.jaw import Jaw
 from finforce_keypoints.detector import KeypointDetector
 from finforce_keypoints.geometry.extrinsics import Extrinsics, SeenJaw, find_extrinsics
 
-ROUNDS = 4  # of finding the key points with the place found before
+ROUNDS = 4  # of finding the key points with the camera pose found before
 # [m]; a guess is allowed to be far off
 LOOSE = {"detector.reference_tolerance": 0.02, "detector.largest_offset": 0.5, "detector.lost_images": 1000}
 STILL = 0.05e-3  # [m] below which another round changes nothing
@@ -85,7 +85,7 @@ def approach(
     guess: NDArray,
     progress: Callable[[int], Any] = lambda images: None,
 ) -> tuple[Extrinsics, JawsAtRest]:
-    """Find the key points, with these the camera's place, and again with that place, until nothing moves.
+    """Find the key points, with these the camera's pose, and again with that pose, until nothing moves.
 
     Args:
         recording: images of jaws at rest.

@@ -88,7 +88,7 @@ def check_recording(
     for side, jaw in look.jaws.items():
         seen = np.isfinite(jaw.pixels).all(axis=1)
         findings.append(Finding(OK, f"{side} jaw: {seen.sum()} of {len(seen)} key points seen"))
-    findings += _judge_place(found, look, recording, parameters.camera_pose)
+    findings += _judge_pose(found, look, recording, parameters.camera_pose)
     if found.residual > GOOD_RESIDUAL:
         findings += _find_reasons(mean, source, recording, parameters.camera_pose)
     picture = _draw(mean, jaws, parameters.camera_pose, found, look)
@@ -154,8 +154,8 @@ def _describe_camera(recording: Recording, depth: str) -> Iterator[Finding]:
         )
 
 
-def _judge_place(found: Extrinsics, look: JawsAtRest, recording: Recording, guess: NDArray) -> list[Finding]:
-    """Return what the camera's place by what is seen says of what was given."""
+def _judge_pose(found: Extrinsics, look: JawsAtRest, recording: Recording, guess: NDArray) -> list[Finding]:
+    """Return how the camera's pose by what is seen compares with the one given."""
     findings = []
     moved = float(np.linalg.norm(found.T_gripper_camera[:3, 3] - guess[:3, 3]))
     turned = rotation_between(guess, found.T_gripper_camera)
@@ -289,10 +289,10 @@ def _draw(
     middle = 0.5 * (OpeningRange().nearest + OpeningRange().farthest)
     for side, jaw in jaws.items():
         sign = -1.0 if side == "left" else 1.0
-        places = [(given, sign * abs(found.origins[side]) if found else sign * middle, GIVEN)]
+        poses = [(given, sign * abs(found.origins[side]) if found else sign * middle, GIVEN)]
         if found is not None:
-            places.append((found.T_gripper_camera, found.origins[side], FITTED))
-        for T, origin, color in places:
+            poses.append((found.T_gripper_camera, found.origins[side], FITTED))
+        for T, origin, color in poses:
             pose, plane = jaw_in_camera(T, side, origin), find_side(jaw)
             for ring in find_shape(jaw).rings:
                 line = project_plane(np.vstack((ring, ring[:1])), plane, pose, camera)

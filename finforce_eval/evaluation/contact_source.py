@@ -68,7 +68,7 @@ class RecordedContact(ContactLoop):
             raise RecordingError(f"object pose at {SECOND * stamp:.3f} s: {error}") from error
 
 
-# Poses from which the place of first touch is averaged at least.
+# Least number of poses from which the location of first touch is averaged.
 LEAST_POSES = 3
 
 
@@ -139,7 +139,7 @@ def first_touch(choice: ContactChoice, recording: Recording, jaw: Jaw, mesh: str
     estimator.take_pose(stamp, mean_pose(track.poses))
     estimate = estimator.update(stamp)
     if estimate.contact is None or not len(estimate.contact.points):
-        raise RecordingError(f"{recording.name}: no place of first touch: {estimate.message or estimate.status}")
+        raise RecordingError(f"{recording.name}: no location of first touch: {estimate.message or estimate.status}")
     point = np.average(estimate.contact.points, axis=0, weights=estimate.contact.weights)
     return Contact(points=point[None], weights=np.ones(1), touching=False, free=True, outline=estimate.contact.outline)
 

@@ -15,7 +15,7 @@ from finforce_ifea.jaw.section import FaceLine
 
 # A vertex farther than this from the plane of the inner surface is not on it [m]; rows closer than this are one.
 _ON_FACE = 1e-4
-# Below it the direction of a force says nothing of its place [N].
+# Below it the direction of a force says nothing of its location [N].
 _LEAST_FORCE = 1e-9
 
 
@@ -57,7 +57,7 @@ class InnerSurface:
         return np.stack([self._average(surface[:, 0]), self._average(surface[:, 2])], axis=1)
 
     def cut(self, surface: NDArray[np.float64], point: NDArray[np.float64], direction: NDArray[np.float64]) -> float:
-        """Return the height on the undeformed surface [m] of the place where a line first meets the deformed one.
+        """Return the height on the undeformed surface [m] of the point where a line first meets the deformed one.
 
         Args:
             surface: deformed vertices (n, 3) [m], in the order of the undeformed ones.

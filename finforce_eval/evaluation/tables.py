@@ -149,13 +149,13 @@ def contact_table(evaluation: Evaluation) -> ScoreTable:
     head += [("ms", "p50", "p50/ms"), ("ms", "p99", "p99/ms")]
     rows = []
     for name, score in _score_rows(evaluation):
-        place = [part[number] for part in (score.place, score.solved_place) for number in _DISTANCES]
+        distances = [part[number] for part in (score.place, score.solved_place) for number in _DISTANCES]
         onset = score.onset
         frames = _numbers([onset[f"{which}_frames"] for which in ("median", "earliest", "max")], 0)
         missed = str(onset["missed"]) if onset["n"] + onset["missed"] else "-"
         times = _numbers([score.contact_ms["p50"], score.contact_ms["p99"]])
         source = _contact_source(evaluation.results.get(name))
-        rows.append([name, source, *_numbers(place), *frames, missed, _number(onset["false_pct"], 1), *times])
+        rows.append([name, source, *_numbers(distances), *frames, missed, _number(onset["false_pct"], 1), *times])
     known = any(map(_contact_source, evaluation.results.values()))
     return ScoreTable(head=head, rows=rows if known else [], meaning=_CONTACT, words=2)
 

@@ -18,14 +18,14 @@ def draw_comparison(changes: Sequence[Change], names: tuple[str, str]) -> Figure
     figure = new_figure(8.0, 1.4 + 0.28 * max(len(both), 3))
     axes = figure.add_subplot()
     style_axes(axes)
-    for place, change in enumerate(both):
+    for row, change in enumerate(both):
         colour = _COLOURS.get(change.verdict, GREY)
         if np.isfinite(change.stddev):
             ends = change.before - SIGMAS * change.stddev, change.before + SIGMAS * change.stddev
-            axes.plot(ends, [place, place], color="#cccccc", linewidth=7, solid_capstyle="butt")
-        axes.plot([change.before, change.after], [place, place], color=colour, linewidth=1.5)
-        axes.plot(change.before, place, "o", color="white", markeredgecolor=BLACK, markersize=5)
-        axes.plot(change.after, place, "o", color=colour, markersize=6)
+            axes.plot(ends, [row, row], color="#cccccc", linewidth=7, solid_capstyle="butt")
+        axes.plot([change.before, change.after], [row, row], color=colour, linewidth=1.5)
+        axes.plot(change.before, row, "o", color="white", markeredgecolor=BLACK, markersize=5)
+        axes.plot(change.after, row, "o", color=colour, markersize=6)
     axes.set_yticks(range(len(both)), [change.name for change in both], fontsize=8)
     axes.invert_yaxis()
     axes.set_xlim(left=0.0)

@@ -29,29 +29,29 @@ def draw_contact(result: ForceSeries) -> Figure:
         result: with a contact series.
     """
     figure = new_figure(11, 6.4)
-    place, error, touch = figure.subplots(3, 1, sharex=True, height_ratios=[3, 1.6, 0.7])
+    height, error, touch = figure.subplots(3, 1, sharex=True, height_ratios=[3, 1.6, 0.7])
     time = result.seconds
-    for axes in (place, error):
+    for axes in (height, error):
         style_axes(axes)
-        shade_phases(axes, result, labelled=axes is place)
-    _draw_places(place, error, result)
+        shade_phases(axes, result, labelled=axes is height)
+    _draw_heights(height, error, result)
     _draw_touching(touch, result)
     figure.legend(loc="outside upper right", ncols=6, frameon=False, fontsize=9)
-    place.set(ylabel="height on the\nundeformed surface [mm]")
-    place.set_title(f"{result.name}, contact: {result.column('contact_source')[0]}", loc="left", fontsize=11)
+    height.set(ylabel="height on the\nundeformed surface [mm]")
+    height.set_title(f"{result.name}, contact: {result.column('contact_source')[0]}", loc="left", fontsize=11)
     error.set(ylabel="off the pressure\ncentre [mm]")
     touch.set(xlabel="time [s]", xlim=(time[0], max(time[-1], 1e-3)))
     return figure
 
 
-def _draw_places(place: Any, error: Any, result: ForceSeries) -> None:
+def _draw_heights(height: Any, error: Any, result: ForceSeries) -> None:
     """Draw the heights, and their distance from the truth where the truth presses."""
     time, given, solved = result.seconds, result.column("contact_height"), result.column("contact_location")[:, 2]
     pressed = result.true_magnitude > LEAST_FORCE
     truth = np.where(pressed, result.column("true_height"), np.nan)
-    place.plot(time, 1e3 * given, color=ORANGE, linewidth=0.9, label="contact given to the solver")
-    place.plot(time, 1e3 * solved, color=GREEN, linewidth=0.9, label="found by the solver")
-    place.plot(time, 1e3 * truth, color=BLACK, linewidth=1.3, dashes=(4, 1.5), label="pressure centre of the truth")
+    height.plot(time, 1e3 * given, color=ORANGE, linewidth=0.9, label="contact given to the solver")
+    height.plot(time, 1e3 * solved, color=GREEN, linewidth=0.9, label="found by the solver")
+    height.plot(time, 1e3 * truth, color=BLACK, linewidth=1.3, dashes=(4, 1.5), label="pressure centre of the truth")
     error.axhline(0.0, color=BLACK, linewidth=0.8)
     for heights, colour in ((given, ORANGE), (solved, GREEN)):
         error.plot(time, 1e3 * (heights - truth), color=colour, linewidth=0.8)

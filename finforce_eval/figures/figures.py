@@ -89,8 +89,8 @@ def _draw_error(axes: Any, result: ForceSeries) -> None:
         axes.plot(time[chosen], result.error[chosen], ".", markersize=2, color=colour)
     lost = time[~result.solved]
     if lost.size:
-        place = {"transform": axes.get_xaxis_transform(), "clip_on": False}
-        axes.plot(lost, np.zeros(lost.size), "|", color=GREY, markersize=7, label="no estimate", **place)
+        style = {"transform": axes.get_xaxis_transform(), "clip_on": False}
+        axes.plot(lost, np.zeros(lost.size), "|", color=GREY, markersize=7, label="no estimate", **style)
 
 
 def draw_unity(results: Sequence[ForceSeries]) -> Figure:

@@ -148,7 +148,7 @@ def place_pixels(pixels: NDArray[np.float64], region: Region, scale: int) -> NDA
 
 
 def moved(found: FoundPixels, region: Region, scale: int) -> FoundPixels:
-    """Return what was found in an image at its places in the enlarged part."""
+    """Return what was found in an image, by the pixels of the enlarged part."""
     return found._replace(pixels=place_pixels(found.pixels, region, scale))
 
 
@@ -158,12 +158,12 @@ def found_at(detection: DetectionTrack, stamp: int) -> FoundPixels:
     return FoundPixels(detection.pixels[row], detection.accepted[row], detection.reasons[row])
 
 
-def _draw_truth(axes: Any, track: JawTrack, stamp: int, place: tuple[Region, int]) -> None:
+def _draw_truth(axes: Any, track: JawTrack, stamp: int, part: tuple[Region, int]) -> None:
     """Draw a cross at each true key point, black where it is hidden."""
     if track.sight is None:
         return
     for row in np.flatnonzero(track.sight.stamps == stamp):
-        pixels, visible = place_pixels(track.sight.pixels[row], *place), track.sight.visible[row]
+        pixels, visible = place_pixels(track.sight.pixels[row], *part), track.sight.visible[row]
         for chosen, color in ((visible, WHITE), (~visible, BLACK)):
             axes.plot(
                 *pixels[chosen].T, "+", color=color, markersize=4, markeredgewidth=0.8, scalex=False, scaley=False
@@ -199,7 +199,7 @@ def _explain(figure: Any, reasons: Iterable[str], *, has_truth: bool) -> None:
         if reason in reasons
     ]
     if has_truth:
-        for color, label in ((WHITE, "true place, visible"), (BLACK, "true place, hidden")):
+        for color, label in ((WHITE, "true pixel, visible"), (BLACK, "true pixel, hidden")):
             entries.append(Line2D([], [], marker="+", color=color, linestyle="", label=label))
     if entries:
         style = {"facecolor": GREY, "edgecolor": "none", "framealpha": 1.0, "fontsize": 9}

@@ -61,9 +61,9 @@ def _window(shown: NDArray) -> tuple[slice, slice]:
     """Return the rows and columns around what is shown (h, w)."""
     slices = []
     for axis in (1, 0):
-        places = np.flatnonzero(shown.any(axis=axis))
-        margin = int(MARGIN * (places[-1] - places[0])) + 2
-        slices.append(slice(max(places[0] - margin, 0), min(places[-1] + margin, shown.shape[1 - axis])))
+        pixels = np.flatnonzero(shown.any(axis=axis))
+        margin = int(MARGIN * (pixels[-1] - pixels[0])) + 2
+        slices.append(slice(max(pixels[0] - margin, 0), min(pixels[-1] + margin, shown.shape[1 - axis])))
     return slices[0], slices[1]
 
 

@@ -100,8 +100,8 @@ class RerunView:
             pose = track.pose
             for row, stamp in enumerate(pose.stamps.tolist() if pose is not None else ()):
                 self._at(stamp)
-                place = self._rr.Transform3D(translation=pose.position[row], quaternion=pose.quaternion[row])
-                self._stream.log(f"jaws/{side}", place)
+                transform = self._rr.Transform3D(translation=pose.position[row], quaternion=pose.quaternion[row])
+                self._stream.log(f"jaws/{side}", transform)
 
     def show_forces(self, jaws: Mapping[str, ForceSeries], grasp: ForceSeries, recording: Recording) -> None:
         """Send contact and force in the jaws, and all forces over time."""
@@ -130,8 +130,8 @@ class RerunView:
             vector = force / NEWTONS_PER_METRE
             arrow = rr.Arrows3D(vectors=[vector], origins=[point - vector], colors=_to_bytes(FORCE), radii=ARROW[0] / 2)
             self._stream.log(f"jaws/{side}/force/arrow", arrow)
-            place = rr.Points3D([point], colors=_to_bytes(CONTACT), radii=CONTACT_DIAMETER / 2)
-            self._stream.log(f"jaws/{side}/force/contact", place)
+            contact = rr.Points3D([point], colors=_to_bytes(CONTACT), radii=CONTACT_DIAMETER / 2)
+            self._stream.log(f"jaws/{side}/force/contact", contact)
 
     def _plot(self, path: str, stamps: NDArray[np.int64], values: NDArray, colour: tuple, name: str) -> None:
         """Send a curve; values that are not known leave a gap."""

@@ -31,7 +31,7 @@ from finforce_keypoints.images import RgbdImage, check_image
 COLOR_ENDS = tuple(f"color/{name}{end}" for end in ("", "/compressed") for name in ("image_raw", "image_rect_raw"))
 DEPTH_ENDS = tuple(f"aligned_depth_to_color/image_raw{end}" for end in ("", "/compressedDepth", "/compressed"))
 INFO_ENDS = ("color/camera_info",)
-ALONE = -1  # in the place of a depth image's stamp [ns], of a colour image without
+ALONE = -1  # instead of a depth image's stamp [ns], of a colour image without
 PAIRED = 8_000_000  # as the detector node takes colour and depth for one image: distance of their stamps [ns]
 
 

@@ -26,7 +26,7 @@ class ObjectTrack:
     Attributes:
         stamps: (n,) image time [ns], rising.
         poses: T_jaw_object (n, 4, 4) [m].
-        cameras: (n, 3) the camera's place in the jaw frame [m]; None when it is not known.
+        cameras: (n, 3) position of the camera in the jaw frame [m]; None when it is not known.
         unpaired: poses left out because no pose of the jaw is of their time.
     """
 
@@ -49,8 +49,8 @@ def find_mesh(recording: Recording, object_file: str | None = None) -> Path | No
         return None
     path = recording.path.resolve()
     folder = path if path.is_dir() else path.parent
-    places = (folder.parent / name, folder / name, folder / Path(name).name)
-    return next((place for place in places if place.is_file()), None)
+    paths = (folder.parent / name, folder / name, folder / Path(name).name)
+    return next((path for path in paths if path.is_file()), None)
 
 
 def require_mesh(recording: Recording, object_file: str | None = None) -> Path:
@@ -76,7 +76,7 @@ def has_object(recording: Recording, side: str) -> bool:
 def track_object(recording: Recording, side: str) -> ObjectTrack:
     """Return the object's poses in the frame of a jaw, T_jaw_object = inv(T_camera_jaw) T_camera_object.
 
-    The jaw's pose is the one nearest in time. Poses that came late are put in their place. Object poses may be recorded
+    The jaw's pose is the one nearest in time. Poses that came late are sorted in. Object poses may be recorded
     in the frame of the jaw itself; no poses of the jaw are needed then.
 
     Args:

@@ -136,7 +136,7 @@ def _read_mcap(path: Path, loss: _Loss) -> Iterator[_Message]:
         schemas: dict[int, Any] = dict(summary.schemas) if summary else {}
         channels: dict[int, Any] = dict(summary.channels) if summary else {}
         known = {each.chunk_start_offset for each in summary.chunk_indexes} if summary else set()
-        for begin, end in pairwise(sorted({_MAGIC, size} | {place for place in known if place < size})):
+        for begin, end in pairwise(sorted({_MAGIC, size} | {start for start in known if start < size})):
             for record in _read_stretch(file, begin, end, loss, is_last=end == size):
                 if isinstance(record, Schema):
                     schemas[record.id] = record
@@ -151,22 +151,22 @@ def _read_mcap(path: Path, loss: _Loss) -> Iterator[_Message]:
 
 
 def _read_stretch(file: BinaryIO, begin: int, end: int, loss: _Loss, *, is_last: bool) -> Iterator[Any]:
-    """Yield the records between two places of a file that are whole, up to the first that is not."""
+    """Yield the records between two positions of a file that are whole, up to the first that is not."""
     from mcap.records import Chunk, Footer
     from mcap.stream_reader import StreamReader
 
     file.seek(begin)
     records = StreamReader(file, skip_magic=True, emit_chunks=True, record_size_limit=end - begin).records
-    while (place := file.tell()) < end:
+    while (start := file.tell()) < end:
         record = None
         with suppress(Exception):  # of a record's fields, anything
             record = next(records, None) if file.peek(1)[:1] != b"\0" else None  # zeros follow where power was lost
         if record is None or file.tell() > end:
-            file.seek(place)
+            file.seek(start)
             if file.read(1)[:1] == bytes([_CHUNK_OPCODE]) and is_last:  # its beginning may be good
-                file.seek(place)
-                yield from _parse_records(_unpack_torn(file.read(end - place)))
-            loss.add(end - place)
+                file.seek(start)
+                yield from _parse_records(_unpack_torn(file.read(end - start)))
+            loss.add(end - start)
             return
         if isinstance(record, Footer):
             return
@@ -229,7 +229,7 @@ def _read_sqlite(path: Path, loss: _Loss) -> Iterator[_Message]:
             last.append(message)
             if len(last) > _NEIGHBOURS:
                 yield last.popleft()
-        # the end of a message may be of what was put in place of the missing pages
+        # the end of a message may be of what was put instead of the missing pages
         for message in last:
             if copy is not None and not any(message.data[-_ENDING:]):
                 return
@@ -263,7 +263,7 @@ def _read_rows(path: Path, loss: _Loss) -> Iterator[_Message]:
 
 
 def _pad_sqlite(path: Path, copy: Path) -> Path | None:
-    """Write a db3 file with empty pages in place of those that are missing, without which nothing can be read of it.
+    """Write a db3 file with empty pages instead of those that are missing, without which nothing can be read of it.
 
     Returns:
         The copy; None where no page is missing.

@@ -211,11 +211,11 @@ if __name__ == "__main__":
 class PlayerParameters:
     """What the player is told; units stand in the metadata."""
 
-    bag: str = setting("", "recording to be played: rosbag2 folder, .mcap or .db3")
-    rate: float = setting(1.0, "speed of playing, 1 as recorded", "", 0.01, 100.0)
-    awaits_poses: bool = setting(False, "wait for listeners to the poses of the jaws, too")
+    bag: str = setting("", "Recording: rosbag2 folder, .mcap or .db3")
+    rate: float = setting(1.0, "Playback speed; 1 as recorded", "", 0.01, 100.0)
+    awaits_poses: bool = setting(False, "Whether playing waits for listeners to the jaw poses, too")
     awaits_images: bool = setting(
-        False, "wait for who finds key points in the images, and for those who use the key points"
+        False, "Whether playing waits for listeners to images, and to the key points that they find"
     )
-    composed: bool = setting(False, "those are one process, which takes images once it is ready")
-    patience: float = setting(120.0, "wait for listeners, which compile first", "s", 0.0, 3600.0)
+    composed: bool = setting(False, "Whether these listeners are one process")
+    patience: float = setting(120.0, "Maximum wait for listeners, which compile first", "s", 0.0, 3600.0)

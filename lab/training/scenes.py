@@ -333,7 +333,7 @@ class FingerScenes:
         bolts = draw_color(rng, 0.2, 0.9)
         sides = finger.half_width(finger.bolts[:, 1])
         decals = [
-            Decal(place=np.array([x, y, z]), radius=r, color=bolts)
+            Decal(centre=np.array([x, y, z]), radius=r, color=bolts)
             for (x, z, r), y in zip(finger.bolts, sides, strict=True)
         ]
         base_y = float(finger.half_width(finger.reference[1:])[0])
@@ -342,7 +342,7 @@ class FingerScenes:
         under = (paint if own else holder_paint).color
         dot = draw_color(rng, 0.6, 0.95) ** 0.3 if float(np.max(under)) < 0.2 else draw_color(rng, 0.005, 0.03)
         place = np.array([finger.reference[0], base_y, finger.reference[1]])
-        mark = Decal(place=place, radius=MARK_RADIUS * rng.uniform(0.75, 1.25), color=dot)
+        mark = Decal(centre=place, radius=MARK_RADIUS * rng.uniform(0.75, 1.25), color=dot)
         marks = (mark,) if self._marked else ()
         jaw = Body(
             vertices=solid.raise_vertices(section),

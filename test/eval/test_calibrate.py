@@ -92,7 +92,7 @@ def test_first_touch_that_is_not_found_is_refused_with_the_reason(jaw, monkeypat
             """Forgets it."""
 
     recording = pressed_by_a_mesh(monkeypatch, Blind())
-    with pytest.raises(RecordingError, match="pressed: no place of first touch: no pose yet"):
+    with pytest.raises(RecordingError, match="pressed: no location of first touch: no pose yet"):
         calibration_case(recording, jaw, parse_contacts(["paper"]))
 
 

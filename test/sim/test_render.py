@@ -83,7 +83,7 @@ def test_a_lamp_casts_a_shadow_and_one_without_shadows_does_not():
 
 
 def test_a_decal_is_round_and_of_its_colour():
-    decal = Decal(place=np.array([0.0, 0.0, 0.10]), radius=4e-3, color=np.array([0.1, 0.0, 0.0]))
+    decal = Decal(centre=np.array([0.0, 0.0, 0.10]), radius=4e-3, color=np.array([0.1, 0.0, 0.0]))
     picture = render([box([-0.02, -0.02, 0.10], [0.02, 0.02, 0.11], decals=(decal,))])
     red = (picture.color[..., 1] == 0.0) & (picture.owner == 0)
     expected = np.pi * (4e-3 / 0.10 * 150.0) ** 2
