@@ -239,7 +239,7 @@ def unpack_rows(what: str, data: NDArray | bytes, dtype: np.dtype, layout: Image
 
 
 def check_depth(depth: NDArray, camera: CameraIntrinsics) -> None:
-    """Refuse a depth image that has another size than its camera, or no depth at all.
+    """Refuse a depth image (h, w) [m] that has another size than its camera, or no depth at all.
 
     Raises:
         ImageError: it is one of these.
@@ -250,7 +250,7 @@ def check_depth(depth: NDArray, camera: CameraIntrinsics) -> None:
 
 
 def check_mask(mask: NDArray, depth: NDArray, least: int = 1) -> None:
-    """Refuse a mask that does not fit its depth image, or selects fewer than `least` pixels with depth.
+    """Refuse a mask (h, w) bool of another size than its depth image, or with fewer than `least` pixels with depth.
 
     Raises:
         ImageError: it is one of these.

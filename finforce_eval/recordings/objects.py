@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from finforce.errors import PoseError
-from finforce.stamps import find_nearest
+from finforce.stamps import SECOND, find_nearest
 from finforce.transforms import invert_pose, pose_from_quaternion
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.tracks import PoseTrack, Recording
+from finforce_ifea.observation import Observation
 
 # A pose of the object and one of the jaw are of the same image up to this distance of their stamps [ns].
 PAIRED = 50_000_000
@@ -109,6 +112,33 @@ def track_object(recording: Recording, side: str) -> ObjectTrack:
         cameras=T_jaw_camera[:, :3, 3],
         unpaired=int((~paired).sum()),
     )
+
+
+class RecordedImage(NamedTuple):
+    """What a recording knows of one image of a jaw.
+
+    Attributes:
+        poses: stamp [s] and T_jaw_object (4, 4) [m] of every pose of the object since the image before.
+        observation: the key points.
+    """
+
+    poses: list[tuple[float, NDArray[np.float64]]]
+    observation: Observation
+
+
+def play(recording: Recording, side: str = "left") -> Iterator[RecordedImage]:
+    """Yield the images of one jaw with the poses of the object between them, as they came.
+
+    Raises:
+        RecordingError: there are no key points of that jaw, or no poses; see `track_object`.
+    """
+    track, objects = recording.jaw(side).keypoints, track_object(recording, side)
+    known = 0
+    for index, stamp in enumerate(track.stamps):
+        newest = int(np.searchsorted(objects.stamps, stamp, side="right"))
+        poses = [(SECOND * objects.stamps[pose], objects.poses[pose]) for pose in range(known, newest)]
+        known = newest
+        yield RecordedImage(poses, track.observation(index))
 
 
 def mean_pose(poses: NDArray[np.float64]) -> NDArray[np.float64]:

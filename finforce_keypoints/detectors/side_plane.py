@@ -154,7 +154,7 @@ class SidePlaneDetector:
 
 
 def check_camera_side(jaw: Jaw, T_gripper_camera: NDArray) -> None:
-    """Refuse a camera that is not beyond the side of a jaw on which its key points lie.
+    """Refuse a camera, T_gripper_camera (4, 4), that is not beyond the side of a jaw on which its key points lie.
 
     Raises:
         GeometryError: it is not; the message says what to give where the camera is mounted on the other side.

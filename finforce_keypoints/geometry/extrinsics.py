@@ -113,7 +113,10 @@ def find_extrinsics(
 
 
 def measure_misses(side: str, jaw: SeenJaw, camera: CameraIntrinsics, T: NDArray, half: float) -> NDArray:
-    """Return column and row by which the seen points lie beside their places [px], one after the other."""
+    """Return by how many columns and rows the seen points are off their places (2 n,) [px].
+
+    The camera is at T (4, 4) in the gripper base, the jaws' origins at -half and half on the closing axis [m].
+    """
     seen = np.isfinite(jaw.pixels).all(axis=1)
     T_camera_jaw = jaw_in_camera(T, side, -half if side == "left" else half)
     places = project(jaw.points[seen] @ T_camera_jaw[:3, :3].T + T_camera_jaw[:3, 3], camera)
