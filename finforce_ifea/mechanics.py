@@ -163,7 +163,7 @@ def _measure_point_stiffness(jaw: Jaw, mesh: VolumeMesh, material: Material) -> 
 def measure_shape(mesh: VolumeMesh) -> float:
     """Return the least scaled Jacobian of a mesh of hexahedra: det J over the lengths of its columns, 1 in a box."""
     gradients = shape_gradients(8, _CORNERS)
-    jacobians = np.einsum("mni,pnj->mpij", mesh.nodes[mesh.hexes], gradients)
+    jacobians = np.einsum("mni,pnj->mpij", mesh.nodes[mesh.elements], gradients)
     return float((np.linalg.det(jacobians) / np.linalg.norm(jacobians, axis=2).prod(axis=2)).min())
 
 
@@ -173,9 +173,9 @@ def warn_of_locking(jaw: Jaw, mesh: VolumeMesh) -> None:
     What cannot lock is not measured: hexahedra of a drawing or of good shape, and 10-node tetrahedra of a material that
     changes its volume.
     """
-    if mesh.hexes is not None:
+    if mesh.is_hexahedral:
         suspect, kind = jaw.drawing is None and measure_shape(mesh) < _DISTORTED, "distorted hexahedra"
-    elif mesh.tets.shape[1] == 4:
+    elif mesh.elements.shape[1] == 4:
         suspect, kind = True, "4-node tetrahedra"
     else:
         suspect, kind = jaw.material.poisson_ratio > _HARD_RATIO, "10-node tetrahedra"

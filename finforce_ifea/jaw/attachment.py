@@ -197,6 +197,6 @@ def check_distances(
     worst = int(distances.argmax())
     name, at = names[worst] if names else f"point {worst}", np.round(1e3 * points[worst], 3).tolist()
     raise MeshError(
-        f"{name} at {at} mm is {1e3 * distances[worst]:.3g} mm away from the {part}, "
+        f"{name} at {at} mm is {1e3 * distances[worst]:.3g} mm off the {part}, "
         f"expected at most {1e3 * max_distance:.3g} mm"
     )

@@ -110,6 +110,11 @@ class Drawing:
         _check_ribs(self)
 
     @property
+    def widest(self) -> float:
+        """The width [m], the same everywhere."""
+        return self.width
+
+    @property
     def inner_face_x(self) -> float:
         """The contact plane x [m]."""
         return self.inner.base[0]
@@ -320,7 +325,7 @@ def mesh_drawing(drawing: Drawing, density: MeshDensity | str = "default") -> Vo
     hexes = np.concatenate([layer_quads, layer_quads + len(points)], axis=2).reshape(-1, 8)
     nodes = nodes.reshape(-1, 3)
     clamped = np.flatnonzero(nodes[:, 2] <= drawing.clamped_z + 1e-9 * drawing.length)
-    return build_volume_mesh(nodes=nodes, hexes=hexes, clamped=clamped)
+    return build_volume_mesh(nodes=nodes, elements=hexes, clamped=clamped)
 
 
 def _mesh_section(drawing: Drawing, density: MeshDensity) -> tuple[NDArray, NDArray]:

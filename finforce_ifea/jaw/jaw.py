@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from finforce.typed_yaml import read_model
 from finforce_ifea.errors import JawFileError, MeshError
-from finforce_ifea.jaw.attachment import attach_points, attach_surface_points
+from finforce_ifea.jaw.attachment import attach_points, attach_surface_points, check_distances
 from finforce_ifea.jaw.drawing import Drawing, MeshDensity, mesh_drawing
 from finforce_ifea.jaw.jaw_file import CandidateRule, JawEntry, JunctionRule, Material
 from finforce_ifea.jaw.mesh import VolumeMesh
@@ -224,42 +224,32 @@ def _choose_model(entry: JawEntry, drawing: Drawing | None) -> Literal["solid", 
 
 
 def _check_candidates(jaw: Jaw) -> None:
-    """Refuse candidates off the plane of the inner face."""
+    """Refuse candidates off the inner face."""
+    shape = jaw.drawing or jaw.section
     for number, point in enumerate(jaw.candidates):
-        if abs(point[0] - jaw.face.read(point[2])) > _CANDIDATE_DISTANCE:
+        x, expected = jaw.face.read(point[2]), ""
+        if abs(point[0] - x) > _CANDIDATE_DISTANCE:
+            expected = f"x = {x:g} m"
+        elif shape is not None and (abs(point[1]) > 0.5 * shape.widest or not 0.0 <= point[2] <= shape.length):
+            half = 0.5 * shape.widest
+            expected = f"y from {-half:g} to {half:g} m and z from 0 to {shape.length:g} m"
+        if expected:
             raise JawFileError(
-                f"candidates[{number}] at {_millimetres(point)} lies off the inner surface; "
-                f"expected x = {jaw.face.read(point[2]):g} m"
+                f"candidates[{number}] at {_millimetres(point)} lies off the inner surface; expected {expected}"
             )
-        shape = jaw.drawing or jaw.section
-        if shape is not None:
-            half, length = 0.5 * (shape.width if jaw.section is None else shape.widest), shape.length
-            if abs(point[1]) > half or not 0.0 <= point[2] <= length:
-                raise JawFileError(
-                    f"candidates[{number}] at {_millimetres(point)} lies off the inner surface; "
-                    f"expected y from {-half:g} to {half:g} m and z from 0 to {length:g} m"
-                )
 
 
 def _check_points(jaw: Jaw) -> None:
     """Refuse key points off the jaw and, of a mesh, candidates off its surface."""
-    shape = jaw.drawing or jaw.section
-    if shape is not None:
-        distances = shape.distance_to(jaw.keypoints)
-        worst = int(distances.argmax())
-        if distances[worst] > KEYPOINT_DISTANCE:
-            raise JawFileError(
-                f"keypoints.{jaw.keypoint_names[worst]} at {_millimetres(jaw.keypoints[worst])} lies "
-                f"{1e3 * distances[worst]:.3g} mm off the jaw, "
-                f"expected at most {1e3 * KEYPOINT_DISTANCE:g} mm"
-            )
-        return
-    mesh = jaw.build_mesh()
-    names = [f"keypoints.{name}" for name in jaw.keypoint_names]
-    candidate_names = [f"candidates[{number}]" for number in range(len(jaw.candidates))]
+    names, shape = [f"keypoints.{name}" for name in jaw.keypoint_names], jaw.drawing or jaw.section
+    mesh = jaw.build_mesh() if shape is None else None
     try:
+        if shape is not None:
+            check_distances(jaw.keypoints, shape.distance_to(jaw.keypoints), KEYPOINT_DISTANCE, "jaw", names)
+            return
         attach_points(mesh, jaw.keypoints, KEYPOINT_DISTANCE, names)
-        attach_surface_points(mesh, jaw.candidates, _CANDIDATE_DISTANCE, candidate_names)
+        candidates = [f"candidates[{number}]" for number in range(len(jaw.candidates))]
+        attach_surface_points(mesh, jaw.candidates, _CANDIDATE_DISTANCE, candidates)
     except MeshError as error:
         raise JawFileError(str(error)) from error
 

@@ -70,72 +70,57 @@ class VolumeMesh:
 
     Attributes:
         nodes: (n, 3) [m], jaw frame.
-        hexes: (m, 8) node indices in the VTK order with positive Jacobians, or None.
-        tets: (m, 4) or (m, 10) node indices in the VTK order with positive Jacobians, or None.
+        elements: node indices of hexahedra (m, 8) or tetrahedra (m, 4 | 10), in the VTK order with positive Jacobians.
         clamped: (c,) indices of the nodes that do not move, rising.
         surface: (t, 3) node indices of the boundary's triangles, outward normals; corner nodes only.
     """
 
     nodes: NDArray
-    hexes: NDArray | None
-    tets: NDArray | None
+    elements: NDArray
     clamped: NDArray
     surface: NDArray
 
     @property
-    def elements(self) -> NDArray:
-        """The node indices of the elements, shape (m, 4 | 8 | 10)."""
-        return self.hexes if self.hexes is not None else self.tets
+    def is_hexahedral(self) -> bool:
+        """Whether it is made of hexahedra."""
+        return self.elements.shape[1] == 8
 
     def mirrored(self) -> "VolumeMesh":
         """Return the mirror image y -> -y, with the same node numbers and positive Jacobians."""
-        hexes = None if self.hexes is None else self.hexes[:, _MIRROR_HEX]
-        tets = None if self.tets is None else self.tets[:, _MIRROR_TET10[: self.tets.shape[1]]]
+        order = _MIRROR_HEX if self.is_hexahedral else _MIRROR_TET10[: self.elements.shape[1]]
         return VolumeMesh(
             nodes=self.nodes * [1.0, -1.0, 1.0],
-            hexes=hexes,
-            tets=tets,
+            elements=self.elements[:, order],
             clamped=self.clamped,
             surface=self.surface[:, [0, 2, 1]],
         )
 
 
-def build_volume_mesh(
-    *, nodes: NDArray, hexes: NDArray | None = None, tets: NDArray | None = None, clamped: Iterable[int]
-) -> VolumeMesh:
+def build_volume_mesh(*, nodes: NDArray, elements: NDArray, clamped: Iterable[int]) -> VolumeMesh:
     """Check a mesh and add its surface.
 
     Args:
         nodes: (n, 3) [m], jaw frame.
-        hexes: (m, 8) node indices in the VTK order; or
-        tets: (m, 4) or (m, 10) node indices in the VTK order.
+        elements: node indices of hexahedra (m, 8) or tetrahedra (m, 4 | 10), in the VTK order.
         clamped: indices of the clamped nodes.
 
     Returns:
         The mesh.
 
     Raises:
-        MeshError: No elements or two kinds of them, wrong shapes, indices out of range or not whole, NaN, millimetres
+        MeshError: No elements, wrong shapes, indices out of range or not whole, NaN, millimetres
             for metres, duplicate or unused nodes, inverted or repeated elements, no clamped nodes.
     """
-    if (hexes is None) == (tets is None):
-        raise MeshError("expected either hexahedra or tetrahedra, got both or neither")
     nodes = np.ascontiguousarray(nodes, dtype=float)
-    elements = _to_indices(tets if hexes is None else hexes, "elements")
+    elements = _to_indices(elements, "elements")
     clamped = np.unique(_to_indices(list(clamped), "clamped nodes"))
     _check_nodes(nodes)
-    _check_elements(elements, len(nodes), (4, 10) if hexes is None else (8,))
+    _check_elements(elements, len(nodes))
     _check_numbering(nodes, elements)
     _check_jacobians(nodes, elements)
     _check_clamped(clamped, len(nodes))
     _check_overlaps(elements, elements[:, _faces_of(elements)])
-    return VolumeMesh(
-        nodes=nodes,
-        hexes=None if hexes is None else elements,
-        tets=None if tets is None else elements,
-        clamped=clamped,
-        surface=surface_triangles(elements),
-    )
+    return VolumeMesh(nodes=nodes, elements=elements, clamped=clamped, surface=surface_triangles(elements))
 
 
 def surface_triangles(elements: NDArray) -> NDArray:
@@ -202,13 +187,13 @@ def to_tet4(mesh: VolumeMesh) -> VolumeMesh:
 
     Linear tetrahedra lock in bending: they serve for comparison.
     """
-    if mesh.hexes is not None:
-        return build_volume_mesh(nodes=mesh.nodes, tets=split_hexes(mesh.hexes), clamped=mesh.clamped)
-    if mesh.tets.shape[1] == 4:
+    if mesh.is_hexahedral:
+        return build_volume_mesh(nodes=mesh.nodes, elements=split_hexes(mesh.elements), clamped=mesh.clamped)
+    if mesh.elements.shape[1] == 4:
         return mesh
-    corners, tets = np.unique(mesh.tets[:, :4], return_inverse=True)
+    corners, tets = np.unique(mesh.elements[:, :4], return_inverse=True)
     clamped = np.flatnonzero(np.isin(corners, mesh.clamped))
-    return build_volume_mesh(nodes=mesh.nodes[corners], tets=tets.reshape(-1, 4), clamped=clamped)
+    return build_volume_mesh(nodes=mesh.nodes[corners], elements=tets.reshape(-1, 4), clamped=clamped)
 
 
 def to_tet10(mesh: VolumeMesh) -> VolumeMesh:
@@ -216,15 +201,17 @@ def to_tet10(mesh: VolumeMesh) -> VolumeMesh:
 
     The nodes of the given mesh keep their indices. A middle node is clamped when both ends of its edge are.
     """
-    if mesh.tets is not None and mesh.tets.shape[1] == 10:
+    if mesh.elements.shape[1] == 10:
         return mesh
-    tets = mesh.tets if mesh.hexes is None else split_hexes(mesh.hexes)
+    tets = split_hexes(mesh.elements) if mesh.is_hexahedral else mesh.elements
     edges = np.sort(tets[:, EDGES_TET10], axis=2)
     ends, middle = np.unique(edges.reshape(-1, 2), axis=0, return_inverse=True)
     nodes = np.concatenate([mesh.nodes, mesh.nodes[ends].mean(axis=1)])
     middles = len(mesh.nodes) + middle.reshape(-1, 6)
     held = len(mesh.nodes) + np.flatnonzero(np.isin(ends, mesh.clamped).all(axis=1))
-    return build_volume_mesh(nodes=nodes, tets=np.hstack([tets, middles]), clamped=np.concatenate([mesh.clamped, held]))
+    return build_volume_mesh(
+        nodes=nodes, elements=np.hstack([tets, middles]), clamped=np.concatenate([mesh.clamped, held])
+    )
 
 
 def _check_jacobians(nodes: NDArray, elements: NDArray) -> None:
@@ -270,11 +257,10 @@ def _check_nodes(nodes: NDArray) -> None:
         raise MeshError(f"the mesh is {extent:.4g} m long, expected at least 1 mm: check its scale")
 
 
-def _check_elements(elements: NDArray, node_count: int, corners: tuple[int, ...]) -> None:
+def _check_elements(elements: NDArray, node_count: int) -> None:
     """Refuse element tables of the wrong shape or with indices out of range."""
-    if elements.ndim != 2 or elements.shape[1] not in corners or len(elements) == 0:
-        expected = " or ".join(f"(m, {n})" for n in corners)
-        raise MeshError(f"elements: got shape {elements.shape}, expected {expected}, at least one")
+    if elements.ndim != 2 or elements.shape[1] not in (4, 8, 10) or len(elements) == 0:
+        raise MeshError(f"elements: got shape {elements.shape}, expected (m, 4), (m, 8) or (m, 10), at least one")
     bad = np.flatnonzero(((elements < 0) | (elements >= node_count)).any(axis=1))
     if len(bad):
         raise MeshError(

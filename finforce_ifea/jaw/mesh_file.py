@@ -80,9 +80,8 @@ def read_volume_mesh(path: Path | str, *, scale: float = 1.0, clamp: ClampRule) 
         raise MeshError(f"{path.name}: the points have shape {nodes.shape}, expected (n, 3)")
     if kind == "tetra10":
         elements = _order_middles(nodes, elements)
-    parts = {"hexes": elements} if kind == "hexahedron" else {"tets": elements}
     try:
-        mesh = build_volume_mesh(nodes=nodes, clamped=clamp.select(nodes), **parts)
+        mesh = build_volume_mesh(nodes=nodes, elements=elements, clamped=clamp.select(nodes))
         check_connection(mesh)
     except MeshError as error:
         raise MeshError(f"{path.name}: {error}") from error

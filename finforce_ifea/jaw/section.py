@@ -112,13 +112,11 @@ def join_loops(loops: list[NDArray]) -> shapely.Polygon:
     Raises:
         JawFileError: The loops bound no area or several areas, cross themselves or each other.
     """
-    polygons = []
-    for number, loop in enumerate(loops):
-        polygon = shapely.Polygon(loop)
+    polygons = [shapely.Polygon(loop) for loop in loops]
+    for number, polygon in enumerate(polygons):
         if not polygon.is_valid:
-            x, z = _where_invalid(polygon)
-            raise JawFileError(f"loop {number} of the section touches or crosses itself near ({x:.4g}, {z:.4g})")
-        polygons.append(polygon)
+            reason = shapely.is_valid_reason(polygon)
+            raise JawFileError(f"loop {number} of the section touches or crosses itself: {reason} m")
     polygons.sort(key=lambda polygon: -polygon.area)
     outer = polygons[0]
     for number, hole in enumerate(polygons[1:], start=1):
@@ -129,16 +127,9 @@ def join_loops(loops: list[NDArray]) -> shapely.Polygon:
             )
     whole = shapely.Polygon(outer.exterior, [hole.exterior for hole in polygons[1:]])
     if not whole.is_valid:
-        x, z = _where_invalid(whole)
-        raise JawFileError(f"holes of the section touch each other or the outline near ({x:.4g}, {z:.4g})")
+        reason = shapely.is_valid_reason(whole)
+        raise JawFileError(f"holes of the section touch each other or the outline: {reason} m")
     return whole
-
-
-def _where_invalid(polygon: shapely.Polygon) -> tuple[float, float]:
-    """Return where a polygon is no polygon."""
-    text = shapely.is_valid_reason(polygon)
-    numbers = text[text.find("[") + 1 : text.find("]")].split() if "[" in text else ()
-    return (float(numbers[0]), float(numbers[1])) if len(numbers) == 2 else (np.nan, np.nan)
 
 
 def read_loops(path: Path) -> tuple[list[NDArray], float | None]:

@@ -229,4 +229,4 @@ def extrude_section(section: Section, share: float = 1.0) -> VolumeMesh:
     flipped = np.einsum("ij,ij->i", np.cross(edges[0], edges[1]), edges[2]) < 0.0
     tets = np.where(flipped[:, None], tets[:, [0, 2, 1, 3]], tets)
     held = np.flatnonzero(section.find_clamped(nodes[:, [0, 2]]))
-    return to_tet10(build_volume_mesh(nodes=nodes, tets=tets, clamped=held))
+    return to_tet10(build_volume_mesh(nodes=nodes, elements=tets, clamped=held))

@@ -194,7 +194,7 @@ def block(counts, size, *, kind="hex", distort=0.0, clamp=lambda nodes: nodes[:,
     order = [0, 4, 6, 2, 1, 5, 7, 3]
     hexes = np.stack([corner[i].ravel() for i in order], axis=1)
     nodes = grid.reshape(-1, 3)
-    return KINDS[kind](build_volume_mesh(nodes=nodes, hexes=hexes, clamped=np.flatnonzero(clamp(nodes))))
+    return KINDS[kind](build_volume_mesh(nodes=nodes, elements=hexes, clamped=np.flatnonzero(clamp(nodes))))
 
 
 @cache

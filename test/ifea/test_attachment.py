@@ -22,7 +22,7 @@ def points_inside(mesh, count, seed):
     """Points made from the corners of random elements, without shape functions."""
     rng = np.random.default_rng(seed)
     rows = mesh.elements[rng.integers(len(mesh.elements), size=count)]
-    corners = rows[:, : 8 if mesh.hexes is not None else 4]
+    corners = rows[:, : 8 if mesh.is_hexahedral else 4]
     return np.einsum("pm,pmi->pi", rng.dirichlet(np.ones(corners.shape[1]), count), mesh.nodes[corners])
 
 
@@ -87,7 +87,7 @@ def test_distorted_hexahedra_are_inverted_exactly(seed):
     rng = np.random.default_rng(seed)
     cube = np.array([[i, j, k] for k in (0, 1) for i, j in ((0, 0), (1, 0), (1, 1), (0, 1))], dtype=float)
     nodes = 0.01 * (cube + rng.uniform(-0.15, 0.15, (8, 3)))
-    mesh = build_volume_mesh(nodes=nodes, hexes=np.arange(8)[None], clamped=[0, 1, 2, 3])
+    mesh = build_volume_mesh(nodes=nodes, elements=np.arange(8)[None], clamped=[0, 1, 2, 3])
     places = rng.uniform(-1, 1, (20, 3))
     points = shape_values(8, places) @ nodes
     np.testing.assert_allclose(attach_points(mesh, points, 1e-6).weights, shape_values(8, places), atol=1e-9)
@@ -118,14 +118,14 @@ def test_no_surface_point_is_closer_than_the_closest(x, y, z, seed):
 
 def test_far_points_are_refused_by_number_place_and_distance():
     points = np.array([[0.0135, 0.0, 0.04], [0.02, 0.0, 0.04]])
-    with pytest.raises(MeshError, match=r"point 1 at \[20.0, 0.0, 40.0\] mm is 6 mm away.*at most 1 mm"):
+    with pytest.raises(MeshError, match=r"point 1 at \[20.0, 0.0, 40.0\] mm is 6 mm off.*at most 1 mm"):
         attach_points(HEXES, points, 1e-3)
 
 
 def test_points_under_the_surface_are_refused_as_surface_points():
     points = np.array([[0.0132, 0.0, 0.04]])
     attach_points(HEXES, points, 1e-4)
-    with pytest.raises(MeshError, match=r"spot at .* is 0.8 mm away from the surface"):
+    with pytest.raises(MeshError, match=r"spot at .* is 0.8 mm off the surface"):
         attach_surface_points(HEXES, points, 1e-4, ["spot"])
 
 

@@ -185,7 +185,7 @@ def test_points_run_smoothly_along_the_inner_face(bench, pressed):
 
 def test_points_off_the_finger_are_refused_by_number(bench):
     points = np.array([[0.0132, 0.01, 0.009], [0.0, 0.0, 0.0325]])
-    with pytest.raises(MeshError, match=r"point 1 at \[0.0, 0.0, 32.5\] mm is 2.54 mm away"):
+    with pytest.raises(MeshError, match=r"point 1 at \[0.0, 0.0, 32.5\] mm is 2.54 mm off the finger"):
         bench.attach(points, 1e-3)
     bench.attach(points, 5e-3)
     with pytest.raises(MeshError, match="point 0"):

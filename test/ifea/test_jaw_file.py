@@ -81,8 +81,8 @@ BAD_VALUES = [
     ("candidates", [[0.014, 0, 0.02], [0.013, 0, 0.03]], r"candidates\[1\] at \(13.000, 0.000, 30.000\) mm"),
     ("candidates.step_z", 0.007, r"candidates\[11\] .* off the inner surface"),
     ("candidates.y", 0.011, r"candidates\[0\] .* off the inner surface; expected y from -0.01 to 0.01"),
-    ("keypoints", {**POINTS, "b": [0.0, 0.01, 0.014]}, r"keypoints.b at .* lies 4 mm off the jaw"),
-    ("keypoints.side_y", 0.02, "keypoints.inner_1 at .* lies 10 mm off the jaw"),
+    ("keypoints", {**POINTS, "b": [0.0, 0.01, 0.014]}, r"keypoints.b at .* is 4 mm off the jaw"),
+    ("keypoints.side_y", 0.02, "keypoints.inner_1 at .* is 10 mm off the jaw"),
     ("drawing.joints", "hinged", "model: got solid, expected frame for this drawing"),
 ]
 
@@ -167,9 +167,9 @@ def test_a_side_is_left_or_right():
         ("mesh__file", 3, "mesh.file: got 3"),
         ("mesh__scal", 1.0, "mesh: unknown key 'scal'; did you mean 'scale'"),
         ("keypoints", {"rule": "rib_junctions", "side_y": 0.01}, "rib_junctions needs a drawing"),
-        ("keypoints", {"off": [0.0, 0.01, 0.014]}, "keypoints.off at .* away from the mesh"),
-        ("inner_face_x", 0.0132, r"candidates\[\d+\] at .* away from the surface"),
-        ("candidates__count", 16, r"candidates\[15\] at .* away from the surface"),
+        ("keypoints", {"off": [0.0, 0.01, 0.014]}, "keypoints.off at .* off the mesh"),
+        ("inner_face_x", 0.0132, r"candidates\[\d+\] at .* off the surface"),
+        ("candidates__count", 16, r"candidates\[15\] at .* off the surface"),
         ("model", "frame", "model: got frame, expected solid for a mesh file"),
     ],
 )

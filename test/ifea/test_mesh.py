@@ -107,7 +107,7 @@ def test_surface_is_closed_and_faces_outwards(drawing, density):
 @given(drawing=drawings(), density=densities())
 def test_tetrahedra_conform_and_fill_the_hexahedra(drawing, density):
     mesh = mesh_drawing(drawing, density)
-    tets = split_hexes(mesh.hexes)
+    tets = split_hexes(mesh.elements)
     volumes = tet_volumes(mesh.nodes, tets)
     assert (volumes > 0).all()
     assert volumes.sum() == pytest.approx(compute_volume(mesh), rel=1e-9)
@@ -131,20 +131,20 @@ def test_ten_node_tetrahedra_keep_nodes_and_clamp_the_middles_of_the_base():
     mesh = mesh_drawing(BENCH, "coarse")
     fine = to_tet10(mesh)
     np.testing.assert_array_equal(fine.nodes[:522], mesh.nodes)
-    assert fine.tets.shape == (6 * len(mesh.hexes), 10)
+    assert fine.elements.shape == (6 * len(mesh.elements), 10)
     assert set(fine.clamped) == set(np.flatnonzero(fine.nodes[:, 2] == 0.0))
     assert compute_volume(fine) == pytest.approx(compute_volume(mesh))
     edges = np.array([[0, 1], [1, 2], [2, 0], [0, 3], [1, 3], [2, 3]])
-    np.testing.assert_allclose(fine.nodes[fine.tets[:, 4:]], fine.nodes[fine.tets[:, edges]].mean(axis=2))
+    np.testing.assert_allclose(fine.nodes[fine.elements[:, 4:]], fine.nodes[fine.elements[:, edges]].mean(axis=2))
 
 
 def test_ten_node_tetrahedra_reduce_to_the_linear_ones_they_came_from():
     linear = to_tet4(mesh_drawing(BENCH, "coarse"))
     back = to_tet4(to_tet10(linear))
-    np.testing.assert_array_equal(back.tets, linear.tets)
+    np.testing.assert_array_equal(back.elements, linear.elements)
     np.testing.assert_array_equal(back.clamped, linear.clamped)
     assert to_tet4(linear) is linear
-    assert to_tet10(to_tet10(linear)).tets.shape[1] == 10
+    assert to_tet10(to_tet10(linear)).elements.shape[1] == 10
 
 
 @pytest.mark.parametrize("convert", [lambda mesh: mesh, to_tet4, to_tet10])
@@ -152,7 +152,7 @@ def test_mirror_image_keeps_node_numbers_and_positive_jacobians(convert):
     mesh = convert(mesh_drawing(BENCH, "coarse"))
     mirror = mesh.mirrored()
     np.testing.assert_array_equal(mirror.nodes, mesh.nodes * [1.0, -1.0, 1.0])
-    parts = {"hexes": mirror.hexes, "tets": mirror.tets}
+    parts = {"elements": mirror.elements}
     rebuilt = build_volume_mesh(nodes=mirror.nodes, clamped=mirror.clamped, **parts)
     assert compute_volume(rebuilt) == pytest.approx(compute_volume(mesh))
     assert compute_volume(mirror) == pytest.approx(compute_volume(mesh))
@@ -166,12 +166,12 @@ def test_a_frame_drawing_has_a_skin():
 def test_surface_tells_a_boundary_face_from_a_shared_one():
     two = np.vstack([CUBE, CUBE[4:] + [0, 0, 1]]) * 0.01
     hexes = np.array([[0, 1, 2, 3, 4, 5, 6, 7], [4, 5, 6, 7, 8, 9, 10, 11]])
-    mesh = build_volume_mesh(nodes=two, hexes=hexes, clamped=[0, 1, 2, 3])
+    mesh = build_volume_mesh(nodes=two, elements=hexes, clamped=[0, 1, 2, 3])
     assert len(mesh.surface) == 2 * 10
 
 
 def cube_parts(**changes):
-    parts = {"nodes": 0.01 * CUBE, "hexes": np.arange(8)[None], "clamped": [0, 1, 2, 3]}
+    parts = {"nodes": 0.01 * CUBE, "elements": np.arange(8)[None], "clamped": [0, 1, 2, 3]}
     return parts | changes
 
 
@@ -182,8 +182,8 @@ BAD_NODES[5, 1] = np.nan
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"hexes": np.array([[4, 5, 6, 7, 0, 1, 2, 3]])}, r"1 of 1 elements are inverted.*element 0"),
-        ({"hexes": np.array([[0, 1, 2, 3, 4, 5, 6, 6]])}, "inverted|no element"),
+        ({"elements": np.array([[4, 5, 6, 7, 0, 1, 2, 3]])}, r"1 of 1 elements are inverted.*element 0"),
+        ({"elements": np.array([[0, 1, 2, 3, 4, 5, 6, 6]])}, "inverted|no element"),
         ({"clamped": []}, "no clamped nodes"),
         ({"clamped": [0, 1]}, "at least three"),
         ({"clamped": range(8)}, "all nodes are clamped"),
@@ -195,11 +195,9 @@ BAD_NODES[5, 1] = np.nan
         ({"nodes": np.vstack([0.01 * CUBE, [[0.02, 0, 0]]])}, "1 of 9 nodes belong to no element.*node 8"),
         ({"nodes": np.vstack([0.01 * CUBE, [[0, 0, 0]]])}, "1 pairs of duplicate nodes.*0 and 8"),
         ({"nodes": np.zeros((8, 2))}, r"got shape \(8, 2\)"),
-        ({"hexes": np.arange(1, 9)[None]}, r"out of 0\.\.7.*element 0"),
-        ({"hexes": np.empty((0, 8), int)}, r"got shape \(0, 8\)"),
-        ({"hexes": np.zeros((1, 6), int)}, r"got shape \(1, 6\)"),
-        ({"tets": np.arange(4)[None]}, "both or neither"),
-        ({"hexes": None}, "both or neither"),
+        ({"elements": np.arange(1, 9)[None]}, r"out of 0\.\.7.*element 0"),
+        ({"elements": np.empty((0, 8), int)}, r"got shape \(0, 8\)"),
+        ({"elements": np.zeros((1, 6), int)}, r"got shape \(1, 6\)"),
     ],
 )
 def test_bad_mesh_is_refused_by_name(change, words):
@@ -210,19 +208,19 @@ def test_bad_mesh_is_refused_by_name(change, words):
 
 def test_the_number_of_inverted_elements_is_told():
     mesh = mesh_drawing(BENCH, "coarse")
-    hexes = mesh.hexes.copy()
+    hexes = mesh.elements.copy()
     hexes[[7, 30]] = hexes[[7, 30]][:, [4, 5, 6, 7, 0, 1, 2, 3]]
     with pytest.raises(MeshError, match=r"2 of 186 elements are inverted or flat \(first: element 7 "):
-        build_volume_mesh(nodes=mesh.nodes, hexes=hexes, clamped=mesh.clamped)
+        build_volume_mesh(nodes=mesh.nodes, elements=hexes, clamped=mesh.clamped)
 
 
 def test_a_middle_node_out_of_place_inverts_a_ten_node_tetrahedron():
     mesh = to_tet10(to_tet4(mesh_drawing(BENCH, "coarse")))
     nodes = mesh.nodes.copy()
-    ends = nodes[mesh.tets[3, :2]]
-    nodes[mesh.tets[3, 4]] = 0.1 * ends[0] + 0.9 * ends[1]
+    ends = nodes[mesh.elements[3, :2]]
+    nodes[mesh.elements[3, 4]] = 0.1 * ends[0] + 0.9 * ends[1]
     with pytest.raises(MeshError, match="inverted"):
-        build_volume_mesh(nodes=nodes, tets=mesh.tets, clamped=mesh.clamped)
+        build_volume_mesh(nodes=nodes, elements=mesh.elements, clamped=mesh.clamped)
 
 
 @pytest.mark.parametrize("number", [0, -1, 2.0, True, "3"])

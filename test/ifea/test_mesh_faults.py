@@ -28,8 +28,7 @@ class Parts:
 
     def build(self) -> VolumeMesh:
         """Return the mesh as a reader of files does, checks included."""
-        kind = "hexes" if np.shape(self.elements)[1] == 8 else "tets"
-        mesh = build_volume_mesh(nodes=self.nodes, clamped=self.clamped, **{kind: self.elements})
+        mesh = build_volume_mesh(nodes=self.nodes, elements=self.elements, clamped=self.clamped)
         check_connection(mesh)
         return mesh
 

@@ -41,13 +41,13 @@ def test_mesh_survives_the_way_through_a_file(tmp_path, kind, suffix, file_forma
 
 def test_middle_nodes_in_the_order_of_gmsh_are_reordered(tmp_path):
     mesh = KINDS["tetra10"]
-    swapped = mesh.tets[:, [0, 1, 2, 3, 4, 5, 6, 7, 9, 8]]
+    swapped = mesh.elements[:, [0, 1, 2, 3, 4, 5, 6, 7, 9, 8]]
     path = write(tmp_path / "finger.vtu", mesh.nodes, [("tetra10", swapped)])
-    np.testing.assert_array_equal(read_volume_mesh(path, clamp=BASE).tets, mesh.tets)
+    np.testing.assert_array_equal(read_volume_mesh(path, clamp=BASE).elements, mesh.elements)
 
 
 def test_scale_turns_millimetres_into_metres(tmp_path):
-    path = write(tmp_path / "finger.vtu", 1e3 * MESH.nodes, [("hexahedron", MESH.hexes)])
+    path = write(tmp_path / "finger.vtu", 1e3 * MESH.nodes, [("hexahedron", MESH.elements)])
     np.testing.assert_allclose(read_volume_mesh(path, scale=1e-3, clamp=BASE).nodes, MESH.nodes, atol=1e-12)
     with pytest.raises(MeshError, match="finger.vtu: the mesh is 80 m long.*millimetres; give scale: 0.001"):
         read_volume_mesh(path, clamp=BASE)
@@ -74,11 +74,11 @@ def test_a_clamp_rule_is_one_rule(rules):
 @pytest.mark.parametrize(
     ("cells", "words"),
     [
-        ([("hexahedron", MESH.hexes), ("tetra", KINDS["tetra"].tets)], "a mixture of hexahedron, tetra"),
-        ([("wedge", MESH.hexes[:, :6])], "got wedge, expected only one of tetra, tetra10, hexahedron"),
+        ([("hexahedron", MESH.elements), ("tetra", KINDS["tetra"].elements)], "a mixture of hexahedron, tetra"),
+        ([("wedge", MESH.elements[:, :6])], "got wedge, expected only one of tetra, tetra10, hexahedron"),
         ([("triangle", MESH.surface)], "got triangle, expected volume elements"),
-        ([("tetra", KINDS["tetra"].tets[:, [0, 2, 1, 3]])], "1116 of 1116 elements are inverted"),
-        ([("tetra", KINDS["tetra"].tets[:100])], "belong to no element"),
+        ([("tetra", KINDS["tetra"].elements[:, [0, 2, 1, 3]])], "1116 of 1116 elements are inverted"),
+        ([("tetra", KINDS["tetra"].elements[:100])], "belong to no element"),
     ],
 )
 def test_unsuitable_cells_are_refused_by_name(tmp_path, cells, words):
@@ -97,7 +97,7 @@ def test_unreadable_files_are_refused_by_name(tmp_path, content, suffix):
 
 
 def test_truncated_file_is_refused(tmp_path):
-    path = write(tmp_path / "finger.vtk", MESH.nodes, [("hexahedron", MESH.hexes)], binary=True)
+    path = write(tmp_path / "finger.vtk", MESH.nodes, [("hexahedron", MESH.elements)], binary=True)
     path.write_bytes(path.read_bytes()[:5000])
     with pytest.raises(MeshError, match="finger.vtk: "):
         read_volume_mesh(path, clamp=BASE)

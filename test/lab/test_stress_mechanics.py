@@ -104,8 +104,8 @@ def test_stability_is_seen_by_both_factors():
 
 def test_a_face_of_three_elements_is_refused():
     mesh = block((1, 1, 2), (0.004, 0.006, 0.008))
-    lower = mesh.hexes[0]
-    shared = np.intersect1d(mesh.hexes[0], mesh.hexes[1])
+    lower = mesh.elements[0]
+    shared = np.intersect1d(mesh.elements[0], mesh.elements[1])
     # a third element on the face between the two, through the upper one
     tall = np.where(np.isin(lower, shared), lower, -1)
     moved = {int(node): len(mesh.nodes) + i for i, node in enumerate(np.setdiff1d(lower, shared))}
@@ -113,7 +113,7 @@ def test_a_face_of_three_elements_is_refused():
     extra = mesh.nodes[np.setdiff1d(lower, shared)] - [0.0, 0.0, 0.001]
     with pytest.raises(MeshError, match="more than two elements"):
         build_volume_mesh(
-            nodes=np.vstack([mesh.nodes, extra]), hexes=np.vstack([mesh.hexes, third]), clamped=mesh.clamped
+            nodes=np.vstack([mesh.nodes, extra]), elements=np.vstack([mesh.elements, third]), clamped=mesh.clamped
         )
 
 
