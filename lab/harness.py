@@ -129,24 +129,6 @@ def time_calls(call: Callable[[], Any], count: int, clock: Callable[[], float] =
     return times
 
 
-def measure_sharpness(stated: NDArray, errors: NDArray) -> NDArray:
-    """Return how sharp stated standard deviations are, their root mean square over that of the errors.
-
-    Below 1 they are too small, far above 1 they say nothing.
-
-    Args:
-        stated: standard deviations (n, k); rows with one that is not finite count for nothing.
-        errors: (n, k).
-
-    Returns:
-        One number for each column (k,); NaN where there is no error.
-    """
-    known = np.isfinite(stated).all(axis=1) & np.isfinite(errors).all(axis=1)
-    squares = [np.square(values[known]).sum(axis=0) / max(known.sum(), 1) for values in (stated, errors)]
-    ratio = np.full(stated.shape[1], np.nan)
-    return np.sqrt(np.divide(*squares, out=ratio, where=squares[1] > NO_ERROR**2))
-
-
 def format_figures(figures: Figures) -> str:
     """Return the tables, each below its name, and the notes in Markdown."""
     tables = [f"**{name}**\n\n{format_table(table)}" for name, table in figures.tables.items()]
@@ -179,9 +161,6 @@ def figures_json(figures: Figures) -> dict[str, Any]:
     rows = {name: table.to_dict("records") for name, table in figures.tables.items()}
     text = {name: format_table(table) for name, table in figures.tables.items()}
     return without_nan({"rows": rows, "tables": text, "notes": list(figures.notes), **figures.more})
-
-
-NO_ERROR = 1e-5  # root mean square of errors that are none [N, N m]: rounding
 
 
 MARKS = (

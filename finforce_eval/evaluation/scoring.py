@@ -26,6 +26,7 @@ WAITED = 1.0  # [s] after which a force that did not show is missed
 WATCHED = 30  # frames after the true begin, by which a touch has to be there to stay
 PHASES = ("all", "load", "unload")
 OFF = 0.3  # [N] along an axis, from which on an image is counted as off
+NO_ERROR = 1e-5  # root mean square of errors that are none [N, N m]: rounding
 _NOTHING = 1e-3  # [N] along an axis, which needs no standard deviation
 Numbers = dict[str, Any]
 
@@ -291,9 +292,27 @@ def compare_vectors(differences: NDArray[np.float64], stated: NDArray[np.float64
     if stated is not None:
         within = np.abs(differences) <= np.maximum(3.0 * stated, _NOTHING)
         found["within_3_sigma_pct"] = tuple((100.0 * within.mean(axis=0)).tolist())
-        widths = np.sqrt((stated**2).mean(axis=0)).tolist()
-        found["sharpness"] = tuple(w / e if e > 0.0 else None for w, e in zip(widths, axes, strict=True))
+        ratios = measure_sharpness(stated, differences).tolist()
+        found["sharpness"] = tuple(ratio if np.isfinite(ratio) else None for ratio in ratios)
     return found
+
+
+def measure_sharpness(stated: NDArray, errors: NDArray) -> NDArray:
+    """Return how sharp stated standard deviations are, their root mean square over that of the errors.
+
+    Below 1 they are too small, far above 1 they say nothing.
+
+    Args:
+        stated: standard deviations (n, k); rows with one that is not finite count for nothing.
+        errors: (n, k).
+
+    Returns:
+        One number for each column (k,); NaN where there is no error.
+    """
+    known = np.isfinite(stated).all(axis=1) & np.isfinite(errors).all(axis=1)
+    squares = [np.square(values[known]).sum(axis=0) / max(known.sum(), 1) for values in (stated, errors)]
+    ratio = np.full(stated.shape[1], np.nan)
+    return np.sqrt(np.divide(*squares, out=ratio, where=squares[1] > NO_ERROR**2))
 
 
 def _percentiles(parts: Iterable[NDArray], scale: float = 1.0, **percents: float) -> Numbers:

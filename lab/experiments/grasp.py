@@ -13,11 +13,11 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from finforce_eval.evaluate import evaluate_all
-from finforce_eval.evaluation.scoring import ONSET_FORCE, Evaluation, force_delays, rms
+from finforce_eval.evaluation.scoring import ONSET_FORCE, Evaluation, force_delays, measure_sharpness, rms
 from finforce_eval.figures.figures import BLACK, BLUE, GREEN, ORANGE
 from lab.experiments.experiment import Experiment, average, draw_panels, tabulate
 from lab.experiments.runs import SHARP, Case, RunOptions, axis_sharpness, build_setup, keep_poses
-from lab.harness import Figures, measure_sharpness
+from lab.harness import Figures
 
 SCENES = {"cylinder": "grasp_cylinder", "cube": "grasp_cube", "asymmetric": "grasp_asymmetric"}
 PLACES = {"lower": 0.024, "middle": 0.040, "upper": 0.058}  # [m] of the object's middle

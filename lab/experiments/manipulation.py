@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from finforce.gripper_frames import SIDES
 from finforce_eval.evaluate import evaluate_all
-from finforce_eval.evaluation.scoring import join_net, rms
+from finforce_eval.evaluation.scoring import join_net, measure_sharpness, rms
 from finforce_eval.evaluation.setup import EvaluationSetup
 from finforce_eval.figures.figures import BLACK, BLUE, new_figure
 from finforce_eval.recordings.tracks import Recording
@@ -22,7 +22,7 @@ from finforce_sim.footage import START
 from finforce_sim.scenarios import build_scenario, write_script
 from lab.experiments.experiment import Experiment, average, tabulate
 from lab.experiments.runs import SHARP, Case, RunOptions, build_setup
-from lab.harness import Figures, measure_sharpness
+from lab.harness import Figures
 
 MASS, SPEED = 0.1, 1.2  # [kg], [rad/s]
 # The axis of the turn, and how the gripper looks at first: level for a turn about where it points, else down.

@@ -19,7 +19,8 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from finforce.errors import FinforceError
-from lab.harness import format_table, measure_sharpness
+from finforce_eval.evaluation.scoring import measure_sharpness
+from lab.harness import format_table
 
 TIME_LIMIT = 60.0
 # No step may take more medians than this.
