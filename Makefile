@@ -6,6 +6,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 PYTHON := .venv/bin/python
 SET_UP := tools/setup_venv.sh
 STRESS_COUNT ?= 4
+STRESS_JAWS ?= bench umi ssg48_fin_ray_1 xlerobot
 DESCRIBED := setup.py setup.cfg pyproject.toml $(SET_UP)
 ROS := $(if $(AMENT_PREFIX_PATH),ament,plain)
 
@@ -30,7 +31,7 @@ bench: .venv/.$(ROS)-run
 
 # Every finger with the fixed seed and with one that is drawn anew and printed.
 stress: .venv/.$(ROS)-run
-	@status=0; for seed in 0 new; do for jaw in bench umi ssg48_fin_ray_1 xlerobot; do \
+	@status=0; for seed in 0 new; do for jaw in $(STRESS_JAWS); do \
 	  $(PYTHON) -m finforce_eval.cli.main stress --seed $$seed --jaw $$jaw --count $(STRESS_COUNT) || status=1; \
 	done; done; exit $$status
 
