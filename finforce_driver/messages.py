@@ -235,26 +235,6 @@ def news_of_state(state: GripperState) -> str:
     return "the gripper is ready" if outcome.level == Level.OK else outcome.text
 
 
-def describe_state(state: GripperState) -> dict[str, str]:
-    """Return what is known of a gripper as text."""
-    return {
-        "phase": state.phase.value,
-        "opening [mm]": _number(1e3 * state.opening, 2),
-        "target [mm]": _number(1e3 * state.target, 2),
-        "current [A]": _number(state.current, 3),
-        "force by the maker's curve [N]": _number(state.force, 1),
-        "contact": state.contact or "none",
-        "outcome of the last move": state.outcome.value,
-        "temperature [deg C]": _number(state.temperature, 0),
-        "voltage [V]": _number(state.voltage, 1),
-        "faults": ", ".join(state.faults) or "none",
-        "emergency stop": "latched" if state.estopped else "no",
-        "calibrated": "yes" if state.calibrated else "no",
-        "activated": "yes" if state.activated else "no",
-        "events": ", ".join(f"{count} {name}" for name, count in state.counts.items() if count) or "none",
-    }
-
-
 def outcome_of_grasp(status: GraspStatus) -> Outcome:
     """Return the level of a grasp, its phase and its sentence; one that was ended deserves attention."""
     level = Level.WARN if status.phase is GraspPhase.STOPPED else Level.OK
@@ -268,30 +248,3 @@ def find_alarms(state: GripperState, status: GraspStatus | None) -> list[Outcome
     if status is not None and status.failed:
         found.append(outcome_of_grasp(status))
     return [outcome for outcome in found if outcome.level != Level.OK]
-
-
-def describe_grasp(status: GraspStatus | None) -> dict[str, str]:
-    """Return the figures of a grasp as text, nothing before the first."""
-    if status is None:
-        return {}
-    rejected = ", ".join(f"{count} {reason}" for reason, count in status.rejected.items() if count)
-    return {
-        "grasp": status.phase.value,
-        "grasp reason": status.reason,
-        "set force [N]": _number(status.goal, 2),
-        "force [N]": _number(status.force, 3),
-        "stated deviation of the force [N]": _number(status.stddev, 3),
-        "predicted force [N]": _number(status.predicted, 3),
-        "peak force [N]": _number(status.peak, 3),
-        "overshoot bound [N]": _number(status.overshoot_bound, 3),
-        "stiffness [N/mm]": _number(1e-3 * status.stiffness, 3),
-        "force of one step [N]": _number(status.resolution, 3),
-        "image to force [ms]": _number(1e3 * status.latency, 0),
-        "image period [ms]": _number(1e3 * status.period, 0),
-        "forces rejected": rejected or "none",
-    }
-
-
-def _number(value: float, digits: int) -> str:
-    """Return a number as text, a dash for one that is not known."""
-    return f"{value + 0.0:.{digits}f}" if math.isfinite(value) else "-"

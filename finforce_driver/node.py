@@ -31,8 +31,6 @@ from finforce_driver.joint import JointGripper, SendCommand
 from finforce_driver.messages import (
     GripperHealth,
     MessageTimes,
-    describe_grasp,
-    describe_state,
     fill_gripper_command,
     fill_joint_state,
     find_alarms,
@@ -45,7 +43,7 @@ from finforce_driver.messages import (
     outcome_of_state,
 )
 from finforce_driver.settings import DriverParameters, GraspGoal, GraspSettings, GripperSettings, JointSettings
-from finforce_driver.state import GripperState
+from finforce_driver.state import GripperState, describe_record
 from finforce_driver.tasks import GripperTasks, MoveAction
 
 JAWS = ("left", "right")
@@ -287,7 +285,7 @@ class GripperDriverNode(Node):
         status = self.session.status
         if status is not None and self.health.is_news("grasp state", f"{status.phase.value}: {status.reason}"):
             outcome = outcome_of_grasp(status)
-            report = Report(level=outcome.level, message=outcome.text, values=describe_grasp(status))
+            report = Report(level=outcome.level, message=outcome.text, values=describe_record(status))
             self.grasp_state.publish(ros.status_message("finforce: grasp", self.get_name(), report))
             if status.failed:
                 self._log(outcome.level, f"the grasp failed: {outcome.text}")
@@ -364,9 +362,9 @@ class GripperDriverNode(Node):
 
     def _report(self, alarms: list[Outcome]) -> Report:
         """Return how gripper and grasp are doing."""
-        state = self.gripper.state
-        values = describe_state(state) | describe_grasp(self.session.status)
-        return self.health.report([*alarms, *find_alarms(state, self.session.status)], values)
+        state, status = self.gripper.state, self.session.status
+        values = describe_record(state) | ({} if status is None else describe_record(status))
+        return self.health.report([*alarms, *find_alarms(state, status)], values)
 
     def _now(self) -> int:
         return self.get_clock().now().nanoseconds

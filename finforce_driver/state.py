@@ -4,10 +4,34 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import MISSING, dataclass, field, fields
 from enum import Enum
+from typing import Any
 
 from finforce_driver.errors import GraspError, UnseenForceError
+
+
+def shown(label: str, default: Any = MISSING, digits: int = 0, scale: float = 1.0, **options: Any) -> Any:
+    """Return a dataclass field that `describe_record` shows by a label, a number times a scale with so many digits."""
+    return field(default=default, metadata={"label": label, "digits": digits, "scale": scale}, **options)
+
+
+def describe_record(record: Any) -> dict[str, str]:
+    """Return the shown fields of a record as text, by their labels."""
+    entries = [entry for entry in fields(record) if entry.metadata]
+    return {entry.metadata["label"]: _describe(getattr(record, entry.name), entry.metadata) for entry in entries}
+
+
+def _describe(value: Any, how: Mapping[str, Any]) -> str:
+    """Return a value as text: a dash for a number that is not known, none for what is empty."""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{how['scale'] * value + 0.0:.{how['digits']}f}" if math.isfinite(value) else "-"
+    if isinstance(value, Mapping):
+        value = [f"{count} {name}" for name, count in value.items() if count]
+    text = value.value if isinstance(value, Enum) else value if isinstance(value, str) else ", ".join(value)
+    return text or "none"
 
 
 class Phase(Enum):
@@ -62,26 +86,26 @@ class GripperState:
         counts: of events since the start, by name.
     """
 
-    phase: Phase = Phase.DISCONNECTED
+    phase: Phase = shown("phase", Phase.DISCONNECTED)
     stamp: float = math.nan
-    opening: float = math.nan
+    opening: float = shown("opening [mm]", math.nan, 2, 1e3)
     velocity: float = math.nan
-    current: float = math.nan
-    force: float = math.nan
-    target: float = math.nan
-    contact: str = ""
+    current: float = shown("current [A]", math.nan, 3)
+    force: float = shown("force by the maker's curve [N]", math.nan, 1)
+    target: float = shown("target [mm]", math.nan, 2, 1e3)
+    contact: str = shown("contact", "")
     at_target: bool = False
-    calibrated: bool = False
-    activated: bool = False
-    faults: tuple[str, ...] = ()
-    estopped: bool = False
+    calibrated: bool = shown("calibrated", False)
+    activated: bool = shown("activated", False)
+    faults: tuple[str, ...] = shown("faults", ())
+    estopped: bool = shown("emergency stop", False)
     stop_pending: bool = False
-    outcome: MoveOutcome = MoveOutcome.NONE
+    outcome: MoveOutcome = shown("outcome of the last move", MoveOutcome.NONE)
     message: str = ""
-    temperature: float = math.nan
-    voltage: float = math.nan
+    temperature: float = shown("temperature [deg C]", math.nan)
+    voltage: float = shown("voltage [V]", math.nan, 1)
     latency: float = math.nan
-    counts: dict[str, int] = field(default_factory=dict)
+    counts: dict[str, int] = shown("events", default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,21 +155,21 @@ class GraspStatus:
         rejected: forces and touches that were not used, by reason.
     """
 
-    phase: GraspPhase
-    reason: str
-    goal: float
-    force: float = math.nan
-    predicted: float = math.nan
-    stiffness: float = math.nan
-    latency: float = math.nan
-    period: float = math.nan
-    overshoot_bound: float = math.nan
-    peak: float = 0.0
-    resolution: float = math.nan
+    phase: GraspPhase = shown("grasp")
+    reason: str = shown("grasp reason")
+    goal: float = shown("set force [N]", digits=2)
+    force: float = shown("force [N]", math.nan, 3)
+    predicted: float = shown("predicted force [N]", math.nan, 3)
+    stiffness: float = shown("stiffness [N/mm]", math.nan, 3, 1e-3)
+    latency: float = shown("image to force [ms]", math.nan, 0, 1e3)
+    period: float = shown("image period [ms]", math.nan, 0, 1e3)
+    overshoot_bound: float = shown("overshoot bound [N]", math.nan, 3)
+    peak: float = shown("peak force [N]", 0.0, 3)
+    resolution: float = shown("force of one step [N]", math.nan, 3)
     target: float = math.nan
-    stddev: float = 0.0
+    stddev: float = shown("stated deviation of the force [N]", 0.0, 3)
     failure: type[GraspError] | None = None
-    rejected: Mapping[str, int] = field(default_factory=dict)
+    rejected: Mapping[str, int] = shown("forces rejected", default_factory=dict)
 
     @property
     def failed(self) -> bool:

@@ -14,7 +14,6 @@ from finforce_driver.errors import TargetError
 from finforce_driver.grasp.session import GraspSession
 from finforce_driver.messages import (
     MessageTimes,
-    describe_state,
     goal_from_joint_state,
     move_from_gripper_command,
     move_from_joint_state,
@@ -23,7 +22,7 @@ from finforce_driver.messages import (
 )
 from finforce_driver.node import build_gripper
 from finforce_driver.settings import DriverParameters, GraspGoal, GraspSettings, GripperSettings
-from finforce_driver.state import MoveOutcome, Phase
+from finforce_driver.state import MoveOutcome, Phase, describe_record
 
 JOINTS = ("left_jaw_joint", "right_jaw_joint")
 
@@ -180,7 +179,7 @@ def test_the_level_follows_from_phase_faults_and_outcome(changes, level):
 
 
 def test_what_is_not_known_is_a_dash():
-    figures = describe_state(replace(READY, opening=math.nan, temperature=math.nan, force=-0.0))
+    figures = describe_record(replace(READY, opening=math.nan, temperature=math.nan, force=-0.0))
     assert (figures["opening [mm]"], figures["temperature [deg C]"]) == ("-", "-")
     assert figures["force by the maker's curve [N]"] == "0.0"
 
