@@ -1,9 +1,13 @@
-"""ROS messages into stamps, poses, wrenches, images, columns of clouds; any object with their attributes will do."""
+"""ROS messages into stamps, poses, wrenches, images, columns of clouds, and which of them belong to one image.
+
+Any object with a message's attributes will do.
+"""
 
 from __future__ import annotations
 
 import math
 import struct
+from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from dataclasses import fields as fields_of
@@ -26,9 +30,10 @@ from finforce.camera import (
     unpack_rows,
 )
 from finforce.errors import ObservationError, PoseError
-from finforce.stamps import NANOSECONDS
 from finforce.transforms import pose_from_quaternion
 
+NANOSECONDS = 1_000_000_000  # in a second
+SECOND = 1e-9  # a nanosecond [s]
 # sensor_msgs/msg/PointField: INT8 = 1 ... FLOAT64 = 8
 DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 STDDEV_COLUMNS = ("stddev_x", "stddev_y", "stddev_z")
@@ -456,3 +461,74 @@ def color_from_image(message: Any) -> NDArray[np.uint8]:
     if hasattr(message, "format"):
         return decode_picture(message.data, f"colour image {message.format!r}")
     return decode_color(np.frombuffer(message.data, dtype=np.uint8), message.encoding, layout_of(message))
+
+
+@dataclass(frozen=True, eq=False)
+class Stamped:
+    """Something and the stamp of its image [ns]."""
+
+    stamp: int
+    value: Any
+
+
+class Synchronizer:
+    """Keeps the newest entries of several streams and finds those that belong to one image.
+
+    Args:
+        streams: their names, each with the number of entries that are kept of it, None for all.
+        tolerance: greatest distance between stamps that belong together [ns].
+    """
+
+    def __init__(self, streams: dict[str, int | None], tolerance: int = 0) -> None:
+        self._streams: dict[str, deque[Stamped]] = {name: deque(maxlen=depth) for name, depth in streams.items()}
+        self._tolerance = tolerance
+
+    def reset(self, *streams: str) -> None:
+        """Forget the entries of some streams, of all without a name."""
+        for name in streams or self._streams:
+            self._streams[name].clear()
+
+    def belong(self, one: int, other: int) -> bool:
+        """Return whether two stamps [ns] are those of one image."""
+        return abs(one - other) <= self._tolerance
+
+    def add(self, stream: str, stamp: int, value: Any) -> None:
+        """Keep an entry of a stream, and forget its oldest where there are too many."""
+        self._streams[stream].append(Stamped(stamp, value))
+
+    def entries(self, stream: str) -> deque[Stamped]:
+        """Return the entries of a stream in the order of their arrival."""
+        return self._streams[stream]
+
+    def nearest(self, stream: str, stamp: int) -> Stamped | None:
+        """Return the entry of a stream that is nearest to a stamp [ns], the oldest of equals."""
+        return min(self._streams[stream], key=lambda entry: abs(entry.stamp - stamp), default=None)
+
+    def find(self, stream: str, stamp: int) -> Stamped | None:
+        """Return the nearest entry of a stream to a stamp [ns], None where none belongs to it."""
+        found = self.nearest(stream, stamp)
+        return found if found is not None and self.belong(found.stamp, stamp) else None
+
+    def take(self, stream: str, stamp: int) -> Stamped | None:
+        """Return the entry that `find` finds, and forget it."""
+        found = self.find(stream, stamp)
+        if found is not None:
+            self._streams[stream].remove(found)
+        return found
+
+    def newest_pair(self, stream: str, other: str) -> tuple[Stamped, Stamped] | None:
+        """Return the newest entry of a stream that has one of another stream, with that one."""
+        for entry in reversed(self._streams[stream]):
+            found = self.find(other, entry.stamp)
+            if found is not None:
+                return entry, found
+        return None
+
+
+def find_nearest(times: NDArray[np.int64], stamps: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return for each of the stamps (n,) the index of the nearest of times (m,) in any order, the earlier of equals."""
+    order = np.argsort(times, kind="stable")
+    rising = times[order]
+    after = np.clip(np.searchsorted(rising, stamps), 0, len(rising) - 1)
+    before = np.maximum(after - 1, 0)
+    return order[np.where(stamps - rising[before] <= rising[after] - stamps, before, after)]

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.errors import FinforceError
-from finforce.stamps import SECOND
+from finforce.messages import SECOND
 from finforce_contact.estimator import ContactEstimate, ContactEstimator
 from finforce_contact.mesh.object_mesh import ObjectMesh
 from finforce_ifea.estimator import JawEstimator

@@ -13,11 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 
-from finforce.health import IDLE, Health, Level, Outcome, Report, Skips
-from finforce.messages import stamp_of
+from finforce.health import IDLE, Health, Idling, Level, Outcome, Report, Skips, StampGate
+from finforce.messages import SECOND, stamp_of
 from finforce.ros import node as ros
 from finforce.settings import refresh_record
-from finforce.stamps import SECOND, Idling, StampGate
 from finforce.transforms import pose_numbers
 from finforce_contact.estimator import ContactEstimate
 from finforce_contact.localization.touch import Slip

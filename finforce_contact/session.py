@@ -14,8 +14,16 @@ from numpy.typing import NDArray
 from finforce.camera import ImageError
 from finforce.errors import FinforceError, MissingDependencyError, ObservationError
 from finforce.health import Skips
-from finforce.messages import check_cloud, decode_keypoints, pose_from_message, stamp_of, wrench_from_message
-from finforce.stamps import SECOND, Stamped, Synchronizer
+from finforce.messages import (
+    SECOND,
+    Stamped,
+    Synchronizer,
+    check_cloud,
+    decode_keypoints,
+    pose_from_message,
+    stamp_of,
+    wrench_from_message,
+)
 from finforce.transforms import invert_pose
 from finforce_contact.errors import ReconstructionError
 from finforce_contact.estimator import ContactEstimator

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from finforce.health import Health, Level, Outcome, Report
-from finforce.stamps import NANOSECONDS, StampError, StampGate
+from finforce.health import Health, Level, Outcome, Report, StampError, StampGate
+from finforce.messages import NANOSECONDS
 from finforce_driver.errors import TargetError
 from finforce_driver.gripper import Clock
 from finforce_driver.settings import GraspGoal

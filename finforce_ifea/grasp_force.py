@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.gripper_frames import SIDES, jaw_in_gripper
-from finforce.stamps import SECOND, Synchronizer
+from finforce.messages import SECOND, Synchronizer
 
 Side = Literal["left", "right"]
 

@@ -15,11 +15,10 @@ from geometry_msgs.msg import PoseStamped, Vector3Stamped, WrenchStamped
 from sensor_msgs.msg import PointCloud2
 
 from finforce.gripper_frames import SIDES
-from finforce.health import IDLE, Health, Level, Outcome, Report, Skips
+from finforce.health import IDLE, Health, Idling, Level, Outcome, Report, Skips, StampGate
 from finforce.messages import pose_from_message, stamp_of, wrench_from_message
 from finforce.ros import node as ros
 from finforce.ros.messages import points_marker
-from finforce.stamps import Idling, StampGate
 from finforce_ifea.grasp_force import ForcePairing, Grasp, Wrench, single_jaw_grasp
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.messages import (

@@ -11,8 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.camera import CameraIntrinsics, ImageError
-from finforce.messages import camera_from_info, check_frame, color_from_image, depth_from_image, same_camera, stamp_of
-from finforce.stamps import SECOND, Stamped, Synchronizer
+from finforce.messages import (
+    SECOND,
+    Stamped,
+    Synchronizer,
+    camera_from_info,
+    check_frame,
+    color_from_image,
+    depth_from_image,
+    same_camera,
+    stamp_of,
+)
 from finforce_keypoints.errors import BlackImageError, EmptyDepthError, FrozenImageError, SyncError
 from finforce_keypoints.parameters import ALIGNED, AUTO, NO_DEPTH, DetectorParameters
 

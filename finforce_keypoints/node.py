@@ -15,10 +15,10 @@ from rcl_interfaces.msg import ParameterDescriptor
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from finforce.errors import FinforceError
-from finforce.health import IDLE, STILL, UNHEARD, Health, Outcome, Report, Skips
+from finforce.health import IDLE, STILL, UNHEARD, Health, Idling, Outcome, Report, Skips, StampGate
+from finforce.messages import Stamped
 from finforce.processors import bind_caller
 from finforce.ros import node as ros
-from finforce.stamps import Idling, Stamped, StampGate
 from finforce.transforms import pose_numbers
 from finforce_keypoints.build import build_detector
 from finforce_keypoints.detectors.dots import DotSettings

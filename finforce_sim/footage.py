@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from finforce.camera import CameraIntrinsics
 from finforce.gripper_frames import BENCH_CAMERA, FRONT_CAMERA, HALF_TURN, ROBOT_CAMERA
-from finforce.stamps import NANOSECONDS
+from finforce.messages import NANOSECONDS
 from finforce.transforms import invert_pose
 from finforce_sim.gripper import FINGER, TwinGripper
 from finforce_sim.mechanics import Assembly

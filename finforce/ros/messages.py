@@ -19,8 +19,15 @@ from visualization_msgs.msg import Marker
 
 from finforce.errors import ObservationError
 from finforce.health import Report
-from finforce.messages import CloudColumns, check_cloud, check_frame, decode_columns, encode_cloud, magnitude_stddev
-from finforce.stamps import NANOSECONDS
+from finforce.messages import (
+    NANOSECONDS,
+    CloudColumns,
+    check_cloud,
+    check_frame,
+    decode_columns,
+    encode_cloud,
+    magnitude_stddev,
+)
 
 MARKERS = {"triangles": Marker.TRIANGLE_LIST, "spheres": Marker.SPHERE_LIST, "arrow": Marker.ARROW}
 

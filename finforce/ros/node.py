@@ -37,6 +37,7 @@ from visualization_msgs.msg import MarkerArray  # noqa: F401 - for those who pub
 from finforce.caches import is_compiled
 from finforce.errors import FinforceError
 from finforce.health import Health, Level, Outcome, Report
+from finforce.messages import NANOSECONDS
 from finforce.processors import free_caller
 from finforce.ros.messages import (  # noqa: F401 - for those who publish
     cloud_message,
@@ -70,7 +71,6 @@ from finforce.ros.topics import (  # noqa: F401 - for those with topics
 from finforce.ros.tracing import write_trace
 from finforce.ros.transport import CHOICES, PROFILES, TRANSPORT, provide_transport  # noqa: F401 - for tests
 from finforce.settings import ParameterError, RecordT, bounds_of, check_value, constraints, describe, is_parameter
-from finforce.stamps import NANOSECONDS
 
 _POLL_PERIOD = 0.1  # [s] of asking whether a node that is being built is still wanted
 STEADY_CLOCK = Clock(clock_type=ClockType.STEADY_TIME)

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from finforce.camera import CameraIntrinsics, ImageError
 from finforce.errors import PoseError
 from finforce.messages import (
+    SECOND,
+    Synchronizer,
     camera_from_info,
     depth_from_image,
     mask_from_image,
@@ -20,7 +22,6 @@ from finforce.messages import (
     same_camera,
     stamp_of,
 )
-from finforce.stamps import SECOND, Synchronizer
 from finforce_contact.mesh.object_mesh import ObjectMesh
 from finforce_contact.parameters import ORIGINS, ContactParameters, TrackerSettings
 from finforce_contact.pose.alignment import DepthImage

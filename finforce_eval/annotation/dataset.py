@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from finforce.camera import MILLIMETRE, CameraIntrinsics, ImageError, decode_picture
 from finforce.errors import one_line
 from finforce.files import FileError, parse_json, read_json, read_text
+from finforce.messages import NANOSECONDS
 from finforce.optional import import_library
-from finforce.stamps import NANOSECONDS
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.recordings.images import StampedImage
 from finforce_keypoints.images import RgbdImage, check_image

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from finforce.errors import PoseError
-from finforce.stamps import SECOND, Idling
+from finforce.health import Idling
+from finforce.messages import SECOND
 from finforce_contact.loop import ContactLoop, ContactSource, GivenContact
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.scoring import ONSET_FORCE

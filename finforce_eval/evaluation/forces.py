@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.errors import ObservationError
-from finforce.stamps import Idling
+from finforce.health import Idling
 from finforce_contact.loop import ContactSource, ForceLoop
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.gripper import with_distances

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from finforce.camera import ImageError
 from finforce.errors import FinforceError
-from finforce.stamps import NANOSECONDS, Idling
+from finforce.health import Idling
+from finforce.messages import NANOSECONDS
 from finforce.transforms import quaternion_from_pose
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.recordings.images import DEPTH_ENDS, PAIRED, ImageTrack

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce.messages import NANOSECONDS
 from finforce.optional import import_cv2, import_library
-from finforce.stamps import NANOSECONDS
 from finforce_eval.evaluation.forces import Estimator
 from finforce_eval.recordings.tracks import JawTrack, Recording
 from finforce_eval.table import ForceSeries

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 from finforce.errors import FinforceError, MissingDependencyError, one_line
 from finforce.files import BUDGET, FileError, parse_yaml, raise_budget, read_text
+from finforce.messages import NANOSECONDS
 from finforce.sandbox import SandboxError, limit_growth, run_limited
-from finforce.stamps import NANOSECONDS
 from finforce_eval.errors import DamagedError, OutOfBoundsError, RecordingError
 
 # Of a type that was recorded without its definition nothing is known but its name.

@@ -21,8 +21,7 @@ from finforce.camera import (
     open_picture,
 )
 from finforce.errors import ObservationError
-from finforce.messages import camera_from_info, color_from_image, layout_of, read_stamp, same_camera
-from finforce.stamps import find_nearest
+from finforce.messages import camera_from_info, color_from_image, find_nearest, layout_of, read_stamp, same_camera
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.bags import BagReader, check_types, open_bag
 from finforce_keypoints.images import RgbdImage, check_image

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from finforce.errors import PoseError
-from finforce.stamps import SECOND, find_nearest
+from finforce.messages import SECOND, find_nearest
 from finforce.transforms import invert_pose, pose_from_quaternion
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.tracks import PoseTrack, Recording

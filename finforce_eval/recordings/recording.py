@@ -10,8 +10,7 @@ import numpy as np
 
 from finforce.errors import ObservationError
 from finforce.files import FileError, read_json
-from finforce.messages import Keypoints, decode_columns, decode_keypoints, stamp_of
-from finforce.stamps import NANOSECONDS
+from finforce.messages import NANOSECONDS, Keypoints, decode_columns, decode_keypoints, stamp_of
 from finforce_eval.errors import DamagedError, RecordingError
 from finforce_eval.recordings.bags import bag_source, check_messages, check_types, open_bag
 from finforce_eval.recordings.images import PAIRED, ImageTrack, find_images

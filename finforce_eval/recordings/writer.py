@@ -10,8 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from finforce.messages import STDDEV_COLUMNS, encode_cloud
-from finforce.stamps import NANOSECONDS
+from finforce.messages import NANOSECONDS, STDDEV_COLUMNS, encode_cloud
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.recording import CLOUD, POSE, STRING, WRENCH
 from finforce_eval.recordings.tracks import KeypointTrack, PhaseTrack, PoseTrack, Recording, WrenchTrack

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce.messages import decode_columns, decode_keypoints, pose_from_message, stamp_of
-from finforce.stamps import NANOSECONDS
+from finforce.messages import NANOSECONDS, decode_columns, decode_keypoints, pose_from_message, stamp_of
 from finforce_eval.evaluation.forces import sight_columns, truth_columns
 from finforce_eval.evaluation.keypoint_source import with_detections
 from finforce_eval.evaluation.pressure_centre import InnerSurface, true_lines

@@ -25,7 +25,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from finforce.health import IDLE
-from finforce.stamps import NANOSECONDS
+from finforce.messages import NANOSECONDS
 from finforce.systems.processes import Process, ReplayOptions, compose, replay_processes
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.keypoint_source import KeypointSource

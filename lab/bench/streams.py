@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from finforce.stamps import NANOSECONDS
+from finforce.messages import NANOSECONDS
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.keypoint_source import TRUTH, KeypointSource
 from finforce_eval.recordings.recording import read_recording

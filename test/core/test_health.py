@@ -3,8 +3,7 @@
 import pytest
 
 from finforce.errors import ObservationError
-from finforce.health import Health, Level, Outcome
-from finforce.stamps import StaleError, StampError, StampGate
+from finforce.health import Health, Level, Outcome, StaleError, StampError, StampGate
 
 SECOND = 1_000_000_000
 GOOD = Outcome(level=Level.OK, reason="ok", text="ok")

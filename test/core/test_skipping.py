@@ -9,8 +9,7 @@ import pytest
 from contact_fakes import JAW, cylinder
 from estimator_fakes import BENCH, CALIBRATION, PERIOD, magnitudes, ramp, record
 
-from finforce.health import ALL, IDLE, RULES, STILL, SkippingError, Skips
-from finforce.stamps import Idling
+from finforce.health import ALL, IDLE, RULES, STILL, Idling, SkippingError, Skips
 from finforce_contact.estimator import ContactEstimator
 from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.observation import Contact, ObjectOutline

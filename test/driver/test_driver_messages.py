@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import pytest
 from driver_node_fakes import READY, FakeGripper
 
-from finforce.health import Level
+from finforce.health import Level, StampError
+from finforce.messages import NANOSECONDS
 from finforce.settings import ParameterError
-from finforce.stamps import NANOSECONDS, StampError
 from finforce_driver.errors import TargetError
 from finforce_driver.grasp.session import GraspSession
 from finforce_driver.messages import (

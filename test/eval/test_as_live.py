@@ -10,9 +10,8 @@ from keypoint_node_fakes import CameraBench
 from node_fakes import KEYPOINTS, FakeEstimator, keypoint_cloud, start_solver
 from rgbd_fakes import FakeDetector, make_footage
 
-from finforce.health import IDLE
+from finforce.health import IDLE, Idling
 from finforce.messages import stamp_of
-from finforce.stamps import Idling
 from finforce_contact.loop import GivenContact
 from finforce_eval.cli.main import parse
 from finforce_eval.cli.twin import write_footage

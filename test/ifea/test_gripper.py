@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from finforce.gripper_frames import ROBOT_CAMERA, jaw_in_gripper
-from finforce.stamps import NANOSECONDS
+from finforce.messages import NANOSECONDS
 from finforce_ifea.grasp_force import (
     R_GRIPPER_JAW,
     ForcePairing,

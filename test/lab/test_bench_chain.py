@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from finforce.stamps import NANOSECONDS
+from finforce.messages import NANOSECONDS
 from finforce_eval.errors import OptionError
 from finforce_eval.replay.live import ReplayLog
 from finforce_eval.replay.node_run import NodeRun
