@@ -5,11 +5,11 @@ from functools import lru_cache
 
 import manifold3d
 import numpy as np
+from chamfer_fakes import compute_chamfer
 from guess_fakes import GuessError, draw_guess, place_mesh
 from scipy.spatial.transform import Rotation
 
 from finforce_contact.mesh.object_mesh import ObjectMesh, prepare_object_mesh
-from finforce_contact.mesh.views import compute_chamfer
 from finforce_contact.reconstruction.evidence import collect_evidence
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_sim.objects import build_object

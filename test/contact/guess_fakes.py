@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from chamfer_fakes import compute_chamfer
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from finforce_contact.mesh.object_mesh import ObjectMesh
-from finforce_contact.mesh.views import compute_chamfer
 from finforce_contact.reconstruction.evidence import GeneratedMesh
 from lab.table_scenes import TableScene
 

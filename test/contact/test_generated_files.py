@@ -6,13 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from chamfer_fakes import compute_chamfer
 from guess_fakes import place_mesh
 from scipy.spatial.transform import Rotation
 
 from finforce.transforms import pose_from_quaternion
 from finforce_contact.errors import ObjectMeshError
 from finforce_contact.mesh.object_mesh import ObjectMesh
-from finforce_contact.mesh.views import compute_chamfer, sample_surface
+from finforce_contact.mesh.views import sample_surface
 from finforce_contact.reconstruction.evidence import GeneratedMesh
 from finforce_contact.reconstruction.generated import CAMERA_FROM_PYTORCH3D, CANONICAL_FROM_GLB, read_generated
 from finforce_eval.recordings.image_files import read_generated_pose

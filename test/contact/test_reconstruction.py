@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from chamfer_fakes import compute_chamfer
 from contact_fakes import bare_mesh, distance_mm, make_case
 from guess_fakes import place_mesh
 from scipy.spatial.transform import Rotation
@@ -9,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from finforce.camera import ImageError, deproject
 from finforce.errors import PoseError
 from finforce_contact.errors import ReconstructionError
-from finforce_contact.mesh.views import MeshView, compute_chamfer
+from finforce_contact.mesh.views import MeshView
 from finforce_contact.reconstruction import generated
 from finforce_contact.reconstruction.evidence import (
     GeneratedMesh,
