@@ -203,7 +203,7 @@ class IfeaSolverNode(ros.ImageNode):
         settings = ros.declare_record(self, EstimatorSettings, "estimator")
         settings = settings.resolve_held(both=parameters.paired or bool(parameters.peer))
         ros.name_unknown_parameters(self)
-        self.skips = Skips(parameters.skip_off)
+        self.skips, self.frame = Skips(parameters.skip_off), parameters.frame
         jaw = load_jaw(parameters.jaw_file, parameters.jaw_name)
         self.contacts = build_contact_feed(jaw, parameters)
         self.gravity = GravityFeed(parameters) if settings.may_be_held else None
@@ -284,7 +284,7 @@ class IfeaSolverNode(ros.ImageNode):
         header, stamp = cloud.header, stamp_of(cloud)
         with self.rejections():
             gravity = self.gravity.at(stamp) if self.gravity is not None else None
-            observation = observation_from_cloud(cloud, self.parameters.frame, gravity)
+            observation = observation_from_cloud(cloud, self.frame, gravity)
             if self.gate.enter(stamp, self.now()):
                 self._restart("the stamps went back: a new recording")
             self.last = solution = self.estimator.update(observation, self.contacts.at(stamp))
