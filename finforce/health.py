@@ -140,12 +140,15 @@ class Health:
 
     Attributes:
         source: the topic that drives the node.
+        times: what latency and age of a message are called.
 
     Args:
         source: the same, as far as it is known at the start.
         stale_after: silence after which the node is stale [s].
         window: number of messages that rates and latencies are taken over.
     """
+
+    times = ("callback to published", "image to published")
 
     def __init__(self, *, source: str, stale_after: float, window: int = 512) -> None:
         self.source = source
@@ -211,12 +214,13 @@ class Health:
         """Return rate, latencies and counts as text."""
         times = [time for time in self._arrivals if monotonic() - time < 5.0]
         rate = (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else 0.0
+        latency, age = self.times
         return {
             "rate [Hz]": f"{rate:.1f}",
-            "callback to published p50 [ms]": _percentile(self._latency, 50),
-            "callback to published p95 [ms]": _percentile(self._latency, 95),
-            "image to published p50 [ms]": _percentile(self._age, 50),
-            "image to published p95 [ms]": _percentile(self._age, 95),
+            f"{latency} p50 [ms]": _percentile(self._latency, 50),
+            f"{latency} p95 [ms]": _percentile(self._latency, 95),
+            f"{age} p50 [ms]": _percentile(self._age, 50),
+            f"{age} p95 [ms]": _percentile(self._age, 95),
             "arrived": str(self._arrived),
             "published": str(self._published),
             "refused": _counts(self._refused),

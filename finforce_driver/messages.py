@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from finforce.health import Health, Level, Outcome, Report, StampError, StampGate
+from finforce.health import Health, Level, Outcome, StampError, StampGate
 from finforce.messages import NANOSECONDS
 from finforce_driver.errors import TargetError
 from finforce_driver.gripper import Clock
@@ -184,6 +184,8 @@ class GripperHealth(Health):
         options: of `finforce.health.Health`.
     """
 
+    times = ("request to reply", "reply to published")
+
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         self._reported: dict[str, str] = {}
@@ -207,15 +209,6 @@ class GripperHealth(Health):
             self.publish(outcome, latency=latency, age=now - state.stamp)
         else:
             self.refuse(outcome)
-
-    def report(self, alarms: Sequence[Outcome] = (), values: Mapping[str, str] | None = None) -> Report:
-        """Return the state now, with the times of a driver by their own names."""
-        report = super().report(alarms, values)
-        names = {
-            name: name.replace("callback to published", "request to reply").replace("image to", "reply to")
-            for name in report.values
-        }
-        return replace(report, values={names[name]: value for name, value in report.values.items()})
 
 
 def outcome_of_state(state: GripperState) -> Outcome:

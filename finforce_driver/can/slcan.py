@@ -58,8 +58,8 @@ class SlcanParser:
     Attributes:
         unexplained: bytes since the last message that belong to no message, acknowledgement or refusal.
         refused: refusals since the last message.
-        counts: lines that came: `messages`; `acknowledgements`; `bells` (refusals); `garbage` (no message, to the
-            letter); `overlong` (no end within 64 bytes); `extended` (29-bit identifiers).
+        counts: lines that came: `messages`; `acknowledgements`; `bells` (refusals); `garbage` (no message
+            exactly); `overlong` (no end within 64 bytes); `extended` (29-bit identifiers).
     """
 
     def __init__(self) -> None:
@@ -142,7 +142,7 @@ class SerialBus(Bus):
     def _connect(self) -> Any:
         port = open_port(self._name, self._baud_rate)
         try:
-            # the empty line ends what an earlier program left half written: no move may come of it and a letter of ours
+            # the empty line ends what an earlier program left half written: no move may come of it and what we send
             write_all(port, END + b"C" + END)
             sleep(_SETTLE)
             port.reset_input_buffer()

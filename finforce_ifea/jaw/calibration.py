@@ -30,7 +30,7 @@ Terms = Annotated[tuple[RelaxationTerm, ...], BeforeValidator(_none_is_empty)]
 
 
 class Calibration(FileModel):
-    """A printed finger as it is, beside its drawing."""
+    """A printed finger as it is, in place of as drawn."""
 
     young_modulus: Number = Field(ge=1e3, le=1e12, description="Young's modulus [Pa]")
     inner_thickness_factor: Factor = Field(1.0, description="Effective over drawn thickness of the inner band [-]")

@@ -174,10 +174,10 @@ class Drawing:
 
     def distance_to(self, points: NDArray) -> NDArray:
         """Compute the distances (n,) [m] of points (n, 3) [m, jaw frame] from the finger, 0 inside."""
-        beside = np.maximum(np.abs(points[:, 1]) - 0.5 * self.width, 0.0)
+        lateral = np.maximum(np.abs(points[:, 1]) - 0.5 * self.width, 0.0)
         parts = shapely.polygons(self.outlines())
         in_plane = shapely.distance(parts, shapely.points(points[:, [0, 2]])[:, None])
-        return np.hypot(beside, in_plane.min(axis=1))
+        return np.hypot(lateral, in_plane.min(axis=1))
 
 
 def _quadrilateral(x_first: NDArray, x_second: NDArray, z: NDArray) -> NDArray:
@@ -229,7 +229,7 @@ def _check_bands(drawing: Drawing) -> None:
 
 
 def _check_ribs(drawing: Drawing) -> None:
-    """Refuse ribs that overlap on a band, or leave the room between the clamped part and the tip."""
+    """Refuse ribs that overlap on a band, or do not lie between the clamped part and the tip."""
     if drawing.bars == "elastic" and any(not rib.thickness > 0 for rib in drawing.ribs):
         raise JawFileError("drawing.ribs.thickness: got 0 or less, expected a positive length in metres")
     end = drawing.tip_z if drawing.tip_z is not None else drawing.length
@@ -407,7 +407,7 @@ class _Section:
         return grid
 
     def bridge(self, start: NDArray, end: NDArray, count: int) -> None:
-        """Fill the room between two columns of existing points with `count` cells per row."""
+        """Fill the gap between two columns of existing points with `count` cells per row."""
         share = np.linspace(0.0, 1.0, count + 1)[1:-1, None]
         between = self.points[start][:, None] * (1.0 - share) + self.points[end][:, None] * share
         self.add_quads(np.concatenate([start[:, None], self.add_points(between), end[:, None]], axis=1))

@@ -14,7 +14,7 @@ from finforce_ifea.errors import MeshError
 from finforce_ifea.jaw.mesh import EDGES_TET10, VolumeMesh, build_volume_mesh, check_connection
 
 _VOLUME_CELLS = ("tetra", "tetra10", "hexahedron")
-# Cells of fewer dimensions that mesh generators write beside the volume.
+# Cells of fewer dimensions that mesh generators write next to the volume.
 _OTHER_CELLS = ("vertex", "line", "line3", "triangle", "triangle6", "quad", "quad8", "quad9")
 
 

@@ -88,9 +88,9 @@ class Section:
 
     def distance_to(self, points: NDArray) -> NDArray:
         """Compute the distances (n,) [m] of points (n, 3) [m, jaw frame] from the finger, 0 inside."""
-        beside = np.maximum(np.abs(points[:, 1]) - 0.5 * self.read_width(points[:, [0, 2]]), 0.0)
+        lateral = np.maximum(np.abs(points[:, 1]) - 0.5 * self.read_width(points[:, [0, 2]]), 0.0)
         in_plane = shapely.distance(self.polygon, shapely.points(points[:, [0, 2]]))
-        return np.hypot(beside, in_plane)
+        return np.hypot(lateral, in_plane)
 
 
 def find_reach(polygon: shapely.Polygon, z: NDArray) -> NDArray:

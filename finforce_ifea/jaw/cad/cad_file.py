@@ -277,7 +277,7 @@ def _join_lines(lines: list[NDArray]) -> shapely.Polygon:
     """Return the polygon that lines (n, 2) [m], open or closed, bound together.
 
     Raises:
-        JawFileError: They bound none, or several that lie beside each other.
+        JawFileError: They bound none, or several separate ones.
     """
     grid = [np.round(np.asarray(line, float) / _GRID) * _GRID for line in lines]
     strings = [shapely.LineString(line) for line in grid if np.ptp(line, axis=0).max() > 0.0]
@@ -285,10 +285,10 @@ def _join_lines(lines: list[NDArray]) -> shapely.Polygon:
     if not areas:
         raise JawFileError(f"{len(lines)} lines bound no area, expected closed loops: an outline and its holes")
     whole = areas[0]
-    beside = [area for area in areas[1:] if not shapely.Polygon(whole.exterior).covers(area.representative_point())]
-    islands = [area for area in areas[1:] if area not in beside and whole.covers(area.representative_point())]
-    if beside or islands:
-        raise JawFileError(f"its section has {1 + len(beside) + len(islands)} separate areas, expected one finger")
+    outside = [area for area in areas[1:] if not shapely.Polygon(whole.exterior).covers(area.representative_point())]
+    islands = [area for area in areas[1:] if area not in outside and whole.covers(area.representative_point())]
+    if outside or islands:
+        raise JawFileError(f"its section has {1 + len(outside) + len(islands)} separate areas, expected one finger")
     return whole
 
 

@@ -43,14 +43,14 @@ def make_jaw(
 
     Args:
         file: the finger, see `read_section`.
-        output: the YAML file; its section goes beside it.
+        output: the YAML file; its section goes next to it.
         name: of the finger.
         material: a name in `MATERIALS`.
         unit: of the file; None to guess it.
         body: which one of several bodies, from 1.
         width: along y [m]; needed for drawings.
         overrides: what is stated in place of the guesses.
-        picture: the PNG file; None for one beside the jaw file.
+        picture: the PNG file; None for one next to the jaw file.
 
     Raises:
         JawFileError: The file shows no fin-ray finger; the message says what it shows and what to do.

@@ -223,11 +223,11 @@ def _turn_upright(
     side = np.array([-direction[1], direction[0]])
     ring = _sample_ring(np.array(polygon.exterior.coords)[:-1])
     low, high = np.sort(np.concatenate([cell @ direction for cell in cells]))[[0, -1]]
-    beside = ring @ direction
+    along = ring @ direction
     height = middles @ direction
     order = np.argsort(height)
-    chain = np.interp(beside, height[order], (middles @ side)[order])
-    within = (beside > low + 0.05 * (high - low)) & (beside < high - 0.05 * (high - low))
+    chain = np.interp(along, height[order], (middles @ side)[order])
+    within = (along > low + 0.05 * (high - low)) & (along < high - 0.05 * (high - low))
     faces = []
     for sign in (1.0, -1.0):
         points = ring[within & (sign * (ring @ side - chain) > 0.0)]
@@ -433,9 +433,9 @@ def _string_up(found: NDArray, name: str) -> Wall:
         JawFileError: There are too few.
     """
     if len(found) < _FEWEST:
-        raise JawFileError(f"beside its cells no {name} band could be measured")
+        raise JawFileError(f"next to its cells no {name} band could be measured")
     found = found[np.argsort(found[:, 1])]
-    # rays through knobs, lugs and the ends of ribs are longer than those beside them
+    # rays through knobs, lugs and the ends of ribs are longer than their neighbours
     near = [found[np.abs(found[:, 1] - z) < _NEIGHBOURS, 2] for z in found[:, 1]]
     found = found[found[:, 2] <= _LONGER * np.array([np.percentile(ways, 25) for ways in near])]
     return _thin_out(found)
