@@ -53,12 +53,10 @@ class Check:
     Attributes:
         findings: line by line.
         picture: (h, w, 3) uint8, the mean image with what was expected (grey) and what was found.
-        extrinsics: where the camera is by the jaws at rest; None where they were not found.
     """
 
     findings: Sequence[Finding]
     picture: NDArray
-    extrinsics: Extrinsics | None = None
 
 
 def check_recording(
@@ -91,8 +89,7 @@ def check_recording(
     findings += _judge_pose(found, look, recording, parameters.camera_pose)
     if found.residual > GOOD_RESIDUAL:
         findings += _find_reasons(mean, source, recording, parameters.camera_pose)
-    picture = _draw(mean, jaws, parameters.camera_pose, found, look)
-    return Check(findings=findings, picture=picture, extrinsics=found)
+    return Check(findings=findings, picture=_draw(mean, jaws, parameters.camera_pose, found, look))
 
 
 def judge_picture(color: NDArray) -> list[Finding]:
