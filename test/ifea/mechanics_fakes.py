@@ -24,8 +24,9 @@ MODULUS, RATIO = 30e6, 0.45
 
 
 def build_jaw(modulus=MODULUS, ratio=RATIO):
-    """The bench jaw of a material, Young's modulus [Pa] and Poisson's ratio."""
-    return replace(SHIPPED_BENCH, material=Material(young_modulus=modulus, poisson_ratio=ratio))
+    """The bench jaw of a material, Young's modulus [Pa] and Poisson's ratio, softer than a jaw file may have it."""
+    material = SHIPPED_BENCH.material.model_copy(update={"young_modulus": modulus, "poisson_ratio": ratio})
+    return replace(SHIPPED_BENCH, material=material)
 
 
 def compute_volume(mesh) -> float:
