@@ -28,6 +28,7 @@ from finforce_ifea.observation import (
 from finforce_ifea.relaxation import Relaxation
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tare import TareKeeper
+from finforce_ifea.tracking.camera_motion import CameraWatch
 from finforce_ifea.tracking.contact_state import UNSEEN_ALONG, ContactState, compute_force, find_rejection_reason
 from finforce_ifea.tracking.contact_tracker import ContactTracker
 from finforce_ifea.tracking.friction import SMOOTH, Coefficient
@@ -37,6 +38,7 @@ from finforce_ifea.tracking.lateral_load import measure_torsion
 
 _LONGEST_GAP = 1.0
 _TOLERANCE = 1e-3
+_FROZEN = "the key points are those of the image before to the last bit: is the camera frozen?"
 _UNTARED = "no tare: the jaw was loaded from the start; key point offsets are unknown"
 # Relative standard deviation of forces without a calibration, at least: a material known by name has its own.
 _UNCALIBRATED = 0.1
@@ -76,7 +78,8 @@ class JawEstimator:
         self.mechanics: Mechanics = build_chosen(self.jaw, self.settings)
         torsion = measure_torsion(self.jaw, self.mechanics.mesh)
         smooth = Coefficient(calibration.friction, calibration.friction_stddev) if calibration else SMOOTH
-        self._tracked = ContactTracker(self.mechanics, self.jaw.keypoints, self.settings, torsion, smooth)
+        reach = self.jaw.contact_range
+        self._tracked = ContactTracker(self.mechanics, self.jaw.keypoints, self.settings, torsion, smooth, reach)
         self._given = GivenContactTracker(self.jaw, self.mechanics, self.settings, self._tracked.response)
         self._tracker: ContactTracker | GivenContactTracker = self._tracked
         self._gate = KeypointGate(self.jaw, self.settings)
@@ -88,16 +91,20 @@ class JawEstimator:
         self._taring = TareKeeper(
             self.jaw.keypoints, self.settings, lambda *chance: self._tracker.significance(*chance)
         )
+        self._camera = CameraWatch(self.jaw.keypoints)
         self._reach = ReachWatch(self.jaw.keypoints, self.jaw.inner_face_x, self._tracked.rest_modes)
         self.reset()
 
     def reset(self) -> None:
         """Forget everything but the jaw: offsets, place, relaxation, stamps."""
         self._stamp: float | None = None
+        self._followed: float | None = None  # stamp of the last image that a tracker took
+        self._seen = np.zeros(0)
         self._contact: Contact | None = None
         self._at_rest = self.is_idle = False
         self._relaxed: float | None = None
         self._taring.reset()
+        self._camera.reset()
         self._gate.reset()
         self._reach.reset()
         self._relaxation.reset()
@@ -151,17 +158,18 @@ class JawEstimator:
             contact: where the object touches; None or no rows when there is no object.
 
         Raises:
-            ObservationError: Key points of wrong shape, infinite, or stamps that do not rise.
+            ObservationError: Key points of wrong shape, infinite, or stamps that do not rise by a camera's period.
             ContactError: The contact is not on the jaw.
         """
         self.learn()
         check_observation(observation, len(self.jaw.keypoints), self._stamp)
-        dt = 0.0 if self._stamp is None else observation.stamp - self._stamp
         if contact is not None and contact is not self._contact:
             check_contact(contact, self.jaw)
             self._follow(contact)
         self._contact = contact
         self._stamp = observation.stamp
+        if self._is_frozen(observation.points):
+            return self._fail("unobservable", _FROZEN, np.zeros(len(self.jaw.keypoints), bool))
         points = self._gate.accept(observation)
         self._taring.add(points, observation.stddev, apart=contact is not None and contact.touching is False)
         used, self.is_idle = np.isfinite(points[:, 0]), False
@@ -172,15 +180,21 @@ class JawEstimator:
         waiting = self._await_tare()
         if waiting:
             return self._fail("waiting", waiting, used)
+        moved = self._find_camera_motion(points, observation.stddev, contact)
+        if moved:
+            return self._fail("unobservable", moved, used)
         if contact is None or not len(contact.points):
             return self._without_contact(points, used)
         self.is_idle = self.tared and self._reach.is_idle(contact, points, self._taring.tare)
         if self.is_idle:
             return self._rest("the object is out of reach, the jaw is at rest", points)
+        beyond = self._find_beyond(contact)
+        if beyond:
+            return self._fail("unobservable", beyond, used)
+        dt = 0.0 if self._followed is None else min(self._stamp - self._followed, _LONGEST_GAP)
+        self._followed = self._stamp
         try:
-            state = self._tracker.update(
-                points, self._taring.tare, min(dt, _LONGEST_GAP), observation.stddev, observation.gravity
-            )
+            state = self._tracker.update(points, self._taring.tare, dt, observation.stddev, observation.gravity)
         except UnobservableError as error:
             return self._fail("unobservable", str(error), used)
         return self._conclude(state, used)
@@ -196,7 +210,35 @@ class JawEstimator:
             NotEnoughDataError: Too few unloaded frames or visible key points.
             UnderLoadError: The jaw is, or looks, loaded.
         """
-        return self._taring.take()
+        found = self._taring.take()
+        self._camera.reset()
+        return found
+
+    def _find_camera_motion(self, points: NDArray, stddev: NDArray | None, contact: Contact | None) -> str:
+        """Return what to say of a camera that has moved since the tare, empty where it has not.
+
+        Where the object is apart from the jaw, this is tared anew.
+        """
+        if not self.tared or self._tracker is not self._tracked:
+            return ""
+        covariance = self._taring.tare.read_covariance(stddev)
+        if not self._camera.update(points, covariance, self._tracked.read_motions()):
+            return ""
+        how = f"all key points have moved alike, by {1e3 * self._camera.motion:.1f} mm"
+        if contact is None or contact.touching is False:
+            self._taring.reset()
+            self._camera.reset()
+        return f"{how}: has the camera moved? Open the jaws, or tare again"
+
+    def _find_beyond(self, contact: Contact) -> str:
+        """Return what to say of a contact at heights where key points tell no force, empty for any other."""
+        low, high = self.jaw.contact_range
+        heights = contact.points[:, 2]
+        if contact.outline is not None or ((heights >= low) & (heights <= high)).all():
+            return ""
+        found = np.round(1e3 * heights, 1).tolist()
+        where = f"contact at heights {found} mm, expected {1e3 * low:g} to {1e3 * high:g} mm"
+        return f"{where}: beyond, key points tell no force"
 
     def _await_tare(self) -> str:
         """Return what is missing for the first tare, empty when it is done or not due."""
@@ -210,6 +252,13 @@ class JawEstimator:
         except NotEnoughDataError as error:
             return str(error)
         return ""
+
+    def _is_frozen(self, points: NDArray) -> bool:
+        """Whether an image shows the key points (K, 3) of the last one to the last bit, which scatter otherwise."""
+        seen, self._seen = self._seen, np.array(points, float)
+        if not self._taring.scatters or np.isnan(self._seen).all():
+            return False
+        return np.array_equal(seen, self._seen, equal_nan=True)
 
     def _follow(self, contact: Contact) -> None:
         """Hand a contact to the tracker that it is for."""
@@ -290,9 +339,8 @@ class JawEstimator:
     def _solution(self, state: ContactState, used: NDArray) -> Solution:
         """Return the force that belongs to a contact, and how good it is."""
         error = hypot(self._force_error, state["location_error"], _EXTRAPOLATED * state["extrapolation"])
-        sliding = 0.0 if self.settings.may_be_held else self.settings.friction
         vectors, dt = np.empty((7, 3)), self._pass_time()
-        magnitude, stddev = compute_force(state, self._relaxation.packed, dt, error, sliding, vectors)
+        magnitude, stddev = compute_force(state, self._relaxation.packed, dt, error, vectors)
         force, torque, force_stddev, torque_stddev, point, location, normal = vectors
         return Solution(
             stamp=self._stamp,

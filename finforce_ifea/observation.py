@@ -17,6 +17,8 @@ from finforce_ifea.jaw.jaw import Jaw
 
 TRUSTED = ("ok", "unloaded")
 _UNIT = 1e-3  # by which the length of a unit vector may be off
+# Images are at least so long apart [s]; what comes sooner is the same one, stamped again.
+_SHORTEST_PERIOD = 0.5e-3
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -63,9 +65,9 @@ class Contact:
         """Return the contact of an object that first touches at height z [m].
 
         Raises:
-            ContactError: The height is not on the jaw's inner surface.
+            ContactError: The height is not among those at which the jaw can be touched, see `Jaw.contact_range`.
         """
-        low, high = jaw.candidates[:, 2].min() - 0.01, jaw.candidates[:, 2].max() + 0.01
+        low, high = jaw.contact_range
         if not low <= z <= high:
             raise ContactError(
                 f"contact height {1e3 * z:g} mm, expected {1e3 * low:g} to {1e3 * high:g} mm on the jaw {jaw.name!r}"
@@ -148,7 +150,7 @@ def check_observation(observation: Observation, count: int, last_stamp: float | 
 
     Raises:
         ObservationError: Wrong shapes, infinite values, a likelihood outside [0, 1], a standard deviation that is none,
-            a direction of gravity of another length than 1, stamps not rising.
+            a direction of gravity of another length than 1, stamps that do not rise by a camera's period.
     """
     points, likelihood = np.asarray(observation.points, float), np.asarray(observation.likelihood, float)
     if points.shape != (count, 3) or likelihood.shape != (count,):
@@ -173,6 +175,11 @@ def check_observation(observation: Observation, count: int, last_stamp: float | 
         raise ObservationError(
             f"stamp {observation.stamp:.6f} s after {last_stamp:.6f} s, expected rising stamps; "
             "reset for a new recording"
+        )
+    if last_stamp is not None and observation.stamp < last_stamp + _SHORTEST_PERIOD:
+        raise ObservationError(
+            f"stamp {observation.stamp - last_stamp:.3g} s after the last, expected at least {_SHORTEST_PERIOD:g} s: "
+            "one image came twice"
         )
 
 

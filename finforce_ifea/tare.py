@@ -134,6 +134,8 @@ def _enlarge_noise(covariance, usual, stddev):
 _FARTHEST_OFFSET = 3e-3
 _FARTHEST_FROM_MEDIAN = 1.8e-3
 _NOISE_FLOOR = 0.02e-3
+# Scatter that is rounding, as a share of that floor's variance.
+_NOISELESS = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -180,11 +182,18 @@ class Tare:
         """
         return self._silent_noise if stddev is None else compute_point_noise(self._usual, stddev)
 
+    def read_covariance(self, stddev: NDArray | None) -> NDArray:
+        """Return the covariance of each key point (K, 3, 3) [m^2] in an image that states `stddev`, or nothing."""
+        if stddev is None:
+            return self._usual.covariance
+        growth = np.maximum(1.0, np.nan_to_num(stddev / self._usual.stddev, nan=1.0))
+        return growth[:, :, None] * self._usual.covariance * growth[:, None, :]
+
     @cached_property
     def _usual(self) -> StatedNoise:
         count = len(self.counts)
         pooled = np.broadcast_to(np.sqrt(np.diag(self.noise)), (count, 3))
-        return self.stated or StatedNoise(np.broadcast_to(self.noise, (count, 3, 3)), pooled)
+        return self.stated or StatedNoise(np.tile(self.noise, (count, 1, 1)), pooled)
 
     @cached_property
     def _silent_noise(self) -> PointNoise:
@@ -274,6 +283,11 @@ class TareKeeper:
     def tared(self) -> bool:
         """Whether the offsets are known."""
         return self.tare.is_taken
+
+    @property
+    def scatters(self) -> bool:
+        """Whether the tare has seen noise, as every camera has it."""
+        return self.tared and float(np.trace(self.tare.noise)) > 3.0 * (1.0 + _NOISELESS) * _NOISE_FLOOR**2
 
     @property
     def missing(self) -> int:

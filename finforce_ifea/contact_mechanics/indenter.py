@@ -434,6 +434,17 @@ class Indenter:
         """Return the least distance [m] of points (p, 3) [m] from the object in a state (3,), negative inside."""
         return float(measure_gap(self.pressed, pose_object(self.pressed, face_x, x), np.ascontiguousarray(points)))
 
+    def find_clearance(self, x: NDArray, low: float, high: float) -> float:
+        """Return the distance [m] from a plane undeformed surface between two heights [m], negative behind it.
+
+        It is infinite where the object is not at these heights, and for a cylinder, which is small and round.
+        """
+        if self.pressed.is_round:
+            return np.inf
+        c, s = np.cos(x[SHAPE]), np.sin(x[SHAPE])
+        least = _find_leading(self.pressed.segments, c, s, low - x[HEIGHT], high - x[HEIGHT])
+        return least + self.pressed.front - x[DEPTH] if least < _OUTSIDE else np.inf
+
     def find_touch(self, x: NDArray, face: FaceProfile) -> float:
         """Return the depth [m] of first touch with an undeformed surface, at the shape and height of a state (3,).
 

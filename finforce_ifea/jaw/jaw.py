@@ -102,6 +102,16 @@ class Jaw:
         return FaceLine.flat(self.inner_face_x) if self.section is None else find_face(self.section, self.inner_face_x)
 
     @cached_property
+    def contact_range(self) -> tuple[float, float]:
+        """Heights [m] at which an object may touch: half of the candidates' distance beyond the outermost of them.
+
+        Nearer to the clamp no key point shows a force, and at the tip the face ends.
+        """
+        heights = np.sort(self.candidates[:, 2])
+        half = 0.5 * float(np.diff(heights).max(initial=0.0))
+        return float(heights[0] - half), float(heights[-1] + half)
+
+    @cached_property
     def digest(self) -> str:
         """What the finger's shape is known by: 12 hexadecimal digits of its content, the same for both sides."""
         shape = self.drawing or self.section

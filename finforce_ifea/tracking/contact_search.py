@@ -54,6 +54,7 @@ class ContactSearch:
         state: of the contact in the last image in which it was found, see `CONTACT_STATE`.
         expectation: of the object, see `EXPECTATION`.
         q: unknowns of the jaw (size,).
+        positions: of the key points in the model (K, 3) [m].
     """
 
     def __init__(self, count: int, settings: EstimatorSettings) -> None:
@@ -65,6 +66,7 @@ class ContactSearch:
         self.average, self._extended = np.zeros(count, AVERAGE), np.zeros(count, AVERAGE)
         self.expectation = np.zeros((), EXPECTATION)
         self.expectation["gate"] = settings.gate
+        self.positions = np.zeros((count, 3))
 
     def begin(self, contact: RigidContact, mean: NDArray) -> None:
         """Begin with the undeformed jaw and an object of expected shape and height (2,) that just touches."""
@@ -113,7 +115,8 @@ class ContactSearch:
                 q = q + contact.approach(q, pressed.correction, x_model)
                 continue
             q = q + pressed.correction
-            positions, motions = model.positions(probe, q), model.project(probe, q, pressed.modes)
+            self.positions = positions = model.positions(probe, q)
+            motions = model.project(probe, q, pressed.modes)
             weigh_keypoints(self.points, positions, motions, x, x_model, forecast, expectation, found)
             if found["used"] < max(self.settings.minimum_keypoints, _LEAST_AGREEMENT * found["known"]):
                 # towards the median depth that the points ask for, which disagree with the forecast

@@ -33,6 +33,7 @@ CONTACT_STATE = np.dtype(
         ("traction_ratio", float),  # of tangential to normal force, with which the state was found
         ("magnitude", float),  # of the force [N]
         ("stddev", float),  # of the force along itself [N]
+        ("hidden", float),  # standard deviation of a force next to the clamp, which moves no key point [N]
         ("depth", float),  # below first touch [m]
         ("depth_variance", float),  # [m^2]
         ("height_stddev", float),  # of the pressure centre [m]
@@ -57,7 +58,7 @@ CONTACT_STATE = np.dtype(
         ("lateral_force", float),  # along y [N]; NaN where it is unknown
         ("lateral_stddev", float),  # of the lateral force as a share of all force
         ("traction_stddev", float),  # of the traction ratio along the finger
-        ("traction_leak", float),  # change of the force along x by one along the finger
+        ("traction_leak", *_V),  # derivative of the force by that ratio where the key points stay as they are [N]
         ("iterations", int),
         ("converged", bool),  # whether the last iteration changed nothing that matters
         ("sound", bool),  # whether the mesh is in order and the numbers are finite
@@ -148,7 +149,10 @@ def find_rejection_reason(state: ContactState, *, settles: bool) -> str:
     if magnitude > state["bearable"]:
         most = f"expected {state['bearable']:.0f} N at most"
         return f"the shape would take {magnitude:.0f} N, {most}; is the contact elsewhere?"
-    if not state["stddev"] <= max(_VAGUE_FORCE, _VAGUE_SHARE * magnitude):
+    vague = max(_VAGUE_FORCE, _VAGUE_SHARE * magnitude)
+    if state["hidden"] > vague:
+        return "the object may press next to the clamp, where no key point shows a force"
+    if not state["stddev"] <= vague:
         return f"the visible key points tell the force only within {state['stddev']:.2g} N"
     return ""
 
@@ -175,15 +179,12 @@ def measure_along(force: NDArray, modes: NDArray, covariance: NDArray) -> float:
     return np.sqrt(total)
 
 
-# What two jaws hold does not slide out, though their bent faces are inclined: friction takes up the force along the
-# finger, and the magnitude that belongs to the same shape is larger, by a share of the tangent of the inclination.
-_INCLINED = 0.3
 # Share of a force that nobody has seen along z.
 UNSEEN_ALONG = 0.3
 
 
 @njit(**_OPTIONS)
-def compute_force(state, relaxation, dt, error, sliding, out):
+def compute_force(state, relaxation, dt, error, out):
     """Write the force that the material gives now, and what belongs to it, to out (7, 3).
 
     The rows are force [N], torque about the jaw frame's origin [N m], their standard deviations, contact point [m],
@@ -194,7 +195,6 @@ def compute_force(state, relaxation, dt, error, sliding, out):
         relaxation: the finger's, see `Relaxation.packed`, which is advanced by dt.
         dt: time since the last force [s].
         error: relative standard deviation of the mechanics.
-        sliding: friction of an object that may slide along the finger, 0 for one that does not.
         out: (7, 3).
 
     Returns:
@@ -207,16 +207,14 @@ def compute_force(state, relaxation, dt, error, sliding, out):
     relax_force(state.force, relaxation, dt, force)
     if before > 0.0 and np.isfinite(state.lateral_force):
         force[1] = state.lateral_force * _measure_length(force) / before
-    magnitude, inclined = _measure_length(force), 0.0
-    if sliding > 0.0:
-        inclined = _INCLINED * min(sliding, abs(force[2]) / max(abs(force[0]), 1e-9))
+    magnitude = _measure_length(force)
     # the mechanics errs in the direction as in the magnitude
-    wrong = (error**2 + inclined**2) * magnitude**2
-    along = state.traction_stddev
-    leaked, inclination = (state.traction_leak * along * magnitude) ** 2, (along * magnitude) ** 2
+    wrong, leaked = (error * magnitude) ** 2, state.traction_stddev * state.traction_leak
     # a larger force is more inclined: where it is hardly known, its direction is not known either
-    inclination += (UNSEEN_ALONG * fit**2 / max(magnitude + fit, 1e-300)) ** 2
-    more = (wrong + leaked, (state.lateral_stddev * magnitude) ** 2, wrong + inclination)
+    inclination = (UNSEEN_ALONG * fit**2 / max(magnitude + fit, 1e-300)) ** 2
+    lateral = (state.lateral_stddev * magnitude) ** 2
+    more = (wrong + leaked[0] ** 2 + state.hidden**2, lateral, wrong + inclination + leaked[2] ** 2)
+    along = (leaked * force).sum() / max(magnitude, 1e-300)
     for a in range(3):
         variance = more[a]
         for i in range(3):
@@ -237,7 +235,7 @@ def compute_force(state, relaxation, dt, error, sliding, out):
             normal[a] = force[a] / magnitude
         else:
             arm[a] = undeformed[a] = normal[a] = np.nan
-    return magnitude, np.sqrt(fit**2 + wrong + leaked)
+    return magnitude, np.sqrt(fit**2 + wrong + along**2 + state.hidden**2)
 
 
 @njit(**_OPTIONS)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce_ifea.contact_mechanics.friction import FRICTIONLESS, constant_traction
-from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, OutlineIndenter, RoundIndenter, expect_object
+from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, SHAPE, OutlineIndenter, RoundIndenter, expect_object
 from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics, RigidContact
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE
 from finforce_ifea.observation import Contact
@@ -26,7 +26,7 @@ from finforce_ifea.tracking.contact_state import (
 )
 from finforce_ifea.tracking.friction import SMOOTH, Coefficient, FrictionEstimate, SlipHistory, leave_play
 from finforce_ifea.tracking.held_weight import LARGEST_RATIO, HeldWeight, project_response
-from finforce_ifea.tracking.hold import HoldHypotheses
+from finforce_ifea.tracking.hold import HoldHypotheses, measure_traction
 from finforce_ifea.tracking.influence import explain_offsets, measure_influence
 from finforce_ifea.tracking.lateral_load import LateralLoad, Torsion
 
@@ -37,6 +37,9 @@ _FARTHEST_HEIGHT = 8.0
 # Shapes so many times as far from the stored ones as these are good for are left to the full mechanics, until the
 # object has gone back to this share of its depth.
 _BEYOND_STORED, _BACK = 1.0, 0.8
+# An object is apart from the jaw where its pose says so by this many standard deviations.
+_APART_SIGMAS = 3.0
+_LEAST_VARIANCE = 1e-12
 # What of the friction the mechanics does not follow, and a traction ratio that is never excluded [-].
 _UNFOLLOWED, _TRACTION = 0.25, 0.08
 # What is kept of the averaged residuals where an object slides.
@@ -71,6 +74,7 @@ class ContactTracker:
         settings: EstimatorSettings,
         torsion: Torsion | None = None,
         smooth: Coefficient = SMOOTH,
+        contact_range: tuple[float, float] = (0.0, np.inf),
     ) -> None:
         """Attach the key points to the model.
 
@@ -80,6 +84,7 @@ class ContactTracker:
             settings: of the estimator.
             torsion: response to what acts laterally; None where unknown.
             smooth: friction of the objects of the calibration.
+            contact_range: heights at which the jaw can be touched, see `Jaw.contact_range` [m].
 
         Raises:
             MeshError: A key point is off the jaw.
@@ -93,8 +98,10 @@ class ContactTracker:
         self._search.expectation["farthest"] = _FARTHEST_HEIGHT * settings.height_stddev
         self.response = measure_influence(self._contact, self._probe, len(keypoints))
         self._outline: OutlineIndenter | None = None
+        self._is_apart = False
         self.slips = SlipHistory(self._contact)
         self.roughness = FrictionEstimate(settings, smooth)
+        self._base = contact_range[0], self._measure_base(contact_range[0])
         self._lateral = LateralLoad(torsion, len(keypoints), UNSEEN_TRACTION * settings.friction)
         self._held = HeldWeight(self._lateral.half_width)
         self._hold = HoldHypotheses()
@@ -163,6 +170,13 @@ class ContactTracker:
         """Which key points of the last image count (K,)."""
         return self._search.points["weight"] > 0
 
+    def read_motions(self) -> NDArray:
+        """Return the key points' derivatives by state, traction ratio, lateral force and moment (K, 3, 6)."""
+        motions = np.zeros((len(self._rest), 3, 6))
+        motions[:, ::2, :4] = self._search.points["modes"]
+        motions[:, :, 4], motions[:, :, 5] = self._lateral.by_force, self._lateral.by_moment
+        return motions
+
     def give_shape(self) -> NDArray:
         """Return the shape (size,) for another tracker to begin with."""
         return self.q if self._fidelity == 0 else self._left[0]
@@ -219,8 +233,9 @@ class ContactTracker:
             self._follow_traction(noise.gain, dt, gravity)
         self._complete(state)
         if held is not None:
-            motions = (points - tare.offsets - held - self._rest)[:, 1]
-            self._lateral.update(motions, self._search.points, state)
+            motions = (points - tare.offsets - held - self._search.positions)[:, 1]
+            bend = self._search.positions[:, 0] - self._rest[:, 0]
+            self._lateral.update(motions, bend, self._search.points, state)
         self._change_fidelity(state)
         return state
 
@@ -309,6 +324,8 @@ class ContactTracker:
         self._lead()
         self._outline = after = expected.indenter
         self._press(after)
+        pressed_by_pose = self._contact.face_x + after.pressed.front - contact.outline.origin[0]
+        self._is_apart = bool(pressed_by_pose < -_APART_SIGMAS * contact.outline.stddev[0])
         height = float(expected.mean[1])
         self._given, self._search.expectation["stiffness"] = None, self.response.stiffness_at(height)
         is_off = abs(self._search.state["x"][HEIGHT] - height) > _FARTHEST_HEIGHT * self.settings.height_stddev
@@ -339,13 +356,43 @@ class ContactTracker:
         normal = hypot(state["force"][0], state["force"][2])
         if not self._is_known:
             traction = UNSEEN_TRACTION * self.settings.friction
-            load, leak = (0.0, MIDDLE_STDDEV, nan, traction), 0.0
+            load = 0.0, MIDDLE_STDDEV, nan, traction
         else:
             load, traction = self._find_lateral(normal), self._find_traction(normal)
-            leak = self._find_leak(state, normal)
         state["y"], state["y_stddev"], state["lateral_force"], state["lateral_stddev"] = load
-        state["traction_stddev"], state["traction_leak"] = traction, leak
+        state["traction_stddev"], state["traction_leak"] = traction, self._find_leak(state)
+        state["hidden"] = self._find_hidden(state)
         state["bearable"] = self._fidelities[0].contact.bearable
+
+    def _measure_base(self, height: float) -> float:
+        """Return force over depth [N/m] of the unloaded jaw at the lowest height [m] that shows in the key points."""
+        contact, x = self._contact, np.array([0.0, np.log(self.settings.radius), height])
+        x_model, _ = find_x_model(contact, x)
+        state = contact.linearize(contact.begin(height), x_model)
+        return abs(float(state.force_modes[0, DEPTH]))
+
+    def _find_hidden(self, state: ContactState) -> float:
+        """Return the standard deviation of a force [N] where the jaw is clamped, by an object that may reach there.
+
+        Within the uncertainty of its state, as by rocking, an object that is clear of the base may press there, and one
+        that seems to press there may be clear of it.
+        """
+        height, stiffness = self._base
+        x, indenter = state["x"], self._contact.indenter
+        clearance = indenter.find_clearance(x, 0.0, height)
+        if self._is_apart or not np.isfinite(clearance):
+            return 0.0
+        slope, covariance = np.array([-1.0, 0.0, 0.0]), state["covariance"]
+        for i in (SHAPE, HEIGHT):
+            step = np.zeros(3)
+            step[i] = sqrt(max(covariance[i, i], _LEAST_VARIANCE))
+            change = [indenter.find_clearance(x + sign * step, 0.0, height) for sign in (-1.0, 1.0)]
+            slope[i] = 0.5 * (change[1] - change[0]) / step[i] if np.isfinite(change).all() else 0.0
+        stddev = sqrt(max(float(slope @ covariance @ slope), 0.0))
+        surface = self._contact.surface
+        row = max(0, int(np.searchsorted(surface.heights, height)) - 1) * surface.across
+        clearance -= self._contact.place_points(self.q)[row, 0] - surface.points[row, 0]
+        return stiffness * max(0.0, stddev - abs(clearance) / _APART_SIGMAS)
 
     def _find_lateral(self, normal: float) -> NDArray:
         """Return what acts laterally, see `LateralLoad`; what a lifted object may do there is uncertainty."""
@@ -355,12 +402,11 @@ class ContactTracker:
             load[3] = hypot(load[3], held.lateral_stddev / max(normal, _LEAST_NORMAL))
         return load
 
-    def _find_leak(self, state: ContactState, normal: float) -> float:
-        """Return by how much a force [N] along the finger that is not known of changes that along x [-]."""
-        if not self.settings.may_be_held or normal < _LEAST_NORMAL:
-            return 0.0
-        leverage = self._held.leverage if self.settings.held == "yes" else self._hold.leverage / normal
-        return float(state["by_traction"][0] / normal - state["force_modes"][0, DEPTH] * leverage)
+    def _find_leak(self, state: ContactState) -> NDArray:
+        """Return the derivative of the force by a traction ratio that is not known of (3,) [N]."""
+        search = self._search
+        absorbed = measure_traction(search.points, search.average, search.expectation["variance"])[2]
+        return state["by_traction"] - state["force_modes"] @ absorbed
 
     def _find_traction(self, normal: float) -> float:
         """Return the standard deviation of the traction ratio of a force [N] along the finger [-]."""

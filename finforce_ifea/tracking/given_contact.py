@@ -206,6 +206,7 @@ class GivenContactTracker:
         traction = UNSEEN_TRACTION * self.settings.friction
         state["y_stddev"], state["lateral_force"] = MIDDLE_STDDEV, np.nan
         state["lateral_stddev"] = state["traction_stddev"] = traction
+        state["traction_leak"] = force[2], 0.0, -force[0]  # the force turns
         is_finite = np.isfinite(result.q).all() and np.isfinite(force).all()
         is_near = np.abs(positions - self._rest).max() < _FARTHEST_MOVE
         state["sound"] = is_finite and is_near and result.smallest_det > 0

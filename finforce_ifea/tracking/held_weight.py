@@ -69,7 +69,6 @@ class HeldWeight:
     Attributes:
         force: along the finger [N].
         stddev: of it [N]; infinite before there is a memory.
-        leverage: depth of the object that such a force is taken for, as long as it is not known of [m/N].
         lateral: force across the finger [N].
         lateral_stddev: of it [N]; infinite before anything is lifted.
     """
@@ -81,7 +80,7 @@ class HeldWeight:
 
     def reset(self) -> None:
         """Forget the object."""
-        self.force, self.stddev, self.leverage = 0.0, np.inf, 0.0
+        self.force, self.stddev = 0.0, np.inf
         self.lateral, self.lateral_stddev = 0.0, np.inf
         self._begin()
 
@@ -151,7 +150,7 @@ class HeldWeight:
         left = _find_left(image, offset, self._before) - self._memory
         beyond = _BEYOND**2 * (offset[DEPTH] ** 2 + offset[HEIGHT] ** 2 + (_TILT_ARM * self._led[0]) ** 2)
         self._information, self._vector = _age(self._information, self._vector, dt)
-        self.leverage = _accumulate(image, left, known, beyond, self._information, self._vector)
+        _accumulate(image, left, known, beyond, self._information, self._vector)
         moment = self._arm * hypot(state["pressing"][0], state["pressing"][2]) + _LEAST_MOMENT
         settles = np.array([0.0, 0.0, _WEIGHT, _WEIGHT, moment, _RISES, _RISES]) ** 2
         settles[:2] = _SETTLES**2 * prior + (_SLIDES * self._led) ** 2
@@ -248,8 +247,7 @@ def _find_left(image, offset, before):
 def _accumulate(image, left, weights, beyond, information, vector):
     """Add one image, its depth eliminated, to information (7, 7) and vector (7,) on what changes.
 
-    `beyond` is the variance of each coordinate of a key point that comes on top of its noise [m^2]. Returns the depth
-    that a force along the finger is taken for [m/N].
+    `beyond` is the variance of each coordinate of a key point that comes on top of its noise [m^2].
     """
     points, state, (by_force, by_moment), (_, lateral) = image
     state = state[()]
@@ -284,4 +282,3 @@ def _accumulate(image, left, weights, beyond, information, vector):
         vector[i] += g[i + 1] - A[i + 1, 0] * g[0] / A[0, 0]
         for j in range(5):
             information[i, j] += A[i + 1, j + 1] - A[i + 1, 0] * A[0, j + 1] / A[0, 0]
-    return A[0, 3] / A[0, 0]

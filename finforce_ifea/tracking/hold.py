@@ -39,7 +39,6 @@ class HoldHypotheses:
     Attributes:
         held: probability that only the jaws hold the object.
         ratio: expected traction ratio and its standard deviation.
-        leverage: depth that a unit of the ratio is taken for [m].
     """
 
     def __init__(self) -> None:
@@ -49,7 +48,7 @@ class HoldHypotheses:
     def reset(self) -> None:
         """Forget the grasp."""
         self._clearest = 0.0
-        self.held, self.leverage = _HELD, 0.0
+        self.held = _HELD
         self.ratio = Coefficient(0.0, inf)
 
     def update(
@@ -71,7 +70,7 @@ class HoldHypotheses:
             expected: traction ratio of what the jaws alone hold, and of what something else holds, too.
             dt: time since the last image [s].
         """
-        asked, spread, self.leverage = measure_traction(points, average, variance)
+        asked, spread, _ = measure_traction(points, average, variance)
         spread = spread * max(1.0, float(state["misfit"]) ** 2) + _RATIO_ERROR**2
         seen = float(state["traction_ratio"]) + asked
         evidence, fitted = 0.0, []
@@ -94,7 +93,9 @@ class HoldHypotheses:
 
 @njit(**_OPTIONS)
 def measure_traction(points, average, variance):
-    """Return the change of the traction ratio that averaged residuals ask for, its variance, and its depth [m].
+    """Return the change of the traction ratio that averaged residuals ask for, its variance, and what absorbs it (3,).
+
+    What the ratio does to the key points looks in part like a change of depth, shape and height.
 
     Args:
         points: (K,), see `KEYPOINT`.
@@ -102,10 +103,11 @@ def measure_traction(points, average, variance):
         variance: prior of shape and height (2,).
     """
     A, b = sum_averages(points, average)
-    leverage = A[0, 3] / A[0, 0] if A[0, 0] > 0.0 else 0.0
     for i in range(2):
         A[i + 1, i + 1] += 1.0 / variance[i]
     known, others = np.empty((3, 2)), A[:3, :3].copy()
+    if not A[0, 0] > 0.0:
+        return 0.0, 1e9, np.zeros(3)
     for i in range(3):
         known[i, 0], known[i, 1] = b[i], A[i, 3]
     eliminate(others, known)
@@ -114,5 +116,5 @@ def measure_traction(points, average, variance):
         information -= A[3, i] * known[i, 1]
         asked -= A[3, i] * known[i, 0]
     if not information > 1e-9:
-        return 0.0, 1e9, leverage
-    return asked / information, 1.0 / information, leverage
+        return 0.0, 1e9, known[:, 1].copy()
+    return asked / information, 1.0 / information, known[:, 1].copy()

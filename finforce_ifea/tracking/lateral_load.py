@@ -6,8 +6,12 @@ A normal force N off the middle twists the finger, a lateral force bends it side
 
 with the location y_c of the pressure, the lateral traction ratio t, and what the normal force has along y because the
 face rolls by the slope r. a and b are those of the linear jaw at rest: the mechanics of the jaw's plane know neither,
-and both are small compared with bending, so that they are added to it. y_c is expected where the object's mesh is
-nearest.
+and both are small compared with bending, so that they are added to it. A finger that is bent by u(z) along x turns
+about its own inclined axis, though: with the turn f(z) of its sections about z that goes with a and b,
+
+    y(z) += int f'(s) (u(z) - u(s) - u'(s) (z - s)) ds.
+
+y_c is expected where the object's mesh is nearest.
 """
 
 from dataclasses import dataclass
@@ -119,7 +123,9 @@ _EVEN, _TRACTION, _NONLINEAR = 0.4, 0.1, 0.04
 _CLEAR = 3.0
 # Images averaged, and the force below which nothing is learnt [N].
 _MEMORY, _LEAST_FORCE = 45.0, 0.3
-_FLOOR = 0.02e-3
+# A key point nearer to the middle plane does not show how its section turns, and one so little above another is of the
+# same section [m].
+_LEAST_ARM, _LEAST_RISE = 1e-3, 2e-3
 # Of a key point over the last images: residual along y [m], its derivatives by y_c and t, and images that count.
 _MEANS = np.dtype([("residual", float), ("modes", float, 2), ("count", float)])
 
@@ -142,6 +148,7 @@ class LateralLoad:
         """
         self._torsion, self._count, self._traction = torsion, count, traction
         self._expected = (0.0, MIDDLE_STDDEV)
+        self._order = np.zeros(0, int)
         self.reset()
 
     @property
@@ -161,15 +168,54 @@ class LateralLoad:
         narrow = max(_WIDE, 1.0 - 3.0 * (stddev / half) ** 2) if half > 0.0 else 1.0
         self._expected = min(max(float(location), -half), half), _EVEN * narrow * float(stddev)
 
-    def update(self, motions: NDArray, points: NDArray, state: ContactState) -> None:
-        """Take the key points' motions along y (K,) [m], NaN where unused, with their weights and the contact."""
+    def update(self, motions: NDArray, bend: NDArray, points: NDArray, state: ContactState) -> None:
+        """Take the key points' motions along y (K,) [m], NaN where unused, with their weights and the contact.
+
+        Args:
+            motions: measured along y (K,) [m].
+            bend: of the model along x (K,) [m].
+            points: see `KEYPOINT`.
+            state: see `CONTACT_STATE`.
+        """
         torsion, force, height = self._torsion, state["force"], float(state["pressure_location"][2])
+        if not len(self._order):
+            self._order = np.argsort(points["rest"][:, 2], kind="stable")
         if torsion is None or not np.hypot(force[0], force[2]) > _LEAST_FORCE or not np.isfinite(height):
             self.reset()
             return
         self.by_moment, self.by_force, roll = torsion.at(height)
+        for motion in (self.by_moment, self.by_force):
+            motion[:, 1] += _turn_bent(motion[:, 0], self._order, points["rest"], bend)
         response = self.by_moment, self.by_force, roll, torsion.half_width
         self.motions = _update(self._means, motions, points, force, response, self._expected, self.load)
+
+
+@njit(**_OPTIONS)
+def _turn_bent(along_x, order, rest, bend):
+    """Return what a turn of the sections moves a bent finger along y (K,), see the module.
+
+    Args:
+        along_x: motions of the key points by the turn (K,).
+        order: of the key points by their height (K,).
+        rest: of the undeformed finger (K, 3) [m].
+        bend: motions along x (K,) [m].
+    """
+    count = len(order)
+    steps, turned, moved = np.zeros((count, 4)), np.zeros(count), np.zeros(count)
+    for k in range(count):
+        if abs(rest[k, 1]) > _LEAST_ARM:
+            turned[k] = -along_x[k] / rest[k, 1]
+    z, u, f, used = 0.0, 0.0, 0.0, 0
+    for n in range(count):
+        k = order[n]
+        rise = rest[k, 2] - z
+        if rise > _LEAST_RISE:
+            steps[used] = z + 0.5 * rise, 0.5 * (u + bend[k]), (bend[k] - u) / rise, turned[k] - f
+            z, u, f, used = rest[k, 2], bend[k], turned[k], used + 1
+        for j in range(used):
+            middle, own, slope, turn = steps[j]
+            moved[k] += turn * (bend[k] - own - slope * (rest[k, 2] - middle))
+    return moved
 
 
 @njit(**_OPTIONS)
@@ -192,7 +238,7 @@ def _update(means, motions, points, force, response, expected, load):
             mean.modes[1] += gain * (normal * by_force[k, 1] - mean.modes[1])
         if mean.count <= 0.5:
             continue
-        weight = 1.0 / (point.width_variance / max(mean.count, 1.0) + point.offset_variance + _FLOOR**2)
+        weight = 1.0 / (point.width_variance / max(mean.count, 1.0) + point.bias)
         row[0], row[1] = mean.modes[0], mean.modes[1]
         for i in range(2):
             g[i] += weight * row[i] * mean.residual

@@ -115,13 +115,51 @@ def test_contact_off_the_jaw_is_refused(points, weights, words):
         estimator.update(pressed().observations[0], Contact(points=points, weights=weights, free=True))
 
 
-@pytest.mark.parametrize("z", [-0.05, 0.12, np.nan, np.inf])
+@pytest.mark.parametrize("z", [-0.05, 0.0, 0.001, 0.005, 0.076, 0.08, 0.12, np.nan, np.inf])
 def test_height_off_the_jaw_is_refused(z):
     with pytest.raises(ContactError, match="contact height"):
         Contact.fixed(BENCH, z)
 
 
+@pytest.mark.parametrize("z", [0.001, 0.079])
+def test_height_where_no_key_point_tells_a_force_gets_none(z):
+    contact = Contact(points=np.array([[BENCH.inner_face_x, 0.0, z]]), weights=np.ones(1), free=True)
+    solutions = run(pressed(40), contact=contact, solver="frame")
+    assert statuses(solutions[REST:]) == {"unobservable"}
+    assert "expected 5.5 to 75.5 mm" in solutions[-1].message
+
+
 # --- malformed observations
+
+
+def test_frozen_camera_gives_no_force():
+    """Key points scatter; the same numbers again are the same image."""
+    recording, estimator = pressed(40), make_estimator(solver="frame")
+    for observation in recording.observations[:150]:
+        last = estimator.update(observation, recording.contact)
+    assert last.status == "ok"
+    frozen = [
+        estimator.update(replace(observation, stamp=observation.stamp + PERIOD * (i + 1)), recording.contact)
+        for i, observation in enumerate([recording.observations[149]] * 5)
+    ]
+    assert statuses(frozen) == {"unobservable"}
+    assert "frozen" in frozen[0].message
+    assert estimator.update(replace(recording.observations[150], stamp=1e3), recording.contact).status == "ok"
+
+
+def test_key_points_without_noise_may_stay_as_they_are():
+    estimator, contact = make_estimator(solver="frame"), Contact.fixed(BENCH, 0.04)
+    for i in range(60):
+        last = estimator.update(spoil(stamp=float(i)), contact)
+    assert last.trusted
+
+
+def test_image_that_comes_twice_is_refused():
+    estimator = make_estimator(solver="frame")
+    estimator.update(spoil(stamp=1.0), None)
+    with pytest.raises(ObservationError, match="came twice"):
+        estimator.update(spoil(stamp=1.0 + 1e-9), None)
+    estimator.update(spoil(stamp=1.001), None)
 
 
 def spoil(points=None, likelihood=None, stamp=20.0):
