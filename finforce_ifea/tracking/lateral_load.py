@@ -119,10 +119,15 @@ def measure_torsion(jaw: Jaw, mesh: VolumeMesh) -> Torsion | None:
 # traction ratio, and of what the linear jaw makes of it [-].
 _WIDE = 0.15
 _EVEN, _TRACTION, _NONLINEAR = 0.4, 0.1, 0.04
+# One over the core of a rectangular section, as a share of half its width.
+_CORE = 3.0
 # A ratio of so many standard deviations is believed by half; less is next to nothing.
 _CLEAR = 3.0
 # Images averaged, and the force below which nothing is learnt [N].
 _MEMORY, _LEAST_FORCE = 45.0, 0.3
+_FLOOR = 0.02e-3
+# Error of what a turn moves a bent finger, as a share of it.
+_TURN_ERROR = 0.5
 # A key point nearer to the middle plane does not show how its section turns, and one so little above another is of the
 # same section [m].
 _LEAST_ARM, _LEAST_RISE = 1e-3, 2e-3
@@ -166,7 +171,9 @@ class LateralLoad:
         """Take where along y the object is nearest [m], and how wide it is there."""
         half = self._torsion.half_width if self._torsion else abs(location)
         narrow = max(_WIDE, 1.0 - 3.0 * (stddev / half) ** 2) if half > 0.0 else 1.0
-        self._expected = min(max(float(location), -half), half), _EVEN * narrow * float(stddev)
+        # beyond a third of the half width, the core of a section, an eccentric pressure leaves the other edge
+        uneven = _EVEN + (1.0 - _EVEN) * min(_CORE * abs(location) / half, 1.0) if half > 0.0 else 1.0
+        self._expected = min(max(float(location), -half), half), uneven * narrow * float(stddev)
 
     def update(self, motions: NDArray, bend: NDArray, points: NDArray, state: ContactState) -> None:
         """Take the key points' motions along y (K,) [m], NaN where unused, with their weights and the contact.
@@ -184,14 +191,15 @@ class LateralLoad:
             self.reset()
             return
         self.by_moment, self.by_force, roll = torsion.at(height)
-        for motion in (self.by_moment, self.by_force):
-            motion[:, 1] += _turn_bent(motion[:, 0], self._order, points["rest"], bend)
-        response = self.by_moment, self.by_force, roll, torsion.half_width
+        turned = np.stack(
+            [turn_bent(each[:, 0], self._order, points["rest"], bend) for each in (self.by_moment, self.by_force)]
+        )
+        response = self.by_moment, self.by_force, turned, roll, torsion.half_width
         self.motions = _update(self._means, motions, points, force, response, self._expected, self.load)
 
 
 @njit(**_OPTIONS)
-def _turn_bent(along_x, order, rest, bend):
+def turn_bent(along_x, order, rest, bend):
     """Return what a turn of the sections moves a bent finger along y (K,), see the module.
 
     Args:
@@ -221,7 +229,7 @@ def _turn_bent(along_x, order, rest, bend):
 @njit(**_OPTIONS)
 def _update(means, motions, points, force, response, expected, load):
     """Add an image to the means; update the load (4,) and return the motions (K, 3) that it causes."""
-    by_moment, by_force, roll, half_width = response
+    by_moment, by_force, turned, roll, half_width = response
     normal = np.hypot(force[0], force[2])
     rolled = force[0] ** 2 * roll * load[0]  # -F_x r, with r = roll (-y F_x)
     A = np.array([[1.0 / expected[1] ** 2, 0.0], [0.0, 1.0 / _TRACTION**2]])
@@ -233,12 +241,13 @@ def _update(means, motions, points, force, response, expected, load):
         gain = share / (min(mean.count, _MEMORY) + 1.0)
         mean.count = min(mean.count * (1.0 - 1.0 / _MEMORY) + share, _MEMORY)
         if share > 0.0:
-            mean.residual += gain * (motions[k] - by_force[k, 1] * rolled - mean.residual)
-            mean.modes[0] += gain * (normal * by_moment[k, 1] - mean.modes[0])
-            mean.modes[1] += gain * (normal * by_force[k, 1] - mean.modes[1])
+            mean.residual += gain * (motions[k] - (by_force[k, 1] + turned[1, k]) * rolled - mean.residual)
+            mean.modes[0] += gain * (normal * (by_moment[k, 1] + turned[0, k]) - mean.modes[0])
+            mean.modes[1] += gain * (normal * (by_force[k, 1] + turned[1, k]) - mean.modes[1])
         if mean.count <= 0.5:
             continue
-        weight = 1.0 / (point.width_variance / max(mean.count, 1.0) + point.bias)
+        variance = point.width_variance / max(mean.count, 1.0) + point.offset_variance + _FLOOR**2
+        weight = 1.0 / (variance + (_TURN_ERROR * turned[0, k] * load[0] * normal) ** 2)
         row[0], row[1] = mean.modes[0], mean.modes[1]
         for i in range(2):
             g[i] += weight * row[i] * mean.residual

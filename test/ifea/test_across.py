@@ -2,6 +2,8 @@
 
 data/shaped_bench.npz holds key points [mm] and forces [N] of CalculiX 2.20, the whole width computed: a block 8 mm wide
 whose middle lies at y = 5 mm, a rod turned by 15 degrees about x, a sphere, and a box of 50 mm that stands upright.
+data/sphere_off_middle.npz holds those of a sphere of 26.2 mm at y = -3.5 mm, low on the finger, by another program of
+20-node bricks.
 """
 
 from functools import cache
@@ -18,9 +20,10 @@ from finforce_ifea.jaw.calibration import Calibration, load_calibration
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.observation import Contact, ObjectOutline, Observation
 from finforce_ifea.settings import EstimatorSettings
-from finforce_ifea.tracking.lateral_load import measure_torsion
+from finforce_ifea.tracking.lateral_load import measure_torsion, turn_bent
 
-TRUTH = np.load(Path(__file__).parents[1] / "data" / "shaped_bench.npz")
+_DATA = Path(__file__).parents[1] / "data"
+TRUTH = {**np.load(_DATA / "shaped_bench.npz"), **np.load(_DATA / "sphere_off_middle.npz")}
 CALIBRATION = Calibration(**{**load_calibration("bench").__dict__, "relaxation": ()})
 STDDEV = np.array([0.5e-3, 0.5e-3, 5e-3])
 BLOCK = 1e-3 * np.array([[0, -10], [20, -10], [20, 10], [0, 10]])
@@ -31,6 +34,7 @@ SHAPES = {
     "cyl25_z40_tilt15": (circle(0.0125)[0], 0.040, (0.0, 5.8e-3)),
     "sphere30_z40": (circle(0.015)[0], 0.040, (0.0, 1.2e-3)),
     "box50_z42": (BOX, 0.042, (0.0, 5.8e-3)),
+    "sphere26_z27_y4": (circle(0.0131)[0], 0.0275, (-3.5e-3, 1.2e-3)),
 }
 
 
@@ -87,7 +91,8 @@ def test_what_is_pressed_in_the_middle_stays_there(name):
 
 
 @pytest.mark.parametrize(
-    ("name", "error"), [("block8_z50_y5", 0.07), ("cyl25_z40_tilt15", 0.05), ("sphere30_z40", 0.05)]
+    ("name", "error"),
+    [("block8_z50_y5", 0.07), ("cyl25_z40_tilt15", 0.05), ("sphere30_z40", 0.05), ("sphere26_z27_y4", 0.05)],
 )
 def test_forces_of_narrow_things_and_their_deviations(name, error):
     solutions, true = play(name)
@@ -95,6 +100,24 @@ def test_forces_of_narrow_things_and_their_deviations(name, error):
     assert np.linalg.norm(force.mean(0) - true[-1]) < error * np.linalg.norm(true[-1])
     off = np.abs(force - true[-60:]) / np.array([s.force_stddev for s in solutions[-60:]])
     assert (off < 3.0).mean(axis=0).min() > 0.98
+
+
+def test_a_bent_finger_that_twists_shows_no_force_along_y():
+    """Bent by 8 mm and turned by a degree, it moves along y by half a millimetre at the tip, which no force did."""
+    solutions, true = play("sphere26_z27_y4")
+    force = np.array([s.force for s in solutions[-60:]])
+    assert abs(force[:, 1].mean() - true[-1, 1]) < 0.1
+    assert abs(np.mean([s.contact_location[1] for s in solutions[-60:]]) + 3.5e-3) < 1e-3
+
+
+def test_turn_of_a_bent_finger():
+    """About its own axis a straight finger does not move, however inclined; one of u = c z^2 moves by t c z^3 / 3."""
+    z = np.arange(1, 33) * 2.5e-3
+    rest = np.stack([0 * z, np.full(len(z), 0.01), z], axis=1)
+    order, rate = np.arange(len(z)), 0.5
+    along_x = -rate * z * rest[:, 1]
+    np.testing.assert_allclose(turn_bent(along_x, order, rest, 0.1 * z), 0.0, atol=1e-15)
+    np.testing.assert_allclose(turn_bent(along_x, order, rest, 2.0 * z**2)[4:], rate * 2.0 * z[4:] ** 3 / 3, rtol=0.05)
 
 
 @pytest.mark.parametrize("name", ["block8_z50_y5", "cyl25_z40_tilt15", "sphere30_z40"])
