@@ -28,7 +28,6 @@ from finforce_ifea.observation import (
 from finforce_ifea.relaxation import Relaxation
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tare import TareKeeper
-from finforce_ifea.tracking.camera_motion import CameraWatch
 from finforce_ifea.tracking.contact_state import UNSEEN_ALONG, ContactState, compute_force, find_rejection_reason
 from finforce_ifea.tracking.contact_tracker import ContactTracker
 from finforce_ifea.tracking.friction import SMOOTH, Coefficient
@@ -91,7 +90,6 @@ class JawEstimator:
         self._taring = TareKeeper(
             self.jaw.keypoints, self.settings, lambda *chance: self._tracker.significance(*chance)
         )
-        self._camera = CameraWatch(self.jaw.keypoints)
         self._reach = ReachWatch(self.jaw.keypoints, self.jaw.inner_face_x, self._tracked.rest_modes)
         self.reset()
 
@@ -104,7 +102,6 @@ class JawEstimator:
         self._at_rest = self.is_idle = False
         self._relaxed: float | None = None
         self._taring.reset()
-        self._camera.reset()
         self._gate.reset()
         self._reach.reset()
         self._relaxation.reset()
@@ -180,9 +177,6 @@ class JawEstimator:
         waiting = self._await_tare()
         if waiting:
             return self._fail("waiting", waiting, used)
-        moved = self._find_camera_motion(points, observation.stddev, contact)
-        if moved:
-            return self._fail("unobservable", moved, used)
         if contact is None or not len(contact.points):
             return self._without_contact(points, used)
         self.is_idle = self.tared and self._reach.is_idle(contact, points, self._taring.tare)
@@ -210,25 +204,7 @@ class JawEstimator:
             NotEnoughDataError: Too few unloaded frames or visible key points.
             UnderLoadError: The jaw is, or looks, loaded.
         """
-        found = self._taring.take()
-        self._camera.reset()
-        return found
-
-    def _find_camera_motion(self, points: NDArray, stddev: NDArray | None, contact: Contact | None) -> str:
-        """Return what to say of a camera that has moved since the tare, empty where it has not.
-
-        Where the object is apart from the jaw, this is tared anew.
-        """
-        if not self.tared or self._tracker is not self._tracked:
-            return ""
-        covariance = self._taring.tare.read_covariance(stddev)
-        if not self._camera.update(points, covariance, self._tracked.read_motions()):
-            return ""
-        how = f"all key points have moved alike, by {1e3 * self._camera.motion:.1f} mm"
-        if contact is None or contact.touching is False:
-            self._taring.reset()
-            self._camera.reset()
-        return f"{how}: has the camera moved? Open the jaws, or tare again"
+        return self._taring.take()
 
     def _find_beyond(self, contact: Contact) -> str:
         """Return what to say of a contact at heights where key points tell no force, empty for any other."""

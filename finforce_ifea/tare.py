@@ -182,18 +182,11 @@ class Tare:
         """
         return self._silent_noise if stddev is None else compute_point_noise(self._usual, stddev)
 
-    def read_covariance(self, stddev: NDArray | None) -> NDArray:
-        """Return the covariance of each key point (K, 3, 3) [m^2] in an image that states `stddev`, or nothing."""
-        if stddev is None:
-            return self._usual.covariance
-        growth = np.maximum(1.0, np.nan_to_num(stddev / self._usual.stddev, nan=1.0))
-        return growth[:, :, None] * self._usual.covariance * growth[:, None, :]
-
     @cached_property
     def _usual(self) -> StatedNoise:
         count = len(self.counts)
         pooled = np.broadcast_to(np.sqrt(np.diag(self.noise)), (count, 3))
-        return self.stated or StatedNoise(np.tile(self.noise, (count, 1, 1)), pooled)
+        return self.stated or StatedNoise(np.broadcast_to(self.noise, (count, 3, 3)), pooled)
 
     @cached_property
     def _silent_noise(self) -> PointNoise:

@@ -170,13 +170,6 @@ class ContactTracker:
         """Which key points of the last image count (K,)."""
         return self._search.points["weight"] > 0
 
-    def read_motions(self) -> NDArray:
-        """Return the key points' derivatives by state, traction ratio, lateral force and moment (K, 3, 6)."""
-        motions = np.zeros((len(self._rest), 3, 6))
-        motions[:, ::2, :4] = self._search.points["modes"]
-        motions[:, :, 4], motions[:, :, 5] = self._lateral.by_force, self._lateral.by_moment
-        return motions
-
     def give_shape(self) -> NDArray:
         """Return the shape (size,) for another tracker to begin with."""
         return self.q if self._fidelity == 0 else self._left[0]
