@@ -68,8 +68,15 @@ def test_radius_is_not_taken_for_known_before_the_finger_was_pressed():
 
 @pytest.mark.parametrize("noise", [2.0, 3.0])
 def test_noise_that_the_tare_did_not_see_is_stated(noise):
-    usual = [s.magnitude_stddev for s, _ in play(session().press())[-10:]]
-    noisy = [(s, t) for s, t in play(session().press(scale=noise))[-10:] if s.trusted]
+    smooth = Bench(Plan(solver="frame"), friction=0.0)  # what is not known of friction has nothing to do with noise
+    history = smooth.history(height=40e-3, radius=12e-3, depth=3e-3)
+
+    def press(scale):
+        steps = open_session(smooth, np.random.default_rng(0), history=history).press(scale=scale)
+        return [(solution, judge(solution, step)) for step in steps for solution in [update(smooth, step)]][-10:]
+
+    usual = [s.magnitude_stddev for s, _ in press(1.0)]
+    noisy = [(s, t) for s, t in press(noise) if s.trusted]
     assert len(noisy) > 5
     assert np.median([s.magnitude_stddev for s, _ in noisy]) > 1.4 * np.median(usual)
     assert max(t.sigmas for _, t in noisy) < 3.0
