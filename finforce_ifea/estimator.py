@@ -37,7 +37,6 @@ from finforce_ifea.tracking.lateral_load import measure_torsion
 
 _LONGEST_GAP = 1.0
 _TOLERANCE = 1e-3
-_FROZEN = "the key points are those of the image before to the last bit: is the camera frozen?"
 _UNTARED = "no tare: the jaw was loaded from the start; key point offsets are unknown"
 # Relative standard deviation of forces without a calibration, at least: a material known by name has its own.
 _UNCALIBRATED = 0.1
@@ -97,7 +96,6 @@ class JawEstimator:
         """Forget everything but the jaw: offsets, place, relaxation, stamps."""
         self._stamp: float | None = None
         self._followed: float | None = None  # stamp of the last image that a tracker took
-        self._seen = np.zeros(0)
         self._contact: Contact | None = None
         self._at_rest = self.is_idle = False
         self._relaxed: float | None = None
@@ -165,8 +163,6 @@ class JawEstimator:
             self._follow(contact)
         self._contact = contact
         self._stamp = observation.stamp
-        if self._is_frozen(observation.points):
-            return self._fail("unobservable", _FROZEN, np.zeros(len(self.jaw.keypoints), bool))
         points = self._gate.accept(observation)
         self._taring.add(points, observation.stddev, apart=contact is not None and contact.touching is False)
         used, self.is_idle = np.isfinite(points[:, 0]), False
@@ -228,13 +224,6 @@ class JawEstimator:
         except NotEnoughDataError as error:
             return str(error)
         return ""
-
-    def _is_frozen(self, points: NDArray) -> bool:
-        """Whether an image shows the key points (K, 3) of the last one to the last bit, which scatter otherwise."""
-        seen, self._seen = self._seen, np.array(points, float)
-        if not self._taring.scatters or np.isnan(self._seen).all():
-            return False
-        return np.array_equal(seen, self._seen, equal_nan=True)
 
     def _follow(self, contact: Contact) -> None:
         """Hand a contact to the tracker that it is for."""

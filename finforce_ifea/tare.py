@@ -134,8 +134,6 @@ def _enlarge_noise(covariance, usual, stddev):
 _FARTHEST_OFFSET = 3e-3
 _FARTHEST_FROM_MEDIAN = 1.8e-3
 _NOISE_FLOOR = 0.02e-3
-# Scatter that is rounding, as a share of that floor's variance.
-_NOISELESS = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -276,11 +274,6 @@ class TareKeeper:
     def tared(self) -> bool:
         """Whether the offsets are known."""
         return self.tare.is_taken
-
-    @property
-    def scatters(self) -> bool:
-        """Whether the tare has seen noise, as every camera has it."""
-        return self.tared and float(np.trace(self.tare.noise)) > 3.0 * (1.0 + _NOISELESS) * _NOISE_FLOOR**2
 
     @property
     def missing(self) -> int:

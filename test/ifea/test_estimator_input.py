@@ -132,26 +132,16 @@ def test_height_where_no_key_point_tells_a_force_gets_none(z):
 # --- malformed observations
 
 
-def test_frozen_camera_gives_no_force():
-    """Key points scatter; the same numbers again are the same image."""
+def test_key_points_of_a_jaw_that_stands_still_may_stay_as_they_are():
+    """A detector repeats the mean of a jaw in which nothing has moved, under the stamp of every image."""
     recording, estimator = pressed(40), make_estimator(solver="frame")
     for observation in recording.observations[:150]:
         last = estimator.update(observation, recording.contact)
-    assert last.status == "ok"
-    frozen = [
+    still = [
         estimator.update(replace(observation, stamp=observation.stamp + PERIOD * (i + 1)), recording.contact)
-        for i, observation in enumerate([recording.observations[149]] * 5)
+        for i, observation in enumerate([recording.observations[149]] * 30)
     ]
-    assert statuses(frozen) == {"unobservable"}
-    assert "frozen" in frozen[0].message
-    assert estimator.update(replace(recording.observations[150], stamp=1e3), recording.contact).status == "ok"
-
-
-def test_key_points_without_noise_may_stay_as_they_are():
-    estimator, contact = make_estimator(solver="frame"), Contact.fixed(BENCH, 0.04)
-    for i in range(60):
-        last = estimator.update(spoil(stamp=float(i)), contact)
-    assert last.trusted
+    assert statuses(still) == {last.status} == {"ok"}
 
 
 def test_image_that_comes_twice_is_refused():
