@@ -76,8 +76,14 @@ class JawEstimator:
         self.mechanics: Mechanics = build_chosen(self.jaw, self.settings)
         torsion = measure_torsion(self.jaw, self.mechanics.mesh)
         smooth = Coefficient(calibration.friction, calibration.friction_stddev) if calibration else SMOOTH
-        reach = self.jaw.contact_range
-        self._tracked = ContactTracker(self.mechanics, self.jaw.keypoints, self.settings, torsion, smooth, reach)
+        self._tracked = ContactTracker(
+            self.mechanics,
+            self.jaw.keypoints,
+            self.settings,
+            torsion,
+            smooth,
+            contact_range=self.jaw.contact_range,
+        )
         self._given = GivenContactTracker(self.jaw, self.mechanics, self.settings, self._tracked.response)
         self._tracker: ContactTracker | GivenContactTracker = self._tracked
         self._gate = KeypointGate(self.jaw, self.settings)

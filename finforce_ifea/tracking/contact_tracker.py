@@ -27,7 +27,7 @@ from finforce_ifea.tracking.contact_state import (
 from finforce_ifea.tracking.friction import SMOOTH, Coefficient, FrictionEstimate, SlipHistory, leave_play
 from finforce_ifea.tracking.held_weight import LARGEST_RATIO, HeldWeight, project_response
 from finforce_ifea.tracking.hold import HoldHypotheses, measure_traction
-from finforce_ifea.tracking.influence import explain_offsets, measure_influence
+from finforce_ifea.tracking.influence import explain_offsets, measure_influence, press_lightly
 from finforce_ifea.tracking.lateral_load import LateralLoad, Torsion
 
 _IMAGES_RELEASED = 15
@@ -74,7 +74,8 @@ class ContactTracker:
         settings: EstimatorSettings,
         torsion: Torsion | None = None,
         smooth: Coefficient = SMOOTH,
-        contact_range: tuple[float, float] = (0.0, np.inf),
+        *,
+        contact_range: tuple[float, float],
     ) -> None:
         """Attach the key points to the model.
 
@@ -101,7 +102,8 @@ class ContactTracker:
         self._is_apart = False
         self.slips = SlipHistory(self._contact)
         self.roughness = FrictionEstimate(settings, smooth)
-        self._base = contact_range[0], self._measure_base(contact_range[0])
+        _, pressed = press_lightly(self._contact, np.log(settings.radius), contact_range[0])
+        self._base = contact_range[0], abs(float(pressed.force_modes[0, DEPTH]))
         self._lateral = LateralLoad(torsion, len(keypoints), UNSEEN_TRACTION * settings.friction)
         self._held = HeldWeight(self._lateral.half_width)
         self._hold = HoldHypotheses()
@@ -222,9 +224,12 @@ class ContactTracker:
                 self._held.reset()
                 self._hold.reset()
                 self._traction = FRICTIONLESS
+        prior = self._search.expectation["variance"]
+        asked, spread, absorbed = measure_traction(self._search.points, self._search.average, prior)
         if held is not None and state["converged"] and state["depth"] >= LOADED_DEPTH and not self._jumped:
-            self._follow_traction(noise.gain, dt, gravity)
+            self._follow_traction((asked, spread), noise.gain, dt, gravity)
         self._complete(state)
+        state["traction_leak"] = state["by_traction"] - state["force_modes"] @ absorbed
         if held is not None:
             motions = (points - tare.offsets - held - self._search.positions)[:, 1]
             bend = self._search.positions[:, 0] - self._rest[:, 0]
@@ -260,7 +265,9 @@ class ContactTracker:
         """Whether the object is known by its outline."""
         return self._outline is self._contact.indenter
 
-    def _follow_traction(self, gain: NDArray, dt: float, gravity: NDArray | None) -> None:
+    def _follow_traction(
+        self, evidence: tuple[float, float], gain: NDArray, dt: float, gravity: NDArray | None
+    ) -> None:
         """Follow the traction of an object that only the jaws hold, or may; friction is left to `learn`."""
         search, prior = self._search, self._search.expectation["variance"]
         self._slides = self.settings.held != "yes"
@@ -271,7 +278,7 @@ class ContactTracker:
         if self.settings.held == "either":
             normal = max(hypot(search.state["pressing"][0], search.state["pressing"][2]), _LEAST_NORMAL)
             expected = Coefficient(wanted, self._find_held_stddev(normal)), self._find_friction()
-            wanted = self._hold.update(search.points, search.average, search.state, prior, expected, dt)
+            wanted = self._hold.update(evidence, search.state, expected, dt)
         self._traction = constant_traction(min(max(wanted, -LARGEST_RATIO), LARGEST_RATIO))
 
     def learn(self) -> None:
@@ -353,16 +360,9 @@ class ContactTracker:
         else:
             load, traction = self._find_lateral(normal), self._find_traction(normal)
         state["y"], state["y_stddev"], state["lateral_force"], state["lateral_stddev"] = load
-        state["traction_stddev"], state["traction_leak"] = traction, self._find_leak(state)
+        state["traction_stddev"] = traction
         state["hidden"] = self._find_hidden(state)
         state["bearable"] = self._fidelities[0].contact.bearable
-
-    def _measure_base(self, height: float) -> float:
-        """Return force over depth [N/m] of the unloaded jaw at the lowest height [m] that shows in the key points."""
-        contact, x = self._contact, np.array([0.0, np.log(self.settings.radius), height])
-        x_model, _ = find_x_model(contact, x)
-        state = contact.linearize(contact.begin(height), x_model)
-        return abs(float(state.force_modes[0, DEPTH]))
 
     def _find_hidden(self, state: ContactState) -> float:
         """Return the standard deviation of a force [N] where the jaw is clamped, by an object that may reach there.
@@ -394,12 +394,6 @@ class ContactTracker:
             load[2] += held.lateral
             load[3] = hypot(load[3], held.lateral_stddev / max(normal, _LEAST_NORMAL))
         return load
-
-    def _find_leak(self, state: ContactState) -> NDArray:
-        """Return the derivative of the force by a traction ratio that is not known of (3,) [N]."""
-        search = self._search
-        absorbed = measure_traction(search.points, search.average, search.expectation["variance"])[2]
-        return state["by_traction"] - state["force_modes"] @ absorbed
 
     def _find_traction(self, normal: float) -> float:
         """Return the standard deviation of the traction ratio of a force [N] along the finger [-]."""

@@ -17,7 +17,6 @@ from math import exp, inf, log, sqrt
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from finforce.elimination import eliminate
 from finforce_ifea.tracking.contact_filter import sum_averages
@@ -53,36 +52,32 @@ class HoldHypotheses:
 
     def update(
         self,
-        points: NDArray,
-        average: NDArray,
+        evidence: tuple[float, float],
         state: ContactState,
-        variance: NDArray,
         expected: tuple[Coefficient, Coefficient],
         dt: float,
     ) -> float:
         """Take one image; return the expected traction ratio.
 
         Args:
-            points: key points of the image, see `KEYPOINT`.
-            average: of their residuals, see `AVERAGE`.
+            evidence: change of the ratio that the key points ask for, and its variance, see `measure_traction`.
             state: of the contact.
-            variance: of expected shape and height (2,).
             expected: traction ratio of what the jaws alone hold, and of what something else holds, too.
             dt: time since the last image [s].
         """
-        asked, spread, _ = measure_traction(points, average, variance)
+        asked, spread = evidence
         spread = spread * max(1.0, float(state["misfit"]) ** 2) + _RATIO_ERROR**2
         seen = float(state["traction_ratio"]) + asked
-        evidence, fitted = 0.0, []
+        odds, fitted = 0.0, []
         for sign, each in zip((1.0, -1.0), expected, strict=True):
             own = each.stddev**2
             both = own + spread
-            evidence += sign * -0.5 * ((seen - each.mean) ** 2 / both + log(both))
+            odds += sign * -0.5 * ((seen - each.mean) ** 2 / both + log(both))
             fitted.append(((each.mean * spread + seen * own) / both, own * spread / both))
-        evidence = min(max(evidence, -_CERTAIN), _CERTAIN)
+        odds = min(max(odds, -_CERTAIN), _CERTAIN)
         self._clearest *= exp(-dt / _FADES)
-        if abs(evidence) > abs(self._clearest):
-            self._clearest = evidence
+        if abs(odds) > abs(self._clearest):
+            self._clearest = odds
         self.held = 1.0 / (1.0 + exp(-self._clearest) * (1.0 - _HELD) / _HELD)
         (one, first), (two, second) = fitted
         mean = self.held * one + (1.0 - self.held) * two

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce_ifea.contact_mechanics.indenter import DEPTH
-from finforce_ifea.contact_mechanics.pressed_jaw import RigidContact
+from finforce_ifea.contact_mechanics.pressed_jaw import PressedState, RigidContact
 from finforce_ifea.observation import Contact
 from finforce_ifea.tare import OFFSET_STDDEV, Tare
 
@@ -99,14 +99,18 @@ def measure_influence(contact: RigidContact, probe: Any, keypoints: int) -> Infl
     motions, stiffness = np.zeros((_HEIGHTS, keypoints, 2)), np.zeros(_HEIGHTS)
     shape = 0.5 * (contact.indenter.lowest + contact.indenter.highest)
     for row, height in enumerate(heights):
-        q = contact.begin(height)
-        place = np.array([0.0, shape, height])
-        place[DEPTH] = _TOUCH if contact.face.is_flat else contact.find_touch(place) + _TOUCH
-        state = contact.linearize(q, place)
+        q, state = press_lightly(contact, shape, height)
         stiffness[row] = np.linalg.norm(state.force_modes[:, DEPTH])
         modes = contact.model.project(probe, q, state.modes)
         motions[row] = modes[:, ::2, DEPTH] / stiffness[row]
     return InfluenceCoefficients(heights=heights, motions=motions, stiffness=stiffness)
+
+
+def press_lightly(contact: RigidContact, shape: float, height: float) -> tuple[NDArray, PressedState]:
+    """Return unknowns (size,) and linearisation of the unloaded jaw that an object of a shape just touches."""
+    q, place = contact.begin(height), np.array([0.0, shape, height])
+    place[DEPTH] = _TOUCH if contact.face.is_flat else contact.find_touch(place) + _TOUCH
+    return q, contact.linearize(q, place)
 
 
 # Standard deviation of an offset that all key points share [m]: a depth scale wrong by 1 % at 0.15 m.

@@ -153,7 +153,6 @@ class LateralLoad:
         """
         self._torsion, self._count, self._traction = torsion, count, traction
         self._expected = (0.0, MIDDLE_STDDEV)
-        self._order = np.zeros(0, int)
         self.reset()
 
     @property
@@ -185,37 +184,31 @@ class LateralLoad:
             state: see `CONTACT_STATE`.
         """
         torsion, force, height = self._torsion, state["force"], float(state["pressure_location"][2])
-        if not len(self._order):
-            self._order = np.argsort(points["rest"][:, 2], kind="stable")
         if torsion is None or not np.hypot(force[0], force[2]) > _LEAST_FORCE or not np.isfinite(height):
             self.reset()
             return
         self.by_moment, self.by_force, roll = torsion.at(height)
-        turned = np.stack(
-            [turn_bent(each[:, 0], self._order, points["rest"], bend) for each in (self.by_moment, self.by_force)]
-        )
+        turned = np.stack([turn_bent(each[:, 0], points["rest"], bend) for each in (self.by_moment, self.by_force)])
         response = self.by_moment, self.by_force, turned, roll, torsion.half_width
         self.motions = _update(self._means, motions, points, force, response, self._expected, self.load)
 
 
 @njit(**_OPTIONS)
-def turn_bent(along_x, order, rest, bend):
+def turn_bent(along_x, rest, bend):
     """Return what a turn of the sections moves a bent finger along y (K,), see the module.
 
     Args:
         along_x: motions of the key points by the turn (K,).
-        order: of the key points by their height (K,).
         rest: of the undeformed finger (K, 3) [m].
         bend: motions along x (K,) [m].
     """
-    count = len(order)
+    count = len(rest)
     steps, turned, moved = np.zeros((count, 4)), np.zeros(count), np.zeros(count)
     for k in range(count):
         if abs(rest[k, 1]) > _LEAST_ARM:
             turned[k] = -along_x[k] / rest[k, 1]
     z, u, f, used = 0.0, 0.0, 0.0, 0
-    for n in range(count):
-        k = order[n]
+    for k in np.argsort(rest[:, 2], kind="mergesort"):
         rise = rest[k, 2] - z
         if rise > _LEAST_RISE:
             steps[used] = z + 0.5 * rise, 0.5 * (u + bend[k]), (bend[k] - u) / rise, turned[k] - f

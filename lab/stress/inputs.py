@@ -103,10 +103,10 @@ def list_shares(usual: str, lasting: str) -> Callable[[Bench], Mapping[str, Any]
 def throw_points(session: Session, setting: tuple[float, bool]) -> Iterable[SessionStep]:
     """Return a press in which a share of the key points lies anywhere in the workspace, with high likelihood."""
     (share, lasts), steps, random = setting, session.press(), session.random
-    wrong, places = _draw_wrong(session, share), _draw_places(session)
+    wrong, places = draw_wrong(session, share), _draw_places(session)
     for step in steps:
         if not lasts:
-            wrong, places = _draw_wrong(session, share), _draw_places(session)
+            wrong, places = draw_wrong(session, share), _draw_places(session)
         step.points[wrong] = places[wrong] + noise_of(random, (len(wrong),))
     return steps
 
@@ -114,7 +114,7 @@ def throw_points(session: Session, setting: tuple[float, bool]) -> Iterable[Sess
 def err_together(session: Session, setting: tuple[float, bool]) -> Iterable[SessionStep]:
     """Return a press in which a share of the key points errs together: shifted alike, or as of another press."""
     (share, alike), steps, random = setting, session.press(), session.random
-    wrong = _draw_wrong(session, share)
+    wrong = draw_wrong(session, share)
     shift = random.uniform(-FARTHEST_SHIFT, FARTHEST_SHIFT, 3)
     other = session.bench.press(random)
     elsewhere = other.keypoints(other.depth)[wrong]
@@ -126,7 +126,7 @@ def err_together(session: Session, setting: tuple[float, bool]) -> Iterable[Sess
     return steps
 
 
-def _draw_wrong(session: Session, share: float) -> NDArray:
+def draw_wrong(session: Session, share: float) -> NDArray:
     """Return the indices of the key points that are wrong."""
     count = len(session.bench.jaw.keypoints)
     return session.random.permutation(count)[: round(share * count)]

@@ -101,11 +101,11 @@ class Session:
             for i in range(len(depths))
         ]
 
-    def press(self, *, scale: float = 1.0) -> list[SessionStep]:
-        """Return the steps of a press: three images of rest, 0.4 s of ramp, 0.7 s of hold."""
+    def press(self, *, scale: float = 1.0, hold: int = 20) -> list[SessionStep]:
+        """Return the steps of a press: three images of rest, 0.4 s of ramp, and `hold` images, 0.7 s, of hold."""
         depth = self.history.depth
         rising = np.linspace(0.0, depth, 13)[1:]
-        return self.steps(np.concatenate([np.zeros(3), rising, np.full(20, depth)]), scale=scale)
+        return self.steps(np.concatenate([np.zeros(3), rising, np.full(hold, depth)]), scale=scale)
 
     def play(self, seed: int, steps: Iterable[SessionStep]) -> Iterator[Trial]:
         """Give steps to the estimator and yields one trial each."""

@@ -9,17 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce_ifea.observation import Contact
+from lab.stress.inputs import FARTHEST_SHIFT, draw_wrong
 from lab.stress.session import Bench, Session, SessionStep, open_session
 from lab.stress.stress import Family, Plan, Trial
 
-HOLD = 60
+HOLD = 80
 # What moves all key points at once: along x, y and z [m], and a turn about the camera [rad].
 BUMPS = {"0.5 mm": (0.5e-3, 0.0), "2 mm": (2e-3, 0.0), "1 degree": (0.0, np.radians(1.0))}
 CAMERA_DISTANCE = 0.11
 CREEPING, CREEP = 5, 0.1e-3
 WALK = 2e-3
-TOGETHER = 8
-FARTHEST_SHIFT = 0.01
+TOGETHER = 8 / 15
 
 
 def run_upsets(plan: Plan) -> Iterator[Trial]:
@@ -29,8 +29,7 @@ def run_upsets(plan: Plan) -> Iterator[Trial]:
         kind = tuple(UPSETS)[seed % len(UPSETS)]
         random = plan.random("upsets", seed)
         session = open_session(bench, random, level=kind)
-        steps = session.press() + session.steps(np.full(HOLD, session.history.depth))
-        steps = [replace(step, stamp=session.start + (i + 1) / 30) for i, step in enumerate(steps)]
+        steps = session.press(hold=HOLD)
         start = int(random.integers(4, 50))
         yield from session.play(seed, steps[:start] + UPSETS[kind](session, steps[start:], random))
 
@@ -78,9 +77,9 @@ def _walk(session: Session, steps: list[SessionStep], random: np.random.Generato
     ]
 
 
-def _err_together(_session: Session, steps: list[SessionStep], random: np.random.Generator) -> list[SessionStep]:
+def _err_together(session: Session, steps: list[SessionStep], random: np.random.Generator) -> list[SessionStep]:
     """Shift more than half of the key points alike."""
-    points = random.permutation(len(steps[0].points))[:TOGETHER]
+    points = draw_wrong(session.bench, random, TOGETHER)
     shift = random.uniform(-FARTHEST_SHIFT, FARTHEST_SHIFT, 3)
     return [_shift(step, points, shift) for step in steps]
 
@@ -98,6 +97,6 @@ UPSETS = {
     "frozen camera": _freeze,
     "five points creep": _creep,
     "stated contact walks": _walk,
-    "eight points off together": _err_together,
+    "more than half of the points off together": _err_together,
 }
 FAMILIES = (Family(name="upsets", what="bumped and frozen cameras, creeping points, walking contacts", run=run_upsets),)

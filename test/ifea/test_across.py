@@ -114,10 +114,10 @@ def test_turn_of_a_bent_finger():
     """About its own axis a straight finger does not move, however inclined; one of u = c z^2 moves by t c z^3 / 3."""
     z = np.arange(1, 33) * 2.5e-3
     rest = np.stack([0 * z, np.full(len(z), 0.01), z], axis=1)
-    order, rate = np.arange(len(z)), 0.5
+    rate = 0.5
     along_x = -rate * z * rest[:, 1]
-    np.testing.assert_allclose(turn_bent(along_x, order, rest, 0.1 * z), 0.0, atol=1e-15)
-    np.testing.assert_allclose(turn_bent(along_x, order, rest, 2.0 * z**2)[4:], rate * 2.0 * z[4:] ** 3 / 3, rtol=0.05)
+    np.testing.assert_allclose(turn_bent(along_x, rest, 0.1 * z), 0.0, atol=1e-15)
+    np.testing.assert_allclose(turn_bent(along_x, rest, 2.0 * z**2)[4:], rate * 2.0 * z[4:] ** 3 / 3, rtol=0.05)
 
 
 @pytest.mark.parametrize("name", ["block8_z50_y5", "cyl25_z40_tilt15", "sphere30_z40"])

@@ -27,7 +27,7 @@ def weigh(images, hold=None):
     """What follows from the images, one after the other."""
     hold = hold or HoldHypotheses()
     for points, average, state in images:
-        hold.update(points, average, state, PRIOR, (HELD, FIXED), DT)
+        hold.update(measure_traction(points, average, PRIOR)[:2], state, (HELD, FIXED), DT)
     return hold
 
 
