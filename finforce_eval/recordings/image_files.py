@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce.camera import PLUMB_BOB, CameraIntrinsics, ImageError, decode_depth, open_picture
+from finforce.camera import CameraIntrinsics, ImageError, IntrinsicsError, decode_depth, open_picture
+from finforce.camera_file import build_camera, camera_numbers, read_camera
 from finforce.errors import PoseError, one_line
-from finforce.files import FileError, read_bytes, read_json, read_yaml
+from finforce.files import FileError, read_bytes, read_json
 from finforce_contact.reconstruction.generated import affine_from_generator
 from finforce_eval.errors import OptionError
 
@@ -23,7 +23,6 @@ POSE_FORMS = (
     '{"rotation": [w, x, y, z], "translation": [x, y, z], "scale": s, "axes": "glb" or "canonical"}, '
     '{"matrix": 4x4}, {"T_camera_object": 4x4} as reconstruct writes it, or a bare 4x4 list'
 )
-INTRINSICS_FORMS = "fx fy cx cy, or a JSON or YAML file with these names, or one of a ROS camera (K and D)"
 
 
 def read_image(path: Path | str) -> NDArray:
@@ -112,68 +111,25 @@ def _read_array(path: Path) -> NDArray:
 
 
 def read_intrinsics(words: Sequence[str], shape: tuple[int, int]) -> CameraIntrinsics:
-    """Return the camera of images (h, w) from numbers or a file.
+    """Return the camera of images (h, w) from numbers, or from a file and perhaps the name of one of its cameras.
 
     Args:
-        words: fx fy cx cy [and k1 k2 p1 p2 k3], or one file name.
+        words: fx fy cx cy [and k1 k2 p1 p2 k3], also with commas, or what `read_camera` takes.
         shape: height and width of the images.
 
     Raises:
         OptionError: they are neither, or of a camera with images of another size.
-        IntrinsicsError: no camera has them.
     """
-    named = _intrinsics_from_file(Path(words[0])) if len(words) == 1 else _name_numbers(words)
-    for name, size in (("height", shape[0]), ("width", shape[1])):
-        if named.get(name, size) not in (size, str(size)):
-            raise OptionError(f"intrinsics: {name} {str(named[name])[:40]}, the depth image has {size}")
     try:
-        values = {name: float(named[name]) for name in ("fx", "fy", "cx", "cy")}
-        distortion = np.array(named.get("distortion", []), dtype=float)
-        model = str(named.get("distortion_model") or PLUMB_BOB)
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise OptionError(f"intrinsics: {error!r} is missing or no number; expected {INTRINSICS_FORMS}") from None
-    return CameraIntrinsics(width=shape[1], height=shape[0], **values, distortion=distortion, model=model)
-
-
-def _name_numbers(words: Sequence[str]) -> dict[str, Any]:
-    """Return numbers by their names."""
-    try:
-        numbers = [float(word) for word in words]
+        numbers = [float(part) for word in words for part in word.split(",")]
     except ValueError:
         numbers = []
-    if len(numbers) not in (4, 8, 9):
-        raise OptionError(f"--intrinsics {' '.join(words)}: expected {INTRINSICS_FORMS}")
-    return {**dict(zip(("fx", "fy", "cx", "cy"), numbers, strict=False)), "distortion": numbers[4:]}
-
-
-def _intrinsics_from_file(path: Path) -> dict[str, Any]:
-    """Return intrinsics by name; of a ROS camera's file, K and D are taken apart."""
     try:
-        content = read_yaml(path)
-    except FileError as error:
-        raise OptionError(f"{path.name}: neither JSON nor YAML: {error}") from error
-    if not isinstance(content, Mapping):
-        raise OptionError(f"{path.name}: expected {INTRINSICS_FORMS}")
-    named = {str(name): value for name, value in content.items()}
-    for size in ("width", "height"):
-        named.setdefault(size, named.get(f"image_{size}"))
-    named = {name: value for name, value in named.items() if value is not None}
-    matrix = _find_list(named, ("K", "k", "camera_matrix"))
-    if matrix is not None and len(matrix) == 9:
-        named.update(fx=matrix[0], cx=matrix[2], fy=matrix[4], cy=matrix[5])
-    distortion = _find_list(named, ("distortion", "D", "d", "coeffs", "distortion_coefficients"))
-    return {**named, "distortion": distortion or []}
-
-
-def _find_list(named: Mapping[str, Any], names: Sequence[str]) -> list | None:
-    """Return the first list under one of the names; those of OpenCV's files lie one level deeper."""
-    for name in names:
-        value = named.get(name)
-        value = value.get("data") if isinstance(value, Mapping) else value
-        if isinstance(value, list):
-            rows = [row if isinstance(row, list) else [row] for row in value]
-            return [number for row in rows for number in row]
-    return None
+        if numbers or len(words) > 2:
+            return build_camera(camera_numbers(numbers), shape)
+        return read_camera(words[0], shape, *words[1:])
+    except IntrinsicsError as error:
+        raise OptionError(f"--intrinsics {' '.join(words)[:80]}: {error}") from error
 
 
 def read_generated_pose(path: Path | str) -> NDArray:

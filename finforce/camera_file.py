@@ -1,0 +1,173 @@
+"""Intrinsics from the files that people keep them in: ROS, OpenCV, kalibr, BOP, OpenICC (UMI), or plain numbers."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from finforce.camera import EQUIDISTANT, PLUMB_BOB, RATIONAL, CameraIntrinsics, IntrinsicsError
+from finforce.files import LARGEST_YAML, FileError, parse_json, parse_yaml, read_text
+
+INTRINSICS_FORMS = (
+    "fx fy cx cy [k1 k2 p1 p2 k3], or a file of ROS, OpenCV, kalibr, BOP or OpenICC, of a 3x3 matrix, or with the "
+    "names fx, fy, cx, cy"
+)
+_NAMES = ("fx", "fy", "cx", "cy")
+_MODELS = {"radtan": PLUMB_BOB, "none": PLUMB_BOB, "pinhole": PLUMB_BOB, "fisheye": EQUIDISTANT}
+_MATRICES = ("K", "k", "camera_matrix", "Camera_Matrix", "cameraMatrix", "cam_K", "intrinsic_matrix")
+_LENSES = ("distortion", "D", "d", "coeffs", "distortion_coefficients", "Distortion_Coefficients", "distCoeffs")
+_LENSES += ("distortion_coeffs", "dist_coeffs")
+_SIZES = {"width": ("width", "image_width", "image_Width"), "height": ("height", "image_height", "image_Height")}
+
+
+def read_camera(path: str | Path, shape: tuple[int, int] | None = None, name: str = "") -> CameraIntrinsics:
+    """Return the camera that a file describes.
+
+    Args:
+        path: YAML of ROS, OpenCV or kalibr, JSON of BOP (camera, scene_camera) or OpenICC (as UMI uses it), a text
+            of fx fy cx cy or of a 3x3 matrix, or YAML or JSON with these names.
+        shape: height and width of its images; without it the file has to say.
+        name: of the camera (kalibr) or image (BOP), where a file has several that differ.
+
+    Raises:
+        IntrinsicsError: the file cannot be read, or describes no camera, several, one with images of another size, or
+            one with a lens that is not known.
+    """
+    path = Path(path)
+    try:
+        content = _parse(read_text(path))
+        named = camera_numbers(content) if isinstance(content, list) else _name_entries(_choose(content, name))
+        return build_camera(named, shape)
+    except (FileError, IntrinsicsError) as error:
+        raise IntrinsicsError(f"{path.name}: {error}") from error
+
+
+def camera_numbers(numbers: Sequence[float]) -> dict[str, Any]:
+    """Return fx fy cx cy and perhaps four or five coefficients of the lens, or a 3x3 matrix, by name."""
+    if len(numbers) == 9 and list(numbers[6:]) == [0.0, 0.0, 1.0]:
+        return _from_matrix(numbers)
+    if len(numbers) not in (4, 8, 9):
+        raise IntrinsicsError(f"{len(numbers)} numbers; expected {INTRINSICS_FORMS}")
+    return {**dict(zip(_NAMES, numbers, strict=False)), "distortion": list(numbers[4:])}
+
+
+def build_camera(named: Mapping[str, Any], shape: tuple[int, int] | None) -> CameraIntrinsics:
+    """Return the camera of entries by name: fx, fy, cx, cy, and perhaps width, height, distortion and model.
+
+    Raises:
+        IntrinsicsError: one is missing or no number, or they are of images of another size than `shape` (h, w).
+    """
+    try:
+        values = {entry: float(named[entry]) for entry in _NAMES}
+        distortion = np.array(named.get("distortion") or [], dtype=float)
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise IntrinsicsError(f"{error} is missing or no number; expected {INTRINSICS_FORMS}") from None
+    size = {}
+    for entry, given in zip(("height", "width"), shape or (None, None), strict=True):
+        try:
+            size[entry] = int(named.get(entry) or given or 0)
+        except (TypeError, ValueError, OverflowError):
+            raise IntrinsicsError(f"{entry} {str(named[entry])[:40]!r}; expected pixels") from None
+        if size[entry] < 1:
+            raise IntrinsicsError("no size of its images; expected width and height next to the other numbers")
+        if given not in (None, size[entry]):
+            raise IntrinsicsError(f"{entry} {size[entry]}, the images have {given}: expected intrinsics of that size")
+    if not (0.0 <= values["cx"] <= size["width"] and 0.0 <= values["cy"] <= size["height"]):
+        raise IntrinsicsError(
+            f"principal point {values['cx']:g}, {values['cy']:g} outside images of {size['width']} x {size['height']}: "
+            "are these the intrinsics of images of another size?"
+        )
+    model = str(named.get("model") or (RATIONAL if distortion.size > 5 else PLUMB_BOB))
+    return CameraIntrinsics(**size, **values, distortion=distortion, model=_MODELS.get(model.lower(), model))
+
+
+def _parse(text: str) -> Any:
+    """Return the content of a JSON or YAML text, that of OpenCV included, or a list where there are numbers alone."""
+    try:
+        return [float(part) for part in re.split(r"[\s,;]+", text.strip("[]() \t\r\n"))]
+    except ValueError:
+        pass
+    if text.lstrip().startswith("{"):
+        return parse_json(text)
+    if len(text) > LARGEST_YAML:
+        raise FileError(f"has more than {LARGEST_YAML >> 10} KiB")
+    return parse_yaml(re.sub(r"^%YAML:.*", "", text, count=1).replace("!!opencv-matrix", ""), text_keys=False)
+
+
+def _choose(content: Any, name: str) -> Mapping[str, Any]:
+    """Return the entries of one camera of a file, of which kalibr's and BOP's may have several."""
+    if not isinstance(content, Mapping):
+        raise IntrinsicsError(f"expected {INTRINSICS_FORMS}")
+    cameras = {
+        str(key): value
+        for key, value in content.items()
+        if isinstance(value, Mapping) and ("cam_K" in value or isinstance(value.get("intrinsics"), list))
+    }
+    if not cameras:
+        return {str(key): value for key, value in content.items()}
+    found = [cameras[name]] if name in cameras else [] if name else list(cameras.values())
+    named = [_name_entries(each) for each in found]
+    if not found or any(each != named[0] for each in named):
+        what = f"no camera {name}, but" if name else "several cameras:"
+        raise IntrinsicsError(f"{what} {', '.join([*cameras][:5])}; expected one of these behind the file's name")
+    return found[0]
+
+
+def _name_entries(entries: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a file says of a camera by the names of `build_camera`."""
+    named: dict[str, Any] = {name: entries[name] for name in _NAMES if name in entries}
+    for name, others in _SIZES.items():
+        named[name] = next((entries[other] for other in others if entries.get(other) is not None), None)
+    size = _numbers(entries.get("resolution") or entries.get("image_size"))
+    if len(size) == 2:
+        named |= {"width": size[0], "height": size[1]}
+    matrix = next((each for each in (_numbers(entries.get(name)) for name in _MATRICES) if len(each) == 9), None)
+    intrinsics = entries.get("intrinsics")
+    if matrix:
+        named |= _from_matrix(matrix)
+    elif isinstance(intrinsics, Mapping):
+        return named | _from_openicc(intrinsics, str(entries.get("intrinsic_type")))
+    elif intrinsics is not None:
+        if entries.get("camera_model", "pinhole") != "pinhole" or len(_numbers(intrinsics)) != 4:
+            raise IntrinsicsError(f"camera_model {entries.get('camera_model')}: expected pinhole, with fu fv pu pv")
+        named |= zip(_NAMES, intrinsics, strict=True)
+    named["distortion"] = next(filter(None, (_numbers(entries.get(name)) for name in _LENSES)), [])
+    named["model"] = EQUIDISTANT if entries.get("fisheye_model") else entries.get("distortion_model")
+    return named
+
+
+def _from_matrix(matrix: Sequence[Any]) -> dict[str, Any]:
+    """Return the entries of a 3x3 matrix, row by row."""
+    if any(matrix[index] for index in (1, 3, 6, 7)):
+        raise IntrinsicsError(f"camera matrix {list(matrix)}: expected no skew, [fx 0 cx 0 fy cy 0 0 1]")
+    return {"fx": matrix[0], "cx": matrix[2], "fy": matrix[4], "cy": matrix[5]}
+
+
+def _from_openicc(intrinsics: Mapping[str, Any], kind: str) -> dict[str, Any]:
+    """Return the entries of a camera of OpenICC, whose fisheye is the equidistant one.
+
+    Source: Theia, FisheyeCameraModel and PinholeCameraModel.
+    """
+    counts = {"FISHEYE": 4, "PINHOLE": 2}
+    if kind not in counts or intrinsics.get("skew"):
+        raise IntrinsicsError(f"intrinsic_type {kind}, skew {intrinsics.get('skew')}: expected FISHEYE or PINHOLE, 0")
+    try:
+        focal = float(intrinsics["focal_length"])
+        bent = [float(intrinsics[f"radial_distortion_{number}"]) for number in range(1, counts[kind] + 1)]
+        named = {"fx": focal, "fy": focal * float(intrinsics.get("aspect_ratio", 1.0))}
+    except (KeyError, TypeError, ValueError) as error:
+        raise IntrinsicsError(f"intrinsics: {error} is missing or no number") from None
+    named |= {"cx": intrinsics.get("principal_pt_x"), "cy": intrinsics.get("principal_pt_y")}
+    is_fisheye = kind == "FISHEYE"
+    return named | {"distortion": bent if is_fisheye else [*bent, 0.0, 0.0], "model": EQUIDISTANT if is_fisheye else ""}
+
+
+def _numbers(value: Any) -> list[Any]:
+    """Return the entries of a list, of rows, or of what OpenCV and ROS write as `data`; none of anything else."""
+    value = value.get("data") if isinstance(value, Mapping) else value
+    rows = value if isinstance(value, list) else []
+    return [number for row in rows for number in (row if isinstance(row, list) else [row])]

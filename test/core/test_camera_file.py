@@ -1,0 +1,143 @@
+"""Claims about cameras from files: each program's file gives its camera, and no file one that it does not describe."""
+
+import json
+
+import numpy as np
+import pytest
+
+from finforce.camera import IntrinsicsError, project, rays_from_pixels
+from finforce.camera_file import read_camera
+
+OPENCV = """%YAML:1.0
+---
+image_width: 640
+image_height: 480
+camera_matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 600., 0., 322., 0., 601., 243., 0., 0., 1. ]
+distortion_coefficients: !!opencv-matrix
+   rows: 5
+   cols: 1
+   dt: d
+   data: [ 0.1, -0.2, 1e-3, 2e-3, 0.05 ]
+"""
+KALIBR = """%YAML:1.0 # a remark
+cam0:
+  camera_model: pinhole
+  distortion_coeffs: [0.01, -0.02, 0.003, -0.004]
+  distortion_model: {model}
+  intrinsics: [300.0, 301.0, 320.0, 240.0]
+  resolution: [640, 480]
+  T_cam_imu:
+    - [1.0, 0.0, 0.0, 0.0]
+"""
+GOPRO = {
+    "image_width": 2704,
+    "image_height": 2028,
+    "intrinsic_type": "FISHEYE",
+    "intrinsics": {
+        "aspect_ratio": 1.01,
+        "focal_length": 800.0,
+        "principal_pt_x": 1350.0,
+        "principal_pt_y": 1010.0,
+        "radial_distortion_1": -0.02,
+        "radial_distortion_2": -0.01,
+        "radial_distortion_3": 0.002,
+        "radial_distortion_4": -0.0001,
+        "skew": 0.0,
+    },
+}
+
+
+def write(tmp_path, content):
+    path = tmp_path / "camera.txt"
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    return path
+
+
+def numbers_of(camera):
+    return [camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy]
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "600,601,322,243",
+        "600 601\n322 243\n",
+        "600.0 0 322\n0 601 243\n0 0 1\n",
+        {"0": {"cam_K": [600, 0, 322, 0, 601, 243, 0, 0, 1], "depth_scale": 0.1}},
+        {str(image): {"cam_K": [600, 0, 322, 0, 601, 243, 0, 0, 1], "depth_scale": 0.1 * image} for image in (1, 2)},
+        {"cx": 322, "cy": 243, "fx": 600, "fy": 601, "width": 640, "height": 480, "depth_scale": 1.0},
+        {"intrinsic_matrix": [[600, 0, 322], [0, 601, 243], [0, 0, 1]]},
+        OPENCV.replace("0.1, -0.2, 1e-3, 2e-3, 0.05", "0., 0., 0., 0., 0."),
+    ],
+)
+def test_every_way_to_write_a_pinhole_gives_the_same_camera(content, tmp_path):
+    camera = read_camera(write(tmp_path, content), (480, 640))
+    assert numbers_of(camera) == [640, 480, 600.0, 601.0, 322.0, 243.0]
+    assert not camera.is_distorted
+
+
+def test_the_lens_of_opencv_keeps_its_coefficients_in_their_order(tmp_path):
+    camera = read_camera(write(tmp_path, OPENCV))
+    assert camera.model == "plumb_bob" and numbers_of(camera)[:2] == [640, 480]
+    np.testing.assert_array_equal(camera.distortion, [0.1, -0.2, 1e-3, 2e-3, 0.05])
+    wide = OPENCV.replace("0.05 ]", "0.05, 0.01, 0.02, 0.03 ]")
+    assert read_camera(write(tmp_path, wide)).model == "rational_polynomial"
+
+
+@pytest.mark.parametrize(("model", "expected"), [("radtan", "plumb_bob"), ("equidistant", "equidistant")])
+def test_kalibr_names_the_lens(model, expected, tmp_path):
+    camera = read_camera(write(tmp_path, KALIBR.format(model=model)))
+    assert camera.model == expected and numbers_of(camera) == [640, 480, 300.0, 301.0, 320.0, 240.0]
+    np.testing.assert_array_equal(camera.distortion[:4], [0.01, -0.02, 0.003, -0.004])
+
+
+def test_a_fisheye_of_umi_is_the_equidistant_lens(tmp_path):
+    camera = read_camera(write(tmp_path, GOPRO))
+    assert camera.model == "equidistant" and camera.fy == pytest.approx(808.0)
+    x, y = 1.0, 0.5
+    angle = np.arctan(np.hypot(x, y))
+    bent = angle * (1 - 0.02 * angle**2 - 0.01 * angle**4 + 0.002 * angle**6 - 0.0001 * angle**8)
+    expected = np.array([1350.0, 1010.0]) + bent / np.hypot(x, y) * np.array([800.0 * x, 808.0 * y])
+    pixel = project(np.array([[x, y, 1.0]]), camera)
+    np.testing.assert_allclose(pixel[0], expected, atol=1e-9)
+    np.testing.assert_allclose(rays_from_pixels(pixel, camera), [[x, y, 1.0]], atol=1e-8)
+
+
+def test_of_several_cameras_one_has_to_be_named(tmp_path):
+    both = KALIBR.format(model="radtan") + KALIBR.format(model="radtan").partition("\n")[2].replace(
+        "cam0", "cam1"
+    ).replace("300.0, 301.0", "400.0, 401.0")
+    path = write(tmp_path, both)
+    with pytest.raises(IntrinsicsError, match="several cameras: cam0, cam1"):
+        read_camera(path)
+    assert read_camera(path, name="cam1").fx == 400.0
+    with pytest.raises(IntrinsicsError, match="no camera cam7, but cam0, cam1"):
+        read_camera(path, name="cam7")
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ({"aruco_dict": {"predefined": "DICT_4X4_50"}}, "'fx' is missing"),
+        ({"intrinsic_type": "DOUBLE_SPHERE", "intrinsics": {}}, "DOUBLE_SPHERE"),
+        (KALIBR.format(model="radtan").replace("pinhole", "omni"), "camera_model omni"),
+        (KALIBR.format(model="fov"), "distortion model 'fov'"),
+        ({"fx": 600, "fy": 600, "cx": 320, "cy": 240}, "no size of its images"),
+        (GOPRO | {"image_width": 640, "image_height": 480}, "principal point 1350, 1010 outside images of 640 x 480"),
+        ("600 601 322", "3 numbers"),
+        ({"K": [600, 2, 322, 0, 601, 243, 0, 0, 1], "width": 640, "height": 480}, "no skew"),
+        ("\x00", "camera.txt"),
+    ],
+)
+def test_what_describes_no_camera_is_refused_by_name(content, words, tmp_path):
+    with pytest.raises(IntrinsicsError, match=f"camera.txt: .*{words}" if words != "camera.txt" else words):
+        read_camera(write(tmp_path, content))
+
+
+def test_a_camera_of_another_picture_size_is_refused(tmp_path):
+    with pytest.raises(IntrinsicsError, match="height 480, the images have 240"):
+        read_camera(write(tmp_path, OPENCV), (240, 320))
