@@ -22,6 +22,7 @@ LARGEST, LARGEST_YAML = 16 << 20, 1 << 19
 _MOST_BUDGET = 10_000.0
 DEEPEST, MOST_VALUES, MOST_DIGITS = 50, 50_000, 400
 BUDGET = "FINFORCE_BUDGET"  # of the environment: a factor on what files may cost
+_POINTER = b"version https://git-lfs.github.com/spec/"
 _OPEN = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
 
 
@@ -59,6 +60,41 @@ def read_bytes(path: str | Path, largest: int = LARGEST) -> bytes:
     if len(content) > allowed:
         raise FileError(f"has more than {allowed >> 10} KiB; {BUDGET}=10 would allow ten times as many")
     return content
+
+
+def check_plain(path: Path) -> None:
+    """Refuse what a reader of content would wait for or stumble over.
+
+    Raises:
+        FileError: it is missing, no plain file, or stands for a file that Git LFS has not fetched.
+    """
+    try:
+        is_plain = stat.S_ISREG(path.stat().st_mode)
+        head = path.open("rb").read(len(_POINTER)) if is_plain else b""
+    except (OSError, ValueError) as error:
+        raise FileError(f"cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    if not is_plain:
+        raise FileError("is no plain file")
+    if head == _POINTER:
+        raise FileError("is the pointer of a file that Git LFS has not fetched: run `git lfs pull` in its repository")
+
+
+def check_inside(path: Path, folder: Path) -> Path:
+    """Return a path that lies in a folder, links followed.
+
+    A snapshot of Hugging Face's cache consists of links to the blobs next to it, which are taken for part of it.
+
+    Raises:
+        FileError: it leads out of the folder.
+    """
+    roots = [folder.resolve()]
+    if roots[0].parent.name == "snapshots":
+        roots.append(roots[0].parents[1] / "blobs")
+    if not any(path.resolve().is_relative_to(root) for root in roots):
+        raise FileError(
+            f"{path.name} leads out of the folder {folder.name}; expected what lies in it, no link elsewhere"
+        )
+    return path
 
 
 def read_text(path: str | Path, largest: int = LARGEST) -> str:

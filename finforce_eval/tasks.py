@@ -99,6 +99,11 @@ class EngineOptions:
             raise OptionError(f"--memory {self.memory}: expected gigabytes, or 0")
 
 
+def is_manifest(path: Path) -> bool:
+    """Say whether a file has the name of a manifest."""
+    return path.match("manifest*.jsonl") and path.is_file()
+
+
 class Manifest:
     """The lines of the tasks that have ended, in a file that grows by one whole line at a time.
 

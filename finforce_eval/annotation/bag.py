@@ -17,9 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.errors import FinforceError, one_line
+from finforce.files import FileError, check_inside
 from finforce.messages import read_stamp
 from finforce_eval.errors import RecordingError
-from finforce_eval.evaluation.forces import estimate_forces, no_force_reasons
+from finforce_eval.evaluation.forces import estimate_forces, no_force_reasons, why_no_force
 from finforce_eval.evaluation.gripper import combine_jaws
 from finforce_eval.evaluation.keypoint_source import parse_source
 from finforce_eval.evaluation.setup import share_setup, sides_of
@@ -72,9 +73,13 @@ def annotate_bag(source: Path, target: Path, options: argparse.Namespace, settin
         if note["key"] == key:
             return note["figures"]
     setup, keypoints = share_setup(settings, options), parse_source(options)
-    recording = read_recording(source, keypoints.pairing, sides_of(options), strict=keypoints.strict)
+    recording = read_recording(source, keypoints.choice, sides_of(options), strict=keypoints.strict)
+    setup.contacts.check(recording)
     recording = keypoints.apply(replace(recording, name=source.stem))
     jaws = estimate_forces(recording, setup)
+    if not any(forces.solved.any() for forces in jaws.values()):
+        images = max(map(len, jaws.values()))
+        raise RecordingError(f"{source.stem}: no force in any of {images} images: {why_no_force(jaws.values())}")
     messages = ForceMessages(jaws, combine_jaws(jaws))
     figures = without_nan(_describe(jaws) | {"notes": list(recording.notes)})
     about = {"key": key, "figures": figures, "settings": dict(setup.about), "version": version()}
@@ -191,6 +196,11 @@ def write_annotated(
         RecordingError: the bag has a topic of the same name.
         OSError: the folder cannot be written, or the disk is full.
     """
+    for path in source.iterdir() if source.is_dir() else ():
+        try:
+            check_inside(path, source)
+        except FileError as error:
+            raise RecordingError(f"{source.name}: {error}") from error
     with open_bag(source, recording.name) as bag:
         same = sorted(bag.types.keys() & forces.topics)
         if same and not side_file:

@@ -16,26 +16,26 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from finforce.files import parse_json, read_json
-from finforce_eval.annotation.dataset import (
+from finforce.files import FileError, check_inside, check_plain, parse_json, read_json
+from finforce_eval.errors import RecordingError
+from finforce_eval.evaluation.forces import estimate_forces, no_force_reasons, why_no_force
+from finforce_eval.evaluation.gripper import combine_jaws
+from finforce_eval.evaluation.keypoint_source import parse_source
+from finforce_eval.evaluation.setup import describe_options, read_contacts, share_setup, sides_of
+from finforce_eval.recordings.dataset import (
     EPISODE_STATS_V2,
     EPISODES_V3,
     INFO,
     STATS,
     Dataset,
     Episode,
-    EpisodeImages,
     open_dataset,
+    read_lens,
     read_parquet,
+    recording_of,
     rows_of,
 )
-from finforce_eval.errors import RecordingError
-from finforce_eval.evaluation.forces import estimate_forces, no_force_reasons
-from finforce_eval.evaluation.gripper import combine_jaws
-from finforce_eval.evaluation.keypoint_source import parse_source
-from finforce_eval.evaluation.setup import describe_options, share_setup, sides_of
-from finforce_eval.recordings.image_files import read_intrinsics
-from finforce_eval.recordings.tracks import JawTrack, KeypointTrack, Recording
+from finforce_eval.recordings.tracks import Recording
 from finforce_eval.table import ForceSeries, read_table, write_table
 from finforce_eval.tasks import Task, hash_settings
 
@@ -50,19 +50,48 @@ def episode_tasks(folder: Path, parts: Path, options: argparse.Namespace) -> lis
     Raises:
         FinforceError: the dataset cannot be read, or its camera is not known.
     """
-    dataset = open_dataset(folder, options.images)
-    camera = read_intrinsics(options.intrinsics, dataset.image_size)
+    dataset = open_dataset(folder, options.color or "")
+    camera = read_lens(dataset, options.intrinsics)
+    _check_files(dataset)
+    own = (f"{options.prefix}.force.", f"{options.prefix}.grasp_force")
+    same = sorted(name for name in dataset.info["features"] if name.startswith(own))
+    if same:
+        raise RecordingError(f"{folder.name}: has {', '.join(same)} already; expected another --prefix")
     settings, tasks = describe_options(options), []
     for episode in dataset.episodes:
-        target, name = part_of(parts, episode.index), f"{folder.name}/episode_{episode.index:06d}"
-        files = [path for path in (episode.video, episode.data) if path is not None and path.is_file()]
+        recording = recording_of(dataset, episode, camera, sides_of(options))
+        if not tasks:
+            read_contacts(options).check(recording)
+        target = part_of(parts, episode.index)
+        files = [path for path in (episode.video, episode.data) if path is not None]
         key = hash_settings(settings | {"episode": episode.index}, files)
-        images = EpisodeImages(
-            episode=episode, name=name, feature=dataset.camera, fps=float(dataset.info["fps"]), camera=camera
-        )
-        given = {"images": images, "target": target, "options": options, "settings": hash_settings(settings)}
+        given = {"recording": recording, "target": target, "options": options, "settings": hash_settings(settings)}
+        name = recording.name
         tasks.append(Task(name=name, key=key, work=annotate_episode, given=given | {"key": key}, output=str(target)))
     return tasks
+
+
+def _check_files(dataset: Dataset) -> None:
+    """Refuse a dataset some of whose files are not there, or lead out of it.
+
+    Raises:
+        RecordingError: which, and how many.
+    """
+    files, missing = {path for each in dataset.episodes for path in (each.video, each.data) if path is not None}, {}
+    for path in sorted(files):
+        try:
+            check_plain(path)
+        except FileError as error:
+            missing[path.relative_to(dataset.folder)] = error
+    if missing:
+        (path, error), *_ = missing.items()
+        what = f"{len(missing)} of {len(files)} files cannot be read"
+        raise RecordingError(f"{dataset.folder.name}: {what}; {path} {error}")
+    try:
+        for path in dataset.folder.rglob("*"):
+            check_inside(path, dataset.folder)
+    except FileError as error:
+        raise RecordingError(f"{dataset.folder.name}: {error}") from error
 
 
 def part_of(parts: Path, index: int) -> Path:
@@ -71,12 +100,12 @@ def part_of(parts: Path, index: int) -> Path:
 
 
 def annotate_episode(
-    images: EpisodeImages, target: Path, options: argparse.Namespace, settings: str, key: str
+    recording: Recording, target: Path, options: argparse.Namespace, settings: str, key: str
 ) -> dict[str, Any]:
     """Find the forces of one episode, write them and return figures; what is there already is not done again.
 
     Args:
-        images: of the episode.
+        recording: the episode.
         target: file of the forces.
         options: of the command `annotate`.
         settings: hash of them and of the files that they name.
@@ -86,26 +115,31 @@ def annotate_episode(
         FinforceError: its pictures cannot be read, or the jaw not be used.
     """
     with suppress(RecordingError):
-        if read_table(target)[1].get("key") == key:
-            return {}
-    setup, keypoints, name = share_setup(settings, options), parse_source(options), images.name
-    jaws = {side: JawTrack(keypoints=KeypointTrack.empty()) for side in sides_of(options)}
-    recording = Recording(name=name, path=images.episode.data, jaws=jaws, images=images)
+        about = read_table(target)[1]
+        if about.get("key") == key:
+            return about["figures"]
+    setup, keypoints, name = share_setup(settings, options), parse_source(options), recording.name
+    images, notes = recording.images, []
     try:
-        found = estimate_forces(keypoints.apply(recording), setup)
+        seen = keypoints.apply(recording)
+        found, notes = estimate_forces(seen, setup), list(seen.notes)
     except RecordingError as error:
         if _NO_KEYPOINTS not in str(error):
             raise
         nothing = {"force": np.full((len(images), 3), np.nan), "message": str(error).removeprefix(f"{name}: ")}
         nothing |= {"force_stddev": nothing["force"], "scored": True, "status": "not found"}
-        found = {side: ForceSeries.build(name, side, images.stamps, **nothing) for side in jaws}
+        found = {side: ForceSeries.build(name, side, images.stamps, **nothing) for side in recording.jaws}
     grasp = combine_jaws(found)
-    write_table(target, [grasp, *(each.renamed(f"{name}/{side}") for side, each in found.items())], {"key": key})
     values = grasp.column("grasp_force")
-    answered = int(np.isfinite(values).sum())
-    largest = float(np.nanmax(values)) if answered else float("nan")
-    jaws = {"both": {"images": len(values), "answered": answered, "largest_N": largest}}
-    return {"jaws": jaws, "span_s": round(len(values) / images.fps, 3), "notes": []}
+    answered = {side: int(each.solved.sum()) for side, each in found.items()}
+    both = int(np.isfinite(values).sum())
+    jaws = {"both": {"images": len(values), "answered": both, "largest_N": float(np.nanmax(values)) if both else None}}
+    if not any(answered.values()):
+        notes = [f"no force in any of {len(values)} images: {why_no_force(found.values())}"]
+    figures = {"jaws": jaws, "found": answered, "span_s": round(len(values) / images.fps, 3), "notes": notes}
+    about = {"key": key, "figures": figures}
+    write_table(target, [grasp, *(each.renamed(f"{name}/{side}") for side, each in found.items())], about)
+    return figures
 
 
 def write_dataset(folder: Path, parts: Path, target: Path, options: argparse.Namespace) -> None:
@@ -120,18 +154,15 @@ def write_dataset(folder: Path, parts: Path, target: Path, options: argparse.Nam
         options: of the command `annotate`.
 
     Raises:
-        RecordingError: the dataset has such features already, or its rows are not those of its episodes.
+        RecordingError: its rows are not those of its episodes.
         OSError: the folder cannot be written.
     """
-    dataset = open_dataset(folder, options.images)
+    dataset = open_dataset(folder, options.color or "")
     features = {
         each.index: _features_of(part_of(parts, each.index), options.prefix, sides_of(options))
         for each in dataset.episodes
     }
     described = _describe_features(next(iter(features.values()), {}))
-    same = sorted(described.keys() & dataset.info["features"].keys())
-    if same:
-        raise RecordingError(f"{folder.name}: has {', '.join(same)} already; expected another --prefix")
     changed = {each.data for each in dataset.episodes}
     _copy_rest(folder, target, changed)
     for path in sorted(changed):
@@ -181,7 +212,7 @@ def _copy_rest(folder: Path, target: Path, changed: set[Path]) -> None:
         copy.parent.mkdir(parents=True, exist_ok=True)
         if path.suffix == ".mp4":
             with suppress(OSError):
-                os.link(path, copy)
+                os.link(path.resolve(), copy)
                 continue
         shutil.copy2(path, copy)
 

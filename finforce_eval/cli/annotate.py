@@ -8,31 +8,26 @@ from pathlib import Path
 from shutil import rmtree
 from typing import Any
 
+from finforce.errors import FinforceError, one_line
 from finforce_eval.annotation.bag import bag_task, new_folder
-from finforce_eval.annotation.dataset import is_dataset
 from finforce_eval.annotation.dataset_forces import episode_tasks, write_dataset
-from finforce_eval.cli.parser import JAWS_CHOICES, add_engine_options, add_run_options, read_engine
+from finforce_eval.cli.parser import BAG_HELP, add_engine_options, add_run_options, read_engine
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.keypoint_source import IMAGES
 from finforce_eval.evaluation.setup import describe_options, print_notes
 from finforce_eval.recordings.bags import name_recordings
-from finforce_eval.tasks import OK, Line, Manifest, choose_shard, run_tasks
+from finforce_eval.recordings.dataset import is_dataset
+from finforce_eval.tasks import OK, Line, Manifest, Task, choose_shard, run_tasks
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
-    text = "rosbag2 folder, .mcap or .db3 file, or the folder of a LeRobot dataset"
-    parser.add_argument("bags", nargs="+", metavar="BAG", help=text)
+    parser.add_argument("bags", nargs="+", metavar="BAG", help=BAG_HELP)
     text = "folder of what is written: one folder per recording, and manifest.jsonl (annotated)"
     parser.add_argument("--out", default="annotated", metavar="DIR", help=text)
     text = "of bags: write the new messages alone instead of a copy of the recording with them"
     parser.add_argument("--side-file", action="store_true", help=text)
-    text = "jaws that are in the images, where no topic tells; of datasets both by default"
-    parser.add_argument("--jaws", choices=JAWS_CHOICES, help=text)
-    text = "of datasets: the feature with the wrist camera's pictures; without it the only one"
-    parser.add_argument("--images", default="", metavar="FEATURE", help=text)
-    text = "of datasets: fx fy cx cy [k1 k2 p1 p2 k3] of that camera in pixels, or a JSON or YAML file"
-    parser.add_argument("--intrinsics", nargs="+", metavar="NUMBER", help=text)
+    parser.add_argument("--images", dest="color", help=argparse.SUPPRESS)
     text = "of datasets: what the names of the new features begin with (observation)"
     parser.add_argument("--prefix", default="observation", metavar="NAME", help=text)
     add_run_options(parser)
@@ -56,24 +51,28 @@ def run(options: argparse.Namespace) -> int:
         for line in lines:
             _print_outcome(line)
         for name, path in datasets.items():
-            lines += _run_dataset(name, path, options, manifest)
-    failed = sum(line["status"] != OK for line in lines)
-    print(f"{len(lines) - failed} of {len(lines)} annotated in {out}; {manifest.path.name} tells of each")
-    return 2 if failed else 0
+            try:
+                lines += _run_dataset(name, path, options, manifest)
+            except FinforceError as error:
+                lines.append(Task(name=name, key="", work=_run_dataset).line(one_line(error)))
+                _print_outcome(lines[-1])
+    annotated = sum(map(_has_force, lines))
+    print(f"{annotated} of {len(lines)} annotated in {out}; {manifest.path.name} tells of each")
+    return 2 if not annotated or any(line["status"] != OK for line in lines) else 0
+
+
+def _has_force(line: Line) -> bool:
+    """Say whether a task found a force in any image."""
+    figures = line["figures"]
+    answered = figures.get("found") or {side: jaw["answered"] for side, jaw in figures.get("jaws", {}).items()}
+    return line["status"] == OK and any(answered.values())
 
 
 def _check_dataset_options(options: argparse.Namespace) -> None:
-    """Complete the options of datasets.
-
-    Raises:
-        OptionError: the camera is not described, or part of a dataset is asked for.
-    """
-    if not options.intrinsics:
-        raise OptionError("--intrinsics: a dataset does not describe its camera; expected fx fy cx cy, or a file")
+    """Complete the options of datasets; raises OptionError where part of one is asked for."""
     if options.shard:
         raise OptionError(f"--shard {options.shard}: a dataset is written as one; give its folder to one job")
     options.jaws = options.jaws or "both"
-    _set_unless_given(options, "depth=none")
 
 
 def _set_unless_given(options: argparse.Namespace, change: str) -> None:
@@ -96,6 +95,9 @@ def _run_dataset(name: str, path: Path, options: argparse.Namespace, manifest: M
     if any(line["status"] != OK for line in lines):
         print(f"{name}: not written: some of its episodes failed", file=sys.stderr)
         return lines
+    if not any(map(_has_force, lines)):
+        print(f"{name}: not written: no force in any of its {len(lines)} episodes", file=sys.stderr)
+        return lines
     with new_folder(target) as folder:
         folder.mkdir()
         write_dataset(path, parts, folder, options)
@@ -114,4 +116,4 @@ def _print_outcome(line: dict[str, Any]) -> None:
         f"{side} {jaw['answered']} of {jaw['images']} images, {jaw['largest_N'] or 0.0:.2f} N at most"
         for side, jaw in line["figures"].get("jaws", {}).items()
     ]
-    print(f"{name}: {'; '.join(words) or 'was done before'}")
+    print(f"{name}: {'; '.join(words)}")

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from finforce.errors import MissingDependencyError
 from finforce.messages import read_stamp
 from finforce_eval.cli.extrinsics import read_at_rest
-from finforce_eval.cli.parser import add_rest_options
+from finforce_eval.cli.parser import BAG_HELP, add_rest_options
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.at_rest import ROUNDS
 from finforce_eval.evaluation.check import FAULT, check_recording
@@ -27,7 +26,7 @@ MORE = 2  # images beyond those wanted, whose depth may not have come
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
-    parser.add_argument("bags", nargs="*", metavar="BAG", help="rosbag2 folder, .mcap or .db3 file with images")
+    parser.add_argument("bags", nargs="*", metavar="BAG", help=f"{BAG_HELP}, with images")
     text = (
         "listen to a running camera instead: to the usual topics, or to those of colour images, camera_info and, "
         "if there is any, aligned depth"
@@ -102,8 +101,6 @@ def _check(options: argparse.Namespace) -> int:
     from finforce.optional import import_cv2
 
     source, recording = read_at_rest(options)
-    if not recording.images.has_depth and "depth" not in source.parameters:
-        source = replace(source, parameters={**source.parameters, "depth": "none"})
     with progress_bar(ROUNDS * len(recording.images), "image") as bar:
         check = check_recording(recording, source, bar.update)
     for line in check.findings:

@@ -14,6 +14,7 @@ from finforce_eval.cli.parser import picture_file
 from finforce_eval.evaluate import read_evaluations
 from finforce_eval.evaluation.comparison import (
     BETTER,
+    LOST,
     SAME,
     WORSE,
     Change,
@@ -36,7 +37,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--figure", type=picture_file, metavar="PNG", help="draw the error of each recording before and after"
     )
-    parser.add_argument("--strict", action="store_true", help="exit with 1 where a recording got worse beyond chance")
+    parser.add_argument("--strict", action="store_true", help="exit with 1 where a recording got worse or is gone")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -55,7 +56,7 @@ def run(options: argparse.Namespace) -> int:
         names = Path(options.before).stem, Path(options.after).stem
         draw_comparison(changes, names).savefig(options.figure)
         print(f"Picture: {options.figure}")
-    return WORSE_FOUND if options.strict and any(change.verdict == WORSE for change in changes) else 0
+    return WORSE_FOUND if options.strict and any(change.verdict in (WORSE, LOST) for change in changes) else 0
 
 
 def _read(path: Path) -> Mapping[str, Any]:
@@ -89,6 +90,6 @@ def format_changes(changes: Sequence[Change]) -> str:
     lines.append(
         f"{counts[BETTER]} better, {counts[WORSE]} worse, {counts[SAME]} the same, {rest} unsure or in one file only. "
         "chance: one standard deviation of the difference, by how it varies within the recording; better and worse are "
-        "beyond three of them."
+        "beyond three of them, worse also where 5 % fewer frames are answered."
     )
     return "\n".join(lines).replace("nan", "  -")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from finforce.camera import ImageError, decode_picture
 from finforce.transforms import pose_numbers, rotation_between
-from finforce_eval.cli.parser import add_rest_options
+from finforce_eval.cli.parser import BAG_HELP, add_rest_options
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.at_rest import ROUNDS, approach, first_images
 from finforce_eval.evaluation.keypoint_source import KeypointSource, build_records, choose_images, parse_source
@@ -24,7 +24,7 @@ from finforce_keypoints.geometry.extrinsics import Extrinsics, GridCamera, find_
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
-    text = "rosbag2 folder, .mcap or .db3 file with images; with --grid a picture"
+    text = f"{BAG_HELP}, with images; with --grid a picture"
     parser.add_argument("bags", nargs=1, metavar="BAG", help=text)
     text = "the picture shows a table with holes this far apart [m]: find the camera's intrinsics and its pose above it"
     parser.add_argument("--grid", type=float, metavar="PITCH", help=text)
@@ -56,7 +56,7 @@ def read_at_rest(options: argparse.Namespace) -> tuple[KeypointSource, Recording
         raise OptionError(f"--images {options.images}: expected at least 5, the mean of which is taken")
     source = parse_source(options)
     sides = sides_of(options)
-    (recording,) = read_recordings(options.bags, source.pairing, sides, strict=source.strict)
+    (recording,) = read_recordings(options.bags, source.choice, sides, strict=source.strict)
     recording = first_images(recording, options.images)
     return source, replace(recording, jaws={side: recording.jaws[side] for side in sides})
 

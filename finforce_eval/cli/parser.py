@@ -15,7 +15,7 @@ MESHES = ("default", "coarse", "fine")
 UNITS = ("m", "cm", "mm", "inch")
 SOURCES = ("images", "keypoints", "truth")
 JAWS_CHOICES = ("left", "right", "both")
-BAG_HELP = "rosbag2 folder, .mcap or .db3 file"
+BAG_HELP = "rosbag2 folder, .mcap or .db3 file, or the folder of a LeRobot dataset"
 CONTACT_HELP = (
     "contact: estimate, closest or paper, from the object's mesh and pose; fixed:Z_MM, the height of first touch above "
     "the clamped base; fixed:case takes it from the case.json next to each recording; NAME=Z_MM gives it for one "
@@ -51,6 +51,8 @@ def add_run_options(parser: argparse.ArgumentParser, *, calibration: bool = True
     text = "key points: images, by the detector; keypoints, as recorded; truth, of a synthetic recording. Without it "
     text += "keypoints where they were recorded, else images"
     parser.add_argument("--from", dest="source", choices=SOURCES, help=text)
+    text = "jaws that are in the images, where no topic tells (both)"
+    parser.add_argument("--jaws", choices=JAWS_CHOICES, help=text)
     add_detector_options(parser)
     text = "refuse a recording that is cut off or damaged; without it, it is read as far as it is good"
     parser.add_argument("--strict", action="store_true", help=text)
@@ -68,6 +70,17 @@ def add_detector_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--detector", action="append", default=[], metavar="NAME=VALUE", help=text)
     text = "the camera in the gripper: robot, bench, or x,y,z,qx,qy,qz,qw; without it that of the case.json, else robot"
     parser.add_argument("--extrinsics", metavar="POSE", help=text)
+    text = "topic of the colour images, of a LeRobot dataset the feature; without it the only one there is"
+    parser.add_argument("--color", metavar="TOPIC", help=text)
+    text = "topic of the depth images; without it the only one in the frame of the colour images"
+    parser.add_argument("--depth", metavar="TOPIC", help=text)
+    text = "topic of the camera_info; without it that next to the colour images"
+    parser.add_argument("--camera-info", metavar="TOPIC", help=text)
+    text = "the camera, instead of camera_info and for LeRobot datasets: fx fy cx cy [k1 k2 p1 p2 k3] in pixels, or a "
+    text += "file of ROS, OpenCV, kalibr, BOP or OpenICC (UMI), and which of its cameras where it has several"
+    parser.add_argument("--intrinsics", nargs="+", metavar="NUMBER", help=text)
+    episode = whole_number(0, 10**9)
+    parser.add_argument("--episode", type=episode, default=0, metavar="N", help="of a LeRobot dataset (0)")
 
 
 def add_rest_options(parser: argparse.ArgumentParser, images: int) -> None:

@@ -9,7 +9,7 @@ from dataclasses import asdict
 from finforce_eval.cli.parser import BAG_HELP, add_run_options
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.keypoint_source import parse_source
-from finforce_eval.evaluation.setup import make_setup
+from finforce_eval.evaluation.setup import make_setup, sides_of
 from finforce_eval.evaluation.tables import evaluation_json, format_tables
 from finforce_eval.machine import write_json
 from finforce_eval.recordings.recording import read_recording
@@ -68,7 +68,7 @@ def run(options: argparse.Namespace) -> None:
         rate=options.rate, sim_time=options.sim_time, domain=options.domain, parameter_file=options.params
     )
     keypoints, calibration = parse_source(options), options.calibration or ""
-    recording = read_recording(options.bag, keypoints.pairing, strict=keypoints.strict)
+    recording = read_recording(options.bag, keypoints.choice, sides_of(options), strict=keypoints.strict)
     result = replay(recording, setup, calibration_file=calibration, playing=playing, keypoints=keypoints)
     print(format_replay(result))
     if options.json:

@@ -11,11 +11,13 @@ from finforce_eval.figures.html_report import write_html
 from finforce_eval.figures.recorded_forces import read_forces
 from finforce_eval.figures.report import write_page
 from finforce_eval.machine import version
+from finforce_eval.tasks import is_manifest
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
-    text = "recordings with forces, as annotate or the nodes write them, or folders of finforce evaluate --out"
+    text = "recordings or LeRobot datasets with forces, as annotate or the nodes write them, or folders of finforce "
+    text += "evaluate --out; the manifest next to them is passed over"
     parser.add_argument("sources", nargs="+", metavar="SOURCE", help=text)
     parser.add_argument("-o", "--output", default="report.html", metavar="FILE", help="the page (report.html)")
     parser.add_argument("--title", default="Forces", help="its heading (Forces)")
@@ -31,10 +33,13 @@ def run(options: argparse.Namespace) -> None:
     if page.suffix not in (".html", ".htm"):
         raise OptionError(f"--output {page}: expected a name that ends in .html")
     tables, recorded = [], []
-    for source in map(Path, options.sources):
+    sources = [Path(source) for source in options.sources if not is_manifest(Path(source))]
+    for source in sources:
         files = sorted(source.glob("*.parquet")) if source.is_dir() else []
         tables += files
         recorded += [] if files else read_forces(source)
+    if not tables and not recorded:
+        raise OptionError(f"{' '.join(options.sources)}: a manifest alone; expected the recordings next to it")
     if tables and recorded:
         raise OptionError("recordings and folders of evaluations: expected the one or the other")
     if tables:

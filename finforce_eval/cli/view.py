@@ -5,11 +5,11 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from finforce_eval.cli.parser import BAG_HELP, JAWS_CHOICES, add_run_options
+from finforce_eval.cli.parser import BAG_HELP, add_run_options
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.forces import estimate_forces
 from finforce_eval.evaluation.gripper import combine_jaws
-from finforce_eval.evaluation.setup import make_setup, read_keypoints, sides_of
+from finforce_eval.evaluation.setup import make_setup, read_keypoints
 from finforce_eval.tasks import progress_bar
 
 
@@ -18,8 +18,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("bags", nargs=1, metavar="BAG", help=BAG_HELP)
     text = "write a Rerun file instead of opening the viewer"
     parser.add_argument("--save", metavar="FILE.rrd", help=text)
-    text = "jaws that are in the images, where no topic tells"
-    parser.add_argument("--jaws", choices=JAWS_CHOICES, help=text)
     add_run_options(parser)
 
 
@@ -30,7 +28,7 @@ def run(options: argparse.Namespace) -> None:
     if options.save and not options.save.endswith(".rrd"):
         raise OptionError(f"--save {options.save}: expected a name that ends in .rrd")
     setup = make_setup(options)
-    (recording,) = read_keypoints(options, sides_of(options))
+    (recording,) = read_keypoints(options)
     view = RerunView(recording.name, Path(options.save) if options.save else None)
     frames = sum(len(track.keypoints.stamps) for track in recording.jaws.values())
     with progress_bar(frames, "image", recording.name) as bar:

@@ -23,6 +23,7 @@ from finforce_eval.table import ForceSeries
 BETTER, WORSE, SAME, UNSURE, GAINED, LOST = "better", "worse", "same", "unsure", "new", "gone"
 # A difference smaller than this [N] matters to nobody, however sure it is; a surer one than so many deviations counts.
 LEAST, SIGMAS = 0.002, 3.0
+LEAST_ANSWERS = 5.0  # fewer percents of the frames answered, from which on a recording got worse whatever its error
 # Seconds that err alike, and blocks without which nothing is known of chance.
 _BLOCK, _FEWEST = 4, 4
 _SECOND = 1_000_000_000
@@ -121,7 +122,7 @@ def _compare(name: str, before: Mapping[str, Any] | None, after: Mapping[str, An
         verdict = GAINED if before is None else LOST
         return Change(name=name, before=errors[0], after=errors[1], stddev=inf, answered=answered, verdict=verdict)
     stddev = _find_stddev(before, after, *errors)
-    verdict = _judge(errors[1] - errors[0], stddev)
+    verdict = WORSE if answered[1] < answered[0] - LEAST_ANSWERS else _judge(errors[1] - errors[0], stddev)
     return Change(name=name, before=errors[0], after=errors[1], stddev=stddev, answered=answered, verdict=verdict)
 
 

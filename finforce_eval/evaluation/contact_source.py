@@ -198,6 +198,18 @@ class ContactChoice:
         is_known = has_object(recording, side) and find_mesh(recording, self.object_file) is not None
         return ESTIMATED[0] if is_known else FIXED
 
+    def check(self, recording: Recording) -> None:
+        """Refuse a recording whose contact cannot be known, before its images are looked at.
+
+        Raises:
+            FinforceError: height or mesh are missing.
+        """
+        for side in recording.jaws:
+            if self.mode_for(recording, side) == FIXED:
+                self.height(recording)
+            else:
+                require_mesh(recording, self.object_file)
+
     def height(self, recording: Recording) -> float:
         """Return the height of first touch above the clamped base for a recording [m].
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Collection
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -10,11 +11,11 @@ from numpy.typing import NDArray
 
 from finforce.errors import ObservationError
 from finforce.health import Idling
-from finforce_contact.loop import ContactSource, ForceLoop
+from finforce_contact.loop import ContactSource, ForceLoop, GivenContact
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.gripper import with_distances
 from finforce_eval.evaluation.pressure_centre import InnerSurface, true_lines
-from finforce_eval.evaluation.scoring import compare_detection, match_samples, match_truth
+from finforce_eval.evaluation.scoring import ONSET_FORCE, compare_detection, match_samples, match_truth
 from finforce_eval.recordings.tracks import JAWS, Recording
 from finforce_eval.table import AXES, ForceSeries, Snapshot
 from finforce_eval.tasks import progress_bar
@@ -103,7 +104,8 @@ def estimate_forces(
     both, found = len(sides) == len(JAWS), {}
     for side in sides:
         own = setup.side(side)
-        estimator, source = own.estimator(both), own.source(recording)
+        source = GivenContact(None) if _is_unseen(recording, side) else own.source(recording)
+        estimator = own.estimator(both)
         found[side] = find_forces(
             recording,
             own.jaw,
@@ -116,6 +118,12 @@ def estimate_forces(
             watch=watch,
         )
     return with_distances(found, recording) if both else found
+
+
+def _is_unseen(recording: Recording, side: str) -> bool:
+    """Say whether a detector found a jaw in none of the images."""
+    track = recording.jaw(side)
+    return track.detection is not None and track.pose is None
 
 
 def check_keypoint_count(recording: Recording, side: str, jaw: Any) -> None:
@@ -143,14 +151,17 @@ def check_solved(result: ForceSeries, recording: Recording) -> None:
     """
     if not result.scored.any():
         raise RecordingError(f"{result.name}: {_why_unscored(result, recording)}")
-    if not result.counted.any():
-        if (result.scored & result.solved).any():
+    counted, loaded = result.counted, result.scored & (np.nan_to_num(result.true_magnitude) > ONSET_FORCE)
+    blind = counted.any() and loaded.any() and not (loaded & result.solved).any()
+    if blind or not counted.any():
+        if not blind and (result.scored & result.solved).any():
             raise RecordingError(f"{result.name}: no ground truth at the stamps of the key points")
-        words, counts = np.unique(result.column("status")[result.scored], return_counts=True)
+        words, counts = np.unique(result.column("status")[loaded if blind else result.scored], return_counts=True)
         statuses = ", ".join(f"{count} {word}" for word, count in zip(words, counts, strict=True))
         message = result.column("message")[~result.solved][-1]
         reason = f" ({statuses}): {message}" if message else f" ({statuses})"
-        raise RecordingError(f"{result.name}: none of the frames to be scored was solved{reason}")
+        what = "frames under load" if blind else "frames to be scored"
+        raise RecordingError(f"{result.name}: none of the {what} was solved{reason}")
 
 
 def _why_unscored(result: ForceSeries, recording: Recording) -> str:
@@ -199,8 +210,12 @@ def find_forces(
     stamps = track.stamps
     run, rows = _JawRun(recording, side, jaw, ForceLoop(source, estimator)), []
     idling, answered = Idling(), np.ones(len(stamps), dtype=bool)
+    unseen = _is_unseen(recording, side)
     for index, stamp in enumerate(stamps.tolist()):
         progress(1)
+        if unseen:
+            rows.append(run.row("not found", f"the {side} jaw is in none of the images"))
+            continue
         if idling.passes(stamp):
             source.contact_at(stamp)  # its node has rules of its own
             answered[index] = False
@@ -334,6 +349,12 @@ def sight_columns(recording: Recording, side: str) -> dict[str, Any]:
         errors = compare_detection(track.detection, track.sight).set_index("stamp")
         columns |= dict(errors.reindex(track.keypoints.stamps).items())
     return columns
+
+
+def why_no_force(jaws: Collection[ForceSeries]) -> str:
+    """Return the commonest reasons why images of some jaws have no force."""
+    counts = Counter(reason for forces in jaws for reason in no_force_reasons(forces) if reason)
+    return "; ".join(reason for reason, _ in counts.most_common(2))
 
 
 def no_force_reasons(forces: ForceSeries) -> list[str]:

@@ -18,7 +18,7 @@ from finforce.health import Idling
 from finforce.messages import NANOSECONDS
 from finforce.transforms import quaternion_from_pose
 from finforce_eval.errors import OptionError, RecordingError
-from finforce_eval.recordings.images import DEPTH_ENDS, PAIRED, ImageTrack
+from finforce_eval.recordings.images import DEPTH_ENDS, PAIRED, ImageChoice, ImageTrack
 from finforce_eval.recordings.tracks import DetectionTrack, JawTrack, KeypointTrack, PoseTrack, Recording
 from finforce_eval.tasks import progress_bar
 from finforce_keypoints.errors import KeypointError
@@ -40,6 +40,7 @@ DECIDED = {
     "depth_topic": _BY_ENDS,
     "info_topic": _BY_ENDS,
 }
+_CHOICES = {"color": "color", "depth": "depth", "info": "camera_info", "episode": "episode"}  # of images, by options
 _SWITCHES = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
 LIVE = ("max_age", "restart_gap", "diagnostics_period")  # without meaning where no clock runs
 
@@ -62,6 +63,7 @@ class KeypointSource:
         parameters: parameters of the detector node that differ from its defaults, by their ROS names.
         strict: refuse recordings that are damaged.
         as_live: leave out the images that the detector's node leaves out.
+        choice: which images are read.
     """
 
     source: str = ""
@@ -69,6 +71,7 @@ class KeypointSource:
     parameters: Mapping[str, Any] = field(default_factory=dict)
     strict: bool = False
     as_live: bool = False
+    choice: ImageChoice = field(default_factory=ImageChoice)
 
     def source_of(self, recording: Recording) -> str:
         """Return "images", "keypoints" or "truth" for a recording.
@@ -103,7 +106,11 @@ class KeypointSource:
 
     def node_parameters(self, recording: Recording) -> dict[str, Any]:
         """Return the parameters of the detector node for a recording, those of its own camera included."""
+        from finforce_keypoints.parameters import NO_DEPTH
+
         own = {"camera_frame": recording.images.frame_id}
+        if not recording.images.has_depth:
+            own["depth"] = NO_DEPTH
         pose = recording.case.get("T_gripper_camera")
         if isinstance(pose, list):
             own["T_gripper_camera"] = [float(number) for number in pose]
@@ -128,12 +135,6 @@ class KeypointSource:
             raise OptionError(f"--detector {live}: means nothing offline; leave it out, or use finforce replay")
         parameters, settings, dots = build_records(self.node_parameters(recording))
         return build_detector(load_jaws(parameters), parameters, settings, dots, self.as_live)
-
-    @property
-    def pairing(self) -> int:
-        """Greatest distance between the stamps of a colour and a depth image that belong together [ns]."""
-        seconds = self.parameters.get("sync_tolerance")
-        return PAIRED if seconds is None else round(seconds * NANOSECONDS)
 
     def _detect(self, recording: Recording) -> Recording:
         detector, parameters = self.build(recording), build_records(self.node_parameters(recording)).parameters
@@ -214,7 +215,14 @@ def parse_source(options: argparse.Namespace) -> KeypointSource:
     if extrinsics:
         parameters["T_gripper_camera"] = _parse_extrinsics(extrinsics)
     switches = {name: bool(getattr(options, name, False)) for name in ("strict", "as_live")}
-    return KeypointSource(source=source, jaw_file=options.jaw, parameters=parameters, **switches)
+    seconds = parameters.get("sync_tolerance")
+    given = {name: getattr(options, option, None) for name, option in _CHOICES.items()}
+    choice = ImageChoice(
+        **{name: value for name, value in given.items() if value},
+        intrinsics=tuple(getattr(options, "intrinsics", None) or ()),
+        pairing=PAIRED if seconds is None else round(seconds * NANOSECONDS),
+    )
+    return KeypointSource(source=source, jaw_file=options.jaw, parameters=parameters, choice=choice, **switches)
 
 
 def _parse_parameters(texts: Sequence[str]) -> dict[str, Any]:
@@ -332,6 +340,7 @@ def detect_keypoints(
         why = commonest or "; ".join(warnings) or "no jaw stands where it could be; another --extrinsics?"
         raise RecordingError(f"{recording.name}: no key points in {len(images)} images: {why}")
     notes = [f"{count} images refused: {text}" for text, count in reasons.items()] + warnings
+    notes += [f"the {side} jaw is in none of the images" for side, seen in found.items() if not seen]
     recording = replace(recording, notes=(*recording.notes, *notes))
     return with_detections(recording, found, dict.fromkeys(found, step_ms), passed)
 
@@ -368,8 +377,11 @@ def with_detections(
     """
     images = recording.images
     stamps = images.stamps[~np.isin(images.stamps, list(passed))]
+    # a jaw that was never found has as many key points as the other
+    counts = [len(jaw.points) for jaws in found.values() for jaw in jaws.values()]
+    counts += [track.sight.points.shape[1] for track in recording.jaws.values() if track.sight]
     jaws = {
-        side: _with_detection(recording.jaw(side), found[side], step_ms[side], stamps, images.frame_id)
+        side: _with_detection(recording.jaw(side), found[side], step_ms[side], stamps, images.frame_id, counts[0])
         for side in found
     }
     return replace(recording, jaws=jaws)
@@ -381,9 +393,9 @@ def _with_detection(
     step_ms: Mapping[int, float],
     stamps: NDArray[np.int64],
     frame_id: str,
+    count: int,
 ) -> JawTrack:
-    """Return the track of a jaw with its detections at some images (n,) [ns]."""
-    count = next((len(each.points) for each in found.values()), track.sight.points.shape[1] if track.sight else 0)
+    """Return the track of a jaw with its detections at some images (n,) [ns], of so many key points."""
     seen = [found.get(stamp) for stamp in stamps.tolist()]
     points, stddev = _rows(seen, "points", (count, 3)), _rows(seen, "stddev", (count, 3))
     accepted = np.nan_to_num(_rows(seen, "valid", (count,))).astype(bool)
@@ -402,7 +414,7 @@ def _with_detection(
         pixels=_rows(seen, "pixels", (count, 2)),
         points=points,
         accepted=accepted,
-        reasons=np.array(reasons, dtype="U16").reshape(-1, count),
+        reasons=np.array(reasons, dtype="U16").reshape(len(stamps), count),
         step_ms=np.array([step_ms.get(stamp, np.nan) for stamp in stamps.tolist()]),
     )
     return replace(track, keypoints=keypoints, pose=_pose_track(found, stamps, frame_id), detection=detection)
@@ -412,7 +424,7 @@ def _rows(seen: Sequence[JawKeypoints | None], name: str, shape: tuple[int, ...]
     """Return one attribute of every image (n, *shape), NaN where the jaw was not found."""
     missing = np.full(shape, np.nan)
     rows = [missing if found is None else np.asarray(getattr(found, name), dtype=np.float64) for found in seen]
-    return np.array(rows).reshape(-1, *shape)
+    return np.array(rows).reshape(len(seen), *shape)
 
 
 def _pose_track(found: Mapping[int, JawKeypoints], images: NDArray[np.int64], frame_id: str) -> PoseTrack | None:

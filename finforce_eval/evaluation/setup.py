@@ -17,7 +17,7 @@ from finforce_eval.evaluation.contact_source import ContactChoice, build_source,
 from finforce_eval.evaluation.keypoint_source import parse_changes, parse_source
 from finforce_eval.machine import commit, version
 from finforce_eval.recordings.bags import name_recordings
-from finforce_eval.recordings.images import PAIRED
+from finforce_eval.recordings.images import ImageChoice
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.tracks import JAWS, Recording
 from finforce_ifea.estimator import JawEstimator
@@ -81,11 +81,7 @@ def make_setup(options: argparse.Namespace) -> EvaluationSetup:
     Raises:
         FinforceError: the contact, the jaw or the calibration cannot be used.
     """
-    contacts = parse_contacts(
-        options.contact,
-        object_file=getattr(options, "object", None),
-        object_unit=getattr(options, "object_unit", "m"),
-    )
+    contacts = read_contacts(options)
     jaw = load_jaw(options.jaw)
     changes = getattr(options, "set", [])
     settings = parse_settings(options.solver, options.mesh, changes)
@@ -105,6 +101,12 @@ def make_setup(options: argparse.Namespace) -> EvaluationSetup:
     return EvaluationSetup(
         jaw=jaw, settings=settings, calibration=calibration, contacts=contacts, about=about, as_live=as_live
     )
+
+
+def read_contacts(options: argparse.Namespace) -> ContactChoice:
+    """Return where the contact comes from; raises OptionError where the words of --contact say nothing."""
+    unit = getattr(options, "object_unit", "m")
+    return parse_contacts(options.contact, object_file=getattr(options, "object", None), object_unit=unit)
 
 
 _last: dict[str, EvaluationSetup] = {}
@@ -166,17 +168,18 @@ def _is_file(word: str) -> bool:
 
 def sides_of(options: argparse.Namespace) -> tuple[str, ...]:
     """Return the jaws that images show, none where the option does not say."""
-    return {None: (), "both": JAWS}.get(options.jaws, (options.jaws,))
+    jaws = getattr(options, "jaws", None)
+    return {None: (), "both": JAWS}.get(jaws, (jaws,))
 
 
 def read_recordings(
-    paths: Sequence[str], pairing: int = PAIRED, sides: Sequence[str] = (), *, strict: bool = False
+    paths: Sequence[str], choice: ImageChoice | None = None, sides: Sequence[str] = (), *, strict: bool = False
 ) -> list[Recording]:
     """Read recordings and give each a name of its own.
 
     Args:
         paths: of the recordings.
-        pairing: greatest distance between the stamps of a colour and a depth image that belong together [ns].
+        choice: which images are read.
         sides: jaws that are in the images, whether or not a topic tells of them.
         strict: refuse recordings that are damaged.
 
@@ -186,7 +189,7 @@ def read_recordings(
     """
     recordings = []
     for name, path in name_recordings(paths, "/"):
-        recording = replace(read_recording(path, pairing, sides, strict=strict), name=name)
+        recording = replace(read_recording(path, choice, sides, strict=strict), name=name)
         print_notes(recording.name, recording.notes)
         recordings.append(recording)
     return recordings
@@ -208,9 +211,9 @@ def read_keypoints(options: argparse.Namespace, sides: Sequence[str] = ()) -> li
     Raises:
         FinforceError: one of them cannot be read, or has no such key points.
     """
-    source = parse_source(options)
+    source, sides = parse_source(options), sides or sides_of(options)
     recordings = []
-    for read in read_recordings(options.bags, source.pairing, sides, strict=source.strict):
+    for read in read_recordings(options.bags, source.choice, sides, strict=source.strict):
         recording = source.apply(read)
         print_notes(recording.name, recording.notes[len(read.notes) :])
         recordings.append(recording)

@@ -1,4 +1,4 @@
-"""Forces that a recording holds already, as `annotate` or the nodes put them there."""
+"""Forces that a recording or dataset holds already, as `annotate` or the nodes put them there."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from finforce.messages import stamp_of
+from finforce.messages import NANOSECONDS, stamp_of
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.scoring import match_truth
 from finforce_eval.recordings.bags import bag_source, check_types, open_bag
+from finforce_eval.recordings.dataset import Dataset, is_dataset, open_dataset, read_parquet, rows_of
 from finforce_eval.recordings.recording import WRENCH
 from finforce_eval.recordings.tracks import JAWS, WrenchTrack
 from finforce_eval.recordings.writer import STATUS
@@ -21,14 +22,16 @@ _FORCE, _STDDEV, _STATUS, _TRUTH = KINDS = ("wrench", "wrench_stddev", "wrench_s
 
 
 def read_forces(path: Path) -> list[ForceSeries]:
-    """Return the forces on the jaws of a recording.
+    """Return the forces on the jaws of a recording, or of the episodes of a dataset.
 
     Args:
-        path: rosbag2 folder, .mcap or .db3 file.
+        path: rosbag2 folder, .mcap or .db3 file, or folder of a LeRobot dataset.
 
     Raises:
         RecordingError: it cannot be read, or holds no forces.
     """
+    if is_dataset(path):
+        return _read_episodes(open_dataset(path, None))
     source = bag_source(path)
     types = {f"/{side}/{kind}": (STATUS if kind == _STATUS else WRENCH,) for side in JAWS for kind in KINDS}
     samples: dict[str, list[Any]] = {}
@@ -40,6 +43,25 @@ def read_forces(path: Path) -> list[ForceSeries]:
     if not sides:
         raise RecordingError(f"{path.stem}: no forces: /left/wrench and /right/wrench have no messages; see annotate")
     return [_make_series(f"{path.stem}/{side}" if len(sides) > 1 else path.stem, side, samples) for side in sides]
+
+
+def _read_episodes(dataset: Dataset) -> list[ForceSeries]:
+    """Return the forces of all episodes of a dataset, as `annotate` writes them."""
+    names = [name for name in dataset.info["features"] if name.endswith(tuple(f".force.{side}" for side in JAWS))]
+    if not names:
+        raise RecordingError(f"{dataset.folder.name}: no forces: no feature ends in .force.left or .force.right")
+    found = []
+    for episode in dataset.episodes:
+        rows = rows_of(read_parquet(episode.data), episode, dataset.folder.name)
+        stamps = np.rint(np.arange(len(rows)) * (NANOSECONDS / float(dataset.info["fps"]))).astype(np.int64)
+        for name in names:
+            side, values = name.rpartition(".")[2], {}
+            for column, end in (("force", ""), ("force_stddev", ".stddev")):
+                values[column] = np.array(rows[name + end].to_pylist(), dtype=np.float64).reshape(-1, 3)
+            stddev = stddev_along(values["force"], values["force_stddev"])
+            case = f"{dataset.folder.name}/episode_{episode.index:06d}/{side}"
+            found.append(ForceSeries.build(case, side, stamps, **values, magnitude_stddev=stddev, status=""))
+    return found
 
 
 def _make_series(name: str, side: str, samples: Mapping[str, list[Any]]) -> ForceSeries:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from finforce.camera import (
+    DEPTH_TYPES,
     MILLIMETRE,
     CameraIntrinsics,
     ImageError,
@@ -24,14 +26,36 @@ from finforce.errors import ObservationError
 from finforce.messages import camera_from_info, color_from_image, find_nearest, layout_of, read_stamp, same_camera
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.bags import BagReader, check_types, open_bag
+from finforce_eval.recordings.image_files import read_intrinsics
 from finforce_keypoints.images import RgbdImage, check_image
 
-# the ends of topics by which the images are found, whatever the camera is called; the first that is there counts
+# the ends of topics by which the images are found first, whatever the camera is called; the first that is there counts
 COLOR_ENDS = tuple(f"color/{name}{end}" for end in ("", "/compressed") for name in ("image_raw", "image_rect_raw"))
 DEPTH_ENDS = tuple(f"aligned_depth_to_color/image_raw{end}" for end in ("", "/compressedDepth", "/compressed"))
-INFO_ENDS = ("color/camera_info",)
+TRANSPORTS = ("/compressed", "/compressedDepth")  # ends of topics with the same images in fewer bytes
 ALONE = -1  # instead of a depth image's stamp [ns], of a colour image without
 PAIRED = 8_000_000  # as the detector node takes colour and depth for one image: distance of their stamps [ns]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageChoice:
+    """Which images of a recording are read.
+
+    Attributes:
+        color: topic, of a dataset a feature; "" for the only one there is.
+        depth: topic; "" for the only one in the frame of the colour images.
+        info: topic of camera_info; "" for that next to the colour images.
+        intrinsics: words of --intrinsics, instead of camera_info.
+        episode: of a dataset.
+        pairing: greatest distance between the stamps of a colour and a depth image that belong together [ns].
+    """
+
+    color: str = ""
+    depth: str = ""
+    info: str = ""
+    intrinsics: tuple[str, ...] = ()
+    episode: int = 0
+    pairing: int = PAIRED
 
 
 class StampedImage(NamedTuple):
@@ -55,6 +79,7 @@ class ImageTrack:
         frame_id: of the camera.
         unpaired: (m,) stamps of colour images left out because no depth image is of their time [ns].
         depth_scale: one step of a 16-bit depth image [m].
+        info: topic of camera_info, "" without.
     """
 
     source: Path
@@ -66,6 +91,7 @@ class ImageTrack:
     frame_id: str
     unpaired: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     depth_scale: float = MILLIMETRE
+    info: str = ""
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -132,32 +158,45 @@ class ImageTrack:
         return StampedImage(stamp, image)
 
 
-def find_images(bag: BagReader, source: Path, pairing: int = PAIRED) -> ImageTrack | None:
+def find_images(bag: BagReader, source: Path, choice: ImageChoice | None = None) -> ImageTrack | None:
     """Return the images of an open bag; None without colour images.
 
     Args:
         bag: where they lie.
         source: of the bag.
-        pairing: greatest distance between the stamps of a colour and a depth image that belong together [ns].
+        choice: which of them.
 
     Raises:
-        RecordingError: there are colour images, but no camera_info; there is depth, but nothing that belongs together;
-            a topic is of another type; stamps go back; the camera changes.
+        RecordingError: there are colour images, but no camera_info; there are several cameras; there is depth, but
+            nothing that belongs together; a topic is not there or of another type; stamps go back; the camera changes.
+        OptionError: the intrinsics that were given cannot be used.
     """
-    color = _find_topic(bag, COLOR_ENDS)
-    if color is None:
+    choice = choice or ImageChoice()
+    seen = _look_at_images(bag)
+    missing = sorted({choice.color, choice.depth, choice.info} - bag.types.keys() - {""})
+    if missing:
+        there = ", ".join(topic for topic, kind in bag.types.items() if kind in (*IMAGES, CAMERA_INFO)) or "none"
+        raise RecordingError(f"{bag.name}: nothing on {', '.join(missing)}; the topics of its cameras are {there}")
+    color = choice.color or _find_topic(bag, COLOR_ENDS) or _only_color(bag, seen)
+    if not color:
         return None
-    depth, info = _find_topic(bag, DEPTH_ENDS), _find_topic(bag, INFO_ENDS)
-    if info is None:
-        raise RecordingError(f"{bag.name}: there are images on {color}, but nothing on {INFO_ENDS[0]}")
-    topics = (color,) if depth is None else (color, depth)
-    check_types(bag.connections, dict.fromkeys(topics, (IMAGE, COMPRESSED)) | {info: (CAMERA_INFO,)}, bag.name)
-    camera, frame_id = _read_camera(bag, info)
+    if color not in seen:
+        raise RecordingError(f"{bag.name}: {color} is {bag.types[color]}; expected {' or '.join(IMAGES)}")
+    aligned = _plain([topic for topic, each in seen.items() if each.is_depth and each.frame == seen[color].frame])
+    depth = choice.depth or _find_topic(bag, DEPTH_ENDS) or (aligned[0] if len(aligned) == 1 else "")
+    info = "" if choice.intrinsics else choice.info or _find_info(bag, color, seen[color].frame)
+    topics = (color, depth) if depth else (color,)
+    check_types(bag.connections, dict.fromkeys(topics, IMAGES) | {info: (CAMERA_INFO,)}, bag.name)
+    if info:
+        camera, frame_id = _read_camera(bag, info)
+    else:
+        camera, frame_id = read_intrinsics(choice.intrinsics, seen[color].shape), seen[color].frame
+    pairing = choice.pairing
     found: dict[str, list[int]] = {topic: [] for topic in topics}
     for raw in bag.raw(topics):
         found[raw.topic].append(read_stamp(raw.data))
     stamps = {topic: _rising(times, topic, bag.name) for topic, times in found.items()}
-    if depth is None:
+    if not depth:
         return ImageTrack(
             source=source,
             name=bag.name,
@@ -166,6 +205,7 @@ def find_images(bag: BagReader, source: Path, pairing: int = PAIRED) -> ImageTra
             depth_stamps=np.full(len(stamps[color]), ALONE),
             camera=camera,
             frame_id=frame_id,
+            info=info,
         )
     nearest = find_nearest(stamps[depth], stamps[color])
     paired = np.abs(stamps[depth][nearest] - stamps[color]) <= pairing
@@ -180,21 +220,88 @@ def find_images(bag: BagReader, source: Path, pairing: int = PAIRED) -> ImageTra
         camera=camera,
         frame_id=frame_id,
         unpaired=stamps[color][~paired],
+        info=info,
     )
 
 
-def _find_topic(bag: BagReader, ends: Sequence[str]) -> str | None:
-    """Return the topic with the first of some ends; one without messages does not count."""
+def _find_topic(bag: BagReader, ends: Sequence[str]) -> str:
+    """Return the topic with the first of some ends, "" without; one without messages does not count."""
     counts: dict[str, int] = {}
     for connection in bag.connections:
         counts[connection.topic] = counts.get(connection.topic, 0) + connection.msgcount
     for end in ends:
         topics = sorted(topic for topic, count in counts.items() if topic.endswith(f"/{end}") and count)
         if len(topics) > 1:
-            raise RecordingError(f"{bag.name}: several cameras: {', '.join(topics)}; expected one in a recording")
+            raise RecordingError(f"{bag.name}: several cameras: {', '.join(topics)}; name one by --color or --depth")
         if topics:
             return topics[0]
-    return None
+    return ""
+
+
+class _FirstImage(NamedTuple):
+    """What the first image of a topic tells of all: its frame, its height and width, and what it shows."""
+
+    frame: str
+    shape: tuple[int, int]
+    is_depth: bool
+    is_grey: bool
+
+
+def _look_at_images(bag: BagReader) -> dict[str, _FirstImage]:
+    """Return what the topics with images show."""
+    topics = {each.topic for each in bag.connections if each.msgtype in IMAGES and each.msgcount}
+    seen: dict[str, _FirstImage] = {}
+    for raw in bag.raw(topics):
+        if raw.topic not in seen:
+            message, shape = bag.decode(raw), (0, 0)
+            words = getattr(message, "encoding", None) or message.format
+            is_depth = words.partition(";")[0].strip() in DEPTH_TYPES or "compressedDepth" in words
+            if hasattr(message, "height"):
+                shape = (message.height, message.width)
+            else:
+                with suppress(OSError), Image.open(io.BytesIO(bytes(message.data))) as picture:
+                    shape = (picture.height, picture.width)
+            seen[raw.topic] = _FirstImage(message.header.frame_id, shape, is_depth, words.startswith("mono"))
+        if len(seen) == len(topics):
+            break
+    return seen
+
+
+def _plain(topics: Collection[str]) -> list[str]:
+    """Return topics without those that bring the same images compressed."""
+    return sorted(set(topics) - {topic + end for topic in topics for end in TRANSPORTS})
+
+
+def _only_color(bag: BagReader, seen: Mapping[str, _FirstImage]) -> str:
+    """Return the only topic with colour images, or else with grey ones; "" where there are none.
+
+    Raises:
+        RecordingError: there are several.
+    """
+    grey = _plain([topic for topic, each in seen.items() if not each.is_depth])
+    colors = [topic for topic in grey if not seen[topic].is_grey] or grey
+    if len(colors) > 1:
+        raise RecordingError(f"{bag.name}: several cameras; expected --color with one of {', '.join(colors)}")
+    return colors[0] if colors else ""
+
+
+def _find_info(bag: BagReader, color: str, frame: str) -> str:
+    """Return the camera_info next to the colour images, or the only one that is in their frame.
+
+    Raises:
+        RecordingError: there is none.
+    """
+    beside = color.removesuffix(TRANSPORTS[0]).rpartition("/")[0] + "/camera_info"
+    topics = {each.topic for each in bag.connections if each.msgtype == CAMERA_INFO and each.msgcount}
+    if beside in topics:
+        return beside
+    same = [topic for topic in topics if bag.decode(next(bag.raw((topic,)))).header.frame_id == frame]
+    if len(same) != 1:
+        raise RecordingError(
+            f"{bag.name}: there are images on {color}, but nothing on {beside}; expected --camera-info with a topic "
+            f"({', '.join(sorted(topics)) or 'there is none'}), or --intrinsics"
+        )
+    return same[0]
 
 
 def _read_camera(bag: BagReader, topic: str) -> tuple[CameraIntrinsics, str]:
@@ -221,7 +328,7 @@ def _rising(stamps: Sequence[int], topic: str, name: str) -> NDArray[np.int64]:
     return times
 
 
-IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+IMAGES = IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 DEPTH_FORMAT = "16UC1; compressedDepth png"
 DEPTH_HEADER = 12  # bytes of compressed_depth_image_transport: an enum and two numbers for 32-bit depth

@@ -13,7 +13,8 @@ from finforce.files import FileError, read_json
 from finforce.messages import NANOSECONDS, Keypoints, decode_columns, decode_keypoints, stamp_of
 from finforce_eval.errors import DamagedError, RecordingError
 from finforce_eval.recordings.bags import bag_source, check_messages, check_types, open_bag
-from finforce_eval.recordings.images import PAIRED, ImageTrack, find_images
+from finforce_eval.recordings.dataset import is_dataset, read_episode
+from finforce_eval.recordings.images import ImageChoice, ImageTrack, find_images
 from finforce_eval.recordings.salvage import SalvagedCopy
 from finforce_eval.recordings.tracks import (
     JAWS,
@@ -59,9 +60,9 @@ class _Content(NamedTuple):
 
 
 def read_recording(
-    path: str | Path, pairing: int = PAIRED, sides: Sequence[str] = (), *, strict: bool = False
+    path: str | Path, choice: ImageChoice | None = None, sides: Sequence[str] = (), *, strict: bool = False
 ) -> Recording:
-    """Read a rosbag2 folder or a single .mcap / .db3 file, with the `case.json` next to it.
+    """Read a rosbag2 folder or a single .mcap / .db3 file, with the `case.json` next to it, or an episode of a dataset.
 
     Topics that are not ours are not decoded; those of unknown type are named in `notes`. Images are not read yet; a
     recording with images may do without key points, its tracks of them are empty then. One that is damaged is read as
@@ -69,8 +70,8 @@ def read_recording(
 
     Args:
         path: the folder or the file.
-        pairing: greatest distance between the stamps of a colour and a depth image that belong together [ns].
-        sides: jaws that are in the images, whether or not a topic tells of them.
+        choice: which images.
+        sides: jaws that are in the images, whether or not a topic tells of them; both where none tells of any.
         strict: refuse a recording that is damaged.
 
     Raises:
@@ -78,22 +79,29 @@ def read_recording(
             or with malformed content.
         MissingDependencyError: rosbags is not installed.
     """
+    choice = choice or ImageChoice()
+    if is_dataset(Path(path)):
+        return read_episode(Path(path), choice, sides)
     source = bag_source(Path(path))
     folder = source if source.is_dir() else source.parent
     name = source.name if source.is_dir() else source.stem
     copy = None
     try:
-        samples, phases, images, notes = _read_samples(source, name, pairing)
+        samples, phases, images, notes = _read_samples(source, name, choice)
     except DamagedError as error:
         if strict:
             raise
         copy = SalvagedCopy(source, str(error))
-        samples, phases, images, notes = _read_samples(copy.path, name, pairing)
+        samples, phases, images, notes = _read_samples(copy.path, name, choice)
         notes.append(copy.note.removeprefix(f"{name}: "))
     known = [side for side in JAWS if _has_jaw(samples, side, images is not None) or (images and side in sides)]
+    if images and not known:
+        known = JAWS
+        notes.append("no topic tells which jaws its images show: both are looked for; --jaws left or right names one")
     jaws = {side: _jaw_track(samples, side, name) for side in known}
     if not jaws:
-        raise RecordingError(f"{name}: {_no_jaw(has_images=images is not None)}")
+        what = "/left/keypoints and /right/keypoints have no messages; no colour images either"
+        raise RecordingError(f"{name}: no key points: {what}")
     poses = samples.get("/object_pose")
     return Recording(
         name=name,
@@ -108,24 +116,13 @@ def read_recording(
     )
 
 
-def _no_jaw(*, has_images: bool) -> str:
-    """Return why nothing is known of a jaw, and what would do."""
-    if not has_images:
-        return "no key points: /left/keypoints and /right/keypoints have no messages; no images either"
-    return (
-        "there are images, but no topic tells which jaws are in them: a score needs their measured force, record "
-        "/left/ground_truth_wrench or /right/ground_truth_wrench (WrenchStamped in left_jaw or right_jaw), too; forces "
-        "without a score: ros2 launch finforce replay.launch.py bag:=FOLDER images:=true contact_height:=METRES"
-    )
-
-
 def _has_jaw(samples: Mapping[str, list[Any]], side: str, has_images: bool) -> bool:
     """Say whether a recording tells of a jaw: by its key points, or with images by anything that is the jaw's own."""
     topics = [topic for topic in samples if topic.startswith(f"/{side}/")]
     return f"/{side}/keypoints" in topics or (has_images and bool(topics))
 
 
-def _read_samples(source: Path, name: str, pairing: int) -> _Content:
+def _read_samples(source: Path, name: str, choice: ImageChoice) -> _Content:
     """Decode the messages of our topics, by topic, and find the images."""
     samples: dict[str, list[Any]] = {}
     phases: list[tuple[int, str]] = []
@@ -141,7 +138,7 @@ def _read_samples(source: Path, name: str, pairing: int) -> _Content:
                 samples.setdefault(raw.topic, []).append(message)
         notes = bag.foreign_notes()
         try:
-            images = find_images(bag, source, pairing)
+            images = find_images(bag, source, choice)
         except RecordingError as error:
             if not any(topic.endswith("/keypoints") for topic in samples):
                 raise

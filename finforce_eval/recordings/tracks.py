@@ -205,7 +205,9 @@ class Recording:
         truth = self.jaw(side).truth
         if truth is None:
             topic = f"/{side}/ground_truth_wrench"
-            raise RecordingError(f"{self.name}: no ground truth: {topic} is absent or has no messages")
+            raise RecordingError(
+                f"{self.name}: no ground truth: {topic} is absent or has no messages; forces without a score: annotate"
+            )
         return truth
 
     def phases_at(self, stamps: NDArray[np.int64]) -> dict[str, NDArray]:

@@ -16,14 +16,14 @@ from finforce_eval.recordings.images import (
     COMPRESSED,
     DEPTH_ENDS,
     IMAGE,
-    INFO_ENDS,
+    ImageTrack,
     depth_steps,
 )
 from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 
 HEADER = "std_msgs/msg/Header"
 # where the nodes listen -> the ends of the topics that are played there
-PLAYED = {COLOR_TOPIC: COLOR_ENDS, DEPTH_TOPIC: DEPTH_ENDS, INFO_TOPIC: INFO_ENDS}
+PLAYED = {COLOR_TOPIC: COLOR_ENDS, DEPTH_TOPIC: DEPTH_ENDS, INFO_TOPIC: ("color/camera_info",)}
 
 
 class RawMessage(NamedTuple):
@@ -61,16 +61,21 @@ class Playback:
     Args:
         source: the bag.
         without: topics to be left out.
+        images: which are played to the nodes; without it those of the usual names.
 
     Raises:
         RecordingError: the bag cannot be read, or holds nothing to be played.
     """
 
-    def __init__(self, source: Path, without: Collection[str]) -> None:
+    def __init__(self, source: Path, without: Collection[str], images: ImageTrack | None = None) -> None:
         self._source = source
+        given = {} if images is None else dict(zip((*images.topics, images.info), PLAYED, strict=True))
         with open_bag(source, source.name) as bag:
-            chosen = [entry for entry in bag.connections if entry.topic not in without and bag.knows(entry.msgtype)]
-            self._topics = {entry.topic: _played_topic(entry.topic) for entry in chosen}
+            known = [entry for entry in bag.connections if entry.topic not in without and bag.knows(entry.msgtype)]
+            ours = {entry.topic: given.get(entry.topic) or _played_topic(entry.topic) for entry in known}
+            # of several cameras one is played
+            chosen = [each for each in known if not given or each.topic in given or ours[each.topic] not in PLAYED]
+            self._topics = {entry.topic: ours[entry.topic] for entry in chosen}
             self._count = sum({id(entry): entry.msgcount for entry in chosen}.values())
             first = next(bag.raw(self._topics), None)
             self._headed = {entry.topic: _begins_with_header(bag.definition(entry.msgtype)) for entry in chosen}
@@ -90,17 +95,18 @@ class Playback:
                 yield RawMessage(raw.time, topic, _played_type(kind), data, self._headed[raw.topic])
 
 
-def read_playback(path: str | Path, without: Collection[str] = ()) -> Playback:
+def read_playback(path: str | Path, without: Collection[str] = (), images: ImageTrack | None = None) -> Playback:
     """Return the messages of a bag in the order of their receipt.
 
     Args:
         path: rosbag2 folder, .mcap or .db3 file.
         without: topics to be left out.
+        images: which are played to the nodes; without it those of the usual names.
 
     Raises:
         RecordingError: the bag cannot be read, or holds nothing to be played.
     """
-    return Playback(bag_source(Path(path)), without)
+    return Playback(bag_source(Path(path)), without, images)
 
 
 def _played_topic(topic: str) -> str:

@@ -138,7 +138,10 @@ def play_to_nodes(
     sides, from_images = tuple(recording.jaws), keypoints.source_of(recording) == IMAGES
     with ExitStack() as stack:
         recording = _choose_keypoints(recording, setup.jaw, keypoints, stack)
-        messages = read_playback(recording.source, without=_results_of(sides) | _unplayed(sides, from_images))
+        images = recording.images if from_images else None
+        if images is not None and not images.info:
+            raise RecordingError(f"{recording.name}: replay needs a bag with camera_info; evaluate does without")
+        messages = read_playback(recording.source, _results_of(sides) | _unplayed(sides, from_images), images)
         options = _graph_options(recording, setup, calibration_file, playing)
         processes = replay_processes(replace(options, images=from_images, composed=False), Path())
         processes = _for_scores(processes, recording, keypoints)

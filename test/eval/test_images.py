@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from finforce.camera import ImageError
 from finforce_eval.cli.twin import RecordingForm, footage_entries, write_footage
 from finforce_eval.errors import RecordingError
-from finforce_eval.recordings.images import DEPTH_HEADER, compress_depth, depth_from_message, depth_steps
+from finforce_eval.recordings.images import DEPTH_HEADER, ImageChoice, compress_depth, depth_from_message, depth_steps
 from finforce_eval.recordings.objects import find_mesh
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.writer import write_entries
@@ -152,7 +152,7 @@ def test_depth_that_is_always_late_is_refused_and_some_lost_depth_leaves_its_ima
     folder = write_without(tmp_path / "late", edit=separate_headers(late))
     with pytest.raises(RecordingError, match="no depth image .* within 8 ms"):
         read_recording(folder)
-    assert len(read_recording(folder, pairing=9_000_000).images) == 12
+    assert len(read_recording(folder, ImageChoice(pairing=9_000_000)).images) == 12
     images = read_recording(write_without(tmp_path / "lost", edit=lost)).images
     assert len(images.unpaired) == 1 and len(list(images)) == 11
     everything = [image.depth is not None for _, image in images.all_colors()]
@@ -161,10 +161,12 @@ def test_depth_that_is_always_late_is_refused_and_some_lost_depth_leaves_its_ima
     assert [stamp for stamp, image in alone if image.depth is None] == [frame.stamp for frame in make_footage()]
 
 
-def test_images_without_any_topic_of_a_jaw_are_refused_with_what_would_do(tmp_path):
+def test_both_jaws_are_looked_for_in_images_of_which_no_topic_tells_the_jaws(tmp_path):
     own = [f"/left/{name}" for name in ("ground_truth_wrench", "ground_truth_keypoints", "ground_truth_jaw_pose")]
-    with pytest.raises(RecordingError, match="no topic tells which jaws.*/left/ground_truth_wrench.*images:=true"):
-        read_recording(write_without(tmp_path / "bag", *own))
+    folder = write_without(tmp_path / "bag", *own)
+    recording = read_recording(folder)
+    assert set(recording.jaws) == {"left", "right"} and "--jaws left or right" in recording.notes[-1]
+    assert set(read_recording(folder, sides=("right",)).jaws) == {"right"}
     assert set(read_recording(write_without(tmp_path / "measured", *own[1:])).jaws) == {"left"}
 
 

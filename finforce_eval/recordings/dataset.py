@@ -8,8 +8,9 @@ Source: the formats as LeRobot 0.1 to 0.4 writes and reads them.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +22,15 @@ from numpy.typing import NDArray
 
 from finforce.camera import MILLIMETRE, CameraIntrinsics, ImageError, decode_picture
 from finforce.errors import one_line
-from finforce.files import FileError, parse_json, read_json, read_text
+from finforce.files import FileError, check_inside, check_plain, parse_json, raise_budget, read_json, read_text
 from finforce.messages import NANOSECONDS
 from finforce.optional import import_library
+from finforce.sandbox import MEMORY, limit_growth
 from finforce_eval.errors import OptionError, RecordingError
-from finforce_eval.recordings.images import StampedImage
+from finforce_eval.recordings.bags import allowed_bytes
+from finforce_eval.recordings.image_files import read_intrinsics
+from finforce_eval.recordings.images import ImageChoice, StampedImage
+from finforce_eval.recordings.tracks import JAWS, JawTrack, KeypointTrack, Recording
 from finforce_keypoints.images import RgbdImage, check_image
 
 INFO, STATS = Path("meta/info.json"), Path("meta/stats.json")
@@ -33,6 +38,9 @@ EPISODES_V2, EPISODE_STATS_V2 = Path("meta/episodes.jsonl"), Path("meta/episodes
 EPISODES_V3 = Path("meta/episodes")
 _LARGEST_LINES = 1 << 28  # bytes; a line per episode
 _VERSIONS = ("v2.0", "v2.1", "v3.0")
+_MOST_FRAMES = 1_000_000  # of an episode: nine hours at 30 Hz
+# what stands for the numbers of an episode and its files in the paths of `info.json`
+_NUMBER = re.compile(r"\{(episode_chunk|episode_index|chunk_index|file_index|video_key)(:0?[1-9]d)?\}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,27 +87,68 @@ class Dataset:
         return (shape[1], shape[2]) if shape[0] == 3 else (shape[0], shape[1])
 
 
+def read_episode(folder: Path, choice: ImageChoice, sides: Sequence[str] = ()) -> Recording:
+    """Return one episode of a dataset as a recording of two jaws, or of those that are named.
+
+    Raises:
+        RecordingError: the dataset cannot be read, or has no such episode.
+        OptionError: its camera is not described.
+    """
+    dataset = open_dataset(folder, choice.color)
+    episode = next((each for each in dataset.episodes if each.index == choice.episode), None)
+    if episode is None:
+        numbers = [each.index for each in dataset.episodes]
+        raise RecordingError(f"{folder.name}: no episode {choice.episode}; expected {min(numbers)} to {max(numbers)}")
+    return recording_of(dataset, episode, read_lens(dataset, choice.intrinsics), sides)
+
+
+def read_lens(dataset: Dataset, words: Sequence[str]) -> CameraIntrinsics:
+    """Return the camera of a dataset by the words of --intrinsics; raises OptionError without any."""
+    if not words:
+        raise OptionError(
+            f"{dataset.folder.name}: --intrinsics: a dataset does not describe its camera; expected fx fy cx cy, or a "
+            "file"
+        )
+    return read_intrinsics(words, dataset.image_size)
+
+
+def recording_of(dataset: Dataset, episode: Episode, camera: CameraIntrinsics, sides: Sequence[str] = ()) -> Recording:
+    """Return an episode as a recording whose jaws are still to be found."""
+    name = f"{dataset.folder.name}/episode_{episode.index:06d}"
+    images = EpisodeImages(
+        episode=episode, name=name, feature=dataset.camera, fps=float(dataset.info["fps"]), camera=camera
+    )
+    jaws = {side: JawTrack(keypoints=KeypointTrack.empty()) for side in sides or JAWS}
+    return Recording(name=name, path=episode.data, jaws=jaws, images=images)
+
+
 def is_dataset(path: Path) -> bool:
     """Say whether a folder is a LeRobot dataset."""
     return (path / INFO).is_file()
 
 
-def open_dataset(folder: Path, camera: str = "") -> Dataset:
+def open_dataset(folder: Path, camera: str | None = "") -> Dataset:
     """Return a dataset of which nothing but its descriptions is read.
 
     Args:
         folder: with `meta/info.json`.
-        camera: the feature with the pictures; "" for the only one, or the only one with "wrist" in its name.
+        camera: the feature with the pictures; "" for the only one, or the only one with "wrist" in its name; None where
+            pictures are not needed.
 
     Raises:
         RecordingError: its layout is another one, or a file is missing or damaged.
         OptionError: the camera is not known, or there are several.
     """
     info = _read_info(folder)
-    camera = _choose_camera(info, camera, folder.name)
-    entries = _read_entries_v3(folder) if info["codebase_version"] == "v3.0" else _read_entries_v2(folder)
+    camera = "" if camera is None else _choose_camera(info, camera, folder.name)
     try:
-        episodes = tuple(_make_episode(folder, info, camera, entry) for entry in entries)
+        with limit_growth(raise_budget(MEMORY)):
+            entries = _read_entries_v3(folder) if info["codebase_version"] == "v3.0" else _read_entries_v2(folder)
+            episodes = tuple(_make_episode(folder, info, camera, entry) for entry in entries)
+    except FileError as error:
+        raise RecordingError(f"{folder.name}: {error}") from error
+    except MemoryError as error:
+        raise RecordingError(f"{folder.name}: its list of episodes takes more memory than one of its size") from error
     except (KeyError, IndexError, ValueError, TypeError, AttributeError) as error:
         raise RecordingError(
             f"{folder.name}: an episode lacks what its layout has: {type(error).__name__}: {error}"
@@ -116,7 +165,7 @@ def open_dataset(folder: Path, camera: str = "") -> Dataset:
 def _read_info(folder: Path) -> dict[str, Any]:
     """Return `meta/info.json` of a layout that is known."""
     try:
-        info = read_json(folder / INFO)
+        info = read_json(check_inside(folder / INFO, folder))
         version, paths = info["codebase_version"], [info["data_path"], info.get("video_path") or ""]
         is_sound = isinstance(info["features"], dict) and all(isinstance(path, str) for path in paths)
         is_sound = is_sound and 0 < float(info["fps"]) < 1e4 and int(info["total_frames"]) >= 0
@@ -126,6 +175,12 @@ def _read_info(folder: Path) -> dict[str, Any]:
         raise RecordingError(f"{folder.name}: layout {version}; expected {', '.join(_VERSIONS)}")
     if not is_sound:
         raise RecordingError(f"{folder.name}: {INFO}: expected features, fps, total_frames and paths of the files")
+    for path in paths:
+        if Path(path).is_absolute() or ".." in Path(path).parts or set("{}") & set(_NUMBER.sub("", path)):
+            raise RecordingError(
+                f"{folder.name}: {INFO}: path {path[:80]!r}; expected one within the dataset, as "
+                "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+            )
     return info
 
 
@@ -136,15 +191,15 @@ def _choose_camera(info: Mapping[str, Any], camera: str, name: str) -> str:
     wrist = [key for key in there if "wrist" in key]
     found = [camera] if camera else (wrist if len(wrist) == 1 else there)
     if len(found) != 1 or found[0] not in there:
-        words = f"--images {camera}: " if camera else "which camera sees the jaws? "
-        raise OptionError(f"{name}: {words}expected --images with one of {', '.join(there) or 'none, it has none'}")
+        words = f"--color {camera}: " if camera else "which camera sees the jaws? "
+        raise OptionError(f"{name}: {words}expected --color with one of {', '.join(there) or 'none, it has none'}")
     return found[0]
 
 
 def _read_entries_v2(folder: Path) -> list[dict[str, Any]]:
     """Return what a dataset of layout v2 says of each episode."""
     try:
-        lines = read_text(folder / EPISODES_V2, _LARGEST_LINES).splitlines()
+        lines = read_text(check_inside(folder / EPISODES_V2, folder), _LARGEST_LINES).splitlines()
         return [parse_json(line) for line in lines if line.strip()]
     except FileError as error:
         raise RecordingError(f"{folder.name}: {EPISODES_V2}: {error}") from error
@@ -154,7 +209,7 @@ def _read_entries_v3(folder: Path) -> list[dict[str, Any]]:
     """Return what a dataset of layout v3 says of each episode, but for its statistics."""
     entries = []
     for path in sorted((folder / EPISODES_V3).glob("*/*.parquet")):
-        table = read_parquet(path)
+        table = read_parquet(check_inside(path, folder))
         entries += table.select([name for name in table.column_names if not name.startswith("stats/")]).to_pylist()
     if not entries:
         raise RecordingError(f"{folder.name}: no episodes in {EPISODES_V3}")
@@ -163,7 +218,7 @@ def _read_entries_v3(folder: Path) -> list[dict[str, Any]]:
 
 def _make_episode(folder: Path, info: Mapping[str, Any], camera: str, entry: Mapping[str, Any]) -> Episode:
     """Return one episode; its files need not be there."""
-    index, is_video = int(entry["episode_index"]), info["features"][camera]["dtype"] == "video"
+    index, is_video = int(entry["episode_index"]), bool(camera) and info["features"][camera]["dtype"] == "video"
     head, begin = f"videos/{camera}/", 0.0
     data = {"episode_chunk": index // int(info.get("chunks_size") or 1000), "episode_index": index}
     video = {**data, "video_key": camera}
@@ -172,11 +227,14 @@ def _make_episode(folder: Path, info: Mapping[str, Any], camera: str, entry: Map
         if is_video:
             video |= {name: entry[f"{head}{name}"] for name in ("chunk_index", "file_index")}
             begin = float(entry[f"{head}from_timestamp"])
+    length = int(entry["length"])
+    if not 0 < length <= _MOST_FRAMES:
+        raise ValueError(f"{length} frames; expected 1 to {_MOST_FRAMES}")
     return Episode(
         index=index,
-        length=int(entry["length"]),
-        data=folder / info["data_path"].format(**data),
-        video=folder / info["video_path"].format(**video) if is_video else None,
+        length=length,
+        data=check_inside(folder / info["data_path"].format(**data), folder),
+        video=check_inside(folder / info["video_path"].format(**video), folder) if is_video else None,
         begin=begin,
     )
 
@@ -184,8 +242,13 @@ def _make_episode(folder: Path, info: Mapping[str, Any], camera: str, entry: Map
 def read_parquet(path: Path) -> pa.Table:
     """Return a Parquet file, rows in the groups that it has; raises RecordingError where it is missing or damaged."""
     try:
-        return pq.ParquetFile(path).read()
-    except (OSError, pa.ArrowException) as error:
+        check_plain(path)
+        with limit_growth(allowed_bytes(path)):
+            return pq.ParquetFile(path).read(use_threads=False)
+    except MemoryError as error:
+        what = f"takes more than {allowed_bytes(path) >> 20} MB of memory, far more than its size allows for"
+        raise RecordingError(f"{path.parent.name}/{path.name}: {what}") from error
+    except (FileError, OSError, pa.ArrowException) as error:
         raise RecordingError(f"{path.parent.name}/{path.name}: {one_line(error)}") from error
 
 
@@ -212,6 +275,7 @@ class EpisodeImages:
         feature: the column with the pictures, where there is no video.
         fps: frames per second.
         camera: intrinsics.
+        frames: (n,) numbers of those to be read, rising; None for all.
         depth_scale: without meaning.
     """
 
@@ -220,18 +284,30 @@ class EpisodeImages:
     feature: str
     fps: float
     camera: CameraIntrinsics
+    frames: NDArray[np.int64] | None = None
     depth_scale: float = MILLIMETRE
     frame_id: str = "camera_color_optical_frame"
     topics: tuple[str, str] = ("", "")
+    info: str = ""
     has_depth: bool = False
 
     def __len__(self) -> int:
-        return self.episode.length
+        return self.episode.length if self.frames is None else len(self.frames)
 
     @property
     def stamps(self) -> NDArray[np.int64]:
         """Stamps of the frames (n,) [ns], from zero."""
-        return np.rint(np.arange(len(self)) * (NANOSECONDS / self.fps)).astype(np.int64)
+        frames = np.arange(self.episode.length) if self.frames is None else self.frames
+        return np.rint(frames * (NANOSECONDS / self.fps)).astype(np.int64)
+
+    def between(self, start: int, stop: int) -> EpisodeImages:
+        """Return the frames with start <= stamp < stop [ns]."""
+        return self.at(self.stamps[(self.stamps >= start) & (self.stamps < stop)])
+
+    def at(self, stamps: NDArray[np.int64]) -> EpisodeImages:
+        """Return the frames at some stamps [ns]."""
+        everything = np.arange(self.episode.length) if self.frames is None else self.frames
+        return replace(self, frames=everything[np.isin(self.stamps, stamps)])
 
     def all_colors(self) -> EpisodeImages:
         """Return them all."""
@@ -245,26 +321,27 @@ class EpisodeImages:
         Raises:
             RecordingError: a frame is missing or damaged, or of another size than its camera.
         """
-        count = 0
-        pictures = self._read_video() if self.episode.video is not None else self._read_column()
-        for stamp, color in zip(self.stamps.tolist(), pictures, strict=False):
-            image = RgbdImage(stamp=stamp / NANOSECONDS, color=color, depth=None, camera=self.camera)
-            try:
-                check_image(image)
-            except ImageError as error:
-                raise RecordingError(f"{self.name}: frame {count}: {error}") from error
-            yield StampedImage(stamp, image)
-            count += 1
-        if count < len(self):
-            raise RecordingError(f"{self.name}: {count} pictures; expected {len(self)}, the length of the episode")
+        frames = range(len(self)) if self.frames is None else self.frames.tolist()
+        wanted, count = dict(zip(frames, self.stamps.tolist(), strict=True)), 0
+        for frame, color in enumerate(self._read_video() if self.episode.video is not None else self._read_column()):
+            if frame in wanted:
+                stamp, count = wanted[frame], count + 1
+                image = RgbdImage(stamp=stamp / NANOSECONDS, color=color, depth=None, camera=self.camera)
+                try:
+                    check_image(image)
+                except ImageError as error:
+                    raise RecordingError(f"{self.name}: frame {frame}: {error}") from error
+                yield StampedImage(stamp, image)
+            if count == len(wanted):
+                return
+        raise RecordingError(f"{self.name}: {count} pictures; expected {len(wanted)}, the length of the episode")
 
     def _read_video(self) -> Iterator[NDArray[np.uint8]]:
         """Yield the frames of the video from the beginning of the episode."""
         av = import_library("av", "reading videos", "'finforce[lerobot]'")
         video = self.episode.video
-        if not video.is_file():
-            raise RecordingError(f"{self.name}: no video {video.parent.name}/{video.name}")
         try:
+            check_plain(video)
             with av.open(str(video)) as container:
                 stream = container.streams.video[0]
                 early = self.episode.begin - 0.5 / self.fps
@@ -273,7 +350,7 @@ class EpisodeImages:
                 for frame in container.decode(stream):
                     if frame.time is None or frame.time >= early:
                         yield frame.to_ndarray(format="rgb24")
-        except (av.FFmpegError, IndexError) as error:
+        except (FileError, av.FFmpegError, IndexError) as error:
             raise RecordingError(f"{self.name}: {video.parent.name}/{video.name}: {error}") from error
 
     def _read_column(self) -> Iterator[NDArray[np.uint8]]:

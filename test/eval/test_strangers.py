@@ -1,0 +1,283 @@
+"""Claims about other people's recordings: their topics and datasets are found, and nothing found is no success."""
+
+import json
+import os
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from eval_fakes import FakeEstimator, FakeJaw, evaluate_recording, make_recording
+from rgbd_fakes import CAMERA, FakeDetector, FakeGripper, make_footage
+
+from finforce_contact.loop import GivenContact
+from finforce_eval.cli.main import main
+from finforce_eval.cli.twin import RecordingForm, footage_entries, write_footage
+from finforce_eval.errors import RecordingError
+from finforce_eval.evaluation.forces import check_solved, find_forces
+from finforce_eval.evaluation.keypoint_source import detect_keypoints
+from finforce_eval.recordings.dataset import read_parquet
+from finforce_eval.recordings.images import ImageChoice
+from finforce_eval.recordings.recording import read_recording
+from finforce_eval.recordings.writer import write_entries
+from finforce_eval.replay.playback import read_playback
+from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
+
+OWN = {f"/left/{name}" for name in ("ground_truth_wrench", "ground_truth_keypoints", "ground_truth_jaw_pose")}
+USB = {COLOR_TOPIC: "/image_raw", INFO_TOPIC: "/camera_info"}
+ZED = {
+    COLOR_TOPIC: "/zed/left/image_rect_color",
+    INFO_TOPIC: "/zed/left/camera_info",
+    DEPTH_TOPIC: "/zed/depth/depth_registered",
+}
+
+
+class LeftOnly(FakeDetector):
+    """Finds the left jaw alone."""
+
+    def detect(self, image):
+        return {side: found for side, found in super().detect(image).items() if side == "left"}
+
+
+def test_a_jaw_that_is_never_seen_has_no_force_and_the_other_keeps_its_own(tmp_path):
+    footage = make_footage(FakeGripper(sides=("left", "right")))
+    recording = read_recording(write_footage(footage, tmp_path / "bag"))
+    blind = {side: replace(track, sight=None, truth=None) for side, track in recording.jaws.items()}
+    found = detect_keypoints(replace(recording, jaws=blind), LeftOnly(recording))
+    left, right = (found.jaws[side].keypoints for side in ("left", "right"))
+    assert right.points.shape == left.points.shape and np.isnan(right.points).all() and not right.likelihood.any()
+    assert "the right jaw is in none of the images" in found.notes
+    series = find_forces(found, None, GivenContact(None), FakeEstimator([]), "right")
+    assert len(series) == 12 and not series.solved.any()
+    assert set(series.column("status")) == {"not found"} and "none of the images" in series.column("message")[0]
+
+
+def write_renamed(folder, names, **options):
+    """Footage whose camera topics have other names, and no topic of a jaw."""
+    entries = footage_entries(make_footage(), RecordingForm(compressed=False))
+    kept = [each._replace(topic=names[each.topic]) for each in entries if each.topic in names]
+    return write_entries(kept, folder, **options)
+
+
+@pytest.mark.parametrize(("names", "has_depth"), [(USB, False), (ZED, True)])
+def test_the_only_camera_of_a_bag_is_found_whatever_its_topics_are_called(names, has_depth, tmp_path):
+    recording = read_recording(write_renamed(tmp_path / "bag", names))
+    images = recording.images
+    assert images.topics[0] == names[COLOR_TOPIC] and images.info == names[INFO_TOPIC]
+    assert images.has_depth == has_depth and images.camera.fx == CAMERA.fx
+    assert len(list(images)) == 12 and set(recording.jaws) == {"left", "right"}
+    played = {message.topic for message in read_playback(recording.source, images=images)}
+    assert played == {COLOR_TOPIC, INFO_TOPIC} | ({DEPTH_TOPIC} if has_depth else set())
+
+
+def two_cameras(folder):
+    entries = footage_entries(make_footage(), RecordingForm(compressed=False))
+    kept = [each for each in entries if each.topic in ZED]
+    right = {name: topic.replace("left", "right") for name, topic in ZED.items() if name != DEPTH_TOPIC}
+    both = [each._replace(topic=names[each.topic]) for names in (ZED, right) for each in kept if each.topic in names]
+    return write_entries(sorted(both, key=lambda each: each.stamp), folder)
+
+
+def test_of_several_cameras_one_is_named(tmp_path, capsys):
+    bag = two_cameras(tmp_path / "bag")
+    with pytest.raises(RecordingError, match="expected --color with one of /zed/left/.*, /zed/right/"):
+        read_recording(bag)
+    images = read_recording(bag, ImageChoice(color="/zed/right/image_rect_color")).images
+    assert images.info == "/zed/right/camera_info"
+    with pytest.raises(RecordingError, match="nothing on /camera; the topics of its cameras are .*/zed/left/"):
+        read_recording(bag, ImageChoice(color="/camera"))
+    forces = ["--contact", "fixed:40"]
+    commands = {"annotate": [*forces, "--out", str(tmp_path / "out")], "check": [], "extrinsics": []}
+    for command, words in (commands | dict.fromkeys(("evaluate", "view", "replay", "trace"), forces)).items():
+        assert main([command, str(bag), *words, "--color", "/nowhere"]) == 2
+        assert "nothing on /nowhere" in capsys.readouterr().err
+
+
+def test_depth_in_another_frame_is_not_taken_for_aligned_depth(tmp_path):
+    def elsewhere(entry):
+        if entry.topic == DEPTH_TOPIC:
+            header = replace(entry.message.header, frame_id="camera_depth_optical_frame")
+            return entry._replace(message=replace(entry.message, header=header))
+        return entry
+
+    entries = [elsewhere(each) for each in footage_entries(make_footage(), RecordingForm(compressed=False))]
+    kept = [each._replace(topic=ZED[each.topic]) for each in entries if each.topic in ZED]
+    bag = write_entries(kept, tmp_path / "bag")
+    assert not read_recording(bag).images.has_depth
+    assert read_recording(bag, ImageChoice(depth=ZED[DEPTH_TOPIC])).images.has_depth
+
+
+def test_a_camera_without_camera_info_needs_its_intrinsics(tmp_path):
+    bag = write_renamed(tmp_path / "bag", {COLOR_TOPIC: "/image_raw"})
+    with pytest.raises(RecordingError, match="nothing on /camera_info; expected --camera-info .*, or --intrinsics"):
+        read_recording(bag)
+    camera = read_recording(bag, ImageChoice(intrinsics=("43", "44", "32", "24"))).images.camera
+    assert (camera.width, camera.height, camera.fx, camera.fy) == (64, 48, 43.0, 44.0)
+
+
+def test_a_score_of_unloaded_frames_alone_is_none(tmp_path):
+    recording = make_recording(phases=False)
+    forces = [[-1.0, 0.0, 0.0]] * len(recording.jaw("left").keypoints.stamps)
+    series = evaluate_recording(recording, FakeJaw(), GivenContact(None), FakeEstimator(forces))
+    loaded = np.linalg.norm(series.true_force, axis=1) > 0.02
+    assert loaded.any() and not loaded.all()
+    check_solved(series, recording)
+    unloaded = series.with_columns(force=np.where(loaded[:, None], np.nan, series.force), message="no such object")
+    with pytest.raises(RecordingError, match="none of the frames under load was solved.*no such object"):
+        check_solved(unloaded, recording)
+
+
+def test_a_file_beside_the_bag_that_leads_elsewhere_is_not_copied(tmp_path, capsys):
+    from test_annotate import short_bag
+
+    bag, secret = short_bag(tmp_path / "in" / "bag"), tmp_path / "secret"
+    secret.write_text("mine")
+    os.symlink(secret, bag / "notes.txt")
+    assert main(["annotate", str(bag), "--out", str(tmp_path / "out")]) == 2
+    assert "notes.txt leads out of the folder bag" in capsys.readouterr().err
+    assert not any(path.name == "notes.txt" for path in (tmp_path / "out").rglob("*"))
+    (bag / "notes.txt").unlink()
+    os.symlink("case.json", bag / "notes.txt")
+    assert main(["annotate", str(bag), "--out", str(tmp_path / "out")]) == 0
+
+
+av = pytest.importorskip("av")
+parquet = pytest.importorskip("pyarrow.parquet")
+DATASET = ["--intrinsics", "43,43,31,23", "--extrinsics", "robot", "--contact", "fixed:40"]
+
+
+@pytest.fixture
+def dataset(tmp_path):
+    """Two episodes of noise in both layouts."""
+    from lerobot_fakes import write_dataset
+
+    pictures = [frame.color for frame in make_footage(FakeGripper(count=8))]
+    write_dataset(tmp_path / "noise", [pictures[:3], pictures], "v2.1")
+    return tmp_path / "noise"
+
+
+def annotate(dataset, *words):
+    return main(["annotate", str(dataset), "--out", str(dataset.parent / "out"), *(words or DATASET)])
+
+
+def test_a_dataset_in_which_no_jaw_is_seen_is_not_annotated(dataset, capsys):
+    assert annotate(dataset) == 2
+    told = capsys.readouterr()
+    assert "0 of 2 annotated" in told.out and "no force in any of its 2 episodes" in told.err
+    assert "no key points in" in told.err and not (dataset.parent / "out" / "noise").exists()
+
+
+def test_what_a_dataset_lacks_is_said_in_one_line_before_its_videos_are_read(dataset, capsys, monkeypatch):
+    monkeypatch.setattr("finforce_eval.recordings.dataset.EpisodeImages._read_video", lambda self: 1 / 0)
+    assert annotate(dataset, *DATASET[:4]) == 2
+    assert "give --contact fixed:Z_MM" in capsys.readouterr().err
+    info = json.loads((dataset / "meta/info.json").read_text())
+    info["features"]["observation.force.left"] = {"dtype": "float32", "shape": [3]}
+    (dataset / "meta/info.json").write_text(json.dumps(info))
+    assert annotate(dataset) == 2
+    assert "has observation.force.left already" in capsys.readouterr().err
+    for video in (dataset / "videos").rglob("*.mp4"):
+        video.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 7\n")
+    assert annotate(dataset) == 2
+    told = capsys.readouterr().err
+    assert "2 of 4 files cannot be read" in told and "git lfs pull" in told and len(told.splitlines()) == 1
+
+
+@pytest.mark.parametrize("command", ["check", "extrinsics", "view", "evaluate"])
+def test_every_command_that_reads_a_bag_reads_an_episode(command, dataset, capsys):
+    words = {"evaluate": ["--contact", "fixed:40"], "view": ["--contact", "fixed:40", "--save", "x.rrd"]}
+    more = words.get(command, ["--images", "5"])
+    if command == "check":
+        more += ["--report", str(dataset.parent)]
+    code = main([command, str(dataset), "--episode", "1", "--intrinsics", "43,43,31,23", *more])
+    told = capsys.readouterr()
+    expected = {"evaluate": "no ground truth", "view": "no key points in 8 images", "check": "no jaw to rely on"}
+    assert code == (1 if command == "check" else 2)
+    assert expected.get(command, "jaw was found in 0 of 5 images") in told.out + told.err
+    assert main([command, str(dataset), "--episode", "7", "--intrinsics", "43,43,31,23", *more]) == 2
+    assert "no episode 7; expected 0 to 1" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "../../{episode_index}.parquet",
+        "/tmp/{episode_index}.parquet",
+        "data/{episode_index:0900000000d}.parquet",
+        "data/{episode_index.__class__}.parquet",
+        "data/{0}.parquet",
+    ],
+)
+def test_a_path_that_leads_out_of_a_dataset_is_refused(path, dataset, capsys):
+    info = json.loads((dataset / "meta/info.json").read_text())
+    (dataset / "meta/info.json").write_text(json.dumps(info | {"data_path": path}))
+    assert annotate(dataset) == 2
+    assert "expected one within the dataset" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "name", ["secret.txt", "data/chunk-000/episode_000000.parquet", "meta/episodes.jsonl", "folder"]
+)
+def test_a_link_out_of_a_dataset_is_refused_and_nothing_of_it_copied(name, dataset, capsys):
+    outside = dataset.parent / "outside"
+    if (dataset / name).exists():
+        os.rename(dataset / name, outside)
+    elif name == "folder":
+        outside.mkdir()
+    else:
+        outside.write_text("mine")
+    os.symlink(outside, dataset / name)
+    assert annotate(dataset) == 2
+    assert "leads out of the folder noise" in capsys.readouterr().err
+    assert not (dataset.parent / "out" / "noise").exists()
+
+
+def test_a_snapshot_of_links_to_its_blobs_is_one_folder(dataset):
+    hub = dataset.parent / "datasets--somebody--noise"
+    (hub / "blobs").mkdir(parents=True)
+    snapshot = hub / "snapshots" / "0123"
+    for number, path in enumerate(sorted(path for path in dataset.rglob("*") if path.is_file())):
+        link = snapshot / path.relative_to(dataset)
+        link.parent.mkdir(parents=True, exist_ok=True)
+        os.rename(path, hub / "blobs" / str(number))
+        os.symlink(os.path.relpath(hub / "blobs" / str(number), link.parent), link)
+    choice = ImageChoice(intrinsics=("43", "43", "31", "23"), episode=1)
+    assert len(list(read_recording(snapshot, choice).images)) == 8
+
+
+def test_a_small_table_that_unpacks_to_far_more_than_its_size_is_refused(dataset, capsys):
+    import pyarrow
+
+    path, zeros = dataset / "data/chunk-000/episode_000000.parquet", pyarrow.array(np.zeros(4_000_000))
+    with parquet.ParquetWriter(path, pyarrow.schema({"number": pyarrow.float64()})) as writer:
+        for _ in range(10):
+            writer.write_table(pyarrow.table({"number": zeros}))
+    assert path.stat().st_size < 1 << 18
+    with pytest.raises(RecordingError, match="takes more than 19. MB of memory"):
+        read_parquet(path)
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(RecordingError, match="is no plain file"):
+        read_parquet(path)
+
+
+def test_forces_of_a_dataset_are_shown_as_those_of_a_bag(dataset):
+    from finforce_eval.figures.recorded_forces import read_forces
+
+    with pytest.raises(RecordingError, match="no forces: no feature ends in .force.left"):
+        read_forces(dataset)
+    info = json.loads((dataset / "meta/info.json").read_text())
+    info["features"] |= dict.fromkeys(("observation.force.left", "observation.force.left.stddev"), {"dtype": "float32"})
+    (dataset / "meta/info.json").write_text(json.dumps(info))
+    for path in (dataset / "data").rglob("*.parquet"):
+        table = parquet.read_table(path)
+        for number, name in enumerate(("observation.force.left", "observation.force.left.stddev")):
+            table = table.append_column(name, [[[-2.0 + 1.9 * number, 0.0, 0.0]] * len(table)])
+        parquet.write_table(table, path)
+    short, long = read_forces(dataset)
+    assert (short.name, long.name) == ("noise/episode_000000/left", "noise/episode_000001/left")
+    assert len(long) == 8 and (long.magnitude == 2.0).all()
+    np.testing.assert_allclose(long.column("magnitude_stddev"), 0.1, atol=1e-6)
+    (dataset.parent / "manifest.jsonl").write_text("{}\n")
+    page = dataset.parent / "page.html"
+    assert main(["report", str(dataset), str(dataset.parent / "manifest.jsonl"), "-o", str(page)]) == 0
+    assert page.is_file()
