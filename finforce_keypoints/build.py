@@ -29,6 +29,7 @@ def build_detector(
     settings: DetectorSettings | None = None,
     dots: DotSettings | None = None,
     rests: bool = False,
+    watched: bool = True,
 ) -> KeypointDetector:
     """Return the detector of the jaws (by side) that the parameters ask for.
 
@@ -38,6 +39,7 @@ def build_detector(
         settings: of the geometry.
         dots: how dots look, where they are used.
         rests: whether pixels and depth are left out where nothing has moved.
+        watched: whether pictures that repeat themselves mean a frozen camera; a video repeats whatever stands still.
 
     Raises:
         PoseError: the camera's pose is none.
@@ -48,7 +50,9 @@ def build_detector(
     if parameters.depth != ALIGNED:
         settings = replace(settings, plane_depth=True)
     pixel_detector = build_pixel_detector(jaws, parameters, settings, dots)
-    return KeypointDetector(pixel_detector, jaws, parameters.camera_pose, settings, ImageWatch(), rests)
+    return KeypointDetector(
+        pixel_detector, jaws, parameters.camera_pose, settings, ImageWatch() if watched else None, rests
+    )
 
 
 def build_pixel_detector(

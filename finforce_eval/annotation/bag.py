@@ -20,7 +20,7 @@ from finforce.errors import FinforceError, one_line
 from finforce.files import FileError, check_inside
 from finforce.messages import read_stamp
 from finforce_eval.errors import RecordingError
-from finforce_eval.evaluation.forces import estimate_forces, no_force_reasons, why_no_force
+from finforce_eval.evaluation.forces import estimate_forces, no_force_reasons, why_unanswered
 from finforce_eval.evaluation.gripper import combine_jaws
 from finforce_eval.evaluation.keypoint_source import parse_source
 from finforce_eval.evaluation.setup import share_setup, sides_of
@@ -77,9 +77,9 @@ def annotate_bag(source: Path, target: Path, options: argparse.Namespace, settin
     setup.contacts.check(recording)
     recording = keypoints.apply(replace(recording, name=source.stem))
     jaws = estimate_forces(recording, setup)
-    if not any(forces.solved.any() for forces in jaws.values()):
-        images = max(map(len, jaws.values()))
-        raise RecordingError(f"{source.stem}: no force in any of {images} images: {why_no_force(jaws.values())}")
+    why = why_unanswered(jaws.values())
+    if why:
+        raise RecordingError(f"{source.stem}: {why}")
     messages = ForceMessages(jaws, combine_jaws(jaws))
     figures = without_nan(_describe(jaws) | {"notes": list(recording.notes)})
     about = {"key": key, "figures": figures, "settings": dict(setup.about), "version": version()}

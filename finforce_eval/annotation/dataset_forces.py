@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from finforce.files import FileError, check_inside, check_plain, parse_json, read_json
 from finforce_eval.errors import RecordingError
-from finforce_eval.evaluation.forces import estimate_forces, no_force_reasons, why_no_force
+from finforce_eval.evaluation.forces import NOT_FOUND, estimate_forces, no_force_reasons, why_unanswered
 from finforce_eval.evaluation.gripper import combine_jaws
 from finforce_eval.evaluation.keypoint_source import parse_source
 from finforce_eval.evaluation.setup import describe_options, read_contacts, share_setup, sides_of
@@ -127,16 +127,14 @@ def annotate_episode(
         if _NO_KEYPOINTS not in str(error):
             raise
         nothing = {"force": np.full((len(images), 3), np.nan), "message": str(error).removeprefix(f"{name}: ")}
-        nothing |= {"force_stddev": nothing["force"], "scored": True, "status": "not found"}
+        nothing |= {"force_stddev": nothing["force"], "scored": True, "status": NOT_FOUND}
         found = {side: ForceSeries.build(name, side, images.stamps, **nothing) for side in recording.jaws}
     grasp = combine_jaws(found)
     values = grasp.column("grasp_force")
-    answered = {side: int(each.solved.sum()) for side, each in found.items()}
-    both = int(np.isfinite(values).sum())
+    both, why = int(np.isfinite(values).sum()), why_unanswered(found.values())
     jaws = {"both": {"images": len(values), "answered": both, "largest_N": float(np.nanmax(values)) if both else None}}
-    if not any(answered.values()):
-        notes = [f"no force in any of {len(values)} images: {why_no_force(found.values())}"]
-    figures = {"jaws": jaws, "found": answered, "span_s": round(len(values) / images.fps, 3), "notes": notes}
+    figures = {"jaws": jaws, "without_force": bool(why), "span_s": round(len(values) / images.fps, 3)}
+    figures |= {"notes": [*notes, why] if why else notes}
     about = {"key": key, "figures": figures}
     write_table(target, [grasp, *(each.renamed(f"{name}/{side}") for side, each in found.items())], about)
     return figures

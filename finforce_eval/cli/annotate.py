@@ -62,10 +62,8 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _has_force(line: Line) -> bool:
-    """Say whether a task found a force in any image."""
-    figures = line["figures"]
-    answered = figures.get("found") or {side: jaw["answered"] for side, jaw in figures.get("jaws", {}).items()}
-    return line["status"] == OK and any(answered.values())
+    """Say whether a task found forces."""
+    return line["status"] == OK and not line["figures"].get("without_force")
 
 
 def _check_dataset_options(options: argparse.Namespace) -> None:

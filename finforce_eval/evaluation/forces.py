@@ -29,6 +29,10 @@ _NUMBERS = ("magnitude_stddev", "residual", "step_ms", "contact_ms", "contact_he
 _POINTS = ("points_x", "points_y", "points_z", "points_weight", "points_touching")
 
 
+NOT_FOUND = "not found"  # status of a jaw that is in none of the images
+LEAST_ANSWERED = 0.1  # share of the images with a force, below which there is no such finger in them
+
+
 class Estimator(Protocol):
     """What is asked of an estimator; `JawEstimator` satisfies it.
 
@@ -214,7 +218,7 @@ def find_forces(
     for index, stamp in enumerate(stamps.tolist()):
         progress(1)
         if unseen:
-            rows.append(run.row("not found", f"the {side} jaw is in none of the images"))
+            rows.append(run.row(NOT_FOUND, f"the {side} jaw is in none of the images"))
             continue
         if idling.passes(stamp):
             source.contact_at(stamp)  # its node has rules of its own
@@ -351,10 +355,19 @@ def sight_columns(recording: Recording, side: str) -> dict[str, Any]:
     return columns
 
 
-def why_no_force(jaws: Collection[ForceSeries]) -> str:
-    """Return the commonest reasons why images of some jaws have no force."""
-    counts = Counter(reason for forces in jaws for reason in no_force_reasons(forces) if reason)
-    return "; ".join(reason for reason, _ in counts.most_common(2))
+def why_unanswered(jaws: Collection[ForceSeries]) -> str:
+    """Return why a recording counts as one without forces, "" where it does not.
+
+    Key points that a detector takes for a jaw where there is none give a force now and then. Counted are the images in
+    which every jaw that was found at all has one.
+    """
+    found = [each for each in jaws if not (each.column("status") == NOT_FOUND).all()]
+    images, answered = max(map(len, jaws)), int(np.all([each.solved for each in found], axis=0).sum()) if found else 0
+    if answered >= max(1, LEAST_ANSWERED * images):
+        return ""
+    counts = Counter(reason for each in jaws for reason in no_force_reasons(each) if reason)
+    reasons = "; ".join(reason for reason, _ in counts.most_common(2))
+    return f"a force in {answered} of {images} images, on all jaws that were found: {reasons}"
 
 
 def no_force_reasons(forces: ForceSeries) -> list[str]:

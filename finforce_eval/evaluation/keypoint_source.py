@@ -134,7 +134,8 @@ class KeypointSource:
         if live is not None:
             raise OptionError(f"--detector {live}: means nothing offline; leave it out, or use finforce replay")
         parameters, settings, dots = build_records(self.node_parameters(recording))
-        return build_detector(load_jaws(parameters), parameters, settings, dots, self.as_live)
+        watched = not recording.images.is_video
+        return build_detector(load_jaws(parameters), parameters, settings, dots, self.as_live, watched)
 
     def _detect(self, recording: Recording) -> Recording:
         detector, parameters = self.build(recording), build_records(self.node_parameters(recording)).parameters

@@ -33,11 +33,13 @@ from finforce_eval.recordings.images import ImageChoice, StampedImage
 from finforce_eval.recordings.tracks import JAWS, JawTrack, KeypointTrack, Recording
 from finforce_keypoints.images import RgbdImage, check_image
 
+pa.set_memory_pool(pa.system_memory_pool())  # the default one takes a gigabyte at once, which no limit tells from use
 INFO, STATS = Path("meta/info.json"), Path("meta/stats.json")
 EPISODES_V2, EPISODE_STATS_V2 = Path("meta/episodes.jsonl"), Path("meta/episodes_stats.jsonl")
 EPISODES_V3 = Path("meta/episodes")
-_LARGEST_LINES = 1 << 28  # bytes; a line per episode
+_LARGEST_LINES = 1 << 26  # bytes; a line per episode
 _VERSIONS = ("v2.0", "v2.1", "v3.0")
+_BYTES_PER_CELL = 8  # of a table, once it is read
 _MOST_FRAMES = 1_000_000  # of an episode: nine hours at 30 Hz
 # what stands for the numbers of an episode and its files in the paths of `info.json`
 _NUMBER = re.compile(r"\{(episode_chunk|episode_index|chunk_index|file_index|video_key)(:0?[1-9]d)?\}")
@@ -142,9 +144,8 @@ def open_dataset(folder: Path, camera: str | None = "") -> Dataset:
     info = _read_info(folder)
     camera = "" if camera is None else _choose_camera(info, camera, folder.name)
     try:
-        with limit_growth(raise_budget(MEMORY)):
-            entries = _read_entries_v3(folder) if info["codebase_version"] == "v3.0" else _read_entries_v2(folder)
-            episodes = tuple(_make_episode(folder, info, camera, entry) for entry in entries)
+        entries = _read_entries_v3(folder) if info["codebase_version"] == "v3.0" else _read_entries_v2(folder)
+        episodes = tuple(_make_episode(folder, info, camera, entry) for entry in entries)
     except FileError as error:
         raise RecordingError(f"{folder.name}: {error}") from error
     except MemoryError as error:
@@ -210,7 +211,8 @@ def _read_entries_v3(folder: Path) -> list[dict[str, Any]]:
     entries = []
     for path in sorted((folder / EPISODES_V3).glob("*/*.parquet")):
         table = read_parquet(check_inside(path, folder))
-        entries += table.select([name for name in table.column_names if not name.startswith("stats/")]).to_pylist()
+        with limit_growth(raise_budget(MEMORY)):
+            entries += table.select([name for name in table.column_names if not name.startswith("stats/")]).to_pylist()
     if not entries:
         raise RecordingError(f"{folder.name}: no episodes in {EPISODES_V3}")
     return sorted(entries, key=lambda entry: entry["episode_index"])
@@ -243,8 +245,13 @@ def read_parquet(path: Path) -> pa.Table:
     """Return a Parquet file, rows in the groups that it has; raises RecordingError where it is missing or damaged."""
     try:
         check_plain(path)
-        with limit_growth(allowed_bytes(path)):
-            return pq.ParquetFile(path).read(use_threads=False)
+        file, allowed = pq.ParquetFile(path), allowed_bytes(path)
+        groups = [file.metadata.row_group(number) for number in range(file.metadata.num_row_groups)]
+        cells = sum(each.column(number).num_values for each in groups for number in range(each.num_columns))
+        if _BYTES_PER_CELL * cells > allowed:
+            raise MemoryError
+        with limit_growth(allowed):
+            return file.read(use_threads=False)
     except MemoryError as error:
         what = f"takes more than {allowed_bytes(path) >> 20} MB of memory, far more than its size allows for"
         raise RecordingError(f"{path.parent.name}/{path.name}: {what}") from error
@@ -293,6 +300,11 @@ class EpisodeImages:
 
     def __len__(self) -> int:
         return self.episode.length if self.frames is None else len(self.frames)
+
+    @property
+    def is_video(self) -> bool:
+        """Whether the pictures are those of a video."""
+        return self.episode.video is not None
 
     @property
     def stamps(self) -> NDArray[np.int64]:

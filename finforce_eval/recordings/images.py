@@ -92,6 +92,7 @@ class ImageTrack:
     unpaired: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     depth_scale: float = MILLIMETRE
     info: str = ""
+    is_video = False
 
     def __len__(self) -> int:
         return len(self.stamps)

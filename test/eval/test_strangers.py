@@ -13,7 +13,7 @@ from finforce_contact.loop import GivenContact
 from finforce_eval.cli.main import main
 from finforce_eval.cli.twin import RecordingForm, footage_entries, write_footage
 from finforce_eval.errors import RecordingError
-from finforce_eval.evaluation.forces import check_solved, find_forces
+from finforce_eval.evaluation.forces import check_solved, find_forces, why_unanswered
 from finforce_eval.evaluation.keypoint_source import detect_keypoints
 from finforce_eval.recordings.dataset import read_parquet
 from finforce_eval.recordings.images import ImageChoice
@@ -49,6 +49,15 @@ def test_a_jaw_that_is_never_seen_has_no_force_and_the_other_keeps_its_own(tmp_p
     series = find_forces(found, None, GivenContact(None), FakeEstimator([]), "right")
     assert len(series) == 12 and not series.solved.any()
     assert set(series.column("status")) == {"not found"} and "none of the images" in series.column("message")[0]
+
+
+def test_a_force_now_and_then_is_none(tmp_path):
+    recording = make_recording(phases=False)
+    count = len(recording.jaw("left").keypoints.stamps)
+    for answered, expected in ((5, "a force in 5 of 60 images"), (6, "")):
+        forces = [[0.0, 0.0, 0.0]] * answered + [None] * (count - answered)
+        series = evaluate_recording(recording, FakeJaw(), GivenContact(None), FakeEstimator(forces))
+        assert why_unanswered([series]).startswith(expected) and bool(why_unanswered([series])) == bool(expected)
 
 
 def write_renamed(folder, names, **options):
@@ -163,6 +172,7 @@ def test_a_dataset_in_which_no_jaw_is_seen_is_not_annotated(dataset, capsys):
     assert annotate(dataset) == 2
     told = capsys.readouterr()
     assert "0 of 2 annotated" in told.out and "no force in any of its 2 episodes" in told.err
+    assert "a force in 0 of 8 images" in told.err
     assert "no key points in" in told.err and not (dataset.parent / "out" / "noise").exists()
 
 
@@ -252,7 +262,7 @@ def test_a_small_table_that_unpacks_to_far_more_than_its_size_is_refused(dataset
         for _ in range(10):
             writer.write_table(pyarrow.table({"number": zeros}))
     assert path.stat().st_size < 1 << 18
-    with pytest.raises(RecordingError, match="takes more than 19. MB of memory"):
+    with pytest.raises(RecordingError, match="takes more than 2.. MB of memory"):
         read_parquet(path)
     path.unlink()
     os.mkfifo(path)
