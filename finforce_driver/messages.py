@@ -173,7 +173,9 @@ class MessageTimes:
         return stamp
 
 
-LEVELS = {Phase.READY: Level.OK, Phase.MOVING: Level.OK, Phase.FAULT: Level.ERROR, Phase.DISCONNECTED: Level.ERROR}
+LEVELS = {Phase.READY: Level.OK, Phase.MOVING: Level.OK} | dict.fromkeys(
+    (Phase.FAULT, Phase.LOST, Phase.DISCONNECTED), Level.ERROR
+)
 FAILURES = (MoveOutcome.BLOCKED, MoveOutcome.TIMED_OUT, MoveOutcome.ABORTED)
 
 

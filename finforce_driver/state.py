@@ -40,6 +40,7 @@ class Phase(Enum):
     DISCONNECTED = "disconnected"  # no port, or nothing answers for long
     PROBING = "probing"  # the port is open, no reply yet
     UNCALIBRATED = "uncalibrated"
+    LOST = "lost"  # moved by an order that was not ours: where the jaws are is not known until a calibration
     CALIBRATING = "calibrating"
     READY = "ready"  # holds, or rests
     MOVING = "moving"
@@ -74,7 +75,7 @@ class GripperState:
         contact: "", "closing" or "opening": what the motor pushes against.
         at_target: whether the gripper says so.
         calibrated: the gripper knows its end stops.
-        activated: its power stage may move it.
+        activated: its power stage may move it, and does not sleep since a fault or a calibration.
         faults: names of what is latched, in the gripper's order.
         estopped: an emergency stop is latched, by us or by it.
         stop_pending: an emergency stop was asked for, and the gripper has not said yet that it stands.
@@ -187,6 +188,7 @@ SILENT = (
     "the adapter's baud_rate"
 )
 OTHER_NODE = "no gripper answers at node {node}, but one does at node {other}: set node_id to {other}"
+LOST = "{what}; the jaws were stopped, and where they are is not known: stop other programs, clear the jaws, calibrate"
 OTHER_MASTER = "another program commands this gripper ({what}): stop it, then command again"
 REBOOTED = "the gripper lost its calibration, it was probably restarted: calibrate it"
 UNCALIBRATED = "the gripper is not calibrated: keep the jaws clear, then calibrate"
@@ -229,6 +231,7 @@ def describe(phase: Phase, outcome: MoveOutcome, faults: Sequence[str]) -> str:
         Phase.DISCONNECTED: "no gripper is connected",
         Phase.PROBING: "waiting for the gripper's first reply",
         Phase.UNCALIBRATED: UNCALIBRATED,
+        Phase.LOST: "where the jaws are is not known: calibrate",
         Phase.CALIBRATING: "calibrating: the jaws open, then close",
         Phase.READY: OUTCOMES.get(outcome, "ready"),
         Phase.MOVING: "moving",

@@ -25,7 +25,7 @@ CLEARING_TIMEOUT = 2.0  # s; it takes 0.2 s
 WATCH_PERIOD = 0.1  # s
 MOVE_MARGIN = 5.0  # s beyond the time that the way takes
 ABSENT = (Phase.DISCONNECTED, Phase.PROBING)
-LIMP = (*ABSENT, Phase.FAULT, Phase.UNCALIBRATED)
+LIMP = (*ABSENT, Phase.FAULT, Phase.UNCALIBRATED, Phase.LOST)
 
 
 class GripperTasks:

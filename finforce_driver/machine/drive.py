@@ -231,7 +231,7 @@ class Drive:
         if self.calibration is not None:
             return Phase.CALIBRATING
         if not self.known.calibrated:
-            return Phase.UNCALIBRATED
+            return Phase.LOST if self.known.doubt not in ("", HALF_CALIBRATED) else Phase.UNCALIBRATED
         if self.arrival is not None and not self.moving:
             return Phase.MOVING if self.arrival.moving else Phase.PROBING
         return Phase.MOVING if self.moving else Phase.READY
@@ -325,7 +325,7 @@ class Drive:
             contact=DIRECTIONS[self._push()] if placed else "",
             at_target=known.driving and bool(reply and reply.at_target) and placed and settled,
             calibrated=placed,
-            activated=bool(reply and reply.activated),
+            activated=bool(reply and reply.activated) and not known.asleep,
             faults=faults,
             stop_pending=self.stop.stage is StopStage.WANTED,
             estopped=stopped or "E-stop" in faults,
@@ -359,8 +359,8 @@ class Drive:
             return STOP_PENDING
         if self.note and phase is not Phase.FAULT:
             return self.note
-        if phase is Phase.UNCALIBRATED and self.known.half_calibrated:
-            return HALF_CALIBRATED
+        if phase in (Phase.UNCALIBRATED, Phase.LOST) and self.known.doubt:
+            return self.known.doubt
         return describe(phase, self.outcome, faults)
 
     # What is sent next

@@ -100,7 +100,8 @@ class Knowledge:
 
     Attributes:
         reply: the last believed one; None before the first.
-        half_calibrated: a calibration was cut short, the gripper's flag says nothing.
+        doubt: why the gripper's own flag of a calibration is not trusted, in a sentence; empty: it is.
+        asleep: the power stage sleeps since a fault, a calibration or a stop, whatever the reply echoes of orders.
         telemetry: temperature, supply, errors.
         filter: decides which replies are believed.
         history: positions over time [counts].
@@ -110,7 +111,8 @@ class Knowledge:
     """
 
     def __init__(self, settings: GripperSettings) -> None:
-        self.half_calibrated = False
+        self.doubt = ""
+        self.asleep = False
         self.telemetry = Telemetry(settings.telemetry_period)
         self.filter = ReplyFilter(settings.reply_timeout)
         self.history = History()
@@ -118,7 +120,7 @@ class Knowledge:
         self._contact_since = math.inf
 
     def forget(self) -> None:
-        """Know nothing any more; only that a calibration was cut short does not heal by itself."""
+        """Know nothing any more; only a doubt and a sleeping power stage do not heal by themselves."""
         self.reply, self._contact_since = None, math.inf
         self.telemetry.forget()
         self.filter.forget()
@@ -138,7 +140,7 @@ class Knowledge:
     @property
     def calibrated(self) -> bool:
         """Whether the position means something."""
-        return self.reply is not None and self.reply.calibrated and not self.half_calibrated
+        return self.reply is not None and self.reply.calibrated and not self.doubt
 
     @property
     def error(self) -> bool:
@@ -148,7 +150,7 @@ class Knowledge:
     @property
     def driving(self) -> bool:
         """Whether the gripper's power stage moves or holds the jaws."""
-        return self.reply is not None and self.reply.driving
+        return self.reply is not None and self.reply.driving and not self.asleep
 
     @property
     def contact_time(self) -> float:
@@ -157,8 +159,8 @@ class Knowledge:
 
     @property
     def position(self) -> float:
-        """The best estimate of the last position [counts]; NaN unknown."""
-        return self.history.last if self.calibrated else math.nan
+        """The best estimate of the last position [counts], between whichever end stops the gripper has; NaN unknown."""
+        return self.history.last
 
     def position_now(self, now: float, target: float | None) -> float:
         """Return where the jaws are by now [counts], at the speed of the last replies and not beyond their target."""

@@ -12,14 +12,15 @@ from functools import wraps
 from threading import Event, RLock
 from typing import Any
 
-from finforce_driver.can.protocol import CanMessage, Command, Flag, Reply, decode_reply, encode_watchdog
+from finforce_driver.can.protocol import CanMessage, Command, Flag, Reply, decode_move, decode_reply, encode_watchdog
 from finforce_driver.errors import GripperStateError
 from finforce_driver.machine.drive import GO, USABLE, Drive, Request
-from finforce_driver.machine.move import Arrival, EchoWatch, Goal, MoveJob
+from finforce_driver.machine.move import CLEAR_CURRENT, Arrival, Goal, MoveJob, OrderWatch
 from finforce_driver.machine.procedures import CalibrationRun, Recovery, Step, StopStage
 from finforce_driver.settings import SLOWEST_BYTE, GripperSettings, check_numbers
 from finforce_driver.state import (
     HALF_CALIBRATED,
+    LOST,
     OTHER_MASTER,
     OTHER_NODE,
     REBOOTED,
@@ -33,15 +34,16 @@ PROBES = 20  # the same before the first reply: a second
 ECHOES = 8  # last messages, in which one of ours is recognised that an adapter gives back
 OLD = 0.1  # [s] after which a reply does not tell where moving jaws are
 STANDING = 2.0  # [counts/s], below which an unknown order is taken to hold
-FOREIGN = frozenset({Command.ESTOP, Command.CLEAR, Command.IDLE, Command.RESET, Command.CALIBRATE})
+FOREIGN = frozenset({Command.ESTOP, Command.CLEAR, Command.IDLE, Command.RESET})  # after which the jaws are limp
 INHERITED = "the jaws were moving by an order from before the link was there; they are held"
 LOST_ORDER = "the gripper fell silent before the order could be sent: command again"
 NO_FAULTS = (False, False, False, False)
-CONNECTED = (Phase.UNCALIBRATED, Phase.READY, Phase.MOVING)
+CONNECTED = (Phase.UNCALIBRATED, Phase.LOST, Phase.READY, Phase.MOVING)
 REFUSALS = {
     Phase.DISCONNECTED: "no gripper answers",
     Phase.PROBING: "the gripper has not answered yet: wait for its first reply",
     Phase.UNCALIBRATED: "the gripper is not calibrated: calibrate it first",
+    Phase.LOST: "where the jaws are is not known: calibrate first",
     Phase.CALIBRATING: "the gripper calibrates, which another command would cut short: wait",
     Phase.FAULT: "a fault or an emergency stop is latched: clear the errors first",
 }
@@ -76,7 +78,7 @@ class GripperMachine(Drive):
         super().__init__(settings, salt)
         self._now = now
         self._lock, self._wake = RLock(), Event()
-        self._echo = EchoWatch()
+        self._watch = OrderWatch()
         self._enabled = True  # not switched off
         self._sent: deque[CanMessage] = deque(maxlen=ECHOES)
         self.refresh()
@@ -155,11 +157,9 @@ class GripperMachine(Drive):
         self._require("calibrate", CONNECTED)
         self._end_job(MoveOutcome.REPLACED)
         self.orders.drop()
-        self._echo.forget()
+        self._watch.forget()
         self.note, self._enabled = "", True
-        self.calibration = CalibrationRun(
-            self.settings, calibrated=self.known.calibrated, reset=self.known.half_calibrated
-        )
+        self.calibration = CalibrationRun(self.settings, calibrated=self.known.calibrated, reset=bool(self.known.doubt))
 
     @_command
     def clear_errors(self) -> None:
@@ -255,7 +255,7 @@ class GripperMachine(Drive):
         """Forget what can have changed by the time the link is back, and want nothing."""
         if self.calibration is not None:
             # without an earlier calibration the gripper's flag will say whether it was completed
-            self.known.half_calibrated |= self.known.calibrated
+            self.known.doubt = self.known.doubt or (HALF_CALIBRATED if self.known.calibrated else "")
             self.calibration = None
         self.recovery = None
         self.stop.end_clearing(False)
@@ -350,7 +350,6 @@ class GripperMachine(Drive):
         """Stop in place; see `hold`."""
         if self.calibration is not None:
             self._break_calibration()
-            self.note = HALF_CALIBRATED
             self.orders.want(self.order(position=0, flags=Flag.ACTIVATE), urgent=True)
             return
         stepping = self.job is not None and self.job.steps is not None and self.job.stepping
@@ -385,18 +384,19 @@ class GripperMachine(Drive):
         self._end_job(MoveOutcome.ABORTED)
         self.hold_wanted = False
         self.orders.drop()
-        self._echo.forget()
+        self._watch.forget()
         self.note = note
 
     def _break_calibration(self) -> None:
         """Note that a calibration under way is cut short."""
         if self.calibration is not None:
-            self.calibration, self.known.half_calibrated = None, True
+            self.calibration, self.known.doubt = None, HALF_CALIBRATED
+            self.known.asleep = True
 
     def _postpone_hold(self) -> None:
         """Hold as soon as it is known where: at an old position, to hold would be to go back."""
         self.orders.forget()
-        self._echo.forget()
+        self._watch.forget()
         self.hold_wanted = True
 
     def _take_reply(self, request: Request, message: CanMessage, now: float) -> None:
@@ -405,19 +405,23 @@ class GripperMachine(Drive):
             self._take_echo(request, now)
         order, before = self.orders.taken, self.known.reply
         speed = 0.0 if order is None else self.settings.speed_of(order.speed) / self.settings.resolution
-        believed = self.known.take(decode_reply(message, now), order, speed)
+        reply = decode_reply(message, now)
+        believed = self.known.take(reply, order, speed)
         self.counts["unconfirmed replies"] = self.known.filter.rejected
-        if believed is not None:
+        if believed is None:
+            self._renew_order(reply)
+        else:
             self._conclude(before, believed)
             self.refresh()
 
     def _take_echo(self, request: Request, now: float) -> None:
         """Note that an order was answered."""
+        self.known.asleep = False
         if self.recovery is not None:
             self.recovery.unflagged()
         elif request.move == self.orders.wanted:
             self.orders.take(request.move)
-            self._echo.send(request.move, now)
+            self._watch.send(request.move, now, self.known.position)
             self.order_sent = now
             self.known.restart_contact()
             if self.job is not None:
@@ -427,6 +431,7 @@ class GripperMachine(Drive):
         """Draw the conclusions from a reply that is believed; `before` is the one before it."""
         if self.silent or before is None:
             self.silent, self.note = False, ""
+        self.known.asleep |= reply.error
         self.stop.take(reply)
         self._follow_recovery(reply)
         self._follow_fault(before, reply)
@@ -434,7 +439,9 @@ class GripperMachine(Drive):
             self._follow_calibration(reply)
         elif before is not None and before.calibrated and not reply.calibrated:
             self._abort(REBOOTED)
-            self.known.half_calibrated = False
+            self.known.doubt = ""
+        elif before is not None and reply.calibrated and not before.calibrated and not self.known.doubt:
+            self._lose_place("the gripper was calibrated, but not by this driver", False)
         elif not reply.error:
             self._follow_orders(reply)
         self._follow_arrival(reply)
@@ -466,7 +473,7 @@ class GripperMachine(Drive):
         recovery.take(reply)
         if recovery.step.over:
             cleared = recovery.step is Step.DONE
-            self.recovery = None
+            self.recovery, self.known.asleep = None, True
             self.stop.end_clearing(cleared)
             self._abort()
             if not cleared:
@@ -486,18 +493,22 @@ class GripperMachine(Drive):
         run.take(reply)
         if run.step.over:
             self.calibration = None
-            self.known.half_calibrated = run.step is Step.FAILED
+            self.known.doubt = HALF_CALIBRATED if run.step is Step.FAILED else ""
+            self.known.asleep = True
             self.known.restart_history()
             self._abort(run.reason)
             self.ended = MoveOutcome.NONE
 
     def _follow_orders(self, reply: Reply) -> None:
         """Judge the move, and whether the gripper has our order."""
-        if self._echo.is_ignored(reply):
-            if self._echo.heard:
-                self._yield_to_other("it does not do what it was told last")
-            elif not (self.moving and self.orders.repeat()):
-                self._echo.forget()
+        fault, runs = self._watch.judge(reply, self.known.asleep), abs(reply.current_mA) >= CLEAR_CURRENT
+        if fault and not self._watch.heard and not runs:
+            if not self.orders.repeat():
+                self._watch.forget()
+        elif fault and not runs and not self._watch.strays(reply):
+            self._yield_to_other(fault)
+        elif fault and not (self.orders.pending or (not self._watch.heard and self.orders.repeat())):
+            self._lose_place(fault, self.known.driving)
         if self.job is not None:
             self.job.take(reply)
             if self.job.outcome is MoveOutcome.TIMED_OUT and self.orders.pending:
@@ -509,9 +520,13 @@ class GripperMachine(Drive):
             self.counts["messages of other nodes"] += 1
         elif message.command == Command.HEARTBEAT:
             self.counts["heartbeats"] += 1
-        elif message.command == Command.MOVE and len(message.data) == 5 and not message.remote:
-            self._yield_to_other("a move was seen on the bus")
-        elif message.command in FOREIGN and not message.remote:
+        elif message.remote:
+            self.counts["unexpected messages"] += 1
+        elif message.command == Command.MOVE and len(message.data) == 5:
+            self._meet_order("a move was seen on the bus", decode_move(message).drives)
+        elif message.command == Command.CALIBRATE and not message.data:
+            self._meet_order("a calibration was seen on the bus", True)
+        elif message.command in FOREIGN and not message.data:
             self._yield_to_other(f"command {message.command} was seen on the bus")
         else:
             self.counts["unexpected messages"] += 1
@@ -521,4 +536,36 @@ class GripperMachine(Drive):
         self.counts["foreign commands"] += 1
         self._break_calibration()
         self._abort(OTHER_MASTER.format(what=what))
+        self.known.asleep = True
         self.refresh()
+
+    def _meet_order(self, what: str, drives: bool) -> None:
+        """Answer another program's order: one that moves the jaws takes them from us."""
+        if drives:
+            self._lose_place(OTHER_MASTER.format(what=what), self.known.driving)
+        else:
+            self._yield_to_other(what)
+
+    def _lose_place(self, what: str, hold: bool) -> None:
+        """Trust the end stops no more, and stop the jaws, once: two drivers that stop each other must come to rest.
+
+        Args:
+            what: happened.
+            hold: the jaws are to be held where they were last; else they are to be limp.
+        """
+        self.counts["foreign commands"] += 1
+        if self.phase is Phase.LOST:
+            self._watch.forget()
+            return
+        position, flags = self.hold_position(self._now()), GO if hold else Flag.ACTIVATE
+        stop = self.order(position=position, flags=flags)
+        self._break_calibration()
+        self._abort()
+        self.known.doubt = LOST.format(what=what)
+        self.orders.want(stop, urgent=True)
+        self.refresh()
+
+    def _renew_order(self, reply: Reply) -> None:
+        """Give the order anew when a reply, true or not, shows jaws that leave their place: it undoes a foreign one."""
+        if self._watch.rests and self.orders.wanted == self.orders.taken and self._watch.strays(reply):
+            self.orders.renew()

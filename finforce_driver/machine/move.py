@@ -280,6 +280,11 @@ class Orders:
         self.wanted = self.taken = None
         self.urgent = False
 
+    def renew(self) -> None:
+        """Give the wanted order anew, as another one that says the same."""
+        self._salt = self._salt + 1 & FREE_FLAGS
+        self.want(self.wanted, self.urgent)
+
     def repeat(self) -> bool:
         """Send the wanted order again, since it has no effect; return whether that is still worth trying."""
         if self._repeats >= REPEATS:
@@ -289,14 +294,23 @@ class Orders:
         return True
 
 
+def _says_the_same(first: Move, second: Move) -> bool:
+    """Return whether two orders differ in their free flags at most."""
+    return replace(first, flags=first.flags | FREE_FLAGS) == replace(second, flags=second.flags | FREE_FLAGS)
+
+
 LASTING = 3  # replies: what the gripper was told may cross with what it says
+STRAY = 3.0  # [counts] that the jaws may be off their way: truncation, and what the gripper calls reached
+EXCESS = 1.25  # times the current limit, and `CLEAR_CURRENT`, that the motor does not exceed
+SLACK = 0.5  # of the current limit, below which nothing is pressed on
 
 
-class EchoWatch:
-    """Looks whether the gripper does what it was told.
+class OrderWatch:
+    """Looks whether the gripper does what it was told, and nothing else.
 
-    The gripper stays at its target, as it says, until it gets another order, whatever pulls at its jaws: leaving that
-    state, or taking itself to be at a target elsewhere, is the sign of an order that was not ours.
+    The gripper stays at its target, as it says, until it gets another order, whatever pulls at its jaws. Another
+    target, a way that does not lead to the target though the motor does not resist, and a motor that is stronger than
+    its limit, or runs while it should sleep, are signs of an order that was not ours.
 
     Attributes:
         heard: it followed the order before: one that is ignored now was overruled, else it was probably lost.
@@ -307,37 +321,69 @@ class EchoWatch:
         self._sent = 0.0
         self.heard = self._arrived = False
         self._odd = 0
+        self._low = self._high = math.nan  # [counts] between which the jaws may be
+        self._position = -1  # in the last reply
 
-    def send(self, order: Move, now: float) -> None:
-        """Note an order that was answered."""
-        if order != self._order:
-            self.heard = False
-        self._order, self._sent = order, now
-        self._odd, self._arrived = 0, False
+    @property
+    def rests(self) -> bool:
+        """Whether the jaws have come to rest under a known order."""
+        return self._order is not None and self._order.drives and self._high - self._low <= 2.0
+
+    def send(self, order: Move, now: float, position: float) -> None:
+        """Note an order that was answered, when the jaws were at a position [counts]."""
+        before, self._order = self._order, order
+        if before is not None and before.flags != order.flags and _says_the_same(before, order):
+            return  # given anew, against another one
+        self.heard = self.heard and order == before
+        self._sent, self._odd, self._arrived = now, 0, False
+        self._low, self._high = sorted((order.position if math.isnan(position) else position, order.position))
 
     def forget(self) -> None:
-        """Expect nothing."""
-        self._order = None
+        """Expect no order to be carried out: the power stage sleeps, or what it does is not known."""
+        self._order, self._odd = None, 0
+        self._low = self._high = math.nan
 
-    def is_ignored(self, reply: Reply) -> bool:
-        """Judge a believed reply; return whether several in a row do not fit the order."""
-        if self._order is None or reply.time - self._sent < GRACE:
-            return False
-        if self._fits(self._order, reply):
+    def judge(self, reply: Reply, asleep: bool) -> str:
+        """Judge a believed reply; return what is wrong, empty where nothing is.
+
+        Args:
+            reply: as it came.
+            asleep: the power stage sleeps.
+        """
+        order = self._order
+        stands, self._position = reply.position == self._position, reply.position
+        if order is None:
+            self._low, self._high = (reply.position if math.isnan(end) else end for end in (self._low, self._high))
+            runs = asleep and abs(reply.current_mA) >= CLEAR_CURRENT and self.strays(reply)
+            return "the motor runs without an order" if runs else ""
+        if reply.time - self._sent < GRACE:
+            self._low, self._high = min(self._low, reply.position), max(self._high, reply.position)
+            return ""
+        if order.drives and self.strays(reply):
+            return "the jaws leave the way that they were ordered to go"
+        self._low, self._high = sorted((reply.position, order.position))
+        if self._fits(order, reply, stands):
             self.heard, self._odd = True, 0
-            return False
+            return ""
         self._odd = (self._odd + 1) % LASTING
-        return self._odd == 0
+        return "" if self._odd else "the gripper does not do what it was told last"
 
-    def _fits(self, order: Move, reply: Reply) -> bool:
-        """Return whether a reply echoes an order's flags, and tells of its target and no other."""
+    def strays(self, reply: Reply) -> bool:
+        """Return whether the jaws are off their way, and the motor does not push them back to it."""
+        beyond = (reply.position > self._high + STRAY) - (reply.position < self._low - STRAY)
+        resists = abs(reply.current_mA) >= CLEAR_CURRENT and push_direction(reply, False) == -beyond
+        return beyond != 0 and not resists
+
+    def _fits(self, order: Move, reply: Reply, stands: bool) -> bool:
+        """Return whether a reply echoes an order's flags, and tells of its target and current and no other."""
         if (reply.activated, reply.action) != (order.activated, order.action):
             return False
+        current, least = abs(reply.current_mA), SLACK * order.current_mA * reply.contact
+        if not order.drives or not least <= current <= EXCESS * order.current_mA + CLEAR_CURRENT:
+            return current <= CLEAR_CURRENT and not order.drives
         near = abs(reply.position - order.position) <= TOLERANCE + 1
-        if not order.drives or self._arrived:
-            return reply.at_target or not order.drives
-        self._arrived = reply.at_target and near
-        return near or not reply.at_target
+        self._arrived |= reply.at_target and near
+        return near or reply.at_target == self._arrived or (reply.at_target and not stands)
 
 
 SETTLING_TIME = 0.3  # [s] in which jaws that go at 1.5 mm/s show it

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
 
-from finforce_driver.can.protocol import Move
+from finforce_driver.can.protocol import LARGEST_CURRENT_MA, Move
 from finforce_sim.emulator.mechanism import Jaws
 
 AT_POSITION = 3  # object code
@@ -152,16 +152,17 @@ class MoveControl:
                 self.object_code = 0
             return
         target = endpoints.target(self.order.position)
+        limit = max(min(self.order.current_mA, LARGEST_CURRENT_MA), -LARGEST_CURRENT_MA)
         self.latched = self.latched or self._reached(jaws, target, position)
         if self.latched:
             self.object_code = AT_POSITION
-            jaws.hold(target, self.order.current_mA)
+            jaws.hold(target, limit)
             return
         error = target - jaws.encoder
         # byte equality may want one tick more than the target, and the sign of the speed is kept there
         reach = abs(error) + (0 if self._firmware.tick_tolerance else 1)
         speed = ticks_per_second(self.order.speed)
-        jaws.drive(speed if error > 0 else -speed, self.order.current_mA, reach)
+        jaws.drive(speed if error > 0 else -speed, limit, reach)
         self.object_code = self._contact_code(jaws)
 
     def _reached(self, jaws: Jaws, target: int, position: int) -> bool:

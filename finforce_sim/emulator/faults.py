@@ -291,7 +291,7 @@ class FaultyAdapter(EmulatedAdapter):
         self._end_later(fault, self.replug)
 
     def _command_otherwise(self, _fault: PlannedFault) -> None:
-        """Let another master move, stop, clear or switch off the gripper."""
+        """Let another master move, stop, clear, calibrate or switch off the gripper."""
         node = self.gripper.node_id << 7
         position = self._random.randrange(256)
         commands = [
@@ -300,5 +300,6 @@ class FaultyAdapter(EmulatedAdapter):
             CanMessage(id=node | 0x00),
             CanMessage(id=node | 0x02),
             CanMessage(id=node | 0x18),
+            CanMessage(id=node | 0x7C),
         ]
         self.put_on_bus(self._random.choice(commands))

@@ -27,7 +27,7 @@ from finforce_driver.machine.machine import INHERITED
 from finforce_driver.settings import GripperSettings
 from finforce_driver.state import GripperState, MoveOutcome, Phase
 from finforce_sim.emulator.control import Mode
-from finforce_sim.emulator.faults import LINE_FAULTS, FaultKind, FaultyAdapter, draw_plan
+from finforce_sim.emulator.faults import LINE_FAULTS, FaultKind, FaultyAdapter, PlannedFault, draw_plan
 from finforce_sim.emulator.firmware import EmulatedGripper, Fault
 from finforce_sim.emulator.mechanism import Jaws
 from finforce_sim.emulator.virtual import VirtualBus, VirtualClock
@@ -112,7 +112,7 @@ class FaultRun:
         self.clock.attach(self.tape)
         settings = GripperSettings(poll_rate=self._random.choice((50.0, 100.0, 200.0)), telemetry_period=0.3)
         self.gripper = Gripper(self.bus, settings, self.clock)
-        self.oracle, self.guard = Oracle(self.tape, settings), Guard(self.tape)
+        self.oracle, self.guard = Oracle(self.tape, settings, self.adapter.injected), Guard(self.tape)
         self._goal, self._stopped, self._clearing, self._allowed = 0.0, False, False, False
         self._next_act = 0.0
         self.gripper.listen(self._take)
@@ -159,7 +159,7 @@ class FaultRun:
             elif state.phase is Phase.FAULT and draw < 0.9:
                 self.gripper.clear_errors()
                 self._stopped = False
-            elif state.phase is Phase.UNCALIBRATED:
+            elif state.phase in (Phase.UNCALIBRATED, Phase.LOST):
                 self._allowed = False
                 self.gripper.calibrate()
             elif draw < 0.05:
@@ -219,8 +219,9 @@ class FaultRun:
         if message.command == Command.MOVE and message.data:
             self.tally.orders += 1
             goal = self.gripper.settings.counts_of(self._goal) if self._allowed else None
-            # jaws that move by somebody's order when a link comes up are held where they are, as documented
-            allowed = self._allowed or self.gripper.state.message == INHERITED
+            # jaws that move by somebody's order are held where they are, as documented
+            state = self.gripper.state
+            allowed = self._allowed or state.message == INHERITED or state.phase is Phase.LOST
             self.tally.motion.update(self.guard.check(decode_move(message), goal, self._stopped, allowed))
         self._send(message)
 
@@ -235,7 +236,7 @@ class FaultRun:
                 if phase is Phase.FAULT:
                     self._stopped = False
                     self.gripper.clear_errors()
-                elif phase is Phase.UNCALIBRATED:
+                elif phase in (Phase.UNCALIBRATED, Phase.LOST):
                     self._allowed = False
                     self.gripper.calibrate()
                 elif phase in (Phase.READY, Phase.MOVING) and self._works():
@@ -359,8 +360,8 @@ class Oracle:
         outcome: of the last move, in the last state that was checked.
     """
 
-    def __init__(self, tape: Tape, settings: GripperSettings) -> None:
-        self.tape = tape
+    def __init__(self, tape: Tape, settings: GripperSettings, injected: Sequence[PlannedFault]) -> None:
+        self.tape, self.injected = tape, injected
         self.worst: Counter[str] = Counter()
         self._settings = settings
         self.outcome = MoveOutcome.NONE
@@ -401,8 +402,6 @@ class Oracle:
         cut = self._cut or "cut short" in state.message
         if state.phase is Phase.UNCALIBRATED and not cut and all(truth.calibrated for truth in near):
             wrong.append("uncalibrated")
-        if not any(truth.echo[0] == state.activated for truth in near):
-            wrong.append("activated")
         if state.faults == () and all(truth.faults for truth in near):
             wrong.append("no fault")
         for name in state.faults:
@@ -410,9 +409,17 @@ class Oracle:
                 continue
             if not any(truth.faults & FAULT_NAMES.get(name, set()) for truth in self.tape.last(state.stamp, 4.0)):
                 wrong.append(f"fault {name}")
-        if state.phase in (Phase.READY, Phase.MOVING) and (stopped or all(truth.faults for truth in near)):
+        usable = state.phase in (Phase.READY, Phase.MOVING)
+        if usable and (stopped or all(truth.faults for truth in near)):
             wrong.append("usable")
-        return wrong
+        if state.activated and not any(truth.echo[0] for truth in near):
+            wrong.append("activated")
+        return wrong + self._check_power(state, near)
+
+    def _check_power(self, state: GripperState, near: list[TrueGripper]) -> list[str]:
+        awake = all(truth.echo[0] and truth.mode is Mode.GRIPPER for truth in near)
+        lost = state.phase is Phase.LOST and all(fault.kind is not FaultKind.OTHER_MASTER for fault in self.injected)
+        return ["not activated"] * (state.phase is Phase.READY and awake and not state.activated) + ["lost"] * lost
 
     def _check_values(self, state: GripperState, near: list[TrueGripper]) -> list[str]:
         wrong = []
