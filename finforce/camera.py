@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import io
-import warnings
-from dataclasses import dataclass, field
-from functools import cache, cached_property, lru_cache
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -276,18 +275,35 @@ def _check_size(image: NDArray, camera: CameraIntrinsics, what: str = "depth ima
         )
 
 
-COLOR_CHANNELS = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2), "bgra8": (2, 1, 0), "mono8": (0, 0, 0)}
-
-
-_PIXEL_BYTES = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1}
+_BYTE, _WORD = np.dtype(np.uint8), np.dtype(np.uint16)
+# type and channels of the encodings of sensor_msgs/Image, and OpenCV's conversion to RGB, "" for RGB itself
+COLOR_ENCODINGS = {
+    "rgb8": (_BYTE, 3, ""),
+    "bgr8": (_BYTE, 3, "BGR2RGB"),
+    "8UC3": (_BYTE, 3, "BGR2RGB"),
+    "rgba8": (_BYTE, 4, "RGBA2RGB"),
+    "bgra8": (_BYTE, 4, "BGRA2RGB"),
+    "mono8": (_BYTE, 1, "GRAY2RGB"),
+    "rgb16": (_WORD, 3, ""),
+    "bgr16": (_WORD, 3, "BGR2RGB"),
+    "mono16": (_WORD, 1, "GRAY2RGB"),
+    "uyvy": (_BYTE, 2, "YUV2RGB_UYVY"),
+    "yuv422": (_BYTE, 2, "YUV2RGB_UYVY"),
+    "yuyv": (_BYTE, 2, "YUV2RGB_YUY2"),
+    "yuv422_yuy2": (_BYTE, 2, "YUV2RGB_YUY2"),
+    "nv12": (_BYTE, 1, "YUV2RGB_NV12"),
+    "nv21": (_BYTE, 1, "YUV2RGB_NV21"),
+    **{f"bayer_{tiles}8": (_BYTE, 1, f"Bayer{tiles.upper()}2RGB") for tiles in ("rggb", "bggr", "gbrg", "grbg")},
+}
+_HALF_CHROMA = ("nv12", "nv21")  # whose rows of brightness are followed by half as many of colour
 
 
 def decode_color(data: NDArray | bytes, encoding: str, layout: ImageLayout | None = None) -> NDArray:
     """Return a colour image as RGB.
 
     Args:
-        data: the image (h, w, channels), or (h, w) when mono8, or its bytes together with their layout.
-        encoding: rgb8, bgr8, rgba8, bgra8 or mono8, as in sensor_msgs/Image.
+        data: the image (h, w, channels), (h, w) with one channel, or its bytes together with their layout.
+        encoding: one of `COLOR_ENCODINGS`, as in sensor_msgs/Image; 8UC3 is taken for bgr8, as OpenCV has it.
         layout: how the bytes lie.
 
     Returns:
@@ -296,19 +312,34 @@ def decode_color(data: NDArray | bytes, encoding: str, layout: ImageLayout | Non
     Raises:
         ImageError: the encoding is another one, or the data do not fill the layout.
     """
-    if encoding not in COLOR_CHANNELS:
-        raise ImageError(f"colour image: encoding {encoding!r}; expected one of {', '.join(COLOR_CHANNELS)}")
-    depth = _PIXEL_BYTES[encoding]
-    image = np.asarray(data) if layout is None else unpack_rows("colour image", data, np.dtype(np.uint8), layout, depth)
-    if image.ndim == 2 and depth == 1:
-        image = image[:, :, None]
-    if image.ndim != 3 or image.shape[2] != depth or image.dtype != np.uint8:
+    if encoding not in COLOR_ENCODINGS:
+        raise ImageError(f"colour image: encoding {encoding!r}; expected one of {', '.join(COLOR_ENCODINGS)}")
+    dtype, channels, conversion = COLOR_ENCODINGS[encoding]
+    if layout is not None:
+        if encoding in _HALF_CHROMA:
+            layout = replace(layout, height=layout.height + layout.height // 2)
+        data = unpack_rows("colour image", data, dtype, layout, channels)
+    image = np.asarray(data)
+    if image.shape[2:] != ((channels,) if channels > 1 else ()) or image.dtype.newbyteorder("=") != dtype:
+        wanted = f"(h, w, {channels})" if channels > 1 else "(h, w)"
         raise ImageError(
-            f"colour image: {image.dtype} of shape {image.shape}; expected uint8 (h, w, {depth}) for {encoding}"
+            f"colour image: {image.dtype} of shape {image.shape}; expected {dtype} {wanted} for {encoding}"
         )
-    if encoding != "rgb8":
-        image = image[:, :, COLOR_CHANNELS[encoding]]
-    return np.ascontiguousarray(image)
+    if dtype == _WORD:
+        image = (image >> 8).astype(np.uint8)
+    return _convert(image, encoding, conversion) if conversion else np.ascontiguousarray(image)
+
+
+def _convert(image: NDArray, encoding: str, conversion: str) -> NDArray[np.uint8]:
+    """Return an image as RGB (h, w, 3), by OpenCV; raises ImageError for a size that the encoding cannot have."""
+    import cv2
+
+    try:
+        return cv2.cvtColor(np.ascontiguousarray(image), getattr(cv2, f"COLOR_{conversion}"))
+    except cv2.error:
+        raise ImageError(
+            f"colour image: {image.shape[:2]} rows and columns; expected even ones for {encoding}"
+        ) from None
 
 
 _SENT = ("JPEG", "PNG")  # formats of a compressed image
@@ -321,31 +352,24 @@ def open_picture(data: bytes, what: str, formats: tuple[str, ...] | None = _SENT
     Raises:
         ImageError: the bytes are none, are damaged, or unpack to more than 50 million pixels; `what` names them.
     """
-    image, expected = _import_pillow(), f"at most {LARGEST_PICTURE} pixels"
+    from PIL import Image, UnidentifiedImageError
+
+    expected = f"at most {LARGEST_PICTURE} pixels"
     try:
-        picture = image.open(io.BytesIO(data), formats=formats)
+        picture = Image.open(io.BytesIO(data), formats=formats)
         if picture.width * picture.height > LARGEST_PICTURE:
             raise ImageError(f"{what}: {picture.width} x {picture.height}; expected {expected}")
         picture.load()
     except ImageError:
         raise
-    except image.UnidentifiedImageError as error:
+    except UnidentifiedImageError as error:
         kinds = "no picture" if formats is None else f"neither {' nor '.join(map(str.lower, formats))}"
         raise ImageError(f"{what}: {len(data)} bytes that are {kinds}") from error
-    except image.DecompressionBombError as error:
+    except Image.DecompressionBombError as error:
         raise ImageError(f"{what}: expected {expected}: {error}") from error
     except Exception as error:  # each format has its own classes for damage
         raise ImageError(f"{what}: damaged: {one_line(error)}") from error
     return picture
-
-
-@cache
-def _import_pillow() -> Any:
-    """Return PIL.Image, which from then on warns of no picture that is refused here anyway."""
-    from PIL import Image
-
-    warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-    return Image
 
 
 def decode_picture(data: NDArray | bytes, what: str, formats: tuple[str, ...] | None = _SENT) -> NDArray[np.uint8]:

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from finforce.camera import (
     EQUIDISTANT,
+    MILLIMETRE,
     PLUMB_BOB,
     CameraIntrinsics,
     ImageError,
@@ -27,6 +28,7 @@ from finforce.camera import (
     decode_color,
     decode_depth,
     decode_picture,
+    open_picture,
     unpack_rows,
 )
 from finforce.errors import ObservationError, PoseError
@@ -385,20 +387,53 @@ def layout_of(image: Any) -> ImageLayout:
     return ImageLayout(height=image.height, width=image.width, step=image.step, is_bigendian=bool(image.is_bigendian))
 
 
-def depth_from_image(image: Any, frame: str, scale: float) -> NDArray:
-    """Return the depth (h, w) [m] of a sensor_msgs/Image, NaN where there is none.
+DEPTH_FORMAT = "16UC1; compressedDepth png"
+DEPTH_HEADER = 12  # bytes of compressed_depth_image_transport: an enum and two numbers for 32-bit depth
+_PNG = b"\x89PNG"
+_STEPPED = ("", "16UC1", "mono16")  # what a png of depth can be said to hold; of 32FC1 it holds inverse depths
 
-    Args:
-        image: 16UC1 in steps of `scale`, or 32FC1 [m].
-        frame: in which it has to come.
-        scale: one step of a 16-bit image [m].
+
+def depth_from_image(image: Any, frame: str, scale: float) -> NDArray:
+    """Return what `depth_from_message` does of an image in a frame.
 
     Raises:
         ObservationError: the frame is another one.
-        ImageError: encoding or size are wrong.
+        ImageError: encoding or size are wrong, or the data are damaged.
     """
     check_frame(image, frame, "the depth image")
-    return decode_depth(image.data, image.encoding, layout_of(image), scale)
+    return depth_from_message(image, scale)
+
+
+def depth_from_message(message: Any, scale: float = MILLIMETRE) -> NDArray[np.float32]:
+    """Return the depth image (h, w) [m], NaN invalid, of a sensor_msgs/Image or CompressedImage.
+
+    One step of 16 bits is `scale` [m].
+
+    Raises:
+        ImageError: the encoding is not known, or the data are damaged.
+    """
+    if not hasattr(message, "format"):
+        return decode_depth(message.data, message.encoding, layout_of(message), scale)
+    return decode_depth(depth_steps(message), "16UC1", scale=scale)
+
+
+def depth_steps(message: Any) -> NDArray[np.uint16]:
+    """Return the depth image (h, w) in steps, most cameras' are of 1 mm, 0 invalid, of a CompressedImage.
+
+    Raises:
+        ImageError: it is no 16-bit png.
+    """
+    encoding = message.format.partition(";")[0].strip() if ";" in message.format else ""
+    if encoding not in _STEPPED:
+        raise ImageError(f"depth image {message.format!r}: encoding {encoding}; expected '{DEPTH_FORMAT}'")
+    data = bytes(message.data)
+    begin = data.find(_PNG, 0, DEPTH_HEADER + len(_PNG))
+    if begin < 0:
+        raise ImageError(f"depth image {message.format!r}: no png in it; expected '{DEPTH_FORMAT}'")
+    image = np.array(open_picture(data[begin:], f"depth image {message.format!r}"))
+    if image.ndim != 2 or image.dtype.kind not in "ui" or image.dtype == np.uint8:
+        raise ImageError(f"depth image {message.format!r}: {image.dtype} {image.shape}; expected 16 bits, one channel")
+    return np.clip(image, 0, 65535).astype(np.uint16)
 
 
 def mask_from_image(image: Any, frame: str) -> NDArray[np.bool_]:
@@ -437,6 +472,22 @@ def check_frame(message: Any, frame: str, what: str) -> None:
     """
     if message.header.frame_id != frame:
         raise ObservationError(f"{what} came in the frame '{message.header.frame_id}'; expected '{frame}'")
+
+
+class CameraFrame:
+    """The one frame of a camera's messages: the one named, else that of the first message.
+
+    Args:
+        name: of the frame; empty while it is not known.
+    """
+
+    def __init__(self, name: str = "") -> None:
+        self.name = name
+
+    def of(self, message: Any) -> str:
+        """Return the frame, which is that of this message where none was known."""
+        self.name = self.name or message.header.frame_id
+        return self.name
 
 
 def check_cloud(cloud: Any, frame: str, what: str) -> None:
@@ -488,6 +539,10 @@ class Synchronizer:
         for name in streams or self._streams:
             self._streams[name].clear()
 
+    def tolerate(self, tolerance: int) -> None:
+        """Change the greatest distance between stamps that belong together [ns]."""
+        self._tolerance = tolerance
+
     def belong(self, one: int, other: int) -> bool:
         """Return whether two stamps [ns] are those of one image."""
         return abs(one - other) <= self._tolerance
@@ -523,6 +578,20 @@ class Synchronizer:
             if found is not None:
                 return entry, found
         return None
+
+
+_SLOWEST = 100_000_000  # [ns] period of a camera whose depth may be half of it away
+_NEAREST = 0.55  # of a period that the nearest of two images may be away, with a tenth for the jitter of stamps
+
+
+def pairing_tolerance(stamps: Sequence[int] | NDArray[np.int64]) -> int:
+    """Return how far [ns] depth may be from colour images with rising stamps (n,) [ns]; 0 of fewer than two."""
+    return round(_NEAREST * min(median_period(stamps), _SLOWEST))
+
+
+def median_period(stamps: Sequence[int] | NDArray[np.int64]) -> float:
+    """Return the median distance of rising stamps (n,) [ns], 0 of fewer than two."""
+    return float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
 
 
 def find_nearest(times: NDArray[np.int64], stamps: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -81,7 +81,7 @@ class ContactParameters(TimeParameters):
     jaws: str = setting("left", "Jaws whose contacts are estimated", choices=("left", "right", "both"))
     jaw_file: str = setting("bench", "Jaw file, or name of a shipped jaw")
     calibration_file: str = setting("", "Calibration file or name of a shipped one, as for the solvers; empty for none")
-    camera_frame: str = setting("camera_color_optical_frame", "Frame of poses and images")
+    camera_frame: str = setting("", "Frame of poses and images; empty for that of the first jaw pose or image")
     object_mesh: str = setting(
         "", "Mesh file of the object, read again by load_mesh; empty when it is unknown", settable=True
     )

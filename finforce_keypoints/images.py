@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from time import monotonic
@@ -13,12 +15,15 @@ from numpy.typing import NDArray
 from finforce.camera import CameraIntrinsics, ImageError
 from finforce.messages import (
     SECOND,
+    CameraFrame,
     Stamped,
     Synchronizer,
     camera_from_info,
     check_frame,
     color_from_image,
     depth_from_image,
+    median_period,
+    pairing_tolerance,
     same_camera,
     stamp_of,
 )
@@ -33,7 +38,11 @@ _BRIGHTEST_PERCENT = 99.0
 _TILES = 4  # rows and columns of parts, each of which can stand still
 _NEAR_BLACK, _NEAR_WHITE = 8, 247  # of 255: what is beyond may stay the same without a fault
 SILENCE = 1.0  # s without an image, after which another colour topic may be the camera's
-WAITING = 3  # colour images that may wait for their depth: a tenth of a second at 30 Hz
+_WAITING = 2.5  # periods of the camera that a colour image waits for its depth, longer where depth has come later
+LONGEST_WAIT = 500_000_000  # [ns] the same, at most
+_MOST_WAITING = 32  # colour images in memory
+_FIRST_TOLERANCE = 8_000_000  # [ns] while the camera's period is not known
+_KNOWN, _PERIODS = 2, 15  # periods from which on it is, and over which it is learnt
 _COLOR, _DEPTH = "color", "depth"
 _LIVELY = 0.2  # share of a part's pixels between these, from which on it has to change
 
@@ -47,12 +56,14 @@ class RgbdImage:
         color: (h, w, 3) uint8 RGB, as the lens made it.
         depth: (h, w) float32 distance along the optical axis [m], NaN invalid; None when there is none.
         camera: intrinsics of both.
+        depth_delay: from the stamp of the colours to that of the depth [s].
     """
 
     stamp: float
     color: NDArray
     depth: NDArray | None
     camera: CameraIntrinsics
+    depth_delay: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -218,12 +229,15 @@ class ImageWatch:
 class RgbdFeed:
     """Brings the images of a camera together by their stamps, the newest first.
 
-    A colour image waits for its depth image; one that a newer whole image overtook is passed over. Where depth may be
-    missing, the first image that waited in vain is taken alone, and so are those after it, until depth comes again. Of
-    several colour topics the first that brings an image is listened to, until it is silent.
+    A colour image takes the depth image nearest to it, at most half a period of the camera away, unless the parameters
+    say how far. One whose depth has been lost, as a later one's shows, is taken alone where depth may be missing; where
+    it must not, the image is passed over. When no depth comes at all, the first image that waited in vain is taken
+    alone, and so are those after it, until depth comes again. Of several colour topics the first that brings an image
+    is listened to, until it is silent.
 
     Attributes:
         camera: intrinsics of both images, None until they came.
+        frame: of the camera, which all messages must have.
         passed: colour images that were overtaken while they waited.
         topic: the colour topic that is listened to, None before the first image.
 
@@ -234,8 +248,8 @@ class RgbdFeed:
 
     def __init__(self, parameters: DetectorParameters, clock: Callable[[], float] = monotonic) -> None:
         self._parameters, self._clock = parameters, clock
-        self._tolerance = round(parameters.sync_tolerance / SECOND)
         self.camera: CameraIntrinsics | None = None
+        self.frame = CameraFrame(parameters.camera_frame)
         self.passed = 0
         self.topic: str | None = None
         self._heard = clock()
@@ -253,8 +267,12 @@ class RgbdFeed:
         return waiting[-1] if waiting else None
 
     def reset(self) -> None:
-        """Forget all images; intrinsics and topic stay."""
-        self._images = Synchronizer({_COLOR: None, _DEPTH: WAITING + 1}, self._tolerance)
+        """Forget all images; intrinsics, frame and topic stay."""
+        given = self._parameters.sync_tolerance
+        self._tolerance = _FIRST_TOLERANCE if math.isnan(given) else round(given / SECOND)
+        self._images = Synchronizer({_COLOR: None, _DEPTH: _MOST_WAITING}, self._tolerance)
+        self._stamps: deque[int] = deque(maxlen=_PERIODS + 1)
+        self._late = 0
         self._alone = self._parameters.depth == NO_DEPTH
 
     def take_info(self, info: Any) -> None:
@@ -264,7 +282,7 @@ class RgbdFeed:
             ObservationError: the frame is another one.
             IntrinsicsError: the numbers are no camera's.
         """
-        camera = camera_from_info(info, self._parameters.camera_frame)
+        camera = camera_from_info(info, self.frame.of(info))
         if not same_camera(self.camera, camera):
             self.camera = camera
 
@@ -278,8 +296,8 @@ class RgbdFeed:
             self._heard = now
         return self.topic == topic
 
-    def take_color(self, topic: str, message: Any) -> Stamped | None:
-        """Take a colour image and return it, an `RgbdImage`, whole; None while its depth has not come, or of no use.
+    def take_color(self, topic: str, message: Any) -> list[Stamped]:
+        """Take a colour image; return the whole ones, each an `RgbdImage`, none while its depth has not come.
 
         Raises:
             SyncError: no depth image came for an earlier image, and every one needs its own.
@@ -287,64 +305,86 @@ class RgbdFeed:
             ImageError: it cannot be used, or the intrinsics are not known yet.
         """
         if not self.listens(topic):
-            return None
+            return []
         taken = Stamped(stamp_of(message), self._read_color(message))
+        self._learn_period(taken.stamp)
         if self._alone:
-            return taken
+            return [taken]
         self._images.add(_COLOR, taken.stamp, taken.value)
         found, waiting = self._match(), self._images.entries(_COLOR)
-        if found is not None or len(waiting) <= WAITING:
+        if found or not self._has_waited(waiting[0].stamp, taken.stamp):
             return found
         if self._parameters.depth == ALIGNED:
             raise self._missing_depth(waiting.popleft().stamp)
         self._alone = True
-        self.passed += len(waiting)
+        self.passed += len(waiting) - 1
         self._images.reset(_COLOR)
-        return taken
+        return [taken]
 
-    def take_depth(self, message: Any) -> Stamped | None:
-        """Take a depth image and return it with its colour, an `RgbdImage`; None while that has not come.
+    def take_depth(self, message: Any) -> list[Stamped]:
+        """Take a depth image; return the images that are whole with it, as `take_color`.
 
         Raises:
             ObservationError: its frame is another one.
             ImageError: it cannot be used.
         """
-        depth = depth_from_image(message, self._parameters.camera_frame, self._parameters.depth_scale)
+        stamp = stamp_of(message)
+        depth = depth_from_image(message, self.frame.of(message), self._parameters.depth_scale)
         is_empty = self._parameters.depth == AUTO and not np.isfinite(depth).any()
         self._alone = False
-        self._images.add(_DEPTH, stamp_of(message), None if is_empty else depth)
+        self._late = max(self._late, max(self._stamps, default=stamp) - stamp)
+        self._images.add(_DEPTH, stamp, None if is_empty else depth)
         return self._match()
 
-    def _match(self) -> Stamped | None:
-        """Return the newest colour image that has its depth, and pass the older ones over."""
+    def _learn_period(self, stamp: int) -> None:
+        """Take the stamp of a colour image [ns] for the camera's period, of which depth may be half away."""
+        if self._stamps and stamp <= self._stamps[-1]:
+            return
+        self._stamps.append(stamp)
+        if math.isnan(self._parameters.sync_tolerance) and len(self._stamps) > _KNOWN:
+            self._tolerance = pairing_tolerance(self._stamps)
+            self._images.tolerate(self._tolerance)
+
+    def _has_waited(self, first: int, newest: int) -> bool:
+        """Say whether the first colour image that waits has waited long enough, given the newest [ns]."""
+        if len(self._images.entries(_COLOR)) > _MOST_WAITING:
+            return True
+        own = _WAITING * median_period(self._stamps) if len(self._stamps) > _KNOWN else LONGEST_WAIT
+        return newest - first > min(own + self._late, LONGEST_WAIT)
+
+    def _match(self) -> list[Stamped]:
+        """Return the newest colour image that has its depth, after the one before whose depth must have been lost."""
         pair = self._images.newest_pair(_COLOR, _DEPTH)
         if pair is None:
-            return None
+            return []
         color, depth = pair
-        waiting = self._images.entries(_COLOR)
-        while waiting.popleft() is not color:
-            self.passed += 1
-        return Stamped(color.stamp, replace(color.value, depth=depth.value))
+        waiting, lost = self._images.entries(_COLOR), []
+        while (first := waiting.popleft()) is not color:
+            lost.append(first)
+        # more of them, and images come faster than they are looked at
+        alone = lost[-1:] if self._parameters.depth == AUTO else []
+        self.passed += len(lost) - len(alone)
+        delay = SECOND * (depth.stamp - color.stamp)
+        return [*alone, Stamped(color.stamp, replace(color.value, depth=depth.value, depth_delay=delay))]
 
     def _read_color(self, message: Any) -> RgbdImage:
         """Return the image of a colour image alone."""
         if self.camera is None:
             raise ImageError(f"images came, but no camera_info on {self._parameters.info_topic} yet")
-        check_frame(message, self._parameters.camera_frame, "the colour image")
+        check_frame(message, self.frame.of(message), "the colour image")
         color = color_from_image(message)
         return RgbdImage(stamp=SECOND * stamp_of(message), color=color, depth=None, camera=self.camera)
 
     def _missing_depth(self, stamp: int) -> SyncError:
         """Return the error of a colour image [ns] that has waited long enough."""
         nearest = self._images.nearest(_DEPTH, stamp)
-        limit = f"{1e3 * self._parameters.sync_tolerance:g} ms"
         if nearest is None:
             return SyncError(
                 f"colour images come, but no depth image on {self._parameters.depth_topic}; "
                 "start the camera with align_depth.enable:=true, or the detector with depth:=none"
             )
         return SyncError(
-            f"no depth image within {limit} of the colour image at {SECOND * stamp:.3f} s, the nearest lies "
-            f"{1e3 * SECOND * abs(nearest.stamp - stamp):.1f} ms away; start the camera with enable_sync:=true or "
-            "raise sync_tolerance"
+            f"no depth image within {1e3 * SECOND * self._tolerance:.3g} ms of the colour image at "
+            f"{SECOND * stamp:.3f} s, the nearest lies {1e3 * SECOND * abs(nearest.stamp - stamp):.1f} ms away; start "
+            "the camera with enable_sync:=true or raise sync_tolerance"
         )

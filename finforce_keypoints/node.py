@@ -16,7 +16,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from finforce.errors import FinforceError
 from finforce.health import IDLE, STILL, UNHEARD, Health, Idling, Outcome, Report, Skips, StampGate
-from finforce.messages import Stamped
+from finforce.messages import CameraFrame, Stamped
 from finforce.processors import bind_caller
 from finforce.ros import node as ros
 from finforce.transforms import pose_numbers
@@ -50,16 +50,21 @@ class DetectorOutputs:
 
     Args:
         stage: makes publishers and watches them.
-        parameters: which jaws, and the camera's frame.
+        sides: of the jaws.
+        frame: of the camera.
         names: of the rows of the clouds; sent once, and kept for whoever comes later.
         detector: that finds them.
     """
 
     def __init__(
-        self, stage: ros.Stage, parameters: DetectorParameters, names: Sequence[str], detector: KeypointDetector
+        self,
+        stage: ros.Stage,
+        sides: Sequence[str],
+        frame: CameraFrame,
+        names: Sequence[str],
+        detector: KeypointDetector,
     ) -> None:
-        sides = parameters.sides
-        self._frame, self._skeleton = parameters.camera_frame, build_skeleton(names)
+        self._frame, self._skeleton = frame, build_skeleton(names)
         self.keypoints = {side: stage.publisher(ros.PointCloud2, f"{side}/keypoints", ros.RESULT) for side in sides}
         self.pose = {side: stage.publisher(ros.PoseStamped, f"{side}/jaw_pose", ros.RESULT) for side in sides}
         self.annotated = stage.publisher(ros.Image, "~/annotated", ros.RESULT)
@@ -76,7 +81,7 @@ class DetectorOutputs:
         """Send the key points of a jaw and its pose, of the image at `stamp` [ns]."""
         time = ros.stamp_message(stamp)
         # the pose goes first: the contact estimator and the solver work at the same time then
-        header = ros.Header(stamp=time, frame_id=self._frame)
+        header = ros.Header(stamp=time, frame_id=self._frame.name)
         self.pose[side].publish(ros.pose_message(header, pose_numbers(found.T_camera_jaw)))
         ros.send_cloud(self.keypoints[side], ros.Header(stamp=time, frame_id=f"{side}_jaw"), keypoint_columns(found))
 
@@ -84,7 +89,7 @@ class DetectorOutputs:
         """Send the image at `stamp` [ns], (h, w, 3), with what was found in it, while someone subscribes."""
         if not self.annotated.get_subscription_count():
             return
-        header = ros.Header(stamp=ros.stamp_message(stamp), frame_id=self._frame)
+        header = ros.Header(stamp=ros.stamp_message(stamp), frame_id=self._frame.name)
         self.annotated.publish(ros.image_message(header, draw_keypoints(color, found.values(), self._skeleton)))
 
 
@@ -147,7 +152,7 @@ class KeypointDetectorNode(ros.ImageNode):
         self.found: Mapping[str, JawKeypoints] = {}
         self.rested, self.idling = float("-inf"), Idling()
         self.stage = ros.Stage(self, pipeline)
-        self.out = DetectorOutputs(self.stage, parameters, names, self.detector)
+        self.out = DetectorOutputs(self.stage, parameters.sides, self.feed.frame, names, self.detector)
         self.detector.warm_up()  # before images come: those that came meanwhile would be lost
         self._serve()
         self._subscribe()
@@ -187,7 +192,7 @@ class KeypointDetectorNode(ros.ImageNode):
             return
         with self.rejections():
             whole = self.feed.take_color(topic, message)
-            if whole is None:
+            if not whole:
                 self._look_ahead()
             self._answer(whole)
 
@@ -204,10 +209,14 @@ class KeypointDetectorNode(ros.ImageNode):
                 self.gate.check_age(waiting.stamp, self.now())
                 self.detector.look(waiting.value)
 
-    def _answer(self, whole: Stamped | None) -> None:
+    def _answer(self, images: Sequence[Stamped]) -> None:
+        """Find the key points of all jaws in images that are whole."""
+        for whole in images:
+            with self.rejections():
+                self._find(whole)
+
+    def _find(self, whole: Stamped) -> None:
         """Find the key points of all jaws in an image that is whole."""
-        if whole is None:
-            return
         began, image = perf_counter(), whole.value
         if self.gate.enter(whole.stamp, self.now()):
             self._restart("the stamps went back: a new recording")

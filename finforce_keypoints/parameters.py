@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -29,7 +30,7 @@ class DetectorParameters(TimeParameters):
 
     jaws: str = setting("both", "Jaws that are looked for", choices=("left", "right", "both"))
     jaw_file: str = setting("bench", "Jaw file, or name of a shipped jaw")
-    camera_frame: str = setting("camera_color_optical_frame", "Frame of the images and of the jaw poses")
+    camera_frame: str = setting("", "Frame of the images and of the jaw poses; empty for that of the first image")
     T_gripper_camera: tuple[float, ...] = setting(
         pose_numbers(ROBOT_CAMERA), "Pose of the colour camera in the gripper frame: x, y, z [m], qx, qy, qz, qw"
     )
@@ -62,7 +63,11 @@ class DetectorParameters(TimeParameters):
     threads: int = setting(2, "Number of network threads", "1", 1, 64)
     depth_scale: float = setting(0.001, "Depth unit of 16-bit depth images", "m", 1e-6, 0.01)
     sync_tolerance: float = setting(
-        0.008, "Maximum difference between the stamps of a colour image and its depth image", "s", 0.0, 0.1
+        math.nan,
+        "Maximum difference between the stamps of a colour image and its depth image; NaN for half the camera's period",
+        "s",
+        0.0,
+        0.1,
     )
     skip_off: tuple[str, ...] = setting(
         ("",), "Skip rules that are off, by their names in the diagnostics after `skipped:`; all: every rule"

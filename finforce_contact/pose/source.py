@@ -14,6 +14,7 @@ from finforce.camera import CameraIntrinsics, ImageError
 from finforce.errors import PoseError
 from finforce.messages import (
     SECOND,
+    CameraFrame,
     Synchronizer,
     camera_from_info,
     depth_from_image,
@@ -45,12 +46,12 @@ class ExternalPoseSource:
         latest: the newest pose taken; a refused one does not replace it.
 
     Args:
-        frame: the camera optical frame that the messages must be in.
+        frame: of the camera, in which the messages must be.
         mesh: the object, for the check that it is not around the camera; None to do without.
         origin: what the poses are of, one of `ORIGINS`.
     """
 
-    def __init__(self, frame: str, *, mesh: ObjectMesh | None = None, origin: str = "mesh") -> None:
+    def __init__(self, frame: CameraFrame, *, mesh: ObjectMesh | None = None, origin: str = "mesh") -> None:
         self.latest: ObjectPose | None = None
         self._frame, self._mesh = frame, mesh
         self._back = np.zeros(3) if mesh is None else -ORIGINS[origin] * mesh.middle
@@ -79,7 +80,10 @@ class ExternalPoseSource:
                 return None
             source = "Detection3DArray"
             message = SimpleNamespace(header=message.header, pose=_pose_of_detection(message.detections[0]))
-        T_camera_object, stamp = pose_from_message(message, self._frame, source), SECOND * stamp_of(message)
+        T_camera_object, stamp = (
+            pose_from_message(message, self._frame.name or message.header.frame_id, source),
+            SECOND * stamp_of(message),
+        )
         if self.latest is not None and stamp <= self.latest.stamp:
             raise PoseError(
                 f"{source}: got stamp {stamp:.6f} s, expected one after {self.latest.stamp:.6f} s; "
@@ -110,12 +114,13 @@ class DepthFeed:
     threads may call it.
 
     Args:
-        parameters: frame, unit of depth and greatest distance of stamps.
+        parameters: unit of depth and greatest distance of stamps.
         settings: of the tracker.
+        frame: of the camera, in which all images must be.
     """
 
-    def __init__(self, parameters: ContactParameters, settings: TrackerSettings) -> None:
-        self._parameters, self._settings = parameters, settings
+    def __init__(self, parameters: ContactParameters, settings: TrackerSettings, frame: CameraFrame) -> None:
+        self._parameters, self._settings, self._frame = parameters, settings, frame
         self._tolerance = round(parameters.pose_tolerance / SECOND)
         self._mesh: ObjectMesh | None = None
         self._camera: CameraIntrinsics | None = None
@@ -144,7 +149,7 @@ class DepthFeed:
             ObservationError: the frame is another one.
             IntrinsicsError: the numbers are no camera's.
         """
-        camera = camera_from_info(info, self._parameters.camera_frame)
+        camera = camera_from_info(info, self._frame.of(info))
         with self._lock:
             if not same_camera(self._camera, camera):
                 self._camera, self._tracker, self._lost = camera, None, True
@@ -211,10 +216,10 @@ class DepthFeed:
         return StampedPose(stamp, self.latest)
 
     def _decode_depth(self, image: Any) -> NDArray:
-        return depth_from_image(image, self._parameters.camera_frame, self._parameters.depth_scale)
+        return depth_from_image(image, self._frame.of(image), self._parameters.depth_scale)
 
     def _decode_mask(self, image: Any) -> NDArray:
-        return mask_from_image(image, self._parameters.camera_frame)
+        return mask_from_image(image, self._frame.of(image))
 
     def _known_camera(self) -> CameraIntrinsics:
         if self._camera is None:

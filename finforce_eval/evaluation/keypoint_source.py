@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -18,7 +19,7 @@ from finforce.health import Idling
 from finforce.messages import NANOSECONDS
 from finforce.transforms import quaternion_from_pose
 from finforce_eval.errors import OptionError, RecordingError
-from finforce_eval.recordings.images import DEPTH_ENDS, PAIRED, ImageChoice, ImageTrack
+from finforce_eval.recordings.images import DEPTH_ENDS, ImageChoice, ImageTrack
 from finforce_eval.recordings.tracks import DetectionTrack, JawTrack, KeypointTrack, PoseTrack, Recording
 from finforce_eval.tasks import progress_bar
 from finforce_keypoints.errors import KeypointError
@@ -221,7 +222,7 @@ def parse_source(options: argparse.Namespace) -> KeypointSource:
     choice = ImageChoice(
         **{name: value for name, value in given.items() if value},
         intrinsics=tuple(getattr(options, "intrinsics", None) or ()),
-        pairing=PAIRED if seconds is None else round(seconds * NANOSECONDS),
+        pairing=None if seconds is None or math.isnan(seconds) else round(seconds * NANOSECONDS),
     )
     return KeypointSource(source=source, jaw_file=options.jaw, parameters=parameters, choice=choice, **switches)
 

@@ -19,11 +19,19 @@ from finforce.camera import (
     CameraIntrinsics,
     ImageError,
     IntrinsicsError,
-    decode_depth,
-    open_picture,
 )
 from finforce.errors import ObservationError
-from finforce.messages import camera_from_info, color_from_image, find_nearest, layout_of, read_stamp, same_camera
+from finforce.messages import (
+    DEPTH_HEADER,
+    camera_from_info,
+    color_from_image,
+    depth_from_message,
+    find_nearest,
+    pairing_tolerance,
+    read_stamp,
+    same_camera,
+    stamp_of,
+)
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.bags import BagReader, check_types, open_bag
 from finforce_eval.recordings.image_files import read_intrinsics
@@ -34,7 +42,6 @@ COLOR_ENDS = tuple(f"color/{name}{end}" for end in ("", "/compressed") for name 
 DEPTH_ENDS = tuple(f"aligned_depth_to_color/image_raw{end}" for end in ("", "/compressedDepth", "/compressed"))
 TRANSPORTS = ("/compressed", "/compressedDepth")  # ends of topics with the same images in fewer bytes
 ALONE = -1  # instead of a depth image's stamp [ns], of a colour image without
-PAIRED = 8_000_000  # as the detector node takes colour and depth for one image: distance of their stamps [ns]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +54,8 @@ class ImageChoice:
         info: topic of camera_info; "" for that next to the colour images.
         intrinsics: words of --intrinsics, instead of camera_info.
         episode: of a dataset.
-        pairing: greatest distance between the stamps of a colour and a depth image that belong together [ns].
+        pairing: greatest distance between the stamps of a colour and a depth image that belong together [ns]; half a
+            period of the colour images when absent.
     """
 
     color: str = ""
@@ -55,7 +63,7 @@ class ImageChoice:
     info: str = ""
     intrinsics: tuple[str, ...] = ()
     episode: int = 0
-    pairing: int = PAIRED
+    pairing: int | None = None
 
 
 class StampedImage(NamedTuple):
@@ -146,9 +154,11 @@ class ImageTrack:
                     pair = next(pairs, None)
 
     def _image(self, stamp: int, color: Any, depth: Any) -> StampedImage:
+        late = 0 if depth is None else stamp_of(depth) - stamp
         try:
             image = RgbdImage(
                 stamp=stamp * 1e-9,
+                depth_delay=late * 1e-9,
                 color=color_from_image(color),
                 depth=None if depth is None else depth_from_message(depth, self.depth_scale),
                 camera=self.camera,
@@ -192,7 +202,6 @@ def find_images(bag: BagReader, source: Path, choice: ImageChoice | None = None)
         camera, frame_id = _read_camera(bag, info)
     else:
         camera, frame_id = read_intrinsics(choice.intrinsics, seen[color].shape), seen[color].frame
-    pairing = choice.pairing
     found: dict[str, list[int]] = {topic: [] for topic in topics}
     for raw in bag.raw(topics):
         found[raw.topic].append(read_stamp(raw.data))
@@ -208,6 +217,7 @@ def find_images(bag: BagReader, source: Path, choice: ImageChoice | None = None)
             frame_id=frame_id,
             info=info,
         )
+    pairing = pairing_tolerance(stamps[color]) if choice.pairing is None else choice.pairing
     nearest = find_nearest(stamps[depth], stamps[color])
     paired = np.abs(stamps[depth][nearest] - stamps[color]) <= pairing
     if not paired.any():
@@ -331,44 +341,8 @@ def _rising(stamps: Sequence[int], topic: str, name: str) -> NDArray[np.int64]:
 
 IMAGES = IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
-DEPTH_FORMAT = "16UC1; compressedDepth png"
-DEPTH_HEADER = 12  # bytes of compressed_depth_image_transport: an enum and two numbers for 32-bit depth
-PNG = b"\x89PNG"
-STEPPED = ("", "16UC1", "mono16")  # what a png of depth can be said to hold; of 32FC1 it holds inverse depths
 QUALITY = 90  # of a jpeg, the key points' pixels stay within a few hundredths
 LEVEL = 1  # of png: the highest makes a noisy depth image a quarter smaller, and takes eighty times as long
-
-
-def depth_from_message(message: Any, scale: float = MILLIMETRE) -> NDArray[np.float32]:
-    """Return the depth image (h, w) [m], NaN invalid, of a sensor_msgs/Image or CompressedImage.
-
-    One step of 16 bits is `scale` [m].
-
-    Raises:
-        ImageError: the encoding is not known, or the data are damaged.
-    """
-    if not hasattr(message, "format"):
-        return decode_depth(message.data, message.encoding, layout_of(message), scale)
-    return decode_depth(depth_steps(message), "16UC1", scale=scale)
-
-
-def depth_steps(message: Any) -> NDArray[np.uint16]:
-    """Return the depth image (h, w) in steps, most cameras' are of 1 mm, 0 invalid, of a CompressedImage.
-
-    Raises:
-        ImageError: it is no 16-bit png.
-    """
-    encoding = message.format.partition(";")[0].strip() if ";" in message.format else ""
-    if encoding not in STEPPED:
-        raise ImageError(f"depth image {message.format!r}: encoding {encoding}; expected '{DEPTH_FORMAT}'")
-    data = bytes(message.data)
-    begin = data.find(PNG, 0, DEPTH_HEADER + len(PNG))
-    if begin < 0:
-        raise ImageError(f"depth image {message.format!r}: no png in it; expected '{DEPTH_FORMAT}'")
-    image = np.array(open_picture(data[begin:], f"depth image {message.format!r}"))
-    if image.ndim != 2 or image.dtype.kind not in "ui" or image.dtype == np.uint8:
-        raise ImageError(f"depth image {message.format!r}: {image.dtype} {image.shape}; expected 16 bits, one channel")
-    return np.clip(image, 0, 65535).astype(np.uint16)
 
 
 def encode_color(color: NDArray[np.uint8]) -> bytes:

@@ -194,7 +194,9 @@ class JawLocalizer:
         """Return the key points of the jaw at an origin."""
         T_camera_jaw = self._origin.place(origin)
         sight = look_along(seen.rays, T_camera_jaw)
-        fit, has_depth = self._fit_side(seen.image, sight, seen.likely, scale, T_camera_jaw)
+        # closing moves the jaw in the plane whose depth is measured: of another time it is as good, from where it was
+        T_measured = self._origin.place(replace(origin, x=origin.x + self._track.speed * seen.image.depth_delay))
+        fit, has_depth = self._fit_side(seen.image, sight, seen.likely, scale, T_measured)
         depths = sight.depths_at(self._rest[:, 1] + fit.y)
         self._check_rest(seen, sight, fit)
         points = np.where(has_depth[:, None], sight.camera + depths[:, None] * sight.rays, np.nan)

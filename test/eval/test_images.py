@@ -10,9 +10,10 @@ from rgbd_fakes import CAMERA, FakeGripper, make_footage
 from scipy.spatial.transform import Rotation
 
 from finforce.camera import ImageError
+from finforce.messages import DEPTH_HEADER, depth_from_message, depth_steps
 from finforce_eval.cli.twin import RecordingForm, footage_entries, write_footage
 from finforce_eval.errors import RecordingError
-from finforce_eval.recordings.images import DEPTH_HEADER, ImageChoice, compress_depth, depth_from_message, depth_steps
+from finforce_eval.recordings.images import ImageChoice, compress_depth
 from finforce_eval.recordings.objects import find_mesh
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.writer import write_entries

@@ -1,5 +1,6 @@
 """Claims about which of several colour topics is the camera's; no ROS runs."""
 
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 import cv2
@@ -8,6 +9,7 @@ import pytest
 from keypoint_node_fakes import COLOR, HEIGHT, OLD_COLOR, WIDTH, camera_info, image_of
 
 from finforce.camera import ImageError
+from finforce.errors import ObservationError
 from finforce_keypoints.errors import SyncError
 from finforce_keypoints.images import SILENCE, RgbdFeed, check_image
 from finforce_keypoints.parameters import DetectorParameters
@@ -35,7 +37,7 @@ class Camera:
         if picture is None:
             picture = self.rng.integers(90, 160, (HEIGHT, WIDTH, 3), dtype=np.uint8)
         self.feed.take_depth(image_of(stamp, np.full((HEIGHT, WIDTH), 120, dtype=np.uint16), "16UC1"))
-        return self.feed.take_color(topic, image_of(stamp, picture, "rgb8")) is not None
+        return bool(self.feed.take_color(topic, image_of(stamp, picture, "rgb8")))
 
 
 def test_a_camera_that_comes_back_under_the_other_name_is_taken_after_a_silence():
@@ -69,7 +71,7 @@ def depth_of(number, value=120):
 def test_without_depth_every_colour_image_is_whole():
     camera = Camera(depth="none")
     for number in range(1, 5):
-        image = camera.feed.take_color(COLOR, color_of(camera, number)).value
+        image = camera.feed.take_color(COLOR, color_of(camera, number))[0].value
         assert image.depth is None and image.stamp == pytest.approx(PERIOD * number)
 
 
@@ -77,9 +79,9 @@ def test_depth_that_comes_and_goes_is_used_while_it_comes():
     camera, had = Camera(depth="auto"), []
 
     def shoot(number, with_depth):
-        whole = [camera.feed.take_depth(depth_of(number)) if with_depth else None]
-        whole.append(camera.feed.take_color(COLOR, color_of(camera, number)))
-        had.extend((number, taken.value.depth is not None) for taken in whole if taken is not None)
+        whole = camera.feed.take_depth(depth_of(number)) if with_depth else []
+        whole += camera.feed.take_color(COLOR, color_of(camera, number))
+        had.extend((number, taken.value.depth is not None) for taken in whole)
 
     for number in range(1, 16):
         shoot(number, with_depth=number < 4 or number > 11)
@@ -89,11 +91,73 @@ def test_depth_that_comes_and_goes_is_used_while_it_comes():
     ]
 
 
+def pair_up(camera, events):
+    """Images (number, whether with depth, delay of the depth [ms]) that become whole, of events in their order."""
+    whole = []
+    for kind, number, shift in events:
+        if kind == "depth":
+            image = depth_of(number)
+            image.header.stamp.nanosec += round(1e6 * shift)
+            found = camera.feed.take_depth(image)
+        else:
+            found = camera.feed.take_color(COLOR, color_of(camera, number))
+        whole += found
+    return [(round(w.stamp / (1e9 * PERIOD)), w.value.depth is not None, 1e3 * w.value.depth_delay) for w in whole]
+
+
+@pytest.mark.parametrize("shift", [-9.0, 9.0, 12.0, 13.4])
+def test_depth_of_an_unsynchronised_camera_is_paired_and_its_delay_known(shift):
+    first = ("color", "depth") if shift > 0 else ("depth", "color")
+    found = pair_up(Camera(), [(kind, n, shift) for n in range(1, 20) for kind in first])
+    assert [number for number, _, _ in found][-15:] == list(range(5, 20))
+    assert all(has and abs(delay) <= 16.5 for _, has, delay in found)
+    assert np.median([delay for _, _, delay in found]) == pytest.approx(shift, abs=0.01)
+
+
+def test_a_stated_tolerance_is_kept():
+    camera = Camera()
+    camera.feed = RgbdFeed(DetectorParameters(sync_tolerance=0.005))
+    camera.feed.take_info(camera_info())
+    with pytest.raises(SyncError, match="within 5 ms"):
+        pair_up(camera, [(kind, n, 9.0) for n in range(1, 9) for kind in ("color", "depth")])
+
+
+@pytest.mark.parametrize("depth", ["auto", "aligned"])
+def test_depth_that_comes_150_ms_late_is_waited_for(depth):
+    camera, whole = Camera(depth=depth), []
+    for n in range(1, 60):
+        for kind, number in (("color", n), ("depth", n - 5)):
+            if number > 0:
+                with suppress(SyncError):
+                    whole += pair_up(camera, [(kind, number, 0.0)])
+    answered = [number for number, has, _ in whole if has]
+    assert answered[-45:] == list(range(10, 55))
+    assert len(camera.feed._images.entries("color")) <= 6
+
+
+def test_images_whose_depth_was_lost_are_taken_alone_in_their_order():
+    events = [(kind, n, 0.0) for n in range(1, 31) for kind in ("color", "depth") if kind == "color" or n % 3]
+    assert [(number, has) for number, has, _ in pair_up(Camera(depth="auto"), events)] == [
+        (n, bool(n % 3)) for n in range(1, 30)
+    ]
+
+
+def test_the_frame_is_that_of_the_first_message_and_no_other_is_taken_then():
+    camera = Camera(depth="none")
+    camera.feed = RgbdFeed(DetectorParameters(depth="none"))
+    info, image = camera_info(), color_of(camera, 1)
+    info.header.frame_id = image.header.frame_id = "my_cam_optical"
+    camera.feed.take_info(info)
+    assert camera.feed.take_color(COLOR, image) and camera.feed.frame.name == "my_cam_optical"
+    with pytest.raises(ObservationError, match="expected 'my_cam_optical'"):
+        camera.feed.take_color(COLOR, color_of(camera, 2))
+
+
 def test_an_empty_depth_image_counts_as_none_only_where_none_is_needed():
     for depth, is_taken in (("auto", True), ("aligned", False)):
         camera = Camera(depth=depth)
         camera.feed.take_depth(depth_of(0, value=0))
-        image = camera.feed.take_color(COLOR, color_of(camera, 0)).value
+        image = camera.feed.take_color(COLOR, color_of(camera, 0))[0].value
         if is_taken:
             assert image.depth is None
         else:
@@ -121,7 +185,7 @@ def test_a_jpeg_stream_is_decoded_and_a_damaged_one_refused():
     picture = cv2.GaussianBlur(np.frombuffer(raw.data, np.uint8).reshape(HEIGHT, WIDTH, 3), (0, 0), 3.0)
     _, data = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])
     topic = f"{COLOR}/compressed"
-    image = camera.feed.take_color(topic, Picture(raw.header, data.tobytes())).value
+    image = camera.feed.take_color(topic, Picture(raw.header, data.tobytes()))[0].value
     assert np.abs(image.color.astype(int) - picture).mean() < 3.0
     for broken in (b"", b"no picture", data.tobytes()[:40]):
         later = color_of(camera, 2)

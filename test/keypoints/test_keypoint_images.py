@@ -34,7 +34,67 @@ def test_grey_pictures_become_three_equal_channels():
     assert decode_color(grey, "mono8").shape == (2, 2, 3)
 
 
-@pytest.mark.parametrize("encoding", ["yuv422", "16UC1", "", "RGB8"])
+PATCHES = np.repeat(
+    np.repeat(np.array([[[200, 60, 40], [30, 160, 90]], [[40, 70, 210], [120, 120, 120]]], np.uint8), 8, 0), 8, 1
+)
+
+
+def luma_and_chroma(rgb):
+    """Y, Cb and Cr of BT.601 in video range."""
+    r, g, b = np.moveaxis(rgb.astype(float), -1, 0)
+    y = 16 + 0.257 * r + 0.504 * g + 0.098 * b
+    cb, cr = 128 - 0.148 * r - 0.291 * g + 0.439 * b, 128 + 0.439 * r - 0.368 * g - 0.071 * b
+    return [np.rint(part).astype(np.uint8) for part in (y, cb, cr)]
+
+
+def interleave(order):
+    """Patches as 4:2:2, with colour before or after brightness."""
+    y, cb, cr = luma_and_chroma(PATCHES)
+    chroma = np.where(np.arange(16) % 2, cr, cb)
+    return np.stack((chroma, y) if order == "uyvy" else (y, chroma), axis=-1)
+
+
+def planes(order):
+    """Patches as 4:2:0: all brightness, then colour of every second row and column in pairs."""
+    y, cb, cr = (part if n == 0 else part[::2, ::2] for n, part in enumerate(luma_and_chroma(PATCHES)))
+    pairs = np.stack((cb, cr) if order == "nv12" else (cr, cb), axis=-1)
+    return np.vstack((y, pairs.reshape(8, 16)))
+
+
+def mosaic(tiles):
+    """Patches as seen through a Bayer filter."""
+    channel = np.array([["rgb".index(tiles[0]), "rgb".index(tiles[1])], ["rgb".index(tiles[2]), "rgb".index(tiles[3])]])
+    return np.take_along_axis(PATCHES, np.tile(channel, (8, 8))[..., None], axis=2)[..., 0]
+
+
+SENT = {
+    **dict.fromkeys(("uyvy", "yuv422"), interleave("uyvy")),
+    **dict.fromkeys(("yuyv", "yuv422_yuy2"), interleave("yuyv")),
+    **{name: planes(name) for name in ("nv12", "nv21")},
+    **{f"bayer_{tiles}8": mosaic(tiles) for tiles in ("rggb", "bggr", "gbrg", "grbg")},
+    "rgb16": (PATCHES.astype(int) * 256 + 99).astype(">u2"),
+    "bgr16": (PATCHES[..., ::-1].astype(int) * 256 + 99).astype(">u2"),
+    "8UC3": PATCHES[..., ::-1],
+}
+
+
+@pytest.mark.parametrize("encoding", SENT)
+def test_what_cameras_send_becomes_rgb(encoding):
+    sent = np.ascontiguousarray(SENT[encoding])
+    layout = ImageLayout(height=16, width=16, step=sent[0].nbytes, is_bigendian=True)
+    inside = np.s_[2:6, 2:6], np.s_[2:6, 10:14], np.s_[10:14, 2:6], np.s_[10:14, 10:14]
+    for found in (decode_color(sent.tobytes(), encoding, layout), decode_color(sent, encoding)):
+        assert found.shape == (16, 16, 3) and found.dtype == np.uint8
+        for patch in inside:
+            assert np.abs(found[patch].astype(int) - PATCHES[patch]).max() <= 3
+
+
+def test_half_a_pair_of_columns_is_refused():
+    with pytest.raises(ImageError, match="even"):
+        decode_color(bytes(2 * 3 * 2), "yuyv", ImageLayout(height=2, width=3))
+
+
+@pytest.mark.parametrize("encoding", ["yuv444", "16UC1", "", "RGB8"])
 def test_an_unknown_encoding_is_refused_by_name(encoding):
     with pytest.raises(ImageError, match=f"'{encoding}'.*rgb8"):
         decode_color(RGB, encoding)
