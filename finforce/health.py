@@ -34,9 +34,13 @@ class StampGate:
     """
 
     def __init__(self, *, max_age: float, restart_gap: float) -> None:
-        self._max_age = round(max_age * NANOSECONDS)
+        self.limit(max_age)
         self._restart_gap = round(restart_gap * NANOSECONDS)
         self._last: int | None = None
+
+    def limit(self, max_age: float) -> None:
+        """Change the greatest age of a sample [s]."""
+        self._max_age = round(max_age * NANOSECONDS)
 
     def enter(self, stamp: int, now: int) -> bool:
         """Admit a sample and return whether a new recording begins with it.

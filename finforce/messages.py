@@ -437,13 +437,15 @@ def depth_steps(message: Any) -> NDArray[np.uint16]:
 
 
 def mask_from_image(image: Any, frame: str) -> NDArray[np.bool_]:
-    """Return the mask (h, w) of a sensor_msgs/Image of 8 bits; not zero is the object.
+    """Return the mask (h, w) of a sensor_msgs/Image of 8 bits, or a compressed one; not zero is the object.
 
     Raises:
         ObservationError: the frame is another one.
         ImageError: encoding or size are wrong.
     """
     check_frame(image, frame, "the mask")
+    if hasattr(image, "format"):
+        return decode_picture(image.data, f"mask {image.format!r}").any(axis=2)
     if image.encoding not in MASKS:
         raise ImageError(f"mask: encoding '{image.encoding}'; expected {' or '.join(MASKS)}")
     return unpack_rows("mask", image.data, np.dtype(np.uint8), layout_of(image)) != 0
@@ -482,11 +484,12 @@ class CameraFrame:
     """
 
     def __init__(self, name: str = "") -> None:
-        self.name = name
+        self.name, self._is_sure = name, bool(name)
 
-    def of(self, message: Any) -> str:
-        """Return the frame, which is that of this message where none was known."""
-        self.name = self.name or message.header.frame_id
+    def of(self, message: Any, *, is_sure: bool = True) -> str:
+        """Return the frame, which is that of this message where none was known, or none for sure."""
+        if not self.name or (is_sure and not self._is_sure):
+            self.name, self._is_sure = message.header.frame_id, is_sure
         return self.name
 
 

@@ -41,11 +41,28 @@ def setting(
 
 @dataclass(frozen=True, kw_only=True)
 class TimeParameters:
-    """What every node that answers images is told about time; units stand in the metadata."""
+    """What every node that answers images is told about time and frames; units stand in the metadata."""
 
-    max_age: float = setting(0.2, "greatest age of data at the time of publishing", "s", 0.001, 60.0)
+    max_age: float = setting(0.2, "greatest age of data at the time of publishing", "s", 0.001, 60.0, settable=True)
     restart_gap: float = setting(1.0, "stamps that go back by more than this begin a new recording", "s", 0.001, 3600.0)
     diagnostics_period: float = setting(1.0, "time between diagnostics", "s", 0.05, 60.0)
+    frame_prefix: str = setting("", "Prefix of the frames of gripper and jaws, such as robot1/")
+
+    def jaw_frame(self, side: str) -> str:
+        """Return the name of a jaw's frame."""
+        return f"{self.frame_prefix}{side}_jaw"
+
+
+@dataclass(frozen=True, kw_only=True)
+class GripperParameters(TimeParameters):
+    """The same of a node that knows the gripper's frame."""
+
+    gripper_frame: str = setting("gripper_base", "Frame of the gripper, without prefix")
+
+    @property
+    def base_frame(self) -> str:
+        """The name of the gripper's frame."""
+        return self.frame_prefix + self.gripper_frame
 
 
 def is_parameter(entry: Field) -> bool:

@@ -27,8 +27,6 @@ from finforce_contact.pose.source import StampedPose
 from finforce_contact.session import ContactSession, detections_type
 from finforce_ifea.messages import columns_from_outline
 
-CAMERA = "/camera/camera"
-
 
 class ContactOutputs:
     """The publishers of a contact estimator node.
@@ -42,7 +40,7 @@ class ContactOutputs:
 
     def __init__(self, stage: ros.Stage, parameters: ContactParameters, frame: CameraFrame, skips: Skips) -> None:
         cloud, sides = ros.PointCloud2, parameters.sides
-        self._frame, self._skips = frame, skips
+        self._frame, self._jaws, self._skips = frame, parameters.jaw_frame, skips
         self.contact = {side: stage.publisher(cloud, f"{side}/contact", ros.RESULT) for side in sides}
         self.outline = {side: stage.publisher(cloud, f"{side}/object_outline", ros.RESULT) for side in sides}
         self.slip = {side: stage.publisher(ros.TwistStamped, f"{side}/slip", ros.RESULT) for side in sides}
@@ -51,7 +49,7 @@ class ContactOutputs:
 
     def send_contact(self, side: str, timed: TimedEstimate) -> None:
         """Send outline and contact of an image; no rows say that there is none."""
-        header = ros.Header(stamp=ros.stamp_message(timed.stamp), frame_id=f"{side}_jaw")
+        header = ros.Header(stamp=ros.stamp_message(timed.stamp), frame_id=self._jaws(side))
         # the outline goes first: the solver looks for it when the contact comes
         if ros.is_wanted(self.outline[side], self._skips):
             ros.send_cloud(self.outline[side], header, columns_from_outline(timed.estimate.outline))
@@ -66,7 +64,7 @@ class ContactOutputs:
         self._slip_told[side] = slip.stamp
         if ros.is_wanted(self.slip[side], self._skips):
             stamp = ros.stamp_message(round(slip.stamp / SECOND))
-            header = ros.Header(stamp=stamp, frame_id=f"{side}_jaw")
+            header = ros.Header(stamp=stamp, frame_id=self._jaws(side))
             self.slip[side].publish(ros.twist_message(header, slip.velocity))
 
     def send_pose(self, found: StampedPose) -> None:
@@ -112,6 +110,7 @@ class ContactEstimatorNode(ros.ImageNode):
         self.session = ContactSession(parameters, contact, tracker, self.skips)
         self.gates = {side: StampGate(max_age=age, restart_gap=parameters.restart_gap) for side in self.sides}
         self.health = {side: Health(source=f"{side}/jaw_pose", stale_after=age) for side in self.sides}
+        ros.follow_settings(self, parameters, self._limit_age)
         self.stage = ros.Stage(self, pipeline)
         self.out = ContactOutputs(self.stage, parameters, self.session.frame, self.skips)
         with self.rejections():
@@ -159,13 +158,16 @@ class ContactEstimatorNode(ros.ImageNode):
     def _subscribe_camera(self) -> None:
         """Subscribe to the images in which the object is found; they wait for each other."""
         camera, group = self.session.camera, MutuallyExclusiveCallbackGroup()
-        info, take_info = f"{CAMERA}/color/camera_info", partial(self._on_image, camera.take_camera)
-        self.stage.subscription(ros.CameraInfo, info, take_info, ros.SENSOR, callback_group=group)
-        for topic, take in (
-            ("object_mask", camera.take_mask),
-            (f"{CAMERA}/aligned_depth_to_color/image_raw", camera.take_depth),
-        ):
-            self.stage.large_subscription(ros.Image, topic, partial(self._on_image, take), callback_group=group)
+        info, transport = partial(self._on_image, camera.take_camera, ""), self.parameters.image_transport
+        self.stage.subscription(ros.CameraInfo, self.parameters.info_topic, info, ros.SENSOR, callback_group=group)
+        images = partial(ros.subscribe_to_images, self.stage, transport=transport, callback_group=group)
+        images("object_mask", partial(self._on_image, camera.take_mask))
+        images(self.parameters.depth_topic, partial(self._on_image, camera.take_depth), end=ros.COMPRESSED_DEPTH)
+
+    def _limit_age(self, changed: ContactParameters) -> None:
+        """Take another greatest age of data."""
+        for gate in self.gates.values():
+            gate.limit(changed.max_age)
 
     def _refreshed(self) -> ContactParameters:
         """Return the parameters with the present values of those that may be set at run time."""
@@ -203,7 +205,7 @@ class ContactEstimatorNode(ros.ImageNode):
             self._check_ahead(message)
             self._hand_on(self.session.read_pose(message))
 
-    async def _on_image(self, take: Callable[[Any], StampedPose | None], image: Any) -> None:
+    async def _on_image(self, take: Callable[[Any], StampedPose | None], _topic: str, image: Any) -> None:
         """Use the object's pose, if one is found with an image, while other callbacks go on."""
         with self.rejections():
             self._check_ahead(image)

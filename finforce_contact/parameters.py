@@ -101,6 +101,13 @@ class ContactParameters(TimeParameters):
     pose_tolerance: float = setting(
         0.017, "Maximum stamp difference between a jaw pose and its object pose", "s", 0.0, 1.0
     )
+    depth_topic: str = setting(
+        "/camera/camera/aligned_depth_to_color/image_raw", "Topic of depth images, for the tracker", topic=True
+    )
+    info_topic: str = setting("/camera/camera/color/camera_info", "Topic of their camera's intrinsics", topic=True)
+    image_transport: str = setting(
+        "auto", "Images that are subscribed to, as for the detector", choices=("raw", "compressed", "auto")
+    )
     depth_scale: float = setting(0.001, "Unit of 16-bit depth images", "m", 1e-6, 0.01)
     reconstruct_method: str = setting(
         "",

@@ -271,7 +271,7 @@ class ContactSession:
         }
         self.mesh: ObjectMesh | None = None
         self.trouble = ""
-        self.frame = CameraFrame(parameters.camera_frame)
+        self.frame, self._frames = CameraFrame(parameters.camera_frame), parameters.jaw_frame
         self._origin = parameters.pose_origin
         self._source = ExternalPoseSource(self.frame)
         self.camera = DepthFeed(parameters, tracker, self.frame) if parameters.tracks else None
@@ -360,7 +360,10 @@ class ContactSession:
         Raises:
             FinforceError: frame or numbers are wrong, or no contact can be found with what is known.
         """
-        T_camera_jaw = pose_from_message(message, self.frame.of(message), f"the pose of the {side} jaw")
+        told, frame = self.frame.name, self.frame.of(message)
+        if told not in ("", frame):
+            self.reset()  # poses of the object had come in another frame
+        T_camera_jaw = pose_from_message(message, frame, f"the pose of the {side} jaw")
         with self._lock:
             return self.jaws[side].take_jaw_pose(stamp_of(message), T_camera_jaw)
 
@@ -375,13 +378,13 @@ class ContactSession:
         Raises:
             FinforceError: frame, fields, number or place of the vertices are wrong.
         """
-        surface = surface_from_cloud(cloud, f"{side}_jaw")
+        surface = surface_from_cloud(cloud, self._frames(side))
         with self._lock:
             return self.jaws[side].take_surface(stamp_of(cloud), surface)
 
     def take_wrench(self, side: str, message: Any) -> list[TimedEstimate]:
         """Take the wrench on a jaw, with which no contact is due; raises ObservationError for frame or numbers."""
-        wrench = wrench_from_message(message, f"{side}_jaw")
+        wrench = wrench_from_message(message, self._frames(side))
         with self._lock:
             self.jaws[side].loop.take_wrench(stamp_of(message), wrench)
         return []

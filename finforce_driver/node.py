@@ -312,7 +312,7 @@ class GripperDriverNode(Node):
     def _on_wrench(self, message: WrenchStamped) -> None:
         """Hand the force of an image to the grasp."""
         with self._rejections("force", told=self.session.reject):
-            force, stamp = ros.grasp_force(message, self.parameters.gripper_frame), self._enter("force", message)
+            force, stamp = ros.grasp_force(message, self.parameters.base_frame), self._enter("force", message)
             sample = ForceSample(stamp=stamp, arrived=self.gripper.clock.now(), force=force)
             self.session.take_force(sample)
             self.seen = sample
@@ -321,13 +321,19 @@ class GripperDriverNode(Node):
     def _on_stddev(self, side: str, message: WrenchStamped) -> None:
         """Keep how sure a jaw's force is."""
         with self._rejections("standard deviation"):
-            stddev, stamp = ros.force_stddev(message, f"{side}_jaw"), self._enter(f"{side} stddev", message)
+            stddev, stamp = (
+                ros.force_stddev(message, self.parameters.jaw_frame(side)),
+                self._enter(f"{side} stddev", message),
+            )
             self.session.take_stddev(side, stddev, stamp)
 
     def _on_slip(self, side: str, message: TwistStamped) -> None:
         """Hand to the grasp how fast the object slides over a jaw."""
         with self._rejections("slip"):
-            speed, stamp = ros.twist_speed(message, f"{side}_jaw"), self._enter(f"{side} slip", message)
+            speed, stamp = (
+                ros.twist_speed(message, self.parameters.jaw_frame(side)),
+                self._enter(f"{side} slip", message),
+            )
             force = self.session.take_slip(side, speed, stamp)
             if force is not None:
                 self.get_logger().warning(
@@ -337,7 +343,7 @@ class GripperDriverNode(Node):
     def _on_contact(self, side: str, cloud: PointCloud2) -> None:
         """Hand to the grasp whether a jaw touches the object."""
         with self._rejections("contact"):
-            touching, stamp = ros.is_touching(cloud, f"{side}_jaw"), self._enter(side, cloud)
+            touching, stamp = ros.is_touching(cloud, self.parameters.jaw_frame(side)), self._enter(side, cloud)
             self.session.take_touch(side, touching, stamp)
 
     def _enter(self, source: str, message: Any) -> float:

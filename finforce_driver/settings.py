@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from finforce.settings import ParameterError, TimeParameters, check_bounds, setting
+from finforce.settings import GripperParameters, ParameterError, check_bounds, setting
 from finforce_driver.can.protocol import LARGEST_BYTE
 from finforce_driver.errors import TargetError
 
@@ -264,7 +264,7 @@ class GraspSettings(_Bounded):
 
 
 @dataclass(frozen=True, kw_only=True)
-class DriverParameters(TimeParameters):
+class DriverParameters(GripperParameters):
     """Parameters of a gripper driver node besides the settings of gripper and grasp; the metadata have units."""
 
     port: str = setting("/dev/ttyACM0", "Serial port of the CAN adapter, python-can channel, or topic or action name")
@@ -282,7 +282,6 @@ class DriverParameters(TimeParameters):
         "Source of the effort in joint_states: vision (fresh grasp_wrench), motor (motor current) or none",
         choices=("vision", "motor", "none"),
     )
-    gripper_frame: str = setting("gripper_base", "Frame of grasp_wrench")
     grasp_force: float = setting(1.0, "Set force until grasp_goal names another", "N", 0.1, 30.0)
     grasp_speed: float = setting(0.004, "Maximum speed of the opening in a grasp", "m/s", 1e-4, 0.1)
     grasp_time_limit: float = setting(20.0, "Maximum time for a grasp to reach its force", "s", 0.1, 3600.0)

@@ -263,7 +263,7 @@ class GravityFeed:
     """
 
     def __init__(self, parameters: NodeParameters) -> None:
-        self._frame, self._R = parameters.gripper_frame, R_GRIPPER_JAW[parameters.jaw_name]
+        self._frame, self._R = parameters.base_frame, R_GRIPPER_JAW[parameters.jaw_name]
         self._max_age = round(1e9 * parameters.max_age)
         self._direction: NDArray | None = None
         self._stamp = 0
@@ -274,8 +274,11 @@ class GravityFeed:
         Raises:
             ObservationError: it is in another frame, or no direction.
         """
-        self._direction = direction_from_message(message, self._frame, "gravity") @ self._R
-        self._stamp = stamp_of(message)
+        self.keep(stamp_of(message), direction_from_message(message, self._frame, "gravity"))
+
+    def keep(self, stamp: int, direction: NDArray) -> None:
+        """Keep a direction (3,) in the gripper's frame, of a time [ns]."""
+        self._direction, self._stamp = direction @ self._R, stamp
 
     def at(self, stamp: int) -> NDArray | None:
         """Return the direction (3,) in the jaw's frame, None where it is farther from an image [ns] than `max_age`."""

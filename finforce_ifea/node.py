@@ -12,8 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped, Vector3Stamped, WrenchStamped
+from numpy.typing import NDArray
 from sensor_msgs.msg import PointCloud2
 
+from finforce.errors import MissingDependencyError
 from finforce.gripper_frames import SIDES
 from finforce.health import IDLE, Health, Idling, Level, Outcome, Report, Skips, StampGate
 from finforce.messages import pose_from_message, stamp_of, wrench_from_message
@@ -83,7 +85,7 @@ class SolverOutputs:
         """Send what the object does to the gripper, once it is known; a torque that is not known is left at zero."""
         if grasp is None:
             return
-        header = ros.Header(stamp=header.stamp, frame_id=self._parameters.gripper_frame)
+        header = ros.Header(stamp=header.stamp, frame_id=self._parameters.base_frame)
         if ros.is_wanted(self.grasp, self._skips):
             self.grasp.publish(ros.wrench_message(header, grasp.grasp))
         if ros.is_wanted(self.manipulation, self._skips):
@@ -207,10 +209,14 @@ class IfeaSolverNode(ros.ImageNode):
         jaw = load_jaw(parameters.jaw_file, parameters.jaw_name)
         self.contacts = build_contact_feed(jaw, parameters)
         self.gravity = GravityFeed(parameters) if settings.may_be_held else None
+        self.frames = ros.Frames(self)
+        if parameters.gravity_frame and not self.frames.listen():
+            raise MissingDependencyError(f"gravity_frame {parameters.gravity_frame} needs tf2_ros: source ROS 2")
         ros.warn_first_start()
         with self._announce_wait(jaw.name):
             self.estimator = build(jaw, parameters, settings)
         self.gate = StampGate(max_age=parameters.max_age, restart_gap=parameters.restart_gap)
+        ros.follow_settings(self, parameters, lambda changed: self.gate.limit(changed.max_age))
         health = Health(source=f"{parameters.jaw_name}/keypoints", stale_after=parameters.max_age)
         self.health[parameters.jaw_name] = health
         self.pairing = ForcePairing(parameters.jaw_name)
@@ -255,7 +261,9 @@ class IfeaSolverNode(ros.ImageNode):
             self.stage.subscription(WrenchStamped, f"{peer}/wrench", self._on_peer, ros.RESULT)
             for jaw in SIDES:
                 self.stage.subscription(PoseStamped, f"{jaw}/jaw_pose", partial(self._on_jaw_pose, jaw), ros.SENSOR)
-        if self.gravity is not None:  # of what one jaw presses, friction tells nothing of its weight
+        if (
+            self.gravity is not None and not self.parameters.gravity_frame
+        ):  # of what one jaw presses, friction tells nothing of its weight
             self.stage.subscription(Vector3Stamped, "gravity", self._on_gravity, ros.SENSOR)
         self.stage.subscription(PointCloud2, f"{side}/keypoints", self._on_keypoints, ros.NEWEST)
 
@@ -283,7 +291,7 @@ class IfeaSolverNode(ros.ImageNode):
         """Solve an image and publish its wrench, if it can be trusted."""
         header, stamp = cloud.header, stamp_of(cloud)
         with self.rejections():
-            gravity = self.gravity.at(stamp) if self.gravity is not None else None
+            gravity = self._find_gravity(stamp)
             observation = observation_from_cloud(cloud, self.frame, gravity)
             if self.gate.enter(stamp, self.now()):
                 self._restart("the stamps went back: a new recording")
@@ -302,6 +310,16 @@ class IfeaSolverNode(ros.ImageNode):
             self.out.send_stddev(header, solution)
             self.confirm(self.parameters.jaw_name, stamp, outcome_of_solution(solution), began)
             self.stage.afterwards(partial(self._finish, header, observation, solution))
+
+    def _find_gravity(self, stamp: int) -> NDArray | None:
+        """Return which way things fall at an image [ns] (3,), in the jaw's frame; None where nobody says."""
+        if self.gravity is None:
+            return None
+        upright = self.parameters.gravity_frame
+        T = self.frames.find(self.parameters.base_frame, upright) if upright else None
+        if T is not None:
+            self.gravity.keep(stamp, -T[:3, 2])
+        return self.gravity.at(stamp)
 
     def _finish(self, header: Any, observation: Observation, solution: Solution) -> None:
         """Do what no force waits for."""
@@ -328,7 +346,7 @@ class IfeaSolverNode(ros.ImageNode):
         """Complete the grasp with the other jaw's force."""
         stamp, peer = stamp_of(wrench), self.parameters.peer
         with self.rejections():
-            found = Wrench(*wrench_from_message(wrench, f"{peer}_jaw"))
+            found = Wrench(*wrench_from_message(wrench, self.parameters.jaw_frame(peer)))
             self.gate.check_age(stamp, self.now())
             self.out.send_grasp(wrench.header, self.pairing.add(stamp, found, own=False))
 

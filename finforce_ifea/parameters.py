@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from finforce.settings import TimeParameters, setting
+from finforce.settings import GripperParameters, setting
 
 if TYPE_CHECKING:
     from finforce_ifea.estimator import JawEstimator
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class NodeParameters(TimeParameters):
+class NodeParameters(GripperParameters):
     """Parameters of a solver node, in addition to the settings of its estimator; metadata holds units."""
 
     jaw_name: str = setting("left", "Jaw that this node solves", choices=("left", "right"))
@@ -23,8 +23,7 @@ class NodeParameters(TimeParameters):
     calibration_file: str = setting(
         "", "Calibration file, or name of a shipped one; empty for the material of the jaw file"
     )
-    jaw_frame: str = setting("", "Frame of key points, contact and wrench; empty for <jaw_name>_jaw")
-    gripper_frame: str = setting("gripper_base", "Frame of grasp_wrench and manipulation_wrench")
+    gravity_frame: str = setting("", "Upright frame that tells gravity by /tf, such as base_link; empty for the topic")
     contact_height: float = setting(
         math.nan,
         "Height of first touch above the clamped base; NaN when contacts come on <jaw_name>/contact",
@@ -55,7 +54,7 @@ class NodeParameters(TimeParameters):
     @property
     def frame(self) -> str:
         """The frame of this jaw's messages."""
-        return self.jaw_frame or f"{self.jaw_name}_jaw"
+        return self.jaw_frame(self.jaw_name)
 
 
 def build_estimator(jaw: Jaw, parameters: NodeParameters, settings: EstimatorSettings) -> JawEstimator:

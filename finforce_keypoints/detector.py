@@ -103,6 +103,11 @@ class KeypointDetector:
         self.was_still = False
         self.counts: Counter[str] = Counter()
 
+    def adjust(self, settings: DetectorSettings) -> None:
+        """Go on with other thresholds of likelihood and of key points at rest; all other settings stay."""
+        for jaw in self._jaws.values():
+            jaw.adjust(settings.likelihood, settings.rest_tolerance)
+
     @property
     def name(self) -> str:
         """The method that finds the pixels, and its network."""

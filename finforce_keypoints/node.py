@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from time import monotonic, perf_counter
 from typing import TYPE_CHECKING, Any
@@ -12,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 from rcl_interfaces.msg import ParameterDescriptor
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from sensor_msgs.msg import CameraInfo
 
-from finforce.errors import FinforceError
+from finforce.errors import FinforceError, ObservationError
 from finforce.health import IDLE, STILL, UNHEARD, Health, Idling, Outcome, Report, Skips, StampGate
 from finforce.messages import CameraFrame, Stamped
 from finforce.processors import bind_caller
@@ -36,7 +37,6 @@ from finforce_keypoints.parameters import (
     NO_DEPTH,
     DetectorParameters,
     DetectorSettings,
-    is_compressed,
     load_jaws,
 )
 
@@ -45,12 +45,15 @@ if TYPE_CHECKING:
     from finforce_keypoints.geometry.jaw_localizer import JawKeypoints
 
 
+TF_WAIT = 2.0  # [s] from the first image, for the camera's pose on /tf
+
+
 class DetectorOutputs:
     """The publishers of a key point detector node.
 
     Args:
         stage: makes publishers and watches them.
-        sides: of the jaws.
+        parameters: which jaws, and the names of their frames.
         frame: of the camera.
         names: of the rows of the clouds; sent once, and kept for whoever comes later.
         detector: that finds them.
@@ -59,12 +62,14 @@ class DetectorOutputs:
     def __init__(
         self,
         stage: ros.Stage,
-        sides: Sequence[str],
+        parameters: DetectorParameters,
         frame: CameraFrame,
         names: Sequence[str],
         detector: KeypointDetector,
     ) -> None:
+        sides, self._jaws = parameters.sides, parameters.jaw_frame
         self._frame, self._skeleton = frame, build_skeleton(names)
+        self._frames = ros.Frames(stage.node) if parameters.publish_tf else None
         self.keypoints = {side: stage.publisher(ros.PointCloud2, f"{side}/keypoints", ros.RESULT) for side in sides}
         self.pose = {side: stage.publisher(ros.PoseStamped, f"{side}/jaw_pose", ros.RESULT) for side in sides}
         self.annotated = stage.publisher(ros.Image, "~/annotated", ros.RESULT)
@@ -83,7 +88,10 @@ class DetectorOutputs:
         # the pose goes first: the contact estimator and the solver work at the same time then
         header = ros.Header(stamp=time, frame_id=self._frame.name)
         self.pose[side].publish(ros.pose_message(header, pose_numbers(found.T_camera_jaw)))
-        ros.send_cloud(self.keypoints[side], ros.Header(stamp=time, frame_id=f"{side}_jaw"), keypoint_columns(found))
+        here = ros.Header(stamp=time, frame_id=self._jaws(side))
+        ros.send_cloud(self.keypoints[side], here, keypoint_columns(found))
+        if self._frames is not None:
+            self._frames.send(header, here.frame_id, found.T_camera_jaw)
 
     def send_annotated(self, stamp: int, color: NDArray, found: Mapping[str, JawKeypoints]) -> None:
         """Send the image at `stamp` [ns], (h, w, 3), with what was found in it, while someone subscribes."""
@@ -145,14 +153,19 @@ class KeypointDetectorNode(ros.ImageNode):
         self.skips = Skips(parameters.skip_off)
         ros.warn_first_start()
         self.detector = build(jaws, parameters, settings, dots, self.skips.allows(STILL))
+        ros.follow_settings(self, settings, lambda changed: self.detector.adjust(changed), "detector")
+        ros.follow_settings(self, parameters, lambda changed: self.gate.limit(changed.max_age))
         self.feed = RgbdFeed(parameters)
+        self.frames, self._build = ros.Frames(self), partial(build, jaws, settings=settings, dots=dots)
+        self._mounting = not ros.is_given(self, "T_gripper_camera") and self.frames.listen()
+        self._asked = float("inf")
         self.gate = StampGate(max_age=parameters.max_age, restart_gap=parameters.restart_gap)
         source, age = self.feed.source, parameters.max_age
         self.health = {side: Health(source=source, stale_after=age) for side in parameters.sides}
         self.found: Mapping[str, JawKeypoints] = {}
         self.rested, self.idling = float("-inf"), Idling()
         self.stage = ros.Stage(self, pipeline)
-        self.out = DetectorOutputs(self.stage, parameters.sides, self.feed.frame, names, self.detector)
+        self.out = DetectorOutputs(self.stage, parameters, self.feed.frame, names, self.detector)
         self.detector.warm_up()  # before images come: those that came meanwhile would be lost
         self._serve()
         self._subscribe()
@@ -169,11 +182,11 @@ class KeypointDetectorNode(ros.ImageNode):
         """Create the subscriptions."""
         parameters = self.parameters
         self.stage.subscription(CameraInfo, parameters.info_topic, self._on_info, ros.SENSOR)
+        images = partial(ros.subscribe_to_images, self.stage, transport=parameters.image_transport)
         if parameters.depth != NO_DEPTH:
-            self.stage.large_subscription(Image, parameters.depth_topic, self._on_depth)
+            images(parameters.depth_topic, self._on_depth, end=ros.COMPRESSED_DEPTH)
         for topic in parameters.color_topics:
-            kind = CompressedImage if is_compressed(topic) else Image
-            self.stage.large_subscription(kind, topic, partial(self._on_color, topic))
+            images(topic, self._on_color)
 
     def _on_info(self, message: CameraInfo) -> None:
         """Keep the camera's intrinsics."""
@@ -196,7 +209,7 @@ class KeypointDetectorNode(ros.ImageNode):
                 self._look_ahead()
             self._answer(whole)
 
-    def _on_depth(self, message: Image) -> None:
+    def _on_depth(self, _topic: str, message: Any) -> None:
         """Take a depth image."""
         with self.rejections():
             self._answer(self.feed.take_depth(message))
@@ -218,6 +231,8 @@ class KeypointDetectorNode(ros.ImageNode):
     def _find(self, whole: Stamped) -> None:
         """Find the key points of all jaws in an image that is whole."""
         began, image = perf_counter(), whole.value
+        if self._mounting:
+            self._mount()
         if self.gate.enter(whole.stamp, self.now()):
             self._restart("the stamps went back: a new recording")
         self.found = {}  # until they are found again
@@ -230,6 +245,26 @@ class KeypointDetectorNode(ros.ImageNode):
                 return
         self._publish(whole.stamp, image.color, began)
         self.idling.note(whole.stamp, is_still)
+
+    def _mount(self) -> None:
+        """Take the camera's pose from /tf; after a while without it, the shipped mount's.
+
+        Raises:
+            ObservationError: /tf has not got it yet.
+        """
+        names = self.parameters.base_frame, self.feed.frame.name
+        T_gripper_camera, arrow = self.frames.find(*names), " <- ".join(names)
+        self._asked = min(self._asked, monotonic())
+        if T_gripper_camera is None and monotonic() - self._asked < TF_WAIT:
+            raise ObservationError(f"waiting for the camera's pose on /tf, {arrow}, or set T_gripper_camera")
+        self._mounting = False
+        if T_gripper_camera is None:
+            self.get_logger().warning(f"/tf has no {arrow}: T_gripper_camera is that of the shipped mount")
+            return
+        self.get_logger().info(f"the camera's pose is that of /tf, {arrow}")
+        if not np.allclose(T_gripper_camera, self.parameters.camera_pose, atol=1e-6):
+            self.parameters = replace(self.parameters, T_gripper_camera=pose_numbers(T_gripper_camera))
+            self.detector = self._build(self.parameters, rests=self.skips.allows(STILL))
 
     def _publish(self, stamp: int, color: NDArray, began: float) -> None:
         """Publish the key points of an image, (h, w, 3), while they are fresh."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from numpy.typing import NDArray
 
 from finforce.gripper_frames import ROBOT_CAMERA
-from finforce.settings import TimeParameters, check_bounds, setting
+from finforce.settings import GripperParameters, check_bounds, setting
 from finforce.transforms import pose_from_quaternion, pose_numbers
 from finforce_keypoints.errors import DetectorSettingsError
 
@@ -21,18 +21,28 @@ CAMERA = "/camera/camera"
 COLOR_TOPIC, OLD_COLOR_TOPIC = f"{CAMERA}/color/image_raw", f"{CAMERA}/color/image_rect_raw"
 DEPTH_TOPIC = f"{CAMERA}/aligned_depth_to_color/image_raw"
 INFO_TOPIC = f"{CAMERA}/color/camera_info"
+TRANSPORTS = ("raw", "compressed", "auto")
 DEPTHS = ALIGNED, AUTO, NO_DEPTH = ("aligned", "auto", "none")
 
 
 @dataclass(frozen=True, kw_only=True)
-class DetectorParameters(TimeParameters):
+class DetectorParameters(GripperParameters):
     """Parameters of a key point detector node, in addition to the settings of its parts."""
 
     jaws: str = setting("both", "Jaws that are looked for", choices=("left", "right", "both"))
     jaw_file: str = setting("bench", "Jaw file, or name of a shipped jaw")
     camera_frame: str = setting("", "Frame of the images and of the jaw poses; empty for that of the first image")
     T_gripper_camera: tuple[float, ...] = setting(
-        pose_numbers(ROBOT_CAMERA), "Pose of the colour camera in the gripper frame: x, y, z [m], qx, qy, qz, qw"
+        pose_numbers(ROBOT_CAMERA),
+        "Pose of the colour camera in the gripper frame: x, y, z [m], qx, qy, qz, qw; while it is not set, that of "
+        "/tf where there is one",
+    )
+    publish_tf: bool = setting(True, "Whether the poses of the jaws go to /tf, where tf2_ros is installed")
+    image_transport: str = setting(
+        AUTO,
+        "Images that are subscribed to: raw, compressed (of a topic .../compressed, of depth .../compressedDepth), or "
+        "auto (compressed where nobody publishes raw ones)",
+        choices=TRANSPORTS,
     )
     color_topics: tuple[str, ...] = setting(
         (COLOR_TOPIC, OLD_COLOR_TOPIC),
@@ -98,7 +108,7 @@ class DetectorParameters(TimeParameters):
 class DetectorSettings:
     """Settings of `KeypointDetector`."""
 
-    likelihood: float = setting(0.6, "Minimum likelihood of a key point", "1", 0.0, 1.0)
+    likelihood: float = setting(0.6, "Minimum likelihood of a key point", "1", 0.0, 1.0, settable=True)
     plane_depth: bool = setting(
         False, "Whether key points without depth are used, on the plane that the side of the jaw is known to be"
     )
@@ -131,7 +141,12 @@ class DetectorSettings:
         alias="largest_beside",
     )
     rest_tolerance: float = setting(
-        1.1e-3, "Distance of key points at rest from the jaw file (RMS) above which a warning is given", "m", 1e-4, 0.1
+        1.1e-3,
+        "Distance of key points at rest from the jaw file (RMS) above which a warning is given",
+        "m",
+        1e-4,
+        0.1,
+        settable=True,
     )
     lost_images: int = setting(5, "Images without a jaw, or without its key points, until it is lost", "1", 1, 1000)
 

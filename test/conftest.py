@@ -25,3 +25,11 @@ def probe():
 
     with ros_domain() as probe:
         yield probe
+
+
+@pytest.fixture
+def tf(monkeypatch):
+    """Transforms by target and source, as tf2_ros gives them away; what is sent is kept under "sent"."""
+    from tf2_fakes import install
+
+    return install(monkeypatch)

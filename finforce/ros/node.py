@@ -8,7 +8,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import Field, fields
+from dataclasses import Field, fields, replace
 from functools import cache, partial
 from threading import Event, Thread
 from time import perf_counter
@@ -39,6 +39,8 @@ from finforce.errors import FinforceError
 from finforce.health import Health, Level, Outcome, Report
 from finforce.messages import NANOSECONDS
 from finforce.processors import free_caller
+from finforce.ros.frames import Frames  # noqa: F401 - for those with frames
+from finforce.ros.image_topics import COMPRESSED_DEPTH, subscribe_to_images  # noqa: F401 - for those with images
 from finforce.ros.messages import (  # noqa: F401 - for those who publish
     cloud_message,
     force_stddev,
@@ -137,8 +139,30 @@ def _check_topic(node: Node, name: str, topic: str) -> None:
 def name_unknown_parameters(node: Node) -> None:
     """Warn of parameters that were given and that the node does not have: most are misspelt."""
     for name in node._parameter_overrides:  # rclpy tells of them nowhere else
-        if not node.has_parameter(name):
+        if not node.has_parameter(name) and not name.startswith("qos_overrides."):
             node.get_logger().warning(f"there is no parameter '{name}'; it is ignored")
+
+
+def is_given(node: Node, name: str) -> bool:
+    """Say whether somebody has set a parameter, in a file or on the command line."""
+    return name in node._parameter_overrides
+
+
+def follow_settings(node: Node, record: RecordT, apply: Callable[[RecordT], None], prefix: str = "") -> None:
+    """Call back with a record, as `declare_record` returned it, after settable parameters of it were changed.
+
+    ROS refuses values outside the declared bounds.
+    """
+    names = {f"{prefix}.{entry.name}" if prefix else entry.name: entry.name for entry in fields(record)}
+
+    def take(changed: list[Parameter]) -> None:
+        given = {names[parameter.name]: parameter.value for parameter in changed if parameter.name in names}
+        if given:
+            current.update(given)
+            apply(replace(record, **current))
+
+    current: dict[str, Any] = {}
+    node.add_post_set_parameters_callback(take)
 
 
 def describe_field(entry: Field) -> ParameterDescriptor:
@@ -202,6 +226,8 @@ def warn_first_start() -> None:
 def publish_diagnostics(stage: Stage, name: str, period: float, report: Callable[[list[Outcome]], Report]) -> None:
     """Publish a report on /diagnostics every `period` seconds; mismatches of the stage are its alarms."""
     node, publisher = stage.node, stage.publisher(DiagnosticArray, "/diagnostics", RESULT)
+    space = node.get_namespace().lstrip("/")
+    space += "/" if space else ""
 
     def make() -> Report | None:
         return report([Outcome(level=Level.ERROR, reason="qos", text=fault) for fault in stage.mismatches()])
@@ -210,7 +236,7 @@ def publish_diagnostics(stage: Stage, name: str, period: float, report: Callable
 
     def publish() -> None:
         made = guarded() or Report(level=Level.ERROR, message=f"stopped by {stage.fault}; start the process again")
-        status = status_message(name, node.get_name(), made)
+        status = status_message(f"{space}{name}", f"{space}{node.get_name()}", made)
         publisher.publish(DiagnosticArray(header=Header(stamp=node.get_clock().now().to_msg()), status=[status]))
 
     # on the steady clock: a stopped /clock must show, too

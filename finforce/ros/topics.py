@@ -15,6 +15,7 @@ from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallba
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
+from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from std_msgs.msg import Header
 
@@ -30,6 +31,8 @@ RESULT = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 STEADY = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)  # the newest alone
 REQUESTS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)  # one that is passed over waits for ever
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+_OVERRIDABLE = QoSOverridingOptions.with_default_policies()  # by the parameters qos_overrides.TOPIC...
 
 BUDGET = 5e-3  # [s] that a stage may take before those that could go on without it do
 WATCHED = 15  # messages over which that is judged
@@ -275,7 +278,7 @@ class Stage:
     def publisher(self, kind: type, topic: str, qos: QoSProfile) -> Outlet:
         """Create a watched publisher."""
         events = PublisherEventCallbacks(incompatible_qos=lambda _: self._suspect(topic, True, qos))
-        made = self.node.create_publisher(kind, topic, qos, event_callbacks=events)
+        made = self.node.create_publisher(kind, topic, qos, event_callbacks=events, qos_overriding_options=_OVERRIDABLE)
         return self.pipeline.outlet(self.node.resolve_topic_name(topic), made, qos)
 
     def subscription(
@@ -295,7 +298,9 @@ class Stage:
         guarded = self.guard_taker(topic, callback)
 
         def subscribe() -> Subscription:
-            return self.node.create_subscription(kind, topic, guarded, qos, event_callbacks=events, **options)
+            return self.node.create_subscription(
+                kind, topic, guarded, qos, event_callbacks=events, **{"qos_overriding_options": _OVERRIDABLE, **options}
+            )
 
         return self.pipeline.add(
             Port(self.pipeline, self.node.resolve_topic_name(topic), guarded, subscribe, can_wait=can_wait)
@@ -319,12 +324,17 @@ class Stage:
             if made:
                 self.node.get_logger().warning(f"{topic} comes with best effort: large messages may be lost")
                 self.node.destroy_subscription(made.pop())
-                self.subscription(kind, topic, callback, SENSOR, **options)
+                # the overrides now hold what was asked for at first
+                self.subscription(kind, topic, callback, SENSOR, qos_overriding_options=None, **options)
 
         def connect() -> None:
             events = SubscriptionEventCallbacks(incompatible_qos=take_as_it_comes)
             taker = self.guard_taker(topic, callback)
-            made.append(self.node.create_subscription(kind, topic, taker, STEADY, event_callbacks=events, **options))
+            made.append(
+                self.node.create_subscription(
+                    kind, topic, taker, STEADY, event_callbacks=events, qos_overriding_options=_OVERRIDABLE, **options
+                )
+            )
 
         self.pipeline.when_open(connect)
 

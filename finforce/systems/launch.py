@@ -132,6 +132,7 @@ def _node_action(process: Process) -> Any:
         package=process.package,
         executable=process.executable,
         name=process.name or None,
+        namespace=process.namespace or None,
         output="screen",
         parameters=[*files, values] if values else files,
         remappings=list(process.remappings.items()),

@@ -18,10 +18,10 @@ from finforce.systems.processes import (
     Process,
     RobotOptions,
     SolverOptions,
-    compose,
     contact_processes,
     detector_processes,
     emulated_port,
+    finish,
     given,
     read_numbers,
     solver_process,
@@ -58,7 +58,7 @@ def bench_processes(options: BenchOptions, share: Path) -> list[Process | Includ
         *([gripper_process(options)] if driven else []),
         *viewer(options, share),
     ]
-    return compose(parts) if options.composed else parts
+    return finish(parts, options)
 
 
 def robot_processes(options: RobotOptions, share: Path) -> list[Process | Include]:
@@ -80,7 +80,7 @@ def robot_processes(options: RobotOptions, share: Path) -> list[Process | Includ
         *frame_processes(options, share),
         *viewer(options, share, "robot.rviz"),
     ]
-    return compose(parts) if options.composed else parts
+    return finish(parts, options)
 
 
 def complete(options: OptionsT, share: Path, setup: str) -> OptionsT:
@@ -137,25 +137,28 @@ def _node(name: str, asked: Mapping[str, Any], options: GripperOptions) -> Proce
 
 
 def see_camera(process: Process, options: RobotOptions) -> Process:
-    """Return a process with the topics and the frame of the camera by its name."""
-    name = options.camera_name
-    if not name:
+    """Return a process with the topics of the camera by its name; the twin films under them, in the camera's frame."""
+    if not options.camera_name:
         return process
-    frame = {"camera_frame": _frame(name)}
-    if process.executable == "keypoint_detector":  # whose messages say its parameters
-        topics = {
-            "color_topics": [f"/camera/{name}/{stream}" for stream in (COLOR, OLD_COLOR)],
-            "depth_topic": f"/camera/{name}/{DEPTH}",
-            "info_topic": f"/camera/{name}/{INFO}",
-        }
-        return replace(process, parameters={**process.parameters, **frame, **topics})
-    topics = {f"/camera/camera/{stream}": f"/camera/{name}/{stream}" for stream in (COLOR, DEPTH, INFO)}
-    return replace(process, parameters={**process.parameters, **frame}, remappings={**process.remappings, **topics})
+    base = f"/{_camera_namespace(options)}/{options.camera_name}"
+    if process.executable == "twin_camera":
+        topics = {f"/camera/camera/{stream}": f"{base}/{stream}" for stream in (COLOR, DEPTH, INFO)}
+        frame = {"camera_frame": _camera_frame(options)}
+        return replace(process, parameters={**process.parameters, **frame}, remappings=topics)
+    topics = {"depth_topic": f"{base}/{DEPTH}", "info_topic": f"{base}/{INFO}"}
+    if process.executable == "keypoint_detector":
+        topics["color_topics"] = [f"{base}/{stream}" for stream in (COLOR, OLD_COLOR)]
+    return replace(process, parameters={**process.parameters, **topics})
 
 
-def _frame(name: str) -> str:
-    """Return the frame of a camera's colour images."""
-    return f"{name}_color_optical_frame"
+def _camera_namespace(options: RobotOptions) -> str:
+    """Return the namespace of the camera's topics, in that of the robot."""
+    return "/".join(filter(None, (options.namespace.strip("/"), "camera")))
+
+
+def _camera_frame(options: RobotOptions) -> str:
+    """Return the frame of the camera's colour images."""
+    return f"{options.frame_prefix}{options.camera_name}_color_optical_frame"
 
 
 def camera_includes(options: RobotOptions, share: Path) -> list[Include]:
@@ -170,12 +173,11 @@ def camera_includes(options: RobotOptions, share: Path) -> list[Include]:
         return []
     if not options.camera_name:
         raise ValueError("camera_name:=none: camera:=true needs a name, as wrist_camera")
-    serial = {"serial_no": f"'{options.camera_serial}'"} if options.camera_serial else {}  # quoted: digits are no text
     arguments = {
-        "camera_namespace": "camera",
+        "camera_namespace": _camera_namespace(options),
         "camera_name": options.camera_name,
         "config_file": options.camera_config or str(share / "config" / "d405.yaml"),
-        **serial,
+        **given({"tf_prefix": options.frame_prefix}),
     }
     chosen = any(os.environ.get(name) for name in CHOICES)
     return [
@@ -203,7 +205,7 @@ def arm_includes(options: RobotOptions, share: Path) -> list[Include]:
         "dof": str(options.dof),
         "description_file": str(Path(description).resolve()),
         "gripper": "",
-        "use_fake_hardware": str(options.sim or options.use_fake_hardware).lower(),
+        "use_fake_hardware": str(options.sim).lower(),
         "launch_rviz": "false",
     }
     return [
@@ -222,11 +224,12 @@ def frame_processes(options: RobotOptions, share: Path) -> list[Process]:
     publishers = []
     if not options.arm:  # whose description holds the gripper, too
         model = (share / "urdf" / "finray_gripper.urdf").read_text(encoding="utf-8")
-        publishers.append(_frames("robot_state_publisher", "robot_state_publisher", {"robot_description": model}))
+        told = {"robot_description": model, **given({"frame_prefix": options.frame_prefix})}
+        publishers.append(_frames("robot_state_publisher", "robot_state_publisher", told))
     if options.camera_name and (options.sim or options.camera):
         pose = zip(POSE_AXES, camera_pose(options), strict=True)
         words = [word for axis, number in pose for word in (f"--{axis}", str(number))]
-        words += ["--frame-id", "gripper_base", "--child-frame-id", _frame(options.camera_name)]
+        words += ["--frame-id", f"{options.frame_prefix}gripper_base", "--child-frame-id", _camera_frame(options)]
         publishers.append(_frames("tf2_ros", "static_transform_publisher", {}, tuple(words)))
     return publishers
 
@@ -264,7 +267,7 @@ def _parameters_of(file: str, node: str) -> Mapping[str, Any]:
     found: dict[str, Any] = {}
     try:
         sections = read_yaml(file) or {}
-        for name in ("/**", node, f"/{node}"):
+        for name in ("/**", f"/**/{node}", node, f"/{node}"):
             found |= (sections.get(name) or {}).get("ros__parameters") or {}
     except (FileError, AttributeError, TypeError, ValueError) as error:
         raise ValueError(f"{file}: {error}; expected ROS parameters: node, ros__parameters, names") from error

@@ -32,6 +32,7 @@ class Process:
         package: that holds the executable.
         executable: as `ros2 run` finds it.
         name: of the node; empty where a process has several, which would all be called so.
+        namespace: of the node.
         parameters: ROS parameters that differ from the node's defaults.
         parameter_file: YAML file with more of them, overruled by `parameters`; empty for none.
         remappings: topic names as the node knows them -> as they are here.
@@ -44,6 +45,7 @@ class Process:
     package: str = "finforce"
     executable: str
     name: str
+    namespace: str = ""
     parameters: Mapping[str, Any] = field(default_factory=dict)
     parameter_file: str = ""
     remappings: Mapping[str, str] = field(default_factory=dict)
@@ -65,6 +67,8 @@ class Process:
     def words(self) -> list[str]:
         """The node's ROS arguments."""
         words = ["-r", f"__node:={self.name}"] if self.name else []
+        if self.namespace:
+            words += ["-r", f"__ns:=/{self.namespace.strip('/')}"]
         if self.parameter_file:
             words += ["--params-file", self.parameter_file]
         for name, value in self.parameters.items():
@@ -98,6 +102,18 @@ class Include:
 def _yaml(value: Any) -> str:
     """Return a value as YAML with its type beyond doubt, which JSON is, but for NaN."""
     return ".nan" if value != value else json.dumps(value)
+
+
+def finish(parts: Sequence[Process | Include], options: SolverOptions) -> list[Process | Include]:
+    """Return parts of a system in its namespace, with its prefix of frames, and composed where that is asked for."""
+    parts = [_place(part, options) if isinstance(part, Process) else part for part in parts]
+    return compose(parts) if options.composed else parts
+
+
+def _place(part: Process, options: SolverOptions) -> Process:
+    """Return a process in the namespace of a system, one of our nodes also with its prefix of frames."""
+    own = {"frame_prefix": options.frame_prefix} if part.executable in (*STAGES, "gripper_driver") else {}
+    return replace(part, namespace=options.namespace, parameters={**part.parameters, **given(own)})
 
 
 def compose(parts: Sequence[Process | Include]) -> list[Process | Include]:
@@ -135,7 +151,6 @@ def solver_process(side: str, options: SolverOptions, **parameters: Any) -> Proc
         # NaN overrules a height in the parameter file
         "contact_height": math.nan if options.object_mesh else height,
         "estimator.solver": options.solver,
-        "estimator.mesh": options.mesh,
     }
     return Process(
         executable="ifea_solver",
@@ -168,9 +183,7 @@ def contact_processes(jaws: str, options: SolverOptions, *, waits: bool = False)
         "object_mesh": options.object_mesh,
         "object_mesh_unit": options.object_mesh_unit,
         "pose_source": options.pose_source,
-        "pose_origin": options.pose_origin,
-        "contact.mode": options.contact,
-        "contact.mesh": "coarse" if options.solver == "paper" else options.mesh,
+        "contact.mesh": "coarse" if options.solver == "paper" else "",
     }
     topics = dict.fromkeys(POSE_TOPICS, options.pose_topic) if options.pose_topic else {}
     return [replace(_jaws_process("contact_estimator", jaws, asked, options), remappings=topics)]
@@ -236,8 +249,7 @@ def replay_processes(options: ReplayOptions, share: Path) -> list[Process]:
     )
     played = [player] if options.bag else []
     estimators = [*contact_processes(options.jaws, options), *detector_processes(options.jaws, options)]
-    parts = [*solvers, *estimators, *played, *viewer(options, share)]
-    return compose(parts) if options.composed else parts
+    return finish([*solvers, *estimators, *played, *viewer(options, share)], options)
 
 
 def viewer(options: SolverOptions, share: Path, config: str = "finforce.rviz") -> list[Process]:
@@ -281,10 +293,8 @@ class SolverOptions:
     )
     object_mesh: str = setting("", "Mesh file of the object, from which contacts are estimated")
     object_mesh_unit: str = setting("", "Unit of the mesh file: m, cm, mm or inch")
-    contact: str = setting("", "Contact estimation: estimate, paper (Algorithm 1) or closest")
     pose_source: str = setting("", "Source of object poses: topic, detections or tracker")
     pose_topic: str = setting("", "Topic of object poses from another program; none: object_pose, object_detections")
-    pose_origin: str = setting("", "Origin of these poses in the object: mesh, middle or added")
     images: bool = setting(False, "Detection of key points in camera images; false: key points come by topic")
     detection_method: str = setting("", "network, frame (DeepLabCut) or dots", alias="finder")
     model: str = setting("", "Folder of a network")
@@ -293,11 +303,12 @@ class SolverOptions:
     )
     T_gripper_camera: str = setting("", "Pose of the camera in the gripper frame: x y z [m] qx qy qz qw")
     solver: str = setting("", "Mechanics: reduced, solid, frame, linear or paper (Eq. 1)")
-    mesh: str = setting("", "Mesh density: default, coarse or fine")
     parameter_file: str = setting("", "YAML file with node parameters; none: that of the system")
     use_sim_time: bool = setting(False, "Time from /clock")
     composed: bool = setting(True, "Detector, contact estimator and solvers in one process; false: one process each")
     rviz: bool = setting(False, "RViz with the markers")
+    namespace: str = setting("", "Namespace of all nodes, for several robots")
+    frame_prefix: str = setting("", "Prefix of all frames, as robot_state_publisher has it")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -337,14 +348,12 @@ class RobotOptions(GripperOptions):
         "wrist_camera", "Topics /camera/NAME/..., frames NAME_...; none: topics and frame of the parameter file"
     )
     camera_config: str = setting("", "YAML file with parameters of realsense2_camera; none: the shipped d405.yaml")
-    camera_serial: str = setting("", "Serial number of the camera; none: the only one")
     arm: bool = setting(False, "Start of the arm, a Kinova Gen3, by kortex_bringup; with sim one that is not there")
     arm_description: str = setting(
         "", "xacro file of arm and gripper; none: the shipped one, the gripper on the flange of a Gen3"
     )
     robot_ip: str = setting("192.168.1.10", "Address of the arm")
     dof: int = setting(7, "Joints of the arm", choices=(6, 7))
-    use_fake_hardware: bool = setting(False, "An arm that is not there: it mirrors its commands")
 
 
 @dataclass(frozen=True, kw_only=True)

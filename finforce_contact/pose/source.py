@@ -81,7 +81,7 @@ class ExternalPoseSource:
             source = "Detection3DArray"
             message = SimpleNamespace(header=message.header, pose=_pose_of_detection(message.detections[0]))
         T_camera_object, stamp = (
-            pose_from_message(message, self._frame.name or message.header.frame_id, source),
+            pose_from_message(message, self._frame.of(message, is_sure=False), source),
             SECOND * stamp_of(message),
         )
         if self.latest is not None and stamp <= self.latest.stamp:

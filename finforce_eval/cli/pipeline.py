@@ -9,7 +9,7 @@ from pathlib import Path
 from finforce.errors import MissingDependencyError
 from finforce.systems.launch import NONE, options_from_texts
 from finforce.systems.live import gripper_process
-from finforce.systems.processes import GripperOptions, Process, ReplayOptions, merge, replay_processes
+from finforce.systems.processes import GripperOptions, Process, ReplayOptions, finish, merge, replay_processes
 from finforce_eval.errors import OptionError
 
 
@@ -52,7 +52,8 @@ def pipeline_process(words: list[str]) -> Process:
         raise OptionError(str(error)) from error
     if options.jaws not in ("both", "left", "right"):
         raise OptionError(f"jaws:={options.jaws}: expected both, left or right")
-    return merge([*processes, *([gripper_process(options)] if options.gripper else [])])
+    driver = finish([gripper_process(options)], replace(options, composed=False)) if options.gripper else []
+    return merge([*processes, *driver])
 
 
 def run(options: argparse.Namespace) -> int:

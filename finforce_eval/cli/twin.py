@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce.messages import DEPTH_FORMAT
 from finforce.optional import import_trimesh
 from finforce.transforms import pose_numbers, quaternion_from_pose
 from finforce_eval.cli.parser import Parser, whole_number
@@ -22,7 +23,6 @@ from finforce_eval.evaluation.keypoint_source import parse_changes
 from finforce_eval.recordings.images import (
     CAMERA_INFO,
     COMPRESSED,
-    DEPTH_FORMAT,
     IMAGE,
     compress_depth,
     encode_color,

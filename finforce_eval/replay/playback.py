@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from finforce.messages import color_from_image, read_stamp
+from finforce.messages import color_from_image, depth_steps, read_stamp
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.bags import BagReader, RawSample, bag_source, open_bag, restamp
 from finforce_eval.recordings.images import (
@@ -17,7 +17,6 @@ from finforce_eval.recordings.images import (
     DEPTH_ENDS,
     IMAGE,
     ImageTrack,
-    depth_steps,
 )
 from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 

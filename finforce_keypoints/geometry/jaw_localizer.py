@@ -91,6 +91,10 @@ class JawLocalizer:
         self._model = SideModel(places=self._rest[:, ::2])
         self._box = np.array([settings.workspace_closing, settings.workspace_width, settings.workspace_length])
 
+    def adjust(self, likelihood: float, rest_tolerance: float) -> None:
+        """Take another least likelihood, and distance [m] of key points at rest above which a warning is given."""
+        self._settings = replace(self._settings, likelihood=likelihood, rest_tolerance=rest_tolerance)
+
     def reset(self) -> None:
         """Forget where the jaw was."""
         self._track.reset()

@@ -33,7 +33,7 @@ def cylinder_before_jaw(gap=0.001, height=0.04):
 def start_contact_estimator(probe, **parameters):
     """Add a contact estimator to the probe's executor; of the shipped cylinder unless told otherwise."""
     # a loaded machine is late: neither is an image old then, nor a node silent
-    given = {"object_mesh": MESH, "diagnostics_period": 0.1, "max_age": 3.0, **parameters}
+    given = {"object_mesh": MESH, "diagnostics_period": 0.1, "max_age": 3.0, "camera_frame": CAMERA, **parameters}
     overrides = [Parameter(name, value=value) for name, value in given.items()]
     node = ContactEstimatorNode(context=probe.context, parameter_overrides=overrides)
     probe.spinner.add_node(node)

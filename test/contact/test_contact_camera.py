@@ -15,7 +15,6 @@ from finforce.messages import depth_from_image, mask_from_image, stamp_of
 from finforce.ros import node as ros
 from finforce_contact.mesh.object_mesh import load_object_mesh
 from finforce_contact.mesh.views import MeshView
-from finforce_contact.node import CAMERA as CAMERA_TOPICS
 from finforce_sim.sensor import build_d405
 
 # from above and the side, 0.22 m away, so that the cylinder shows its wall and a lid
@@ -73,8 +72,8 @@ class TrackingBench(ContactBench):
         # the first image loads libraries, which takes seconds where other programs have the processor
         super().__init__(probe, pose_source="tracker", max_age=MAX_AGE, **parameters)
         self.camera = camera
-        self.info = probe.speak(f"{CAMERA_TOPICS}/color/camera_info", CameraInfo)
-        self.depth = probe.speak(f"{CAMERA_TOPICS}/aligned_depth_to_color/image_raw", Image, qos)
+        self.info = probe.speak("/camera/camera/color/camera_info", CameraInfo)
+        self.depth = probe.speak("/camera/camera/aligned_depth_to_color/image_raw", Image, qos)
         self.mask = probe.speak("object_mask", Image, qos)
         for out in (self.info, self.depth, self.mask):
             probe.connected(out)
@@ -192,7 +191,7 @@ def test_a_mask_of_another_kind_is_refused(scene, encoding, word):
 
 def test_images_are_asked_for_reliably_and_those_of_best_effort_are_taken_too(probe, camera, scene):
     bench = TrackingBench(probe, camera, qos=ros.SENSOR)
-    topics = (f"{CAMERA_TOPICS}/aligned_depth_to_color/image_raw", "/object_mask")
+    topics = ("/camera/camera/aligned_depth_to_color/image_raw", "/object_mask")
 
     def reliability(topic):
         return probe.get_subscriptions_info_by_topic(topic)[0].qos_profile.reliability
@@ -204,7 +203,7 @@ def test_images_are_asked_for_reliably_and_those_of_best_effort_are_taken_too(pr
 
 def test_large_images_come_again_where_their_publisher_keeps_them(probe, camera):
     TrackingBench(probe, camera)
-    for topic in (f"{CAMERA_TOPICS}/aligned_depth_to_color/image_raw", "/object_mask"):
+    for topic in ("/camera/camera/aligned_depth_to_color/image_raw", "/object_mask"):
         (heard,) = probe.get_subscriptions_info_by_topic(topic)
         assert heard.qos_profile.reliability == ReliabilityPolicy.RELIABLE
 

@@ -80,12 +80,9 @@ def test_every_parameter_of_the_graph_is_one_of_the_node():
         "calibration_file": "b",
         "contact_height": 0.1,
         "solver": "frame",
-        "mesh": "fine",
         "object_mesh": "c",
         "object_mesh_unit": "mm",
-        "contact": "paper",
         "pose_source": "tracker",
-        "pose_origin": "middle",
         "images": True,
         "detection_method": "frame",
         "model": "d",
@@ -115,26 +112,24 @@ def test_colour_alone_is_asked_for_by_another_word_than_nothing(asked, told):
 
 
 def test_an_object_mesh_brings_one_contact_estimator_and_its_contacts_go_to_the_solvers():
-    options = ReplayOptions(composed=False, jaws="both", object_mesh="can.stl", contact="closest", contact_height=0.04)
+    options = ReplayOptions(composed=False, jaws="both", object_mesh="can.stl", contact_height=0.04)
     processes = by_name(replay_processes(options, ROOT))
     estimator = processes["contact_estimator"]
     assert estimator.executable == "contact_estimator" and estimator.parameters["jaws"] == "both"
-    assert estimator.parameters["object_mesh"] == "can.stl" and estimator.parameters["contact.mode"] == "closest"
+    assert estimator.parameters["object_mesh"] == "can.stl"
     assert "recording_player" not in processes
     # NaN overrules the height of a parameter file, too
     assert all(math.isnan(processes[f"{side}_ifea_solver"].parameters["contact_height"]) for side in ("left", "right"))
 
 
 def test_without_an_object_mesh_no_contact_is_estimated():
-    processes = bench_processes(BenchOptions(composed=False, contact_height=0.04, contact="paper"), ROOT)
+    processes = bench_processes(BenchOptions(composed=False, contact_height=0.04), ROOT)
     assert [process.executable for process in processes] == ["ifea_solver"]
 
 
-@pytest.mark.parametrize(("solver", "mesh", "seen"), [("", "fine", "fine"), ("paper", "", "coarse"), ("", "", None)])
-def test_solver_and_contact_estimator_have_the_same_mesh_of_the_jaw(solver, mesh, seen):
-    options = BenchOptions(
-        composed=False, object_mesh="can.stl", solver=solver, mesh=mesh, jaw_file="j", calibration_file="k"
-    )
+@pytest.mark.parametrize(("solver", "seen"), [("paper", "coarse"), ("", None)])
+def test_solver_and_contact_estimator_have_the_same_mesh_of_the_jaw(solver, seen):
+    options = BenchOptions(composed=False, object_mesh="can.stl", solver=solver, jaw_file="j", calibration_file="k")
     _, estimator = bench_processes(options, ROOT)
     assert estimator.parameters.get("contact.mesh") == seen
     assert (estimator.parameters["jaw_file"], estimator.parameters["calibration_file"]) == ("j", "k")
@@ -170,7 +165,7 @@ def test_a_camera_pose_that_is_not_seven_numbers_is_named(text):
 @pytest.mark.parametrize("name", ["bench", "bench_sim"])
 def test_the_bench_configuration_has_the_camera_of_the_bench(name):
     bench = yaml.safe_load((ROOT / "config" / f"{name}.yaml").read_text(encoding="utf-8"))
-    numbers = tuple(bench["keypoint_detector"]["ros__parameters"]["T_gripper_camera"])
+    numbers = tuple(bench["/**/keypoint_detector"]["ros__parameters"]["T_gripper_camera"])
     # 1e-7: of the printed digits
     np.testing.assert_allclose(DetectorParameters(T_gripper_camera=numbers).camera_pose, BENCH_CAMERA, atol=1e-7)
 
@@ -234,7 +229,7 @@ GRIPPER_FILES = sorted((ROOT / "config" / "grippers").glob("*.yaml"))
 @pytest.mark.parametrize("path", NODE_FILES, ids=lambda path: path.name)
 def test_every_key_of_a_configuration_is_a_parameter_and_differs_from_its_default(path):
     for node, section in yaml.safe_load(path.read_text(encoding="utf-8")).items():
-        defaults = PARAMETERS[node]
+        defaults = PARAMETERS[node if node == "/**" else node.removeprefix("/**/")]
         for name, value in section["ros__parameters"].items():
             value = tuple(value) if isinstance(value, list) else value
             assert name in defaults
@@ -288,7 +283,7 @@ def test_every_value_of_a_configuration_has_its_unit_or_reason_beside_it(path):
 )
 def test_every_field_is_read(record, folder):
     read = set()
-    for path in (ROOT / folder).rglob("*.py"):
+    for path in (*(ROOT / folder).rglob("*.py"), ROOT / "finforce" / "settings.py"):
         tree = ast.parse(path.read_text(encoding="utf-8"))
         read |= {node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
     assert {entry.name for entry in fields(record)} <= read

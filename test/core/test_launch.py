@@ -168,12 +168,12 @@ def group_of(actions):
 
 
 def test_an_included_file_sees_its_own_arguments_only(recorded_launch):
-    group = group_of(act(ROBOT, camera_serial="0123"))
+    group = group_of(act(ROBOT, namespace="r1"))
     # an argument of ours, such as "gripper", means something else there
     assert group.kwargs == {"scoped": True, "forwarding": False}
     *_, included = group.args[0]
     assert included.args[0].args[0] == "/share/realsense2_camera/launch/rs_launch.py"
-    assert dict(included.kwargs["launch_arguments"])["serial_no"] == "'0123'"
+    assert dict(included.kwargs["launch_arguments"])["camera_namespace"] == "r1/camera"
 
 
 def test_the_environment_of_an_included_file_is_set_in_its_scope(recorded_launch, monkeypatch):

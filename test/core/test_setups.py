@@ -79,20 +79,19 @@ def test_the_gripper_has_the_port_that_was_asked_for():
 def test_detector_and_contacts_read_the_camera_that_is_started():
     parts = robot(camera_name="hand")
     assert parts["realsense2_camera"].arguments["camera_name"] == "hand"
-    detector, contacts = parts["keypoint_detector"].parameters, parts["contact_estimator"]
-    assert detector["camera_frame"] == contacts.parameters["camera_frame"] == "hand_color_optical_frame"
+    detector, contacts = (parts[name].parameters for name in ("keypoint_detector", "contact_estimator"))
     assert detector["color_topics"] == ["/camera/hand/color/image_raw", "/camera/hand/color/image_rect_raw"]
     assert detector["info_topic"] == "/camera/hand/color/camera_info"
     depth = "/camera/hand/aligned_depth_to_color/image_raw"
-    assert detector["depth_topic"] == contacts.remappings["/camera/camera/aligned_depth_to_color/image_raw"] == depth
+    assert detector["depth_topic"] == contacts["depth_topic"] == depth
 
 
 def test_poses_of_another_program_come_from_its_topic_beside_those_of_the_camera():
-    asked = {"object_mesh": "c.stl", "pose_source": "detections", "pose_origin": "added"}
+    asked = {"object_mesh": "c.stl", "pose_source": "detections"}
     contacts = robot(camera_name="hand", pose_topic="/pose_estimation/output", **asked)["contact_estimator"]
     assert contacts.remappings["object_detections"] == contacts.remappings["object_pose"] == "/pose_estimation/output"
-    assert contacts.remappings["/camera/camera/color/image_raw"] == "/camera/hand/color/image_raw"
-    assert (contacts.parameters["pose_source"], contacts.parameters["pose_origin"]) == ("detections", "added")
+    assert contacts.parameters["info_topic"] == "/camera/hand/color/camera_info"
+    assert contacts.parameters["pose_source"] == "detections"
     assert "object_pose" not in robot(**asked)["contact_estimator"].remappings
 
 
@@ -106,13 +105,26 @@ def test_a_camera_without_a_name_leaves_topics_and_frame_to_the_parameter_file()
 
 def test_the_cameras_frames_are_not_those_of_the_arms_own_camera():
     names = {"camera_link", "camera_depth_frame", "camera_color_frame"}  # of kortex_description with vision
-    frame = robot()["keypoint_detector"].parameters["camera_frame"]
+    frame = robot(sim=True)["twin_camera"].parameters["camera_frame"]
     assert not any(frame.startswith(name.removesuffix("link")) for name in names)
 
 
-def test_the_camera_of_a_serial_number_is_text_for_its_launch_file():
-    assert yaml.safe_load(robot(camera_serial="012345")["realsense2_camera"].arguments["serial_no"]) == "012345"
-    assert "serial_no" not in robot()["realsense2_camera"].arguments
+def test_two_robots_in_one_domain_share_neither_topics_nor_frames():
+    parts = robot(sim=True, namespace="r1", frame_prefix="r1/")
+    ours = [part for part in parts.values() if part.package == "finforce"]
+    assert {part.namespace for part in parts.values()} == {"r1"}
+    assert all(part.words[2:4] == ["-r", "__ns:=/r1"] for part in ours)
+    nodes = [part for part in ours if part.executable != "twin_camera"]
+    assert {part.parameters["frame_prefix"] for part in nodes} == {"r1/"}
+    color = "/r1/camera/wrist_camera/color/image_raw"
+    assert parts["keypoint_detector"].parameters["color_topics"][0] == color
+    twin = parts["twin_camera"]
+    assert twin.remappings["/camera/camera/color/image_raw"] == color
+    assert twin.parameters["camera_frame"] == "r1/wrist_camera_color_optical_frame"
+    assert parts["robot_state_publisher"].parameters["frame_prefix"] == "r1/"
+    assert {"r1/gripper_base", twin.parameters["camera_frame"]} < set(parts["static_transform_publisher"].arguments)
+    camera = robot(namespace="r1", frame_prefix="r1/")["realsense2_camera"].arguments
+    assert (camera["camera_namespace"], camera["tf_prefix"]) == ("r1/camera", "r1/")
 
 
 def test_the_camera_gets_the_transport_of_our_nodes_unless_somebody_chose_one(monkeypatch):

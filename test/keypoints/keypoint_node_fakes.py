@@ -68,6 +68,9 @@ class FakeDetector:
     def warm_up(self):
         self.warmed = True
 
+    def adjust(self, settings):
+        self.settings = settings
+
 
 def start_detector(probe, **parameters):
     """Add a detector node around a fake detector to the probe's executor."""
@@ -75,7 +78,7 @@ def start_detector(probe, **parameters):
     given = {"diagnostics_period": 0.1, "max_age": 3.0, **parameters}
     overrides = [Parameter(name, value=value) for name, value in given.items()]
 
-    def build(jaws, *_):
+    def build(jaws, *_, **__):
         return FakeDetector(tuple(jaws))
 
     node = KeypointDetectorNode(build, context=probe.context, parameter_overrides=overrides)

@@ -1,0 +1,119 @@
+"""Claims about the detector node with other people's cameras, frames, transports, namespaces and thresholds."""
+
+from time import time_ns
+
+import cv2
+import numpy as np
+import pytest
+from keypoint_node_fakes import (
+    COLOR,
+    FRAME,
+    HEIGHT,
+    TOPICS,
+    WIDTH,
+    CameraBench,
+    FakeDetector,
+    camera_info,
+    header,
+    start_detector,
+)
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import CompressedImage
+
+from finforce.health import Level
+from finforce.messages import stamp_of
+from finforce.transforms import pose_from_quaternion
+from finforce_eval.recordings.images import compress_depth
+from finforce_keypoints import node as detector_node
+from finforce_keypoints.node import KeypointDetectorNode
+
+CAMERA = pose_from_quaternion((0.1, -0.2, 0.3), (0.0, 0.6, 0.0, 0.8))
+
+
+def test_the_cameras_pose_is_that_of_tf_unless_one_was_given(probe, tf):
+    tf["r1/gripper_base", FRAME] = CAMERA
+    bench = CameraBench(probe, frame_prefix="r1/")
+    first = bench.node.detector
+    stamp = bench.shoot()
+    cloud = bench.wait_for_clouds()
+    assert stamp_of(cloud) == stamp and cloud.header.frame_id == "r1/left_jaw"
+    assert bench.node.detector is not first
+    np.testing.assert_allclose(bench.node.parameters.camera_pose, CAMERA, atol=1e-9)
+    assert {(sent.header.frame_id, sent.child_frame_id) for sent in tf["sent"]} == {
+        (FRAME, "r1/left_jaw"),
+        (FRAME, "r1/right_jaw"),
+    }
+
+
+def test_a_pose_that_was_given_is_kept_and_jaws_stay_off_tf_where_they_are_not_wanted(probe, tf):
+    tf["gripper_base", FRAME] = CAMERA
+    given = TOPICS.T_gripper_camera
+    bench = CameraBench(probe, T_gripper_camera=list(given), publish_tf=False)
+    bench.shoot()
+    bench.wait_for_clouds()
+    assert bench.node.parameters.T_gripper_camera == list(given) and not tf["sent"]
+
+
+def test_while_tf_may_still_tell_the_cameras_pose_nothing_is_answered(probe, tf, monkeypatch):
+    bench = CameraBench(probe)
+    bench.shoot()
+    bench.refused("gripper_base <- camera_color_optical_frame", Level.ERROR)
+    monkeypatch.setattr(detector_node, "TF_WAIT", 0.0)
+    bench.shoot()
+    bench.wait_for_clouds()
+    assert bench.node.parameters.T_gripper_camera == TOPICS.T_gripper_camera
+
+
+@pytest.mark.parametrize("transport", ["compressed", "auto"])
+def test_compressed_images_are_taken_where_nobody_sends_raw_ones(probe, transport):
+    node = start_detector(probe, image_transport=transport)
+    probe.hear("left/keypoints", detector_node.ros.PointCloud2)
+    color = probe.speak(f"{COLOR}/compressed", CompressedImage)
+    depth = probe.speak(f"{TOPICS.depth_topic}/compressedDepth", CompressedImage)
+    info = probe.speak(TOPICS.info_topic, detector_node.CameraInfo)
+    for publisher in (color, depth, info):
+        probe.connected(publisher)
+    info.publish(camera_info())
+    probe.wait_for(lambda: node.feed.camera is not None)
+    picture = cv2.imencode(".png", np.random.default_rng(0).integers(90, 160, (HEIGHT, WIDTH, 3), np.uint8))[1]
+    stamp = time_ns()
+    color.publish(CompressedImage(header=header(stamp), format="rgb8; png compressed bgr8", data=picture.tobytes()))
+    plane = compress_depth(np.full((HEIGHT, WIDTH), 120, np.uint16))
+    depth.publish(CompressedImage(header=header(stamp), format="16UC1; compressedDepth png", data=plane))
+    probe.wait_for(lambda: probe.got["left/keypoints"])
+    assert stamp_of(probe.got["left/keypoints"][0]) == stamp
+
+
+def test_thresholds_can_be_set_while_the_node_runs_within_their_bounds(probe):
+    bench = CameraBench(probe)
+    set_one = lambda name, value: bench.node.set_parameters([Parameter(name, value=value)])[0]  # noqa: E731
+    assert set_one("detector.likelihood", 0.8).successful and set_one("detector.rest_tolerance", 2e-3).successful
+    assert (bench.node.detector.settings.likelihood, bench.node.detector.settings.rest_tolerance) == (0.8, 2e-3)
+    assert not set_one("detector.likelihood", 1.5).successful and not set_one("detector.quantum", 1e-3).successful
+    assert bench.node.detector.settings.likelihood == 0.8
+    assert set_one("max_age", 0.001).successful
+    bench.shoot()
+    bench.refused("old", Level.STALE)
+
+
+def test_diagnostics_of_robots_in_namespaces_are_told_apart(probe):
+    node = KeypointDetectorNode(
+        lambda jaws, *_, **__: FakeDetector(tuple(jaws)),
+        context=probe.context,
+        namespace="r1",
+        parameter_overrides=[Parameter("diagnostics_period", value=0.1)],
+    )
+    probe.spinner.add_node(node)
+
+    def seen():
+        return {(s.name, s.hardware_id) for array in probe.got["/diagnostics"] for s in array.status}
+
+    wanted = {(f"r1/finforce: {side} key points", "r1/keypoint_detector") for side in ("left", "right")}
+    probe.wait_for(lambda: wanted <= seen())
+
+
+def test_quality_of_service_of_images_can_be_overridden(probe):
+    name = f"qos_overrides.{TOPICS.color_topics[0]}.subscription.reliability"
+    bench = CameraBench(probe, **{name: "best_effort"})
+    ends = bench.node.get_subscriptions_info_by_topic(COLOR)
+    assert [end.qos_profile.reliability.name for end in ends] == ["BEST_EFFORT"]
