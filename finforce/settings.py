@@ -43,9 +43,9 @@ def setting(
 class TimeParameters:
     """What every node that answers images is told about time and frames; units stand in the metadata."""
 
-    max_age: float = setting(0.2, "greatest age of data at the time of publishing", "s", 0.001, 60.0, settable=True)
-    restart_gap: float = setting(1.0, "stamps that go back by more than this begin a new recording", "s", 0.001, 3600.0)
-    diagnostics_period: float = setting(1.0, "time between diagnostics", "s", 0.05, 60.0)
+    max_age: float = setting(0.2, "Maximum age of data when a result is published", "s", 0.001, 60.0, settable=True)
+    restart_gap: float = setting(1.0, "Backward jump of stamps that starts a new recording", "s", 0.001, 3600.0)
+    diagnostics_period: float = setting(1.0, "Period of the diagnostics", "s", 0.05, 60.0)
     frame_prefix: str = setting("", "Prefix of the frames of gripper and jaws, such as robot1/")
 
     def jaw_frame(self, side: str) -> str:

@@ -49,6 +49,7 @@ def describe(feed: RgbdFeed, method: str, found: JawKeypoints | None) -> dict[st
         "colour images": feed.topic or "none yet",
         "camera": "no camera_info yet" if camera is None else f"{camera.width} x {camera.height}",
         "overtaken while waiting for depth": str(feed.passed),
+        "taken without depth": str(feed.alone),
     }
     return known if found is None else known | _describe_jaw(found)
 

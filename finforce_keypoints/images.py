@@ -239,6 +239,7 @@ class RgbdFeed:
         camera: intrinsics of both images, None until they came.
         frame: of the camera, which all messages must have.
         passed: colour images that were overtaken while they waited.
+        alone: colour images that were taken without depth.
         topic: the colour topic that is listened to, None before the first image.
 
     Args:
@@ -250,7 +251,7 @@ class RgbdFeed:
         self._parameters, self._clock = parameters, clock
         self.camera: CameraIntrinsics | None = None
         self.frame = CameraFrame(parameters.camera_frame)
-        self.passed = 0
+        self.passed = self.alone = 0
         self.topic: str | None = None
         self._heard = clock()
         self.reset()
@@ -309,6 +310,7 @@ class RgbdFeed:
         taken = Stamped(stamp_of(message), self._read_color(message))
         self._learn_period(taken.stamp)
         if self._alone:
+            self.alone += 1
             return [taken]
         self._images.add(_COLOR, taken.stamp, taken.value)
         found, waiting = self._match(), self._images.entries(_COLOR)
@@ -317,6 +319,7 @@ class RgbdFeed:
         if self._parameters.depth == ALIGNED:
             raise self._missing_depth(waiting.popleft().stamp)
         self._alone = True
+        self.alone += 1
         self.passed += len(waiting) - 1
         self._images.reset(_COLOR)
         return [taken]
@@ -364,6 +367,7 @@ class RgbdFeed:
         # more of them, and images come faster than they are looked at
         alone = lost[-1:] if self._parameters.depth == AUTO else []
         self.passed += len(lost) - len(alone)
+        self.alone += len(alone) + (depth.value is None)
         delay = SECOND * (depth.stamp - color.stamp)
         return [*alone, Stamped(color.stamp, replace(color.value, depth=depth.value, depth_delay=delay))]
 

@@ -51,8 +51,8 @@ class DetectorParameters(GripperParameters):
     )
     depth_topic: str = setting(DEPTH_TOPIC, "Topic of depth images, aligned to the colour images", topic=True)
     depth: str = setting(
-        ALIGNED,
-        "Use of depth: aligned (required for every colour image), auto (used where there is some), none",
+        AUTO,
+        "Use of depth: auto (where there is some), aligned (required for every colour image), none",
         choices=DEPTHS,
     )
     info_topic: str = setting(INFO_TOPIC, "Topic of the colour camera's intrinsics", topic=True)

@@ -1,15 +1,24 @@
-"""Fill the tables of the pages in docs/ from the JSON of benchmarks: `tools/fill_pages.py report/*.json`.
+"""Fill the tables of the pages in docs/ from the JSON of benchmarks, and from the parameters that the nodes declare.
+
+    python -m tools.fill_pages report/*.json
 
 A table stands between `<!-- begin NAME -->` and `<!-- end NAME -->`; NAME is its place in the figures, as
-`solvers.tables.tiers`, or `machine.NAME` for what the part NAME was measured on. What no file holds stays as it was.
+`solvers.tables.tiers`, `machine.NAME` for what the part NAME was measured on, or `parameters.NODE`. What is not known
+stays as it was.
 """
 
 import json
 import re
 import sys
 from collections.abc import Mapping
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
+
+from finforce.settings import TimeParameters, describe, is_parameter
+from finforce_contact.parameters import ContactParameters
+from finforce_ifea.parameters import NodeParameters
+from finforce_keypoints.parameters import DetectorParameters
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 _BLOCK = re.compile(r"(<!-- begin (?P<name>\S+) -->\n).*?(<!-- end (?P=name) -->)", re.DOTALL)
@@ -24,6 +33,38 @@ def list_texts(figures: Mapping[str, Any], path: str = "") -> dict[str, str]:
         elif isinstance(value, str):
             texts[f"{path}{name}"] = value
     return texts
+
+
+def list_parameters() -> dict[str, str]:
+    """Return a table of parameters for every node, without those of its parts and those that all nodes have."""
+    records = {
+        "all": TimeParameters,
+        "ifea_solver": NodeParameters,
+        "contact_estimator": ContactParameters,
+        "keypoint_detector": DetectorParameters,
+    }
+    shared = {entry.name for entry in fields(TimeParameters)}
+    return {
+        f"parameters.{node}": "\n".join(
+            [
+                "| parameter | default | meaning |",
+                "|---|---|---|",
+                *(
+                    f"| `{entry.name}` | {_show(entry.default)} | {describe(entry).replace('<', '&lt;')} |"
+                    for entry in filter(is_parameter, fields(record))
+                    if node == "all" or entry.name not in shared
+                ),
+            ]
+        )
+        for node, record in records.items()
+    }
+
+
+def _show(default: Any) -> str:
+    """Return a default as a table shows it."""
+    if isinstance(default, tuple):
+        return ", ".join(f"{part:.4g}" if isinstance(part, float) else f"`{part}`" for part in default if part != "")
+    return "NaN" if default != default else f"`{default}`" if default != "" else ""
 
 
 def describe_machine(machine: Mapping[str, Any]) -> str:
@@ -52,7 +93,7 @@ def fill(page: str, texts: Mapping[str, str]) -> str:
 
 def main() -> None:
     """Read the figures, fill the pages, say which tables stayed as they were."""
-    texts: dict[str, str] = {}
+    texts = list_parameters()
     for name in sys.argv[1:]:
         texts |= read_texts(Path(name))
     for path in sorted(DOCS.glob("*.md")):

@@ -190,3 +190,10 @@ def test_page_takes_its_tables_from_the_figures_and_keeps_what_they_do_not_hold(
     filled = fill_pages.fill(page, texts)
     assert filled == page.replace("old", "| t |", 1)
     assert fill_pages.fill(filled, texts) == filled
+
+
+def test_the_parameters_on_the_page_are_those_that_the_nodes_declare(fill_pages):
+    page = (ROOT / "docs" / "interfaces.md").read_text(encoding="utf-8")
+    texts = fill_pages.list_parameters()
+    assert all(f"<!-- begin {name} -->" in page for name in texts)
+    assert fill_pages.fill(page, texts) == page
