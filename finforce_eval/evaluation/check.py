@@ -26,7 +26,7 @@ from finforce_keypoints.geometry.extrinsics import Extrinsics, SeenJaw, measure_
 from finforce_keypoints.geometry.side_picture import find_side, project_plane
 from finforce_keypoints.geometry.template import find_shape
 from finforce_keypoints.images import RgbdImage
-from finforce_keypoints.parameters import ALIGNED
+from finforce_keypoints.parameters import NO_DEPTH
 
 OK, WARNING, FAULT = "ok", "warning", "fault"
 DARK, BRIGHT = 25.0, 235.0  # of 255: mean brightness beyond which a picture shows little
@@ -135,7 +135,7 @@ def _describe_camera(recording: Recording, depth: str) -> Iterator[Finding]:
     if camera.model == EQUIDISTANT:
         across = np.degrees(camera.width / camera.fx)
     rate = (len(images) - 1) / max(1e-9 * float(images.stamps[-1] - images.stamps[0]), 1e-6)
-    kind = "with depth" if images.has_depth and depth == ALIGNED else "colour alone"
+    kind = "with depth" if images.has_depth and depth != NO_DEPTH else "colour alone"
     yield Finding(
         OK, f"camera {camera.width}x{camera.height}, {camera.model}, {across:.0f} degrees, {rate:.0f} Hz, {kind}"
     )

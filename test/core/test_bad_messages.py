@@ -93,7 +93,7 @@ def test_images_that_announce_more_than_they_hold_are_refused(probe):
     with_step = Image(header=seen, height=2**31, width=2**31, encoding="16UC1", step=2**32 - 1, data=bytes(12))
     for message in (huge, with_step):
         node._on_color(f"{CAMERA}/color/image_raw", message)
-        node._on_depth(message)
+        node._on_depth("depth", message)
     assert len(refused) >= 3, refused
     assert all("20000" in text or "4294967295" in text or "bytes" in text or "encoding" in text for text in refused), (
         refused

@@ -116,7 +116,7 @@ def test_depth_of_an_unsynchronised_camera_is_paired_and_its_delay_known(shift):
 
 def test_a_stated_tolerance_is_kept():
     camera = Camera()
-    camera.feed = RgbdFeed(DetectorParameters(sync_tolerance=0.005))
+    camera.feed = RgbdFeed(DetectorParameters(sync_tolerance=0.005, depth="aligned"))
     camera.feed.take_info(camera_info())
     with pytest.raises(SyncError, match="within 5 ms"):
         pair_up(camera, [(kind, n, 9.0) for n in range(1, 9) for kind in ("color", "depth")])

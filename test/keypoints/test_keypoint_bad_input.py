@@ -21,17 +21,18 @@ def recovers(bench):
 
 
 def test_colour_without_any_depth_is_refused(probe):
-    bench = CameraBench(probe)
-    for _ in range(4):
-        bench.color(time_ns())
+    bench = CameraBench(probe, depth="aligned")
+    first = time_ns()
+    for k in range(8):
+        bench.color(first + k * PERIOD)
     bench.refused(f"no depth image on {TOPICS.depth_topic}", Level.ERROR)
     recovers(bench)
 
 
 def test_depth_that_never_has_the_stamp_of_a_colour_image_is_refused(probe):
-    bench = CameraBench(probe)
+    bench = CameraBench(probe, depth="aligned", sync_tolerance=0.008)
     first = time_ns()
-    for k in range(4):
+    for k in range(8):
         bench.depth(first + k * PERIOD - 12 * MILLISECOND)
         bench.color(first + k * PERIOD)
     bench.refused("12.0 ms away", Level.ERROR)
@@ -104,7 +105,7 @@ def test_depth_of_another_size_is_refused(probe):
 
 
 def test_a_depth_image_without_any_depth_is_refused(probe):
-    bench = CameraBench(probe)
+    bench = CameraBench(probe, depth="aligned")
     bench.shoot(depth=np.zeros((HEIGHT, WIDTH), dtype=np.uint16))
     bench.refused("the depth image is empty", Level.ERROR)
     recovers(bench)
@@ -113,8 +114,8 @@ def test_a_depth_image_without_any_depth_is_refused(probe):
 @pytest.mark.parametrize(
     ("stream", "shape", "kind", "encoding"),
     [
-        ("color", (HEIGHT, WIDTH, 2), np.uint8, "yuv422"),
-        ("color", (HEIGHT, WIDTH), np.uint8, "bayer_rggb8"),
+        ("color", (HEIGHT, WIDTH, 2), np.uint8, "nv24"),
+        ("color", (HEIGHT, WIDTH), np.uint8, "bayer_rggb16"),
         ("depth", (HEIGHT, WIDTH), np.uint16, "8UC2"),
         ("depth", (HEIGHT, WIDTH), np.float64, "64FC1"),
     ],
