@@ -227,7 +227,7 @@ def test_the_step_of_the_depth_image_is_that_of_the_parameter(recording, monkeyp
 
 
 def test_colour_and_depth_belong_together_as_the_parameter_says():
-    assert parse_source(options()).choice.pairing == 8_000_000
+    assert parse_source(options()).choice.pairing is None
     assert parse_source(options(detector=["sync_tolerance=0.012"])).choice.pairing == 12_000_000
 
 
