@@ -312,11 +312,21 @@ class GripperDriverNode(Node):
     def _on_wrench(self, message: WrenchStamped) -> None:
         """Hand the force of an image to the grasp."""
         with self._rejections("force", told=self.session.reject):
+            self._check_source()
             force, stamp = ros.grasp_force(message, self.parameters.base_frame), self._enter("force", message)
             sample = ForceSample(stamp=stamp, arrived=self.gripper.clock.now(), force=force)
             self.session.take_force(sample)
             self.seen = sample
             self._tell_grasp()
+
+    def _check_source(self) -> None:
+        """Reject forces that several nodes publish, by raising TargetError: they may contradict each other."""
+        topic = self.resolve_topic_name("grasp_wrench")
+        if self.count_publishers(topic) > 1:
+            ends = self.get_publishers_info_by_topic(topic)
+            names = sorted({f"{end.node_namespace.rstrip('/')}/{end.node_name}" for end in ends})
+            if len(names) > 1:
+                raise TargetError(f"{topic} is published by {' and '.join(names)}; expected one: stop the others")
 
     def _on_stddev(self, side: str, message: WrenchStamped) -> None:
         """Keep how sure a jaw's force is."""

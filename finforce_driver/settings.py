@@ -247,7 +247,7 @@ class GraspSettings(_Bounded):
         0.0, "Share of the set force that is added while the object slides; 0: none", "", 0.0, 1.0
     )
     motor_force: float = setting(
-        7.5, "Motor limit as grip force by the maker's curve; 2.5 times the set force if that is more", "N", 7.0, 62.0
+        7.5, "Motor limit as grip force by the maker's curve; 1.5 times the set force if that is more", "N", 7.0, 62.0
     )
 
     def check_force(self, force: float) -> float:

@@ -99,7 +99,8 @@ class GripperTasks:
         return "the gripper is active" if on else "the gripper is off, its jaws are limp"
 
     def calibrate(self) -> str:
-        """Find the end stops, and wait for it."""
+        """Find the end stops, and wait for it; refused during a grasp by force."""
+        self._refuse_in_grasp("calibrate")
         self._command(self._gripper.calibrate, "a calibration was commanded")
         state = self._await(lambda state: state.phase is not Phase.CALIBRATING, CALIBRATION_TIMEOUT, self._commands)
         _check(state, "the calibration failed")
@@ -120,6 +121,7 @@ class GripperTasks:
 
     def grasp_without_vision(self) -> str:
         """Close until something resists, by the motor's current alone; return while it is held."""
+        self._refuse_in_grasp("grasp_without_vision")
         given = self._parameters
         least, force = self._gripper.settings.closed_opening, given.motor_force
         state = self.go(MoveRequest(opening=least, speed=given.grasp_speed, force=force), "a grasp without vision")
@@ -164,6 +166,11 @@ class GripperTasks:
             if leave(state := self._gripper.state):
                 return state
         raise GripperTimeoutError(f"the move has no end after {longest:.1f} s")
+
+    def _refuse_in_grasp(self, what: str) -> None:
+        """Raise GripperStateError during a grasp by force: what is held is not to be let go or crushed unasked."""
+        if self._session.runs:
+            raise GripperStateError(f"{what}: a grasp by force is under way; stop or release it first")
 
     def _command(self, command: Callable[[], None], reason: str) -> None:
         """Give a command that ends whatever the gripper was doing."""

@@ -6,6 +6,7 @@ import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
+from statistics import median
 
 from finforce_driver.errors import BackOffError, GraspError, UnseenForceError
 from finforce_driver.grasp.load_watch import NOISE, ForceFeed, ForceSample, JawPosition, LoadWatch, TouchSample
@@ -19,6 +20,9 @@ _RELAXATION = 0.4  # share of the set force that holding may make up for by clos
 _SETTLED = 3  # images at rest without a reason to move after which the force is held
 _SATURATED_AFTER = 1.0  # [s] at the least opening
 _RESERVE_STEPS = 3  # that holding may close in any case
+_WITHIN, _FARTHEST = 0.2, 1.0  # share of the set force, and [N], below it that still hold it; a step may be more
+_FIRST_GRASPS = 9  # that teach how the motor's force goes with the camera's
+_FACTOR, _REST_FRICTION = 1.5, 0.4  # times the camera's force, and [N], that the motor's may be at rest
 _WITNESSED = 0.05  # [s] that the motor's force has to be too large; the current of a motor that starts is, too
 
 
@@ -31,6 +35,7 @@ class ForceGrasp:
         resolution: opening per step of the gripper [m].
         closed_opening: opening of the closed gripper [m].
         stroke: of the gripper [m].
+        ratios: of the camera's force to the motor's in the first grasps of this gripper, which adds its own.
 
     Raises:
         TargetError: the set force is above the limit of the settings.
@@ -44,7 +49,10 @@ class ForceGrasp:
         resolution: float,
         closed_opening: float = 0.0,
         stroke: float = 0.048,
+        ratios: list[float] | None = None,
     ) -> None:
+        self._ratios = [] if ratios is None else ratios
+        self._below, self._doubts = False, 0
         self.goal, self.settings = goal, settings or GraspSettings()
         self.set_force = self.settings.check_force(goal.force)
         self._feed = ForceFeed(self.settings.stale_after)
@@ -116,6 +124,8 @@ class ForceGrasp:
             self._plan.check_power(state)
             fresh = self._drain(state, now, opening_at)
             self._check_witness(state, now)
+            if fresh:
+                self._compare_motor(state)
             self._check_limits(state, now)
             move = self._wait_for_image(state, now)
             if move is None and fresh and math.isnan(self._waits_since):
@@ -165,20 +175,24 @@ class ForceGrasp:
             self.phase = GraspPhase.LOADING if self._load.loaded else GraspPhase.APPROACH
 
     def _wait_for_image(self, state: GripperState, now: float) -> MoveRequest | None:
-        """Return a move that stops the approach where the motor meets something that no image shows yet.
+        """Return a move that stops the jaws where the motor meets something that no image shows yet.
 
-        What free motion takes is learnt from the motor's forces up to each image in which nothing presses.
+        That is more than the force that is expected there and what free motion takes, which is learnt from the motor's
+        forces up to each image.
         """
-        if self.phase is not GraspPhase.APPROACH or not math.isfinite(state.force):
+        if self.phase not in (GraspPhase.APPROACH, GraspPhase.LOADING) or not math.isfinite(state.force):
             self._waits_since = math.nan
             return None
+        loaded = self._load.loaded
+        excess = state.force - (self._load.model.predict(state.opening) if loaded else 0.0)
         if not self._motor or state.stamp > self._motor[-1][0]:
-            self._motor.append((state.stamp, state.force))
+            self._motor.append((state.stamp, excess))
         while self._motor and self._motor[0][0] <= self._feed.stamp:
-            self._free = max(self._free, self._motor.popleft()[1])
+            older = self._motor.popleft()[1]
+            self._free = max(0.0, min(self._free, older)) if loaded else max(self._free, older)
         if self._feed.stamp > self._waits_since:
             self._waits_since = math.nan
-        meets = self._free > 0.0 and state.force > self._free + _MOTOR_ONSET
+        meets = (self._free > 0.0 or loaded) and excess > self._free + _MOTOR_ONSET
         if not meets or not math.isnan(self._waits_since):
             return None
         self._waits_since = now
@@ -218,7 +232,8 @@ class ForceGrasp:
         plan, pressing = self._plan, 0.0 if math.isnan(self._load.force) else self._load.pressing
         got = f"{pressing:.2f} N of {self.set_force:g} N"
         if self.phase is not GraspPhase.HOLDING and now - self._began > self.goal.time_limit:
-            raise GraspError(f"{got} within the time limit of {self.goal.time_limit:g} s")
+            below = f": {self._reason}" if self._below else ""
+            raise GraspError(f"{got} within the time limit of {self.goal.time_limit:g} s{below}")
         if now - self._saturated > _SATURATED_AFTER:
             raise GraspError(f"{got} with the jaws at their least opening, {1e3 * plan.target:.1f} mm")
         if plan.is_late(now, state.opening):
@@ -239,11 +254,11 @@ class ForceGrasp:
         self._plan.note_rest()
         ideal = self._plan.ideal_target(self.set_force)
         target = self._plan.limit(ideal)
-        self._watch(ideal, target, now)
+        self._watch(ideal, target, state, now)
         speed = self._plan.choose_speed(target)
         return self._move(target, speed, state, now) if self._plan.is_worth(target, speed, state.opening) else None
 
-    def _watch(self, ideal: float, target: float, now: float) -> None:
+    def _watch(self, ideal: float, target: float, state: GripperState, now: float) -> None:
         """See whether the force is held, and whether the least opening keeps it from being reached."""
         near = 0.5 * self._plan.step  # openings are multiples of it, but for rounding
         settled = self._load.resting and abs(target - self._plan.target) < near
@@ -252,12 +267,46 @@ class ForceGrasp:
         elif math.isnan(self._saturated):
             self._saturated = now
         held = settled and abs(ideal - target) < near and self._load.loaded
+        if held:
+            held = self._is_near_set_force()
         self._settled = self._settled + 1 if held else 0
         if self._settled >= _SETTLED and self.phase is not GraspPhase.HOLDING:
-            self.phase, self._reason, self._held_at = GraspPhase.HOLDING, "holds the set force", target
+            self.phase, self._held_at = GraspPhase.HOLDING, target
+            if self._load.pressing > 0.0 and state.force > 0.0 and len(self._ratios) < _FIRST_GRASPS:
+                self._ratios.append(self._load.pressing / state.force)
             # as it is now: a force that drifts while the jaws close looks like something that gets softer
             yielded = _RELAXATION * self.set_force / self._load.model.stiffness
             self._reserve = yielded + _RESERVE_STEPS * self._plan.step
+
+    def _is_near_set_force(self) -> bool:
+        """Return whether the force that is held is near to the set one, and say it, or why it is held below."""
+        plan, load, short = self._plan, self._load, self.set_force - self._load.pressing
+        self._below = short > min(_FARTHEST, max(_WITHIN * self.set_force, plan.force_per_step))
+        cause = f"one step of the gripper is {plan.force_per_step:.2f} N"
+        if load.stddev > plan.force_per_step:
+            cause = f"its stated deviation is {load.stddev:.2f} N"
+        self._reason = f"held below the set force by {short:.2f} N: {cause}" if self._below else "holds the set force"
+        return not self._below
+
+    def _compare_motor(self, state: GripperState) -> None:
+        """Refuse a camera that sees, at rest, much less than the motor gives, by what that was in the first grasps.
+
+        Raises:
+            UnseenForceError: that is so in several images.
+        """
+        load, plan = self._load, self._plan
+        if not (
+            load.loaded and load.resting and plan.rests_at(state.stamp, state.opening) and load.opening == plan.target
+        ):
+            return
+        known = state.force * (median(self._ratios) if len(self._ratios) >= _SETTLED else 1.0)
+        low = known > _FACTOR * load.pressing + _REST_FRICTION
+        self._doubts = self._doubts + 1 if low else 0
+        if self._doubts >= _SETTLED:
+            raise UnseenForceError(
+                f"the motor holds {known:.1f} N by its current, the camera says {load.pressing:.2f} N: is the "
+                "camera's calibration off by a factor? The jaws back off"
+            )
 
     def _pause(self, state: GripperState, now: float) -> MoveRequest | None:
         """Return a move that keeps the jaws where they are until the next image says what to think of this one."""
@@ -273,7 +322,7 @@ class ForceGrasp:
     @property
     def _motor_force(self) -> float:
         """The motor's limit [N]: no hindrance to the set force, which both jaws give, and friction takes from."""
-        return max(self.settings.motor_force, 2.5 * self.set_force)
+        return max(self.settings.motor_force, _FACTOR * self.set_force)
 
     def status(self, state: GripperState, now: float) -> GraspStatus:
         """Return the grasp as it is, after an `update` with the same state and time."""
@@ -310,8 +359,10 @@ def check_force_value(force: float, stddev: float = 0.0) -> float:
         stddev: as its source states it [N].
 
     Raises:
-        GraspError: the force is no finite number, or negative.
+        GraspError: the force is no finite number, or negative, or its deviation is.
     """
+    if not 0.0 <= stddev < math.inf:
+        raise GraspError(f"a stated deviation of {stddev} N came, expected a number from 0: holds in place")
     if not math.isfinite(force) or force < -3.0 * max(NOISE, stddev):
         raise GraspError(f"a grasp force of {force} N came, expected a number from 0: holds in place")
     return max(0.0, force)

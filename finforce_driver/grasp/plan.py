@@ -23,6 +23,7 @@ MOTOR_MARGIN = 4.0  # [N] of the motor's force above the camera's, friction incl
 _APPROACH_SHARE = 0.7  # of the set force, that may build up before an image can show the contact
 _TOLERANCE = 0.08  # [N] by which the set force may be passed to come nearer to it
 _LEAST_SPEED = 0.001  # [m/s] slower would only cost time: the target is bounded anyway
+_SLOWEST = 1e-4  # [m/s] however uncertain the force is
 _FEW_STEPS = 3.5  # by which a target may lie ahead of the one that was sent
 _BACK_STEPS = 1.5  # by which it must lie behind while the jaws move, where a step is noise
 _SPEED_CHANGE = 1.25  # ratio at which a new speed is worth a command
@@ -131,7 +132,7 @@ class GraspPlan:
         travel = abs(self._load.opening - target)
         due = self._feed.latency + 1.5 * self._feed.period + self._settings.reaction
         wanted = self._goal.speed if self._load.loaded else min(self._goal.speed, self._settings.approach_speed)
-        return min(wanted * self._confidence, self._blind_speed, max(_LEAST_SPEED, travel / due))
+        return max(_SLOWEST, min(wanted * self._confidence, self._blind_speed, max(_LEAST_SPEED, travel / due)))
 
     @property
     def _blind_speed(self) -> float:

@@ -100,6 +100,7 @@ class GraspSession:
         self._touch_told = -math.inf
         self._stddevs: dict[str, tuple[float, float]] = {}
         self._slips = SlipGuard(settings)
+        self._ratios: list[float] = []
         self._changed = Condition()
 
     @property
@@ -131,6 +132,7 @@ class GraspSession:
                 resolution=gripper.resolution,
                 closed_opening=gripper.settings.closed_opening,
                 stroke=gripper.settings.stroke,
+                ratios=self._ratios,
             )
             self._slips.begin(self.goal.force)
             self.status = None

@@ -542,7 +542,7 @@ class GripperMachine(Drive):
     def _meet_order(self, what: str, drives: bool) -> None:
         """Answer another program's order: one that moves the jaws takes them from us."""
         if drives:
-            self._lose_place(OTHER_MASTER.format(what=what), self.known.driving)
+            self._lose_place(f"another program commands this gripper ({what})", self.known.driving)
         else:
             self._yield_to_other(what)
 

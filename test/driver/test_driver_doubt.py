@@ -131,9 +131,36 @@ def test_an_object_stiffer_than_the_settings_say_is_held_or_let_go_and_never_cru
     world, course = press(10_000.0, variant, latency=latency)
     assert max(course.forces) < 3.0 + 0.9 * 10_000.0 * STEP  # less than a step of the gripper beyond; it was 5.5 N
     if course.error:
-        assert "largest_stiffness" in course.error or "fell to" in course.error
+        assert any(words in course.error for words in ("largest_stiffness", "fell to", "held below the set force"))
     else:
         assert course.forces[-1] < 3.1
+
+
+@pytest.mark.parametrize(("rise", "most"), [(10.0, 7.5), (30.0, 8.6)])
+def test_an_object_that_bottoms_out_gets_little_more_than_a_step_adds(variant, rise, most):
+    def force_at(opening):
+        way = max(0.0, 0.025 - opening)
+        return 1000.0 * (min(way, 0.0025) + rise * max(0.0, way - 0.0025))
+
+    plant = Plant(name="bottoms out", force_at=force_at)
+    world = World(
+        GraspCase(plant=plant, force=5.0, speed=0.004, latency=0.06, seed=1, variant=variant), NoisySensor(0.05, 1)
+    )
+    assert 3.0 < max(world.run().forces) < most  # it was 7 to 14 N
+
+
+def test_a_force_that_is_too_uncertain_to_be_reached_is_no_success():
+    course = build(5.0, stddev=4.0).run(25.0)
+    assert not any(status.phase is GraspPhase.HOLDING for status in course.statuses)
+    assert course.status.failed and course.peak < 5.0
+    assert "held below the set force" in course.status.reason
+    assert "its stated deviation is 4.00 N" in course.status.reason
+
+
+@pytest.mark.parametrize("stddev", [float("inf"), float("nan"), -0.1])
+def test_a_stated_deviation_that_is_no_number_ends_the_grasp(stddev):
+    course = build(stddev=stddev).run(2.0)
+    assert course.status.failed and "a stated deviation of" in course.status.reason
 
 
 def test_a_wall_is_let_go_with_the_setting_named(variant):

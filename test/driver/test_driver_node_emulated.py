@@ -149,7 +149,7 @@ def test_another_program_that_commands_the_gripper_is_named(bench):
     bench.probe.wait_for(lambda: abs(bench.gripper.jaws.opening - 0.03) < 2 * STEP)
     with bench.port.lock:
         bench.port.adapter.put_on_bus(CanMessage(id=0x07A, data=bytes([0x40, 0x80, 0x01, 0xF4, 0xC0])))
-    bench.diagnosis(Level.WARN, "another program")
+    bench.diagnosis(Level.ERROR, "another program")
 
 
 BAD_COMMANDS = {

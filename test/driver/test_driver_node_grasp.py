@@ -5,6 +5,7 @@ from time import time_ns
 
 import numpy as np
 import pytest
+import rclpy
 from driver_node_fakes import (
     COMMAND,
     GOAL,
@@ -64,6 +65,21 @@ def test_a_force_that_cannot_be_is_named_and_not_used(probe, name):
     out.publish(make())
     gripper_state(probe, None, words)
     assert gripper.calls == []
+
+
+def test_forces_of_two_nodes_are_refused_with_both_names(probe):
+    gripper, node = driver(probe)
+    gripper.reply()
+    out = probe.speak("grasp_wrench", WrenchStamped)
+    second = rclpy.create_node("second_solver", context=probe.context)
+    try:
+        second.create_publisher(WrenchStamped, "grasp_wrench", ros.RESULT)
+        probe.wait_for(lambda: node.count_publishers("/grasp_wrench") == 2)
+        out.publish(wrench(1.0))
+        gripper_state(probe, None, "published by /probe and /second_solver")
+        assert node.seen is None
+    finally:
+        second.destroy_node()
 
 
 def test_a_grasp_closes_with_the_forces_and_says_how_it_is(probe):

@@ -136,7 +136,6 @@ class Grasping:
     [
         ("stop", "stopped by command", "hold"),
         ("estop", "emergency stop", "estop"),
-        ("calibrate", "calibration", "calibrate"),
         ("release", "release was commanded", "move"),
         ("close", "the driver ends", "move"),
     ],
@@ -150,6 +149,21 @@ def test_another_command_ends_a_grasp(name, words, last):
         assert not grasp.session.runs
         assert grasp.gripper.calls[-1][0] == last
         assert grasp.session.status.phase is GraspPhase.STOPPED
+
+
+@pytest.mark.parametrize("name", ["calibrate", "grasp_without_vision"])
+def test_what_would_let_go_or_crush_what_a_grasp_holds_is_refused_until_it_is_stopped(name):
+    with Grasping() as grasp:
+        before = list(grasp.gripper.calls)
+        with pytest.raises(GripperStateError, match=f"{name}: a grasp by force is under way; stop or release it first"):
+            getattr(grasp.tasks, name)()
+        assert grasp.session.runs and grasp.gripper.calls == before
+        grasp.tasks.stop()
+        assert grasp.refusal()
+        with Caller(getattr(grasp.tasks, name)) as other:
+            other.wait_for(lambda: grasp.gripper.calls[-1][0] in ("calibrate", "move"))
+            grasp.gripper.reply(phase=Phase.READY, outcome=MoveOutcome.GRASPED)
+            other.result()
 
 
 def test_a_command_that_is_refused_leaves_a_grasp_as_it_was():

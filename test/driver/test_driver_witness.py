@@ -1,9 +1,15 @@
 """Claims about the motor's current as a second witness of the force; the true force on the object is the judge."""
 
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
+from grasp_fakes import STEP
 
-from finforce_driver.state import Phase
+from finforce_driver.errors import UnseenForceError
+from finforce_driver.grasp.controller import ForceGrasp
+from finforce_driver.settings import GraspGoal
+from finforce_driver.state import GripperState, Phase
 from lab.experiments.grasp_world import GraspCase, NoisySensor, Plant, World, build_spring
 
 
@@ -30,6 +36,33 @@ def grasp(sensor, *, stiffness, force, variant, speed=0.004):
     with np.errstate(all="ignore"):
         world.gripper.wait(lambda state: state.phase is Phase.READY, 10.0)
     return world, course
+
+
+class LowSensor(NoisySensor):
+    """A camera that sees half of the force."""
+
+    def measure(self, stamp, force, opening):
+        return 0.5 * super().measure(stamp, force, opening)
+
+
+@pytest.mark.parametrize("force", [2.0, 3.0, 5.0])
+def test_a_camera_that_reads_half_is_noticed_at_rest(variant, force):
+    world, course = grasp(LowSensor(0.05, 1), stiffness=800.0, force=force, variant=variant)
+    assert "calibration off by a factor" in course.error
+    assert max(course.forces) < 4.5 and world.force < 1.0
+
+
+@pytest.mark.parametrize(("ratios", "noticed"), [([], True), ([0.7] * 2, True), ([0.7] * 3, False)])
+def test_the_motor_is_compared_by_what_the_first_grasps_taught(ratios, noticed):
+    grasp = ForceGrasp(GraspGoal(force=3.0), resolution=STEP, ratios=ratios)
+    grasp._load.loaded = grasp._load.resting = True
+    grasp._load.model.begin(0.02, 3.0, 0.0)
+    grasp._load.opening = grasp._plan.target = 0.02
+    grasp._plan._arrives = 0.0
+    state = GripperState(phase=Phase.READY, stamp=1.0, opening=0.02, force=6.0)
+    with pytest.raises(UnseenForceError, match="the motor holds 6.0 N") if noticed else nullcontext():
+        for _ in range(3):
+            grasp._compare_motor(state)
 
 
 @pytest.mark.parametrize("stiffness", [400.0, 1300.0])
