@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import atexit
 import hashlib
 import os
 import shutil
+import stat
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from functools import cache
 from pathlib import Path
+from tempfile import mkdtemp
+
+from finforce.errors import FinforceError
 
 # Packages whose functions are compiled, and days after which what nobody has used is removed.
 _COMPILED = ("finforce", "finforce_contact", "finforce_ifea", "finforce_keypoints")
@@ -17,12 +23,54 @@ _UNUSED = 30.0
 ROOT = Path(__file__).parents[1]
 
 
+class CacheError(FinforceError, PermissionError):
+    """Others can write into the folder of the cache, from which compiled code is run."""
+
+
 def cache_folder() -> Path:
-    """Return the folder of the cache, which may not exist yet: FINFORCE_CACHE, else `finforce` in the user's own."""
+    """Return the folder of the cache, which may not exist yet: FINFORCE_CACHE, else `finforce` in the user's own.
+
+    Raises:
+        CacheError: others can write there, or into a folder above it.
+    """
     named = os.environ.get("FINFORCE_CACHE")
-    if named:
-        return Path(named)
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "finforce"
+    folder = Path(named) if named else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "finforce"
+    refuse_foreign(folder)
+    return folder
+
+
+def refuse_foreign(folder: Path) -> None:
+    """Refuse a folder that others could have put something into, as ssh refuses a file of keys.
+
+    Raises:
+        CacheError: it, what lies in it, or a folder above it is another user's, or open to the group or to all; above
+            it root's folders count as one's own, and such as /tmp, where nobody can touch what is another's.
+    """
+    folder = folder.resolve()
+    for path in (folder, *folder.parents):
+        try:
+            state = path.stat()
+        except OSError:
+            continue
+        above = path != folder
+        writers = stat.S_IWOTH if _is_own_group(state.st_gid) else stat.S_IWGRP | stat.S_IWOTH
+        is_open = state.st_mode & writers and not (above and state.st_mode & stat.S_ISVTX)
+        if is_open or state.st_uid not in ({os.geteuid(), 0} if above else {os.geteuid()}):
+            raise CacheError(
+                f"{path}: others can write there, and code is run from the cache {folder}; expected a folder of your "
+                "own: chmod go-w, or another FINFORCE_CACHE"
+            )
+
+
+def _is_own_group(number: int) -> bool:
+    """Say whether a group is the user's own, as Debian gives one to everybody."""
+    import grp
+    import pwd
+
+    with suppress(KeyError):
+        group, user = grp.getgrgid(number), pwd.getpwuid(os.geteuid()).pw_name
+        return group.gr_name == user and set(group.gr_mem) <= {user}
+    return False
 
 
 def keep_compiled() -> None:
@@ -32,13 +80,20 @@ def keep_compiled() -> None:
     Called before anything is compiled; a folder that cannot be written leaves Numba to its own choice.
     """
     if os.environ.get("NUMBA_CACHE_DIR"):
-        return
-    folder = cache_folder() / "compiled" / _name_sources(ROOT)
+        return _remove_truncated(Path(os.environ["NUMBA_CACHE_DIR"]))
+    try:
+        folder = cache_folder() / "compiled" / _name_sources(ROOT)
+        refuse_foreign(folder)
+    except CacheError as error:
+        print(f"finforce: {error}; compiled code is kept for this process alone", file=sys.stderr)
+        folder = Path(mkdtemp(prefix="finforce_"))
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
     with suppress(OSError, RuntimeError):
         if not folder.is_dir():
-            folder.mkdir(parents=True, exist_ok=True)
+            folder.mkdir(parents=True, exist_ok=True, mode=0o700)
             _remove_unused(folder.parent)
         os.utime(folder)
+        _remove_truncated(folder)
     os.environ["NUMBA_CACHE_DIR"] = str(folder)
     if "numba" in sys.modules:
         sys.modules["numba"].config.CACHE_DIR = str(folder)
@@ -70,6 +125,17 @@ def _name_sources(root: Path) -> str:
             state = path.stat()
             digest.update(f"{path} {state.st_size} {state.st_mtime_ns}".encode())
     return digest.hexdigest()[:16]
+
+
+@cache
+def _remove_truncated(folder: Path) -> None:
+    """Remove compiled code that was cut off, by a full disk or a crash: a pickle ends with a point."""
+    for path in folder.rglob("*.nb[ci]"):
+        with suppress(OSError), path.open("rb") as file:
+            file.seek(0, os.SEEK_END)
+            file.seek(max(0, file.tell() - 1))
+            if file.read(1) != b".":
+                path.unlink()
 
 
 def _remove_unused(parent: Path) -> None:

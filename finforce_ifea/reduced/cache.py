@@ -10,7 +10,7 @@ import logging
 import os
 import struct
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import fields, replace
 from pathlib import Path
@@ -21,7 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from finforce.caches import cache_folder, locked
+from finforce.caches import CacheError, cache_folder, locked
+from finforce.files import check_plain
 from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics
 from finforce_ifea.fem.frame import FrameModel
 from finforce_ifea.fem.plane import PlaneModel
@@ -33,9 +34,11 @@ from finforce_ifea.reduced.equilibria import Manifold
 from finforce_ifea.reduced.evaluation import ReducedContact, ReducedModel, scale_manifold
 
 # To be raised when what is stored, or how it is found, changes.
-VERSION = 6
+VERSION = 7
 # What reading a damaged archive raises, one or the other by where the damage is.
 _UNREADABLE = (OSError, ValueError, KeyError, EOFError, RuntimeError, BadZipFile, struct.error, zlib.error)
+# Share by which loads and motions of the first equilibria may differ by their compliances: right ones reach 0.001.
+LARGEST_MISS = 0.05
 # By name and modulus [Pa]; two jaws of a gripper are each other's mirror image, for which the equilibria are the same.
 _SHARED: WeakValueDictionary[tuple[str, float], Manifold] = WeakValueDictionary()
 _LOG = logging.getLogger(__name__)
@@ -57,7 +60,11 @@ def fetch_manifold(key: str, build: Callable[[], Manifold]) -> Manifold:
 
     A folder that cannot be written costs a warning and the time to build anew.
     """
-    path = cache_folder() / f"{key}.npz"
+    try:
+        path = cache_folder() / f"{key}.npz"
+    except CacheError as error:
+        _LOG.warning("%s; the equilibria are built anew", error)
+        return build()
     found = _read(path)
     if found is not None:
         return found
@@ -70,10 +77,13 @@ def fetch_manifold(key: str, build: Callable[[], Manifold]) -> Manifold:
 
 
 def _read(path: Path) -> Manifold | None:
-    """Return a stored manifold, None when there is none that can be read."""
+    """Return a stored manifold, None when there is none that can be read, or it is not what its name says."""
     try:
+        if path.exists():
+            check_plain(path)
         with np.load(path, allow_pickle=False) as stored:
             values = {field.name: stored[field.name] for field in fields(Manifold)}
+            _check(values, str(stored["key"]), path.stem)
     except FileNotFoundError:
         return None
     except _UNREADABLE as error:
@@ -81,6 +91,16 @@ def _read(path: Path) -> Manifold | None:
         return None
     values["young_modulus"] = float(values["young_modulus"])
     return Manifold(**values)
+
+
+def _check(values: Mapping[str, NDArray], key: str, expected: str) -> None:
+    """Refuse what is stored under another jaw's name, or is no set of equilibria; raises ValueError."""
+    if key != expected:
+        raise ValueError(f"they are those of {key}")
+    loads, moves = (np.diff(values[name][:2], axis=0)[0] for name in ("loads", "moves"))
+    miss = np.einsum("zij,zj->zi", values["compliance"][:2].mean(axis=0), loads) - moves
+    if not np.median(np.linalg.norm(miss, axis=1)) <= LARGEST_MISS * np.median(np.linalg.norm(moves, axis=1)):
+        raise ValueError("their loads, motions and compliances do not fit each other")
 
 
 def _write(path: Path, manifold: Manifold) -> None:
@@ -91,7 +111,7 @@ def _write(path: Path, manifold: Manifold) -> None:
         for left in path.parent.glob(f"{path.stem}.*.part"):
             left.unlink(missing_ok=True)
         with part.open("wb") as file:
-            np.savez(file, **{field.name: getattr(manifold, field.name) for field in fields(Manifold)})
+            np.savez(file, key=path.stem, **{field.name: getattr(manifold, field.name) for field in fields(Manifold)})
         os.replace(part, path)
     except OSError as error:
         with suppress(OSError):

@@ -70,3 +70,41 @@ def test_a_first_start_is_known_by_its_empty_cache(cache):
     (folder,) = cache.iterdir()
     (folder / "kernels.1.nbc").touch()
     assert caches.is_compiled()
+
+
+@pytest.mark.parametrize("place", ["cache", "above"])
+def test_a_cache_that_others_can_write_is_not_used(place, tmp_path, monkeypatch, capsys):
+    above = tmp_path / "above"
+    folder = above / "cache"
+    folder.mkdir(parents=True, mode=0o700)
+    monkeypatch.setenv("FINFORCE_CACHE", str(folder))
+    assert caches.cache_folder() == folder
+    (folder if place == "cache" else above).chmod(0o777)
+    with pytest.raises(caches.CacheError, match=f"{place}: others can write there"):
+        caches.cache_folder()
+    above.chmod(0o1777)
+    if place == "above":  # as in /tmp, nobody can replace what is another's
+        assert caches.cache_folder() == folder
+
+
+def test_compiled_code_in_a_folder_of_others_is_left_alone(cache, capsys):
+    cache.parent.chmod(0o777)
+    caches.keep_compiled()
+    assert "others can write there" in capsys.readouterr().err
+    assert not cache.exists() and not os.environ["NUMBA_CACHE_DIR"].startswith(str(cache.parent))
+
+
+def test_a_cache_of_another_user_is_refused(cache, monkeypatch):
+    monkeypatch.setattr(os, "geteuid", lambda: os.stat(cache.parent).st_uid + 1)
+    with pytest.raises(caches.CacheError):
+        caches.cache_folder()
+
+
+def test_compiled_code_that_was_cut_off_is_removed(cache):
+    caches.keep_compiled()
+    (folder,) = cache.iterdir()
+    for name, content in (("whole.nbi", b"pickled."), ("cut.nbi", b"pick"), ("empty.1.nbc", b"")):
+        (folder / name).write_bytes(content)
+    caches._remove_truncated.cache_clear()
+    caches.keep_compiled()
+    assert [path.name for path in folder.iterdir()] == ["whole.nbi"]

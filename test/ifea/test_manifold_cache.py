@@ -38,7 +38,12 @@ class Builder:
     def __call__(self):
         self.count += 1
         names = [field.name for field in fields(Manifold) if field.name != "young_modulus"]
-        return Manifold(young_modulus=2.5e7, **{name: np.full((2, 3), float(self.count)) for name in names})
+        values = dict.fromkeys(names, np.full((2, 3), float(self.count)))
+        loads = np.arange(16.0).reshape(2, 4, 2) * self.count
+        compliance = np.broadcast_to(0.5 * np.eye(2), (2, 4, 2, 2))
+        return Manifold(
+            young_modulus=2.5e7, **values | {"loads": loads, "moves": 0.5 * loads, "compliance": compliance}
+        )
 
 
 def test_second_request_finds_what_the_first_has_built(folder):
@@ -188,3 +193,27 @@ def test_equilibria_are_the_same_of_one_process_and_of_two(name, solver, monkeyp
     stretched = [manifold.shapes @ manifold.basis.T for manifold in (alone, shared)]
     np.testing.assert_allclose(*stretched, rtol=0, atol=1e-6 * np.abs(stretched[0]).max())
     assert told == sorted(told) and told[-1] == 1.0
+
+
+def test_equilibria_of_another_jaw_or_with_other_loads_are_built_anew(folder, caplog):
+    build = Builder()
+    right = fetch_manifold(KEY, build)
+    path = folder / f"{KEY}.npz"
+    path.rename(folder / "other.npz")
+    with caplog.at_level(logging.WARNING):
+        fetch_manifold("other", build)
+    assert build.count == 2 and f"those of {KEY}" in caplog.text
+    doubled = {field.name: getattr(right, field.name) for field in fields(Manifold)} | {"loads": 2.0 * right.loads}
+    np.savez(path, key=KEY, **doubled)
+    with caplog.at_level(logging.WARNING):
+        assert fetch_manifold(KEY, build).moves[1, 0, 0] == 3.0 * right.moves[1, 0, 0]
+    assert build.count == 3 and "do not fit each other" in caplog.text
+
+
+def test_a_folder_that_others_can_write_is_neither_read_nor_written(folder, caplog):
+    folder.mkdir(mode=0o700)
+    fetch_manifold(KEY, build := Builder())
+    folder.chmod(0o777)
+    with caplog.at_level(logging.WARNING):
+        fetch_manifold(KEY, build)
+    assert build.count == 2 and "others can write there" in caplog.text
