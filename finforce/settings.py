@@ -111,7 +111,8 @@ def check_value(entry: Field, value: Any, error: type[Exception] = ParameterErro
     if value != value and _may_be_nan(entry):
         return
     if (low is not None and not value >= low) or (high is not None and not value <= high):
-        unit = f" {entry.metadata['unit']}" if entry.metadata.get("unit") else ""
+        unit = entry.metadata.get("unit") or "1"
+        unit = "" if unit == "1" else f" {unit}"
         bounds = f"at least {low:g}" if high is None else f"at most {high:g}" if low is None else f"{low:g} to {high:g}"
         raise error(f"{name}: got {value!r}, expected {bounds}{unit}")
 

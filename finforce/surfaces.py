@@ -88,11 +88,24 @@ def _load_cells(path: Path) -> tuple[NDArray, Cells]:
     return content.points, [(block.type, block.data) for block in content.cells]
 
 
+def _refuse_other_kinds(content: bytes) -> None:
+    """Refuse by name what has the ending of a mesh and is none, or one of a version that is not read."""
+    if content[:4] == b"glTF" and content[4:8] == b"\1\0\0\0":
+        raise FileError("is glTF 1.0, expected 2.0: export it anew, from Blender as one")
+    if content[:3] == b"ply":
+        header = content[: content.find(b"end_header")]
+        if b"f_dc_0" in header:
+            raise FileError("holds Gaussian splats, expected triangles: `finforce reconstruct --mesh` takes them")
+        if b"element face" not in header and b"element tristrips" not in header:
+            raise FileError("is a point cloud, expected triangles: reconstruct its surface, as MeshLab does")
+
+
 def _load_triangles(path: Path) -> tuple[NDArray, NDArray]:
     """Return vertices and triangles; without the file's name, its content leads to no other file."""
     content, kind = read_bytes(path, LARGEST), path.suffix[1:].lower()
     if not content:
         raise FileError(f"got 0 bytes, expected a whole .{kind} file: export it again")
+    _refuse_other_kinds(content)
     scene = import_trimesh().load_scene(io.BytesIO(content), file_type=kind, process=False, skip_materials=True)
     mesh = scene.to_mesh()
     vertices, triangles = np.array(mesh.vertices, dtype=float), np.array(mesh.faces, dtype=np.int64)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from manifold3d import Manifold
 
 UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "inch": 0.0254}
-FORMATS = (".stl", ".obj", ".ply", ".glb")
+FORMATS = (".stl", ".obj", ".ply", ".off", ".glb", ".3mf", ".step", ".stp")
 SMALLEST, LARGEST = 0.005, 0.6  # [m], largest extent of what a gripper of 50 mm stroke holds by some part
 THINNEST = 1e-4  # [m], a mesh that is thinner is a sheet, and has no inside
 FARTHEST = 1.0  # [m], of a vertex from the origin of its frame; poses are of that origin, and turn about it
@@ -315,9 +315,16 @@ def _check_size(vertices: NDArray, triangles: NDArray, name: str, unit: str) -> 
     extent = float(np.ptp(vertices[triangles].reshape(-1, 3), axis=0).max())
     if SMALLEST <= extent * UNITS[unit] <= LARGEST:
         return
-    sizes = {other: extent * factor for other, factor in UNITS.items() if SMALLEST <= extent * factor <= LARGEST}
+    is_metric = name.lower().endswith(".glb")  # metres by the standard: what is no such size is of any scale
+    sizes = (
+        {}
+        if is_metric
+        else {other: extent * factor for other, factor in UNITS.items() if SMALLEST <= extent * factor <= LARGEST}
+    )
     likely = sorted(sizes.items(), key=lambda item: abs(np.log(item[1] / _COMMON)))
     advice = "no unit makes it so; scale it, or remove what lies far from the object"
+    if is_metric:
+        advice = "a GLB is in metres by its standard, this one has a scale of its own: scale it to the object's size"
     if likely:
         named = ", or ".join(f'unit="{other}" ({size * 1e3:.0f} mm)' for other, size in likely)
         advice = f"the file is likely in another unit: {named}"

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from finforce.camera import CameraIntrinsics, check_depth, check_mask, compute_rays
 from finforce_contact.errors import ReconstructionError
-from finforce_contact.mesh.object_mesh import ObjectMesh
+from finforce_contact.mesh.object_mesh import LARGEST, ObjectMesh
 from finforce_contact.mesh.views import MeshView
 
 EDGE_BAND = 2  # [px] along the mask's edge and around holes, where pixels fly between object and background
@@ -20,6 +20,7 @@ SMOOTHING = 5  # [px] window over which depth is averaged
 ROUGHNESS = 6e-3  # [m] of depth within a window, above which it holds a step
 STEEPEST = 3.0  # tangent of the angle between ray and normal up to which a slope is no step
 LEAST_POINTS = 50
+FARTHEST_OBJECT = 2.0  # [m]; beyond, the noise of depth cameras is as large as what a gripper holds
 POINT_COUNT = 2000
 OCCLUSION_STEP = 6e-3  # [m] by which what lies beyond the outline is nearer when it hides the object
 OUTSIDE_REACH = 4  # [px] beyond the outline where that is looked for
@@ -62,12 +63,20 @@ def collect_evidence(depth: NDArray, mask: NDArray, camera: CameraIntrinsics) ->
 
     Raises:
         ImageError: the sizes differ, the mask is empty, or too few of its pixels have a depth.
+        ReconstructionError: the object is farther away or larger than what a gripper holds.
     """
     check_depth(depth, camera)
     depth = np.where(np.nan_to_num(depth) > 0.0, depth, np.nan).astype(float)
     check_mask(mask, depth, least=LEAST_POINTS)
     mask = np.asarray(mask, dtype=bool)
     points = _smooth_points(depth, mask, camera)
+    away, across = float(np.median(points[:, 2])), float(np.ptp(points[:, :2], axis=0).max())
+    if away > FARTHEST_OBJECT or across > LARGEST:
+        raise ReconstructionError(
+            f"the object is {away:.2f} m away and {across:.2f} m across; expected at most {FARTHEST_OBJECT:g} m and "
+            f"{LARGEST:g} m: does a step of its depth mean so much? TUM's is 0.2 mm (--depth-scale 0.0002), that of "
+            "many BOP sets 0.1 mm; are mask and intrinsics of this image?"
+        )
     distance = _edge_distance(mask)
     return ImageEvidence(
         camera=camera,
@@ -165,8 +174,8 @@ def score_shape(view: MeshView, affine: NDArray, evidence: ImageEvidence, step: 
     covered = np.isfinite(seen.depth)
     with np.errstate(invalid="ignore"):
         is_hidden = depth < seen.depth - HIDING_STEP
-    # the mesh may go on where nothing was measured or something nearer is, and nowhere else
-    excess = covered & ~mask & ~is_hidden & np.isfinite(depth)
+    # the mesh may go on where something nearer is, and nowhere else: that nothing was measured there hides nothing
+    excess = covered & ~mask & ~is_hidden
     both = covered & mask
     offsets = (depth - seen.depth)[covered] * _normal_shares(seen.points, seen.normals)
     offsets = offsets[both[covered]]

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from finforce.camera import MILLIMETRE
 from finforce.optional import import_trimesh
 from finforce_contact.reconstruction.evidence import GeneratedMesh, ImageEvidence, Reconstruction, collect_evidence
 from finforce_contact.reconstruction.generated import read_generated as read_mesh
@@ -26,8 +27,10 @@ OUTPUTS = (".stl", ".ply", ".glb")
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
     parser.add_argument("--depth", required=True, metavar="FILE", help="16-bit PNG [mm], or .npy [m]")
+    text = "one step of a 16-bit depth image [m]: 0.0002 of TUM, 0.0001 of many BOP sets (0.001)"
+    parser.add_argument("--depth-scale", type=float, default=MILLIMETRE, metavar="METRES", help=text)
     parser.add_argument("--mask", required=True, metavar="FILE", help="the object's pixels: picture or .npy")
-    intrinsics = "fx fy cx cy [k1 k2 p1 p2 k3] in pixels, or a JSON or YAML file"
+    intrinsics = "fx fy cx cy [k1 k2 p1 p2 k3] in pixels, or a file of ROS, OpenCV, kalibr, BOP or OpenICC"
     parser.add_argument("--intrinsics", required=True, nargs="+", metavar="NUMBER", help=intrinsics)
     parser.add_argument("--color", metavar="FILE", help="colour picture, for the picture that is written")
     parser.add_argument(
@@ -74,6 +77,8 @@ def check_options(options: argparse.Namespace) -> None:
     Raises:
         OptionError: they do not.
     """
+    if not 1e-6 <= options.depth_scale <= 1.0:
+        raise OptionError(f"--depth-scale {options.depth_scale:g}: expected metres for a step, 0.001 of most cameras")
     if Path(options.output).suffix.lower() not in OUTPUTS:
         raise OptionError(f"-o {options.output}: expected a name that ends in {', '.join(OUTPUTS)}")
     if bool(options.mesh) != bool(options.pose):
@@ -90,7 +95,7 @@ def read_evidence(options: argparse.Namespace) -> tuple[ImageEvidence, NDArray |
     Raises:
         FinforceError: an image cannot be used.
     """
-    depth, mask = read_depth(options.depth), read_mask(options.mask)
+    depth, mask = read_depth(options.depth, options.depth_scale), read_mask(options.mask)
     color = read_image(options.color) if options.color else None
     if color is not None and (color.ndim != 3 or color.shape[:2] != depth.shape):
         raise OptionError(f"{options.color}: shape {color.shape}; expected colour of the depth's size, {depth.shape}")

@@ -14,11 +14,13 @@ from scipy.spatial.transform import Rotation
 from finforce.camera import EQUIDISTANT, CameraIntrinsics, ImageError
 from finforce.errors import FinforceError, one_line
 from finforce.gripper_frames import HALF_TURN, OpeningRange, jaw_in_camera
+from finforce.messages import NANOSECONDS
 from finforce.optional import import_cv2
 from finforce.transforms import invert_pose, move_pose, pose_numbers, rotation_between
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.at_rest import JawsAtRest, approach
 from finforce_eval.evaluation.keypoint_source import KeypointSource, build_records, choose_images
+from finforce_eval.recordings.images import ImageTrack
 from finforce_eval.recordings.tracks import Recording
 from finforce_ifea.jaw.jaw import Jaw, list_shipped_jaws, load_jaw
 from finforce_keypoints.errors import KeypointError
@@ -199,14 +201,20 @@ def fit_focal(jaws: Mapping[str, SeenJaw], camera: CameraIntrinsics, found: Extr
 
 
 def _find_reasons(mean: RgbdImage, source: KeypointSource, recording: Recording, guess: NDArray) -> list[Finding]:
-    """Return which other reading of picture, extrinsics or jaw file shows the jaws better."""
+    """Return which other reading of picture, extrinsics or jaw file shows the jaws better.
+
+    A network likes what has some likeness to a finger; named is a reading whose key points lie as the jaw file says.
+    """
     own = _score(mean, source, recording, guess)
-    best, words = own, ""
-    for text, image, pose, jaw_file in _readings(mean, source, guess):
-        likelihood = _score(image, replace(source, jaw_file=jaw_file), recording, pose)
-        best, words = max((best, words), (likelihood, text), key=lambda entry: entry[0])
-    if best > max(own + BETTER, ENOUGH):
-        return [Finding(FAULT, f"the jaws show (likelihood {best:.2f} instead of {own:.2f}) if {words}")]
+    scored = [
+        (_score(image, replace(source, jaw_file=jaw_file), recording, pose), words, image, pose, jaw_file)
+        for words, image, pose, jaw_file in _readings(mean, source, guess)
+    ]
+    for likelihood, words, image, pose, jaw_file in sorted(scored, key=lambda entry: -entry[0]):
+        if likelihood <= max(own + BETTER, ENOUGH):
+            break
+        if _lies_as_drawn(replace(recording, images=_OneImage(image, recording.images)), source, pose, jaw_file):
+            return [Finding(FAULT, f"the jaws show (likelihood {likelihood:.2f} instead of {own:.2f}) if {words}")]
     return [
         Finding(
             WARNING,
@@ -214,6 +222,32 @@ def _find_reasons(mean: RgbdImage, source: KeypointSource, recording: Recording,
             "another shipped finger: are the jaws in view, lit, and within some 15 mm of where the extrinsics say?",
         )
     ]
+
+
+class _OneImage:
+    """One image in place of the images of a recording."""
+
+    def __init__(self, image: RgbdImage, images: ImageTrack) -> None:
+        self.image, self.camera = image, image.camera
+        self.frame_id, self.has_depth, self.is_video = images.frame_id, False, images.is_video
+
+    def __len__(self) -> int:
+        return 1
+
+    def __iter__(self) -> Iterator[tuple[int, RgbdImage]]:
+        yield round(self.image.stamp * NANOSECONDS), self.image
+
+
+def _lies_as_drawn(recording: Recording, source: KeypointSource, pose: NDArray, jaw_file: str) -> bool:
+    """Say whether both jaws are found, with their key points where the jaw file has them, seen from one camera."""
+    jaws = {side: load_jaw(jaw_file, side) for side in recording.jaws}
+    here = replace(source, jaw_file=jaw_file, parameters={**source.parameters, "depth": NO_DEPTH})
+    try:
+        found, look = approach(recording, here, jaws, pose)
+    except FinforceError:
+        return False
+    seen = min(np.isfinite(jaw.pixels).all(axis=1).mean() for jaw in look.jaws.values())
+    return found.residual <= GOOD_RESIDUAL and seen >= ENOUGH
 
 
 def _readings(image: RgbdImage, source: KeypointSource, T: NDArray) -> Iterator[tuple[str, RgbdImage, NDArray, str]]:

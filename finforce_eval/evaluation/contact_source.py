@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -106,11 +109,22 @@ def build_estimator(choice: ContactChoice, mode: str, recording: Recording, jaw:
         MissingDependencyError: a library that reads or cuts meshes is not installed.
     """
     from finforce_contact.estimator import ContactEstimator
-    from finforce_contact.mesh.object_mesh import load_object_mesh
     from finforce_contact.parameters import ContactSettings
 
-    body = load_object_mesh(require_mesh(recording, choice.object_file), unit=choice.object_unit)
+    path = require_mesh(recording, choice.object_file)
+    body = _load_object(path, choice.object_unit, path.stat().st_mtime_ns if path.exists() else 0)
     return ContactEstimator(jaw, mesh=body, settings=ContactSettings(mode=mode, mesh=mesh))
+
+
+@lru_cache(maxsize=4)
+def _load_object(path: Path, unit: str, changed: int) -> Any:
+    """Return the mesh of a file, as long as that stays the same, and print what was done to it once."""
+    from finforce_contact.mesh.object_mesh import load_object_mesh
+
+    body = load_object_mesh(path, unit=unit)
+    for note in body.notes:
+        print(f"note: {body.name}: {note}", file=sys.stderr)
+    return body
 
 
 def first_touch(choice: ContactChoice, recording: Recording, jaw: Jaw, mesh: str = "default") -> Contact:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from finforce.errors import FinforceError, MissingDependencyError, one_line
-from finforce.files import BUDGET, FileError, parse_yaml, raise_budget, read_text
+from finforce.files import BUDGET, FileError, check_plain, parse_yaml, raise_budget, read_text
 from finforce.messages import NANOSECONDS
 from finforce.sandbox import SandboxError, limit_growth, run_limited
 from finforce_eval.errors import DamagedError, OutOfBoundsError, RecordingError
@@ -253,6 +253,15 @@ def check_types(connections: Iterable[Any], expected: Mapping[str, Collection[st
             raise RecordingError(f"{name}: {connection.topic} is {connection.msgtype}; expected {wanted}")
 
 
+# what people have recordings in, by the ending of their names, and what makes one of ours of it
+_OTHERS = {
+    ".bag": "a ROS 1 bag: rosbags-convert --src FILE --dst FOLDER makes a ROS 2 bag of it",
+    ".hdf5": "HDF5, as ALOHA and robomimic write it: make a LeRobot dataset of it, with LeRobotDataset.create",
+    ".zarr": "Zarr, as UMI writes it: make a LeRobot dataset of it, with LeRobotDataset.create",
+}
+_OTHERS |= {".h5": _OTHERS[".hdf5"], ".zip": _OTHERS[".zarr"]}
+
+
 def bag_source(path: Path) -> Path:
     """Return what rosbags can open: a folder with metadata.yaml, or the one bag file in a folder without.
 
@@ -262,18 +271,30 @@ def bag_source(path: Path) -> Path:
     if not path.exists():
         raise RecordingError(f"{path}: no such recording")
     path = path.resolve()
+    if path.suffix in _OTHERS:
+        raise RecordingError(f"{path.name}: {_OTHERS[path.suffix]}")
     if path.is_file() and path.suffix not in (".mcap", ".db3"):
         raise RecordingError(f"{path.name}: not a recording; expected a rosbag2 folder, .mcap or .db3")
     if path.is_file():
-        return path
+        return _check_bag(path)
     _refuse_pipes(path)
     if (path / "metadata.yaml").exists():
         return path
     files = sorted([*path.glob("*.mcap"), *path.glob("*.db3")])
     if len(files) != 1:
-        found = f"no metadata.yaml and {len(files)} bag files" if files else "no metadata.yaml, .mcap or .db3"
+        found = f"no metadata.yaml and {len(files)} bag files: run `ros2 bag reindex` on it; expected one or metadata"
+        found = found if files else "no metadata.yaml, .mcap or .db3"
         raise RecordingError(f"{path.name}: the folder is no recording: {found} in it")
-    return files[0]
+    return _check_bag(files[0])
+
+
+def _check_bag(path: Path) -> Path:
+    """Return the path of a bag file; raises RecordingError where Git LFS has not fetched it."""
+    try:
+        check_plain(path)
+    except FileError as error:
+        raise RecordingError(f"{path.name}: {error}") from error
+    return path
 
 
 def list_files(path: Path) -> list[Path]:
@@ -322,8 +343,8 @@ def _refuse_pipes(folder: Path) -> None:
         RecordingError: there is such a thing.
     """
     for path in [folder / "metadata.yaml", *folder.glob("*.mcap*"), *folder.glob("*.db3*")]:
-        if path.exists() and not path.is_file():
-            raise RecordingError(f"{folder.name}: {path.name} is no plain file")
+        if path.exists():
+            _check_bag(path)
 
 
 @contextmanager

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce.camera import CameraIntrinsics, ImageError, IntrinsicsError, decode_depth, open_picture
+from finforce.camera import MILLIMETRE, CameraIntrinsics, ImageError, IntrinsicsError, decode_depth, open_picture
 from finforce.camera_file import build_camera, camera_numbers, read_camera
 from finforce.errors import PoseError, one_line
 from finforce.files import FileError, read_bytes, read_json
@@ -48,8 +48,8 @@ def _read_file(path: Path) -> bytes:
         raise OptionError(f"{path.name}: {error}") from error
 
 
-def read_depth(path: Path | str) -> NDArray:
-    """Return a depth image (h, w) [m], NaN invalid, of a 16-bit PNG in millimetres or an .npy file in metres.
+def read_depth(path: Path | str, scale: float = MILLIMETRE) -> NDArray:
+    """Return a depth image (h, w) [m], NaN invalid, of whole numbers in steps of `scale` [m], or others in metres.
 
     Raises:
         OptionError: the file holds neither.
@@ -62,10 +62,14 @@ def read_depth(path: Path | str) -> NDArray:
             "shape (height, width) [m]"
         )
     if image.dtype.kind in "ui":
-        return decode_depth(np.clip(image, 0, 65535).astype(np.uint16), "16UC1")
-    depth = decode_depth(image, "32FC1")
+        depth = decode_depth(np.clip(image, 0, 65535).astype(np.uint16), "16UC1", scale=scale)
+    else:
+        depth = decode_depth(image, "32FC1")
     if np.isfinite(depth).any() and np.nanmedian(depth) > FARTHEST:
-        raise OptionError(f"{path.name}: a median depth of {np.nanmedian(depth):.0f} m; are these millimetres?")
+        raise OptionError(
+            f"{path.name}: a median depth of {np.nanmedian(depth):.0f} m, expected {FARTHEST:g} m at most; whole "
+            "numbers are steps of --depth-scale (0.001 m; TUM 0.0002, many BOP sets 0.0001), others metres"
+        )
     return depth
 
 

@@ -582,7 +582,8 @@ def _refuse_other_ranks(shapes: Sequence[tuple[str, tuple[int, ...]]]) -> None:
     """Refuse outputs that are no maps."""
     if all(len(shape) == 4 for _, shape in shapes):
         return
-    hint = "its SimCC head (RTMPose) has one vector per axis; " if all(len(s) == 3 for _, s in shapes) else ""
+    named = all("simcc" in name.lower() for name, _ in shapes)
+    hint = "its SimCC head (RTMPose) has one vector per axis; " if named else ""
     raise ModelError(
         f"outputs {list(shapes)}: {hint}expected heatmaps (batch, parts, h, w); export a network with a heatmap head"
     )

@@ -337,3 +337,30 @@ def test_missing_library_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "manifold3d", None)
     with pytest.raises(MissingDependencyError, match="pip install manifold3d"):
         prepare_object_mesh(*BOX)
+
+
+AXES = "".join(f"property float {axis}\n" for axis in "xyz")
+PLY = f"ply\nformat ascii 1.0\nelement vertex 1\n{AXES}{{}}end_header\n0 0 0\n"
+OTHERS = {
+    "old.glb": (b"glTF\1\0\0\0" + bytes(12), "glTF 1.0, expected 2.0"),
+    "cloud.ply": (PLY.format("").encode(), "is a point cloud"),
+    "splats.ply": (PLY.format("property float f_dc_0\n").encode(), "Gaussian splats.*reconstruct --mesh"),
+    "cup.dae": (b"<COLLADA/>", "got ending '.dae'"),
+}
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_what_is_no_mesh_of_ours_is_called_by_its_name(tmp_path, name):
+    content, words = OTHERS[name]
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ObjectMeshError, match=words):
+        load_object_mesh(tmp_path / name)
+
+
+def test_a_glb_of_any_scale_is_not_said_to_be_in_inches(tmp_path):
+    for name, expected in (("cup.glb", False), ("cup.stl", True)):
+        path = write(tmp_path, name, fakes.cylinder_triangles(), factor=39.37)
+        with pytest.raises(ObjectMeshError) as raised:
+            load_object_mesh(path)
+        assert ('unit="inch"' in str(raised.value)) == expected
+        assert ("scale it to the object's size" in str(raised.value)) != expected

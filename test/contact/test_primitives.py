@@ -1,3 +1,4 @@
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -5,9 +6,11 @@ import pytest
 from contact_fakes import distance_mm, make_case
 
 from finforce.optional import import_manifold3d
+from finforce_contact.errors import ReconstructionError
 from finforce_contact.mesh.object_mesh import ObjectMesh
+from finforce_contact.mesh.views import MeshView
 from finforce_contact.reconstruction import reconstruction
-from finforce_contact.reconstruction.evidence import collect_evidence
+from finforce_contact.reconstruction.evidence import collect_evidence, score_shape
 from finforce_contact.reconstruction.reconstruction import complete_surface, reconstruct
 from finforce_contact.reconstruction.shape_search import HANDICAP, build_primitive, fit_primitive, spread_directions
 from finforce_sim.sensor import build_d405
@@ -45,6 +48,34 @@ def test_ball_is_a_sphere_and_no_short_cylinder():
     assert result.method == "primitive: sphere"
     np.testing.assert_allclose(np.ptp(result.mesh.vertices, axis=0), 0.07, atol=1e-3)
     np.testing.assert_allclose(result.T_camera_object[:3, 3], scene.T_camera_object[:3, 3], atol=1e-3)
+
+
+def test_a_pen_before_a_background_that_was_not_measured_keeps_its_size():
+    pen = make_pen(0.02, 0.12)
+    scene = draw_scene(pen, build_d405(step=2), np.random.default_rng(3))
+    depth = np.where(scene.mask, scene.depth, np.nan)
+    result = fit_primitive(collect_evidence(depth, scene.mask, scene.camera))
+    np.testing.assert_allclose(np.sort(np.ptp(result.mesh.vertices, axis=0)), [0.02, 0.02, 0.12], rtol=0.1)
+    ball = place_ball(0.2, result.T_camera_object)
+    assert score_shape(MeshView(ball), np.eye(4), collect_evidence(depth, scene.mask, scene.camera)).overlap < 0.5
+
+
+def test_depth_in_steps_of_another_size_is_refused():
+    scene = draw_scene(make_pen(0.02, 0.12), build_d405(step=2), np.random.default_rng(3))
+    # 0.26 m in steps of 0.1 mm, or 0.52 m in those of 0.2 mm, taken for millimetres
+    with pytest.raises(ReconstructionError, match="m away and .* m across; expected .*--depth-scale 0.0002"):
+        collect_evidence(10.0 * scene.depth, scene.mask, scene.camera)
+
+
+def make_pen(thickness, length):
+    pen = build_primitive("cylinder").mesh
+    return replace(pen, vertices=pen.vertices * (thickness, thickness, length))
+
+
+def place_ball(radius, T):
+    ball = make_ball(radius)
+    away = T[:3, 3] / np.linalg.norm(T[:3, 3])
+    return replace(ball, vertices=ball.vertices + T[:3, 3] + radius * away)
 
 
 def test_half_hidden_cylinder_keeps_its_size():

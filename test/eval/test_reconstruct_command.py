@@ -146,7 +146,7 @@ def test_depth_files_are_metres_or_sixteen_bit_millimetres(tmp_path):
     for name in ("metres.npy", "steps.npy", "depth.png"):
         np.testing.assert_allclose(read_depth(tmp_path / name), [[0.25, np.nan]], rtol=1e-6)
     np.save(tmp_path / "wrong.npy", np.array([[250.0, 251.0]]))
-    with pytest.raises(OptionError, match="are these millimetres"):
+    with pytest.raises(OptionError, match="--depth-scale .*, others metres"):
         read_depth(tmp_path / "wrong.npy")
     Image.fromarray(np.array([[250, 0]], dtype=np.uint8)).save(tmp_path / "grey.png")
     with pytest.raises(OptionError, match="16-bit"):

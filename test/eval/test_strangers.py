@@ -13,6 +13,7 @@ from finforce_contact.loop import GivenContact
 from finforce_eval.cli.main import main
 from finforce_eval.cli.twin import RecordingForm, footage_entries, write_footage
 from finforce_eval.errors import RecordingError
+from finforce_eval.evaluation.comparison import compare_evaluations
 from finforce_eval.evaluation.forces import check_solved, find_forces, why_unanswered
 from finforce_eval.evaluation.keypoint_source import detect_keypoints
 from finforce_eval.recordings.dataset import read_parquet
@@ -147,6 +148,35 @@ def test_a_file_beside_the_bag_that_leads_elsewhere_is_not_copied(tmp_path, caps
     (bag / "notes.txt").unlink()
     os.symlink("case.json", bag / "notes.txt")
     assert main(["annotate", str(bag), "--out", str(tmp_path / "out")]) == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("take.bag", "ROS 1 bag: rosbags-convert"),
+        ("episode_0.hdf5", "HDF5.*LeRobotDataset.create"),
+        ("replay_buffer.zarr.zip", "Zarr, as UMI"),
+        ("pointer.mcap", "git lfs pull"),
+    ],
+)
+def test_recordings_of_other_kinds_are_refused_with_what_makes_one_of_ours(name, words, tmp_path):
+    (tmp_path / name).write_text("version https://git-lfs.github.com/spec/v1\n")
+    with pytest.raises(RecordingError, match=words):
+        read_recording(tmp_path / name)
+
+
+def test_bag_files_without_their_metadata_are_to_be_indexed(tmp_path):
+    for number in (0, 1):
+        (tmp_path / f"part_{number}.mcap").write_bytes(b"")
+    with pytest.raises(RecordingError, match="ros2 bag reindex"):
+        read_recording(tmp_path)
+
+
+def test_fewer_answers_are_worse_whatever_the_error():
+    case = {"all": {"rmse_N": 0.1}, "record_frames": 100, "record_skipped": 14}
+    before, after = {"cases": {"a": case}}, {"cases": {"a": case | {"record_skipped": 50}}}
+    assert [change.verdict for change in compare_evaluations(before, after)] == ["worse"]
+    assert [change.verdict for change in compare_evaluations(before, before)] == ["same"]
 
 
 av = pytest.importorskip("av")
