@@ -92,7 +92,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         options = parse(sys.argv[1:] if argv is None else argv)
         return options.run(options) or 0
     except (FinforceError, OSError) as error:
-        print(f"finforce: {one_line(error)}", file=sys.stderr)
+        print(f"finforce: {one_line(error)}".encode("utf-8", "backslashreplace").decode(), file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         return 130

@@ -89,7 +89,8 @@ def write_overview(evaluation: Evaluation, folder: str | Path, *, about: Mapping
         lines += _show_pictures(folder, f"Images of {name}", _stem(name), IMAGES)
     for name in evaluation.results:
         lines += _show_pictures(folder, name, _stem(name), PICTURES)
-    page.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    # names of recordings may hold HTML; none of it is ours
+    page.write_text("\n".join(lines).replace("<", "&lt;") + "\n", encoding="utf-8")
     write_page(evaluation, folder / "report.html", about=about, title=title)
     return page
 

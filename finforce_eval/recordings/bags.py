@@ -314,9 +314,12 @@ def name_recordings(texts: Sequence[str | Path], between: str) -> list[tuple[str
         between: stands between the parts of a name.
 
     Raises:
-        RecordingError: one was given twice.
+        RecordingError: one was given twice, or has a name that is no UTF-8.
     """
     paths = [Path(text).resolve() for text in texts]
+    odd = next((path for path in paths if not str(path).isprintable()), None)
+    if odd is not None:
+        raise RecordingError(f"{str(odd)!a}: expected a name in UTF-8 that can be printed: rename it")
     if len(set(paths)) < len(paths):
         raise RecordingError("a recording was given twice")
     plain = [_bag_stem(path) for path in paths]

@@ -59,3 +59,9 @@ def test_matplotlib_is_loaded_only_for_a_report():
         "assert report and forces and 'matplotlib' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_html_in_the_name_of_a_recording_stays_text(tmp_path):
+    result, recording = evaluate("<img src=x onerror=alert(1)>")
+    page = write_report(score_results([result], [recording]), tmp_path, keypoint_names="abcd", about={})
+    assert "&lt;img" in page.read_text() and "<" not in page.read_text()

@@ -165,6 +165,13 @@ def test_recordings_of_other_kinds_are_refused_with_what_makes_one_of_ours(name,
         read_recording(tmp_path / name)
 
 
+def test_a_name_that_cannot_be_printed_is_refused(tmp_path, capsys):
+    folder = os.fsencode(tmp_path) + b"/take\xff"
+    os.mkdir(folder)
+    assert main(["evaluate", os.fsdecode(folder), "--contact", "fixed:40"]) == 2
+    assert "expected a name in UTF-8" in capsys.readouterr().err
+
+
 def test_bag_files_without_their_metadata_are_to_be_indexed(tmp_path):
     for number in (0, 1):
         (tmp_path / f"part_{number}.mcap").write_bytes(b"")
