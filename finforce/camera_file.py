@@ -64,18 +64,18 @@ def build_camera(named: Mapping[str, Any], shape: tuple[int, int] | None) -> Cam
     try:
         values = {entry: float(named[entry]) for entry in _NAMES}
         distortion = np.array(named.get("distortion") or [], dtype=float)
+        own = {entry: int(named[entry]) for entry in ("height", "width") if named.get(entry)}
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise IntrinsicsError(f"{error} is missing or no number; expected {INTRINSICS_FORMS}") from None
-    size = {}
-    for entry, given in zip(("height", "width"), shape or (None, None), strict=True):
-        try:
-            size[entry] = int(named.get(entry) or given or 0)
-        except (TypeError, ValueError, OverflowError):
-            raise IntrinsicsError(f"{entry} {str(named[entry])[:40]!r}; expected pixels") from None
-        if size[entry] < 1:
-            raise IntrinsicsError("no size of its images; expected width and height next to the other numbers")
-        if given not in (None, size[entry]):
-            raise IntrinsicsError(f"{entry} {size[entry]}, the images have {given}: expected intrinsics of that size")
+    size = dict(zip(("height", "width"), shape, strict=True)) if shape else own
+    if (
+        own | size != size | own
+        or len(size) < 2
+        or not all(isinstance(side, int) and side > 0 for side in own.values())
+    ):
+        found = " x ".join(str(own[entry]) for entry in ("width", "height") if entry in own) or "no size"
+        expected = f"{shape[1]} x {shape[0]}, as the images have" if shape else "width and height next to the numbers"
+        raise IntrinsicsError(f"intrinsics of {found}; expected {expected}")
     if not (0.0 <= values["cx"] <= size["width"] and 0.0 <= values["cy"] <= size["height"]):
         raise IntrinsicsError(
             f"principal point {values['cx']:g}, {values['cy']:g} outside images of {size['width']} x {size['height']}: "
@@ -150,20 +150,18 @@ def _from_matrix(matrix: Sequence[Any]) -> dict[str, Any]:
 def _from_openicc(intrinsics: Mapping[str, Any], kind: str) -> dict[str, Any]:
     """Return the entries of a camera of OpenICC, whose fisheye is the equidistant one.
 
-    Source: Theia, FisheyeCameraModel and PinholeCameraModel.
+    Source: Theia, FisheyeCameraModel.
     """
-    counts = {"FISHEYE": 4, "PINHOLE": 2}
-    if kind not in counts or intrinsics.get("skew"):
-        raise IntrinsicsError(f"intrinsic_type {kind}, skew {intrinsics.get('skew')}: expected FISHEYE or PINHOLE, 0")
+    if kind != "FISHEYE" or intrinsics.get("skew"):
+        raise IntrinsicsError(f"intrinsic_type {kind}, skew {intrinsics.get('skew')}: expected FISHEYE without skew")
     try:
         focal = float(intrinsics["focal_length"])
-        bent = [float(intrinsics[f"radial_distortion_{number}"]) for number in range(1, counts[kind] + 1)]
         named = {"fx": focal, "fy": focal * float(intrinsics.get("aspect_ratio", 1.0))}
+        bent = [intrinsics[f"radial_distortion_{number}"] for number in (1, 2, 3, 4)]
     except (KeyError, TypeError, ValueError) as error:
         raise IntrinsicsError(f"intrinsics: {error} is missing or no number") from None
     named |= {"cx": intrinsics.get("principal_pt_x"), "cy": intrinsics.get("principal_pt_y")}
-    is_fisheye = kind == "FISHEYE"
-    return named | {"distortion": bent if is_fisheye else [*bent, 0.0, 0.0], "model": EQUIDISTANT if is_fisheye else ""}
+    return named | {"distortion": bent, "model": EQUIDISTANT}
 
 
 def _numbers(value: Any) -> list[Any]:

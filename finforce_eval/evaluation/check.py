@@ -14,13 +14,11 @@ from scipy.spatial.transform import Rotation
 from finforce.camera import EQUIDISTANT, CameraIntrinsics, ImageError
 from finforce.errors import FinforceError, one_line
 from finforce.gripper_frames import HALF_TURN, OpeningRange, jaw_in_camera
-from finforce.messages import NANOSECONDS
 from finforce.optional import import_cv2
 from finforce.transforms import invert_pose, move_pose, pose_numbers, rotation_between
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.at_rest import JawsAtRest, approach
 from finforce_eval.evaluation.keypoint_source import KeypointSource, build_records, choose_images
-from finforce_eval.recordings.images import ImageTrack
 from finforce_eval.recordings.tracks import Recording
 from finforce_ifea.jaw.jaw import Jaw, list_shipped_jaws, load_jaw
 from finforce_keypoints.errors import KeypointError
@@ -38,7 +36,7 @@ FLAT, TILES = 1.5, 12  # of 255: contrast of such a part; parts each way
 GOOD_RESIDUAL = 1.0  # [px] left over when jaws at rest are laid on what is seen
 FAR, TURNED = 3e-3, np.radians(1.5)  # [m], [rad] by which the camera may be elsewhere than it is stated to be
 FOCAL_ERROR = 0.03  # of the focal length, from which on it is named
-BETTER, ENOUGH = 0.2, 0.5  # by which another reading has to be likelier, and how likely, to be named
+ENOUGH = 0.5  # share of a jaw's key points that have to be seen for another reading to be named
 
 
 class Finding(NamedTuple):
@@ -201,53 +199,43 @@ def fit_focal(jaws: Mapping[str, SeenJaw], camera: CameraIntrinsics, found: Extr
 
 
 def _find_reasons(mean: RgbdImage, source: KeypointSource, recording: Recording, guess: NDArray) -> list[Finding]:
-    """Return which other reading of picture, extrinsics or jaw file shows the jaws better.
+    """Return by which other reading of picture, extrinsics or jaw file the key points lie as the jaw file says.
 
-    A network likes what has some likeness to a finger; named is a reading whose key points lie as the jaw file says.
+    That a network likes a picture, as it does some that show no finger, is no reason.
     """
-    own = _score(mean, source, recording, guess)
-    scored = [
-        (_score(image, replace(source, jaw_file=jaw_file), recording, pose), words, image, pose, jaw_file)
-        for words, image, pose, jaw_file in _readings(mean, source, guess)
-    ]
-    for likelihood, words, image, pose, jaw_file in sorted(scored, key=lambda entry: -entry[0]):
-        if likelihood <= max(own + BETTER, ENOUGH):
-            break
-        if _lies_as_drawn(replace(recording, images=_OneImage(image, recording.images)), source, pose, jaw_file):
-            return [Finding(FAULT, f"the jaws show (likelihood {likelihood:.2f} instead of {own:.2f}) if {words}")]
+    readings = _readings(mean, source, guess)
+    residual, words = min((_misfit(recording, source, *reading), text) for text, *reading in readings)
+    if residual <= GOOD_RESIDUAL:
+        return [Finding(FAULT, f"the jaws show, {residual:.2f} px left over, if {words}")]
     return [
         Finding(
             WARNING,
-            f"likelihood {own:.2f}, no better upside down, mirrored, with other conventions of the extrinsics or with "
-            "another shipped finger: are the jaws in view, lit, and within some 15 mm of where the extrinsics say?",
+            "no better upside down, mirrored, with other conventions of the extrinsics or with another shipped finger: "
+            "are the jaws in view, lit, and within some 15 mm of where the extrinsics say?",
         )
     ]
 
 
-class _OneImage:
+class _OneImage(list):
     """One image in place of the images of a recording."""
 
-    def __init__(self, image: RgbdImage, images: ImageTrack) -> None:
-        self.image, self.camera = image, image.camera
-        self.frame_id, self.has_depth, self.is_video = images.frame_id, False, images.is_video
+    has_depth, is_video = False, True
 
-    def __len__(self) -> int:
-        return 1
-
-    def __iter__(self) -> Iterator[tuple[int, RgbdImage]]:
-        yield round(self.image.stamp * NANOSECONDS), self.image
+    def __init__(self, image: RgbdImage, frame_id: str) -> None:
+        super().__init__([(0, image)])
+        self.camera, self.frame_id = image.camera, frame_id
 
 
-def _lies_as_drawn(recording: Recording, source: KeypointSource, pose: NDArray, jaw_file: str) -> bool:
-    """Say whether both jaws are found, with their key points where the jaw file has them, seen from one camera."""
+def _misfit(recording: Recording, source: KeypointSource, image: RgbdImage, pose: NDArray, jaw_file: str) -> float:
+    """Return what is left over [px] once the jaws are laid on their key points; infinite where few are seen."""
     jaws = {side: load_jaw(jaw_file, side) for side in recording.jaws}
     here = replace(source, jaw_file=jaw_file, parameters={**source.parameters, "depth": NO_DEPTH})
     try:
-        found, look = approach(recording, here, jaws, pose)
+        found, look = approach(replace(recording, images=_OneImage(image, recording.images.frame_id)), here, jaws, pose)
     except FinforceError:
-        return False
+        return np.inf
     seen = min(np.isfinite(jaw.pixels).all(axis=1).mean() for jaw in look.jaws.values())
-    return found.residual <= GOOD_RESIDUAL and seen >= ENOUGH
+    return found.residual if seen >= ENOUGH else np.inf
 
 
 def _readings(image: RgbdImage, source: KeypointSource, T: NDArray) -> Iterator[tuple[str, RgbdImage, NDArray, str]]:
@@ -292,21 +280,6 @@ def _flip(image: RgbdImage, *, rows: bool, columns: bool) -> RgbdImage:
     cx = camera.width - 1 - camera.cx if columns else camera.cx
     cy = camera.height - 1 - camera.cy if rows else camera.cy
     return replace(image, color=np.ascontiguousarray(color), camera=replace(camera, cx=cx, cy=cy))
-
-
-def _score(image: RgbdImage, source: KeypointSource, recording: Recording, pose: NDArray) -> float:
-    """Return the mean likelihood of the key points, looked for all along the closing axis; 0 where nothing can be."""
-    from finforce_keypoints.build import build_pixel_detector
-    from finforce_keypoints.parameters import load_jaws
-
-    given = {**source.node_parameters(recording), "T_gripper_camera": list(pose_numbers(pose))}
-    try:
-        parameters, settings, dots = build_records(given)
-        pixel_detector = build_pixel_detector(load_jaws(parameters), parameters, settings, dots)
-        found = pixel_detector.detect(image, dict.fromkeys(recording.jaws))
-    except FinforceError:
-        return 0.0
-    return float(np.mean([found[side].likelihood.mean() if side in found else 0.0 for side in recording.jaws]))
 
 
 GIVEN, SEEN, FITTED = (150, 150, 150), (60, 230, 90), (255, 170, 40)

@@ -126,7 +126,7 @@ def test_of_several_cameras_one_has_to_be_named(tmp_path):
         ({"intrinsic_type": "DOUBLE_SPHERE", "intrinsics": {}}, "DOUBLE_SPHERE"),
         (KALIBR.format(model="radtan").replace("pinhole", "omni"), "camera_model omni"),
         (KALIBR.format(model="fov"), "distortion model 'fov'"),
-        ({"fx": 600, "fy": 600, "cx": 320, "cy": 240}, "no size of its images"),
+        ({"fx": 600, "fy": 600, "cx": 320, "cy": 240}, "intrinsics of no size; expected width and height"),
         (GOPRO | {"image_width": 640, "image_height": 480}, "principal point 1350, 1010 outside images of 640 x 480"),
         ("600 601 322", "3 numbers"),
         ({"K": [600, 2, 322, 0, 601, 243, 0, 0, 1], "width": 640, "height": 480}, "no skew"),
@@ -139,5 +139,5 @@ def test_what_describes_no_camera_is_refused_by_name(content, words, tmp_path):
 
 
 def test_a_camera_of_another_picture_size_is_refused(tmp_path):
-    with pytest.raises(IntrinsicsError, match="height 480, the images have 240"):
+    with pytest.raises(IntrinsicsError, match="intrinsics of 640 x 480; expected 320 x 240"):
         read_camera(write(tmp_path, OPENCV), (240, 320))
