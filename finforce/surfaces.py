@@ -21,7 +21,7 @@ from finforce.sandbox import SandboxError, run_limited
 LARGEST = 1 << 30  # bytes, more than any format needs for millions of triangles
 # What these formats take goes with the size of the file.
 _PLAIN = (".stl", ".obj", ".ply", ".off")
-_STEP = (".step", ".stp")
+_LIBRARIES = {".step": ("cascadio",), ".stp": ("cascadio",), ".3mf": ("networkx", "lxml")}
 _MEMORY, _SECONDS = 2 << 30, 60
 
 
@@ -34,8 +34,8 @@ def read_surface(path: Path) -> tuple[NDArray, NDArray]:
     """
     suffix = path.suffix.lower()
     import_trimesh()
-    if suffix in _STEP:
-        import_library("cascadio", f"reading {path.name}, which may be exported as STL instead,")
+    for library in _LIBRARIES.get(suffix, ()):
+        import_library(library, f"reading {path.name}, which may be exported as STL instead,")
     try:
         if suffix in _PLAIN:
             return _load_triangles(path)
@@ -92,8 +92,8 @@ def _refuse_other_kinds(content: bytes) -> None:
     """Refuse by name what has the ending of a mesh and is none, or one of a version that is not read."""
     if content[:4] == b"glTF" and content[4:8] == b"\1\0\0\0":
         raise FileError("is glTF 1.0, expected 2.0: export it anew, from Blender as one")
-    if content[:3] == b"ply":
-        header = content[: content.find(b"end_header")]
+    header, end, _ = content.partition(b"end_header")
+    if content[:3] == b"ply" and end and b"element vertex 0" not in header:
         if b"f_dc_0" in header:
             raise FileError("holds Gaussian splats, expected triangles: `finforce reconstruct --mesh` takes them")
         if b"element face" not in header and b"element tristrips" not in header:

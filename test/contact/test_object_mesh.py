@@ -112,7 +112,7 @@ def test_unknown_unit_is_refused(tmp_path):
         ("noise.ply", b"ply\nformat ascii 1.0\n", "cannot be read"),
         ("points.obj", b"v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\n", "no triangles|cannot be read"),
         ("cut.stl", b"\x00" * 80 + b"\x64\x00\x00\x00" + b"\x00" * 30, "no triangles"),
-        ("cup.step", b"ISO-10303-21;", "expected one of .stl .obj .ply .glb"),
+        ("cup.fbx", b"ISO-10303-21;", "expected one of .stl .obj .ply .off .glb"),
         ("nan.obj", b"v nan 0 0\nv 0.1 0 0\nv 0 0.1 0\nf 1 2 3\n", "NaN or infinite"),
     ],
 )
