@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from finforce.files import parse_json, read_text
 from finforce_ifea.errors import JawFileError
 
-UNITS = {"m": 1.0, "mm": 1e-3, "inch": 25.4e-3}
+UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "inch": 25.4e-3}
 _LARGEST_FILE, _MOST_VERTICES = 5_000_000, 100_000
 
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import shapely
+import shapely.affinity
 import trimesh
 from scipy.spatial.transform import Rotation
 from section_fakes import BASE, LENGTH, MILLIMETRE, WIDTH, draw_polygon, make_section
@@ -59,10 +60,75 @@ def test_a_finger_is_found_in_any_unit_and_any_way_round(tmp_path, surface, unit
     mesh.apply_transform(frame)
     path = tmp_path / "finger.stl"
     mesh.export(path)
-    raw = read_section(path)
+    if unit == "inch":  # of which centimetres make a finger, too
+        with pytest.raises(JawFileError, match="--unit cm .* or --unit inch"):
+            read_section(path)
+    raw = read_section(path, unit="inch" if unit == "inch" else None)
     assert not raw.taper.any()
     assert f"unit: {unit}" in raw.notes[0]
     check_found(recognize(raw.polygon, raw.width, Overrides()))
+
+
+def boxes_joined(surface, *boxes, cut=False):
+    """A finger with boxes (extents, middle) [mm] added or cut away."""
+    solids = [trimesh.creation.box(extents, trimesh.transformations.translation_matrix(at)) for extents, at in boxes]
+    return (trimesh.boolean.difference if cut else trimesh.boolean.union)([surface, *solids], engine="manifold")
+
+
+def read_mesh(tmp_path, mesh, name="finger.stl", **options):
+    mesh.export(tmp_path / name)
+    return read_section(tmp_path / name, **options)
+
+
+@pytest.mark.parametrize("name", ["finger.3mf", "finger.obj", "finger.ply"])
+def test_what_else_programs_export_is_the_same_finger(tmp_path, surface, name):
+    check_found(recognize((raw := read_mesh(tmp_path, surface, name)).polygon, raw.width, Overrides()))
+
+
+def test_a_floor_a_slot_and_a_wider_base_are_named_with_their_place(tmp_path, surface):
+    low, high = surface.bounds
+    size, middle, side = high - low, 0.5 * (low + high), np.array([0.0, 0.5 * WIDTH, 0.0])
+    floor = boxes_joined(surface, ((0.6 * size[0], 1.0, 0.6 * size[2]), middle - side + [0.0, 0.5, 0.0]))
+    base = boxes_joined(surface, ((size[0], 1.6 * WIDTH, 8.0), [middle[0], middle[1], low[2] + 4.0]))
+    slot = boxes_joined(surface, ((3.0, 0.4 * WIDTH, 0.5 * size[2]), [high[0], middle[1], middle[2]]), cut=True)
+    for mesh, word in ((floor, "a floor"), (base, "wider than the blade"), (slot, "a slot")):
+        with pytest.raises(JawFileError, match=f"have another section.*{word}"):
+            read_mesh(tmp_path, mesh)
+
+
+def test_a_small_hole_across_is_left_out_with_a_word(tmp_path, surface):
+    low, high = surface.bounds
+    drill = trimesh.creation.cylinder(0.5, 200.0)
+    drill.apply_transform(trimesh.transformations.rotation_matrix(0.5 * np.pi, [0, 1, 0]))
+    drill.apply_translation([0.0, 0.0, low[2] + 0.75 * (high[2] - low[2])])
+    raw = read_mesh(tmp_path, trimesh.boolean.difference([surface, drill], engine="manifold"))
+    assert any("hole across" in note for note in raw.notes)
+    check_found(recognize(raw.polygon, raw.width, Overrides()))
+
+
+def test_a_missing_triangle_and_doubled_faces_are_mended_with_a_word(tmp_path, surface):
+    lacking = surface.copy()
+    lacking.update_faces(np.arange(len(lacking.faces)) != 7)
+    double = trimesh.Trimesh(surface.vertices, np.vstack([surface.faces, surface.faces[:5]]), process=False)
+    for mesh in (lacking, double):
+        raw = read_mesh(tmp_path, mesh)
+        assert any(note.startswith("mended") for note in raw.notes)
+        check_found(recognize(raw.polygon, raw.width, Overrides()))
+
+
+@pytest.mark.parametrize(("unit", "scale"), [("um", 1e3), ("m", 1e-3)])
+def test_a_unit_is_found_where_only_one_makes_a_finger_and_a_stated_one_is_checked(tmp_path, surface, unit, scale):
+    mesh = surface.copy()
+    mesh.apply_scale(scale)
+    assert f"unit: {unit}" in read_mesh(tmp_path, mesh).notes[0]
+    with pytest.raises(JawFileError, match="expected a finger of 5 to 1000 mm"):
+        read_mesh(tmp_path, mesh, unit="m" if unit == "um" else "um")
+
+
+def test_a_finger_that_would_stand_on_one_leg_is_refused():
+    polygon = shapely.affinity.scale(draw_polygon(), MILLIMETRE, MILLIMETRE, origin=(0, 0))
+    with pytest.raises(JawFileError, match="would not be held"):
+        recognize(polygon, WIDTH * MILLIMETRE, Overrides(clamp_z=-1e-3))
 
 
 def taper_surface(surface, slope, lean):
@@ -281,7 +347,7 @@ LOOP = "ISO-10303-21;\nHEADER;\nENDSEC;\nDATA;\n#1=SHELL_BASED_SURFACE_MODEL('',
 
 def test_bad_files_are_refused_in_one_line(tmp_path, capsys, surface):
     open_one = surface.copy()
-    open_one.update_faces(np.arange(len(open_one.faces)) > 3)
+    open_one.update_faces(np.arange(len(open_one.faces)) > len(open_one.faces) // 2)
     open_one.export(tmp_path / "open.stl")
     surface.export(tmp_path / "whole.stl")
     whole = (tmp_path / "whole.stl").read_bytes()

@@ -18,16 +18,17 @@ from finforce_ifea.jaw.section import UNITS, check_loops, join_loops, read_loops
 
 SURFACES = (".stl", ".obj", ".ply", ".off", ".3mf", ".glb")
 SUFFIXES = (*SURFACES, ".step", ".stp", ".dxf", ".svg", ".json")
-# Largest size of a finger in its file's numbers: below the first it is metres, below the second inches, else mm.
-_METRES, _INCHES = 0.5, 15.0
+# Largest size of a finger [m]; the second pair is for a unit that was stated.
+_PLAUSIBLE, _POSSIBLE = (0.015, 0.25), (0.005, 1.0)
 _MOST_TRIANGLES, _LARGEST_FILE = 2_000_000, 200_000_000
 # A surface is prismatic when so much of it stands upright on, or lies across, the direction of extrusion.
 _UPRIGHT, _PRISMATIC = 0.02, 0.97
 # Of a tapered one the normals of walls have less than this along its direction, those of sides more; a side is plane
 # within so much [m].
 _ASIDE, _SIDE, _RULINGS = 0.5, 1e-4, 4
-# Cuts across it at these shares of the width may differ in area by so much.
-_CUTS, _ALIKE = (0.3, 0.5, 0.7), 0.03
+# Cuts across it, evenly over the width: they may differ from the usual one by so much of its area on average, and few
+# of them by what is seen; what differs by more is another section.
+_CUTS, _ALIKE, _SEEN, _RARE, _OTHER = 25, 0.02, 0.01, 0.2, 0.1
 # Ends of cut triangles are joined on a grid of this size [m].
 _GRID = 2e-7
 _CHORD = 2e-5
@@ -56,7 +57,7 @@ def read_section(path: Path, *, unit: str | None = None, body: int | None = None
 
     Args:
         path: a surface (.stl and others), a solid (.step), a drawing (.dxf, .svg), or a section (.json).
-        unit: "m", "mm" or "inch"; None to guess it by the size.
+        unit: one of `UNITS`; None for the only one in which it has a finger's size.
         body: which one of several bodies, from 1.
 
     Raises:
@@ -91,11 +92,22 @@ def read_section(path: Path, *, unit: str | None = None, body: int | None = None
 
 def _choose_unit(extent: float, unit: str | None) -> tuple[float, str]:
     """Return the metres of a file's unit, and a line that says which one it is."""
+    sizes = {name: extent * scale for name, scale in UNITS.items()}
     if unit is not None:
-        return UNITS[unit], f"unit: {unit}, {1e3 * extent * UNITS[unit]:.4g} mm in its largest direction"
-    guess = "m" if extent < _METRES else "inch" if extent < _INCHES else "mm"
-    size = 1e3 * extent * UNITS[guess]
-    return UNITS[guess], f"unit: {guess}, since the largest size is {extent:.4g}, thus {size:.4g} mm (--unit)"
+        if not _POSSIBLE[0] <= sizes[unit] <= _POSSIBLE[1]:
+            raise JawFileError(
+                f"is {1e3 * sizes[unit]:.4g} mm long in the unit {unit}, expected a finger of "
+                f"{1e3 * _POSSIBLE[0]:g} to {1e3 * _POSSIBLE[1]:g} mm"
+            )
+        return UNITS[unit], f"unit: {unit}, {1e3 * sizes[unit]:.4g} mm in its largest direction"
+    likely = [name for name, size in sizes.items() if _PLAUSIBLE[0] <= size <= _PLAUSIBLE[1]]
+    if len(likely) != 1:
+        choices = " or ".join(f"--unit {name} ({1e3 * sizes[name]:.4g} mm)" for name in likely or UNITS)
+        raise JawFileError(f"its largest size is {extent:.4g} and its unit not sure, expected {choices}")
+    (guess,) = likely
+    return UNITS[
+        guess
+    ], f"unit: {guess}, since the largest size is {extent:.4g}, thus {1e3 * sizes[guess]:.4g} mm (--unit)"
 
 
 def _load_surface(path: Path) -> trimesh.Trimesh:
@@ -117,8 +129,9 @@ def _cut_surface(mesh: trimesh.Trimesh, unit: str | None, body: int | None) -> R
     """Return the section of a closed surface across the direction in which it was extruded."""
     scale, note = _choose_unit(float(mesh.extents.max()), unit)
     notes = [note]
-    mesh = _choose_body(mesh, body, scale, notes)
+    mesh = _choose_body(_drop_doubles(mesh, notes), body, scale, notes)
     mesh.apply_scale(scale)
+    _close_holes(mesh, notes)
     if not mesh.is_watertight:
         _, count = np.unique(np.sort(mesh.edges, axis=1), axis=0, return_counts=True)
         raise JawFileError(
@@ -129,20 +142,93 @@ def _cut_surface(mesh: trimesh.Trimesh, unit: str | None, body: int | None) -> R
         mesh.invert()
         notes.append("its surface was inside out and has been turned")
     axis, share = _find_axis(mesh)
-    if share < _PRISMATIC:
+    cuts = _cut_often(mesh, axis)
+    if share < _PRISMATIC and not cuts.is_one:
         return _cut_tapered(mesh, axis, notes)
-    low, high = np.sort(mesh.vertices @ axis)[[0, -1]]
-    cuts = [_cut(mesh, axis, low + at * (high - low)) for at in _CUTS]
-    areas = np.array([cut.area for cut in cuts])
-    middle = cuts[int(np.argsort(areas)[len(areas) // 2])]
     letters = np.round(axis, 3).tolist()
-    if np.ptp(areas) > _ALIKE * areas.max():
-        raise JawFileError(
-            f"is not prismatic: cuts across {letters} have {1e6 * areas.min():.4g} to {1e6 * areas.max():.4g} mm^2, "
-            "expected a finger whose walls all run in one direction"
+    if not cuts.is_one:
+        raise JawFileError(f"is not prismatic along {letters}: {cuts.describe()}")
+    notes.append(f"prismatic along {letters} of the file, {1e3 * cuts.width:.4g} mm wide")
+    if share < _PRISMATIC:
+        notes.append(f"edges that are chamfered or rounded are left out: {1.0 - share:.0%} of its surface")
+    if pieces := int((cuts.pieces > 1).sum()):
+        notes.append(f"a hole across it is left out: it parts {pieces} of {_CUTS} cuts")
+    return RawSection(polygon=cuts.section, width=cuts.width, notes=notes)
+
+
+def _drop_doubles(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
+    """Return a surface without faces that are there twice."""
+    kept = mesh.unique_faces()
+    if not kept.all():
+        notes.append(f"mended: {int((~kept).sum())} doubled faces left out")
+        mesh.update_faces(kept)
+    return mesh
+
+
+def _close_holes(mesh: trimesh.Trimesh, notes: list[str]) -> None:
+    """Close holes of a missing triangle or two in a surface."""
+    before = len(mesh.faces)
+    if not mesh.is_watertight and trimesh.repair.fill_holes(mesh):
+        notes.append(f"mended: holes closed by {len(mesh.faces) - before} triangles")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Cuts:
+    """Cuts of a body, evenly over its width [m].
+
+    Attributes:
+        section: the one that is most like all others, in one piece.
+        difference: (n,) of each cut from that, as a share of its area.
+        areas: (n,) [m^2].
+        pieces: (n,) into which each falls.
+        width: of the body.
+    """
+
+    section: shapely.Polygon
+    difference: NDArray
+    areas: NDArray
+    pieces: NDArray
+    width: float
+
+    @property
+    def is_one(self) -> bool:
+        """Whether they are one section, but for holes, rounded edges and the like."""
+        return self.difference.mean() <= _ALIKE and (self.difference > _SEEN).mean() <= _RARE
+
+    def describe(self) -> str:
+        """Say where the section changes, and what would do."""
+        other = self.difference > (_OTHER if (self.difference > _OTHER).any() else _SEEN)
+        where = 1e3 * self.width * (np.flatnonzero(other) + 0.5) / len(other)
+        areas = 1e6 * self.areas[other]
+        width, rest = 1e3 * self.width, 1.0 - other.mean()
+        return (
+            f"{other.mean():.0%} of its {width:.3g} mm, at {where[0]:.3g} to {where[-1]:.3g} mm, have another section "
+            f"({areas.min():.4g} to {areas.max():.4g} mm^2) than the other {width * rest:.3g} mm "
+            f"({1e6 * self.section.area:.4g} mm^2): a floor, a slot, or a base wider than the blade; expected one "
+            "section: export the blade alone, or use a volume mesh (`mesh:` in the jaw file)"
         )
-    notes.append(f"prismatic along {letters} of the file, {1e3 * (high - low):.4g} mm wide")
-    return RawSection(polygon=middle, width=float(high - low), notes=notes)
+
+
+def _cut_often(mesh: trimesh.Trimesh, axis: NDArray) -> _Cuts:
+    """Return cuts of a body across an axis.
+
+    Raises:
+        JawFileError: no cut is in one piece.
+    """
+    low, high = np.sort(mesh.vertices @ axis)[[0, -1]]
+    found = [_cut(mesh, axis, low + (number + 0.5) / _CUTS * (high - low)) for number in range(_CUTS)]
+    whole = [cut for cut in found if cut.geom_type == "Polygon"]
+    if not whole:
+        raise JawFileError(f"its section has {len(found[_CUTS // 2].geoms)} separate areas, expected one finger")
+    typical = float(np.median([cut.area for cut in found]))
+    section = min(whole, key=lambda cut: abs(cut.area - typical))
+    return _Cuts(
+        section=section,
+        difference=np.array([cut.symmetric_difference(section).area for cut in found]) / section.area,
+        areas=np.array([cut.area for cut in found]),
+        pieces=np.array([len(getattr(cut, "geoms", [cut])) for cut in found]),
+        width=float(high - low),
+    )
 
 
 def _choose_body(mesh: trimesh.Trimesh, body: int | None, scale: float, notes: list[str]) -> trimesh.Trimesh:
@@ -216,7 +302,7 @@ def _cut_tapered(mesh: trimesh.Trimesh, axis: NDArray, notes: list[str]) -> RawS
     bottom, top = (corners @ plane[:2] + plane[2] for plane in (low, high))
     if not bottom.max() < top.min():
         raise JawFileError(f"tapers so much that no cut across {letters} meets all of it")
-    polygon = _cut(mesh, axis, 0.5 * float(bottom.max() + top.min()))
+    polygon = _one_piece(_cut(mesh, axis, 0.5 * float(bottom.max() + top.min())))
     notes.append(
         f"tapered: walls along {letters} of the file, {1e3 * widths.min():.3g} to {1e3 * widths.max():.3g} mm wide; "
         "taken as symmetric about its middle"
@@ -265,12 +351,12 @@ def _span(axis: NDArray) -> tuple[NDArray, NDArray]:
     return first, np.cross(axis, first)
 
 
-def _cut(mesh: trimesh.Trimesh, axis: NDArray, height: float) -> shapely.Polygon:
-    """Return the cut of a body across an axis at a height [m]."""
+def _cut(mesh: trimesh.Trimesh, axis: NDArray, height: float) -> shapely.Geometry:
+    """Return the cut of a body across an axis at a height [m], a polygon or several."""
     lines = trimesh.intersections.mesh_plane(mesh, axis, height * axis)
     first, second = _span(axis)
     flat = np.stack([lines @ first, lines @ second], axis=-1)
-    return _join_lines([line for line in flat])
+    return _fill_lines([line for line in flat])
 
 
 def _join_lines(lines: list[NDArray]) -> shapely.Polygon:
@@ -279,16 +365,34 @@ def _join_lines(lines: list[NDArray]) -> shapely.Polygon:
     Raises:
         JawFileError: They bound none, or several separate ones.
     """
+    return _one_piece(_fill_lines(lines))
+
+
+def _one_piece(area: shapely.Geometry) -> shapely.Polygon:
+    """Return a polygon; raises JawFileError for several separate ones."""
+    if area.geom_type != "Polygon":
+        raise JawFileError(f"its section has {len(area.geoms)} separate areas, expected one finger")
+    return area
+
+
+def _fill_lines(lines: list[NDArray]) -> shapely.Geometry:
+    """Return what lines (n, 2) [m], open or closed, bound together: a polygon or several.
+
+    Raises:
+        JawFileError: They bound nothing.
+    """
     grid = [np.round(np.asarray(line, float) / _GRID) * _GRID for line in lines]
     strings = [shapely.LineString(line) for line in grid if np.ptp(line, axis=0).max() > 0.0]
     areas = sorted(polygonize(unary_union(strings)), key=lambda area: -area.area) if strings else []
     if not areas:
         raise JawFileError(f"{len(lines)} lines bound no area, expected closed loops: an outline and its holes")
-    whole = areas[0]
-    outside = [area for area in areas[1:] if not shapely.Polygon(whole.exterior).covers(area.representative_point())]
-    islands = [area for area in areas[1:] if area not in outside and whole.covers(area.representative_point())]
-    if outside or islands:
-        raise JawFileError(f"its section has {1 + len(outside) + len(islands)} separate areas, expected one finger")
+    # a face within an odd number of others' outlines is a hole
+    filled = [shapely.Polygon(area.exterior) for area in areas]
+    whole = shapely.Polygon()
+    for area in areas:
+        point = area.representative_point()
+        if sum(outline.contains(point) for outline in filled) % 2:
+            whole = whole.union(area)
     return whole
 
 

@@ -137,6 +137,7 @@ def _find_face_end(finger: RecognizedFinger) -> float:
 def _choose_reference(finger: RecognizedFinger) -> tuple[NDArray, str]:
     """Return a point (2,) [m] that never bends: in the middle of the largest flat patch of what is clamped."""
     held = finger.polygon.intersection(shapely.box(-1.0, -1.0, 1.0, finger.clamped_z))
+    held = max(getattr(held, "geoms", [held]), key=lambda part: part.area, default=held)
     circle = shapely.maximum_inscribed_circle(held) if held.area > 0.0 else None
     if circle is None or circle.length < 1.5e-3:
         return np.array([0.0, _BELOW]), "on the holder, below the finger: mark it there with a dot"

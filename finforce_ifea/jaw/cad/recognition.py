@@ -32,6 +32,9 @@ _NEIGHBOURS, _LONGER = 3e-3, 1.4
 _FEWEST, _FLAT = 5, 1e-4
 
 
+_HELD = 0.5  # of the distance between the bands, that the clamp has to span at least
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Wall:
     """A band or a rib.
@@ -141,6 +144,7 @@ def recognize(
     bolts, cells = _fit_bolts(bolts), _order_cells(cells)
     inner, outer, ribs = _measure_walls(turned, cells)
     clamped_z, circles = _propose_clamp(cells, bolts, inner, overrides, notes)
+    _check_legs(turned, (inner, outer), clamped_z, circles)
     face_x, deviation = _measure_face(turned, cells, clamped_z)
     if deviation > _FLAT:
         notes.append(f"inner face curved: it leaves its plane by {1e3 * deviation:.2g} mm")
@@ -168,6 +172,26 @@ def recognize(
         face_deviation=deviation,
         notes=notes,
     )
+
+
+def _check_legs(polygon: shapely.Polygon, bands: tuple[Wall, Wall], clamped_z: float, circles: NDArray) -> None:
+    """Refuse a clamp that does not reach from one band to the other: a finger on one leg is many times too soft.
+
+    Raises:
+        JawFileError: It does not.
+    """
+    low_x, low_z, high_x, _ = polygon.bounds
+    below = shapely.box(low_x, low_z - 1.0, high_x, clamped_z)
+    held = polygon.intersection(shapely.union_all([below, *(shapely.Point(x, z).buffer(r) for x, z, r in circles)]))
+    feet = [float(band.line[band.line[:, 1].argmin(), 0]) for band in bands]
+    apart = abs(feet[0] - feet[1])
+    reach = 0.0 if held.is_empty else held.bounds[2] - held.bounds[0]
+    if reach < _HELD * apart:
+        raise JawFileError(
+            f"what lies below z = {1e3 * clamped_z:.3g} mm is {1e3 * reach:.3g} mm wide, and its bands start "
+            f"{1e3 * apart:.3g} mm apart: one of them would not be held, as on a tilted base; state the clamp's height "
+            "(--clamp), or export the finger with its base across the inner face"
+        )
 
 
 def _say_range(values) -> str:
