@@ -144,7 +144,7 @@ def play_to_nodes(
         messages = read_playback(recording.source, _results_of(sides) | _unplayed(sides, from_images), images)
         options = _graph_options(recording, setup, calibration_file, playing)
         processes = replay_processes(replace(options, images=from_images, composed=False), Path())
-        processes = _for_scores(processes, recording, keypoints)
+        processes = _for_scores(processes, recording, setup, keypoints)
         environment = {} if playing.domain is None else {"ROS_DOMAIN_ID": str(playing.domain)}
         run = run_nodes(
             compose(processes) if playing.composed else processes,
@@ -193,9 +193,15 @@ def _unplayed(sides: Sequence[str], from_images: bool) -> set[str]:
     return {COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC}
 
 
-def _for_scores(processes: Sequence[Process], recording: Recording, keypoints: KeypointSource) -> list[Process]:
-    """Return the processes: they answer every image, so that each is scored, and the detector knows the camera."""
+def _for_scores(
+    processes: Sequence[Process], recording: Recording, setup: EvaluationSetup, keypoints: KeypointSource
+) -> list[Process]:
+    """Return the processes: they answer every image, so that each is scored, as the options of the command say."""
     more = {name: {"skip_off": [IDLE]} for name in ("keypoint_detector", "contact_estimator", "ifea_solver")}
+    more["ifea_solver"] |= {"estimator.mesh": setup.settings.mesh}
+    if (mode := _contact_mode(recording, setup.contacts)) != FIXED:
+        density = {} if setup.settings.solver == "paper" else {"contact.mesh": setup.settings.mesh}
+        more["contact_estimator"] |= {"contact.mode": mode, **density}
     if any(each.executable == "keypoint_detector" for each in processes):
         more["keypoint_detector"] |= keypoints.node_parameters(recording)
     return [replace(each, parameters={**each.parameters, **more.get(each.executable, {})}) for each in processes]
@@ -218,10 +224,15 @@ def _graph_options(
         calibration_file=calibration_file,
         **_contact_options(recording, setup.contacts),
         solver=setup.settings.solver,
-        mesh=setup.settings.mesh,
         parameter_file=playing.parameter_file,
         use_sim_time=playing.has_clock,
     )
+
+
+def _contact_mode(recording: Recording, choice: ContactChoice) -> str:
+    """Return how the contacts of all jaws are found, or that their height is fixed."""
+    modes = {choice.mode_for(recording, side) for side in recording.jaws}
+    return modes.pop() if len(modes) == 1 else FIXED
 
 
 def _contact_options(recording: Recording, choice: ContactChoice) -> dict[str, Any]:
@@ -230,8 +241,7 @@ def _contact_options(recording: Recording, choice: ContactChoice) -> dict[str, A
     Raises:
         FinforceError: height, mesh or poses are missing.
     """
-    modes = {choice.mode_for(recording, side) for side in recording.jaws}
-    mode = modes.pop() if len(modes) == 1 else FIXED
+    mode = _contact_mode(recording, choice)
     if mode == FIXED:
         return {"contact_height": choice.height(recording)}
     for side, track in recording.jaws.items():
@@ -239,7 +249,7 @@ def _contact_options(recording: Recording, choice: ContactChoice) -> dict[str, A
             needed = f"/object_pose and /{side}/jaw_pose"
             raise RecordingError(f"{recording.name}: --contact {mode} needs {needed}; give --contact fixed:Z_MM")
     mesh = require_mesh(recording, choice.object_file).resolve()
-    return {"contact": mode, "object_mesh": str(mesh), "object_mesh_unit": choice.object_unit}
+    return {"object_mesh": str(mesh), "object_mesh_unit": choice.object_unit}
 
 
 def _score(recording: Recording, setup: EvaluationSetup, log: ReplayLog) -> Evaluation:
