@@ -110,6 +110,20 @@ def test_which_way_things_fall_reaches_the_estimator_in_the_jaws_frame(probe, si
     np.testing.assert_allclose(estimator.observations[0].gravity, expected, atol=1e-12)
 
 
+def test_which_way_things_fall_is_told_by_a_frame_that_stands_upright(probe, tf):
+    tilt = np.eye(4)
+    tilt[1:3, 1:3] = [[0.8, -0.6], [0.6, 0.8]]  # the base's z points along (0, -0.6, 0.8) of the gripper
+    tf["r1/gripper_base", "base_link"] = tilt
+    estimator = FakeEstimator()
+    start_solver(probe, estimator, peer="right", gravity_frame="base_link", frame_prefix="r1/")
+    out = probe.speak("left/keypoints")
+    probe.connected(out)
+    out.publish(keypoint_cloud(frame="r1/left_jaw"))
+    probe.wait_for(lambda: estimator.observations)
+    expected = R_GRIPPER_JAW["left"].T @ [0.0, 0.6, -0.8]
+    np.testing.assert_allclose(estimator.observations[0].gravity, expected, atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("message", "word"),
     [(((0.0, 0.0, 0.0),), "not all zero"), (((0.0, np.nan, 1.0),), "finite"), (((0, 0, 1.0), "camera"), "camera")],
