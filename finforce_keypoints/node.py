@@ -55,6 +55,7 @@ class DetectorOutputs:
         stage: makes publishers and watches them.
         parameters: which jaws, and the names of their frames.
         frame: of the camera.
+        frames: by which the jaws' poses go to /tf.
         names: of the rows of the clouds; sent once, and kept for whoever comes later.
         detector: that finds them.
     """
@@ -64,12 +65,13 @@ class DetectorOutputs:
         stage: ros.Stage,
         parameters: DetectorParameters,
         frame: CameraFrame,
+        frames: ros.Frames,
         names: Sequence[str],
         detector: KeypointDetector,
     ) -> None:
         sides, self._jaws = parameters.sides, parameters.jaw_frame
         self._frame, self._skeleton = frame, build_skeleton(names)
-        self._frames = ros.Frames(stage.node) if parameters.publish_tf else None
+        self._frames = frames if parameters.publish_tf else None
         self.keypoints = {side: stage.publisher(ros.PointCloud2, f"{side}/keypoints", ros.RESULT) for side in sides}
         self.pose = {side: stage.publisher(ros.PoseStamped, f"{side}/jaw_pose", ros.RESULT) for side in sides}
         self.annotated = stage.publisher(ros.Image, "~/annotated", ros.RESULT)
@@ -165,7 +167,7 @@ class KeypointDetectorNode(ros.ImageNode):
         self.found: Mapping[str, JawKeypoints] = {}
         self.rested, self.idling = float("-inf"), Idling()
         self.stage = ros.Stage(self, pipeline)
-        self.out = DetectorOutputs(self.stage, parameters, self.feed.frame, names, self.detector)
+        self.out = DetectorOutputs(self.stage, parameters, self.feed.frame, self.frames, names, self.detector)
         self.detector.warm_up()  # before images come: those that came meanwhile would be lost
         self._serve()
         self._subscribe()

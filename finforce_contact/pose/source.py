@@ -80,10 +80,8 @@ class ExternalPoseSource:
                 return None
             source = "Detection3DArray"
             message = SimpleNamespace(header=message.header, pose=_pose_of_detection(message.detections[0]))
-        T_camera_object, stamp = (
-            pose_from_message(message, self._frame.of(message, is_sure=False), source),
-            SECOND * stamp_of(message),
-        )
+        stamp = SECOND * stamp_of(message)
+        T_camera_object = pose_from_message(message, self._frame.of(message, is_sure=False), source)
         if self.latest is not None and stamp <= self.latest.stamp:
             raise PoseError(
                 f"{source}: got stamp {stamp:.6f} s, expected one after {self.latest.stamp:.6f} s; "

@@ -30,9 +30,8 @@ _GRIP, _WASHER = 3.0, 2.0
 _FACES = 0.7
 _NEIGHBOURS, _LONGER = 3e-3, 1.4
 _FEWEST, _FLAT = 5, 1e-4
-
-
-_HELD = 0.5  # of the distance between the bands, that the clamp has to span at least
+# The clamp spans so much of the distance between the bands at least.
+_HELD = 0.5
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
