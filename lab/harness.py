@@ -178,6 +178,8 @@ def find_front(points: pd.DataFrame, time: str, error: str) -> pd.DataFrame:
 
 def draw_tradeoff(figures: Figures, path: Path | str) -> None:
     """Draw time against error, from the median to the 99th percentile, with the front of methods that always answer."""
+    from matplotlib.ticker import LogFormatter
+
     from finforce_eval.figures.figures import GREY, new_figure, style_axes
 
     plan = figures.picture
@@ -203,10 +205,8 @@ def draw_tradeoff(figures: Figures, path: Path | str) -> None:
         front = find_front(pd.concat(complete), plan.time, plan.error)
         axes.step(front[plan.time], front[plan.error], where="post", color=GREY, linewidth=5, alpha=0.35, zorder=0)
     axes.set(xscale="log", xlabel=f"{plan.time}: marker p50, line to p99", ylabel=plan.error)
-    if plan.log_error:
-        axes.set(yscale="log")
-    else:
-        axes.set_ylim(bottom=0.0)
+    axes.xaxis.set(major_formatter="{x:g}", minor_formatter=LogFormatter(minor_thresholds=(2, 0.4)))
+    axes.set(yscale="log") if plan.log_error else axes.set_ylim(bottom=0.0)
     axes.set_title(plan.title, loc="left", fontsize=11)
     figure.legend(loc="outside right upper", frameon=False, fontsize=9)
     figure.savefig(path)

@@ -112,7 +112,6 @@ def measure(quick: bool) -> Figures:
         picture=Tradeoff(
             table="tiers",
             method=("tier",),
-            text="key points",
             time="step p50/ms",
             slow="step p99/ms",
             error="RMSE/N",
