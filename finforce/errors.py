@@ -1,5 +1,8 @@
 """The base of the errors that finforce raises on purpose, and of missing libraries."""
 
+from collections.abc import Iterable
+from difflib import get_close_matches
+
 
 class FinforceError(Exception):
     """The base of every error that finforce raises on purpose."""
@@ -24,3 +27,10 @@ class ServiceError(FinforceError, RuntimeError):
 def one_line(error: BaseException, longest: int = 1000) -> str:
     """Return what an error says as one line of so many characters, or its class where it says nothing."""
     return " ".join(str(error).split())[:longest] or type(error).__name__
+
+
+def suggest(word: str, known: Iterable[str]) -> str:
+    """Return "did you mean NAME?" for a word that resembles a known one, else "expected one of" all of them."""
+    names = list(known)
+    close = get_close_matches(word, names, n=1)
+    return f"did you mean {close[0]}?" if close else f"expected one of {', '.join(names)}"

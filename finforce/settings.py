@@ -107,14 +107,23 @@ def check_value(entry: Field, value: Any, error: type[Exception] = ParameterErro
     choices, low, high = (entry.metadata.get(key) for key in ("choices", "min", "max"))
     name = name or entry.name
     if choices and value not in choices:
-        raise error(f"{name}: got {value!r}, expected one of {', '.join(choices)}")
+        raise error(f"{name}: got {value!r}, expected one of {', '.join(filter(None, map(str, choices)))}")
     if value != value and _may_be_nan(entry):
         return
     if (low is not None and not value >= low) or (high is not None and not value <= high):
         unit = entry.metadata.get("unit") or "1"
         unit = "" if unit == "1" else f" {unit}"
         bounds = f"at least {low:g}" if high is None else f"at most {high:g}" if low is None else f"{low:g} to {high:g}"
-        raise error(f"{name}: got {value!r}, expected {bounds}{unit}")
+        raise error(f"{name}: got {value!r}, expected {bounds}{unit}{_millimetres(entry, value)}")
+
+
+def _millimetres(entry: Field, value: Any) -> str:
+    """Return what a length would be in metres where it is in bounds only if it was meant in millimetres."""
+    low, high = (entry.metadata.get(key) for key in ("min", "max"))
+    likely = (
+        entry.metadata.get("unit") == "m" and high is not None and high < value and (low or 0.0) <= value / 1e3 <= high
+    )
+    return f"; {value:g} mm are {value / 1e3:g} m" if likely else ""
 
 
 def check_bounds(record: Any, error: type[Exception]) -> None:

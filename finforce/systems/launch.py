@@ -9,8 +9,8 @@ from dataclasses import Field, fields
 from pathlib import Path
 from typing import Any, TypeVar
 
-from finforce.errors import MissingDependencyError
-from finforce.settings import describe
+from finforce.errors import MissingDependencyError, suggest
+from finforce.settings import check_bounds, describe
 from finforce.systems.processes import SINGLE_THREAD, Include, Process
 
 OptionsT = TypeVar("OptionsT")
@@ -49,7 +49,7 @@ def _arguments_of(entry: Field, default: str | None) -> list[Any]:
 
     choices = SWITCH if isinstance(entry.default, bool) else entry.metadata.get("choices")
     some = {"choices": [str(word) or NONE for word in choices]} if choices else {}
-    default = default or (str(entry.default).lower() if isinstance(entry.default, bool) else str(entry.default)) or NONE
+    default = default or default_text(entry)
     former = entry.metadata.get("alias")
     if former is None:
         return [DeclareLaunchArgument(entry.name, default_value=default, description=describe(entry), **some)]
@@ -60,13 +60,45 @@ def _arguments_of(entry: Field, default: str | None) -> list[Any]:
     ]
 
 
+def default_text(entry: Field) -> str:
+    """Return the default of an option as an argument has it."""
+    return (str(entry.default).lower() if isinstance(entry.default, bool) else str(entry.default)) or NONE
+
+
+def options_from_words(record: type[OptionsT], words: Sequence[str], without: Sequence[str] = ()) -> OptionsT:
+    """Return an options record from words such as `object_mesh:=can.stl`.
+
+    Args:
+        record: the options.
+        words: of a command line.
+        without: names of options that cannot be given.
+
+    Raises:
+        ValueError: a word names no option, or its value is none.
+    """
+    known = {entry.name: entry for entry in fields(record) if entry.name not in without}
+    former = {entry.metadata["alias"]: name for name, entry in known.items() if "alias" in entry.metadata}
+    texts = {entry.name: default_text(entry) for entry in fields(record)}
+    for word in words:
+        name, given, text = word.partition(":=")
+        name = former.get(name, name)
+        if name not in known:
+            raise ValueError(f"{name!r} is no option: {suggest(name, known)}")
+        if not given:
+            raise ValueError(f"{word!r}: expected {name}:=VALUE")
+        texts[name] = text
+    return options_from_texts(record, texts)
+
+
 def options_from_texts(record: type[OptionsT], texts: Mapping[str, str]) -> OptionsT:
     """Return an options record from launch arguments, each turned into the type of its default.
 
     Raises:
         ValueError: a text is no such value.
     """
-    return record(**{entry.name: _value(entry.name, texts[entry.name], entry.default) for entry in fields(record)})
+    options = record(**{entry.name: _value(entry.name, texts[entry.name], entry.default) for entry in fields(record)})
+    check_bounds(options, ValueError)
+    return options
 
 
 def _value(name: str, text: str, default: Any) -> Any:
@@ -93,7 +125,7 @@ def launch_action(part: Process | Include) -> Any:
 
     folder = find_share(part.package)
     if folder is None:
-        text = _missing(part.package, part.advice)
+        text = missing(part.package, part.advice)
         if isinstance(part, Process) and part.optional:
             return LogInfo(msg=text)
         raise MissingDependencyError(text)
@@ -102,15 +134,15 @@ def launch_action(part: Process | Include) -> Any:
 
 def find_share(package: str) -> Path | None:
     """Return the share folder of a ROS package, None where it is not installed."""
-    from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
-
     try:
+        from ament_index_python.packages import get_package_share_directory
+
         return Path(get_package_share_directory(package))
-    except PackageNotFoundError:
+    except (ImportError, LookupError, OSError):  # no ROS, no such package, no ROS that is sourced
         return None
 
 
-def _missing(package: str, advice: str) -> str:
+def missing(package: str, advice: str) -> str:
     """Say that a package is missing, and what would do."""
     archive = f"ros-{os.environ.get('ROS_DISTRO', 'jazzy')}-{package.replace('_', '-')}"
     return f"{package} is not installed: sudo apt install {archive}" + (f"; {advice}" if advice else "")
@@ -153,7 +185,7 @@ def _include_action(part: Include, folder: Path) -> Any:
 
     for program in part.programs:
         if shutil.which(program) is None:
-            raise MissingDependencyError(_missing(program, part.advice))
+            raise MissingDependencyError(missing(program, part.advice))
     source = PythonLaunchDescriptionSource(str(folder / "launch" / part.file))
     environment = [SetEnvironmentVariable(name, value) for name, value in part.environment.items()]
     included = IncludeLaunchDescription(source, launch_arguments=list(part.arguments.items()))

@@ -55,7 +55,9 @@ class Process:
     advice: str = ""
 
     def command(self) -> list[str]:
-        """Return the command line that runs one of our nodes with this Python, without `ros2`."""
+        """Return the command line that runs the process: a node of ours with this Python, without `ros2`."""
+        if self.package != "finforce":
+            return ["ros2", "run", self.package, self.executable, *self.arguments, "--ros-args", *self.words]
         return [sys.executable, "-m", "finforce.ros.start", self.executable, *self.arguments, "--ros-args", *self.words]
 
     @property
@@ -289,7 +291,7 @@ class SolverOptions:
         "", "Calibration file or name of a shipped calibration; none: material of the jaw file"
     )
     contact_height: float = setting(
-        math.nan, "Height of first touch above the clamped base [m]; nan: contacts come by topic"
+        math.nan, "Height of first touch above the clamped base; nan: contacts come by topic", "m", 0.0, 0.5
     )
     object_mesh: str = setting("", "Mesh file of the object, from which contacts are estimated")
     object_mesh_unit: str = setting("", "Unit of the mesh file: m, cm, mm or inch")

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
+import sys
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from shutil import rmtree
+from shutil import rmtree, which
 from typing import Any
 
+from finforce.systems.launch import find_share
 from finforce_eval.annotation.bag import new_folder
 from finforce_eval.cli.parser import CONTACT_HELP
 from finforce_eval.cli.replay import format_replay
@@ -82,7 +85,15 @@ def run(options: argparse.Namespace) -> None:
 
         skeleton = build_skeleton(setup.jaw.keypoint_names)
         write_movie(result.recording, list(result.evaluation.results.values()), options.movie, skeleton)
-    print(f"\n{format_summary(result)}\nReport: {page}")
+    print(f"\n{format_summary(result)}\nReport: {page}\nNext, the simulated robot: {next_command()}")
+
+
+def next_command() -> str:
+    """Return the command that starts the simulated robot, as this environment can run it."""
+    if which("ros2") and find_share("finforce"):
+        return "ros2 launch finforce robot.launch.py sim:=true"
+    program = "finforce" if which("finforce") else os.path.relpath(Path(sys.executable).with_name("finforce"))
+    return f"{program} launch robot sim:=true"
 
 
 def format_summary(result: Replay) -> str:

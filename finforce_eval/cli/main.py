@@ -22,6 +22,7 @@ COMMANDS = {
     "view": "show a recording with its forces in Rerun: pictures, key points, bending jaws, contact, forces over time",
     "replay": "play a recording through the real nodes in real time and score it",
     "prepare": "compile and build ahead of time what a first start would have to wait for",
+    "launch": "start a whole system, such as the simulated robot, without `ros2`",
     "pipeline": "find the grasp force in a camera's images, all stages in one process",
     "trace": "show the way of a recording's images through the stages: who waits for whom, and where time goes",
     "jaw": "make the jaw file of a printed finger from its STL, STEP, DXF or SVG file",

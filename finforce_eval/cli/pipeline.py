@@ -7,7 +7,8 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 from finforce.errors import MissingDependencyError
-from finforce.systems.launch import NONE, options_from_texts
+from finforce.settings import setting
+from finforce.systems.launch import options_from_words
 from finforce.systems.live import gripper_process
 from finforce.systems.processes import GripperOptions, Process, ReplayOptions, finish, merge, replay_processes
 from finforce_eval.errors import OptionError
@@ -17,7 +18,7 @@ from finforce_eval.errors import OptionError
 class PipelineOptions(ReplayOptions, GripperOptions):
     """What the command is asked for: what the launch files are, as far as it is about our nodes."""
 
-    jaws: str = "both"
+    jaws: str = setting("both", "Jaws in the images", choices=("left", "right", "both"))
     images: bool = True
     use_sim_time: bool = False
     gripper: bool = False
@@ -39,19 +40,11 @@ def pipeline_process(words: list[str]) -> Process:
     Raises:
         OptionError: a word names no option, or its value is none.
     """
-    known = {entry.name: entry.default for entry in fields(PipelineOptions) if entry.name not in OTHER}
-    given = dict(word.partition(":=")[::2] for word in words)
-    unknown = [name for name in given if name not in known]
-    if unknown:
-        raise OptionError(f"{unknown[0]!r} is no option; expected NAME:=VALUE with one of {', '.join(known)}")
-    texts = {entry.name: str(entry.default) or NONE for entry in fields(PipelineOptions)}
     try:
-        options = options_from_texts(PipelineOptions, texts | given)
+        options = options_from_words(PipelineOptions, words, without=OTHER)
         processes = replay_processes(replace(options, composed=False), Path())
     except ValueError as error:
         raise OptionError(str(error)) from error
-    if options.jaws not in ("both", "left", "right"):
-        raise OptionError(f"jaws:={options.jaws}: expected both, left or right")
     driver = finish([gripper_process(options)], replace(options, composed=False)) if options.gripper else []
     return merge([*processes, *driver])
 

@@ -30,10 +30,11 @@ class ProcessGroup:
     Args:
         processes: what to run, with this Python.
         environment: variables in addition to those of this process.
+        quiet: keep what they print, of which a complaint has the last line; else they print to the terminal.
     """
 
-    def __init__(self, processes: Sequence[Process], environment: Mapping[str, str]) -> None:
-        self._processes = processes
+    def __init__(self, processes: Sequence[Process], environment: Mapping[str, str], *, quiet: bool = True) -> None:
+        self._processes, self._quiet = processes, quiet
         self._environment = {**os.environ, **SINGLE_THREAD, **environment}
         self._children: list[subprocess.Popen] = []
         self._logs: list[IO[bytes]] = []
@@ -55,8 +56,8 @@ class ProcessGroup:
                 process.command(),
                 env=self._environment,
                 stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=subprocess.STDOUT,
+                stdout=log if self._quiet else None,
+                stderr=subprocess.STDOUT if self._quiet else None,
                 start_new_session=True,  # Ctrl-C comes to us alone; we end the children in our order
             )
         except OSError as error:
@@ -76,8 +77,19 @@ class ProcessGroup:
         """
         for process, child, log in zip(self._processes, self._children, self._logs, strict=True):
             if child.poll() is not None:
-                words = last_words(log)
-                raise ProcessError(f"{process.label} ended with status {child.returncode}: {words}")
+                words = f": {last_words(log)}" if self._quiet else ""
+                raise ProcessError(f"{process.label} ended with status {child.returncode}{words}")
+
+    def has_finished(self) -> bool:
+        """Return whether the process has ended well that ends all.
+
+        Raises:
+            ProcessError: one has ended with an error.
+        """
+        statuses = [child.poll() for child in self._children]
+        if any(statuses):
+            self.check()
+        return any(part.ends_all and status == 0 for part, status in zip(self._processes, statuses, strict=True))
 
     def __exit__(self, *_: Any) -> None:
         for number, patience in PATIENCE:

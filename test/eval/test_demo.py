@@ -159,5 +159,5 @@ def test_the_demo_plays_its_recording_and_ends_with_figures_and_report(rendered,
     assert (asked["calibration"], asked["source"], asked["about"]["contact"]) == ("twin", "images", "estimate")
     assert asked["recordings"] == [played]
     lines = capsys.readouterr().out.splitlines()
-    assert lines[-1] == f"Report: {tmp_path / 'report' / 'README.md'}"
+    assert lines[-2] == f"Report: {tmp_path / 'report' / 'README.md'}" and "launch" in lines[-1]
     assert [line.split(":")[0] for line in lines[-4:-1]] == ["Grasp force", "Key points", "Delay"]

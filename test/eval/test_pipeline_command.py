@@ -32,7 +32,7 @@ def test_one_jaw_at_a_known_height_needs_no_contact_estimator_and_the_driver_com
     [
         ("sim:=true", "'sim' is no option"),
         ("nothing", "'nothing' is no option"),
-        ("jaws:=three", "jaws:=three"),
+        ("jaws:=three", "jaws: got 'three', expected one of left, right, both"),
         ("images:=perhaps", "expected true or false"),
         ("contact_height:=low", "expected a float"),
     ],

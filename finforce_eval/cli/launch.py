@@ -1,0 +1,94 @@
+"""The subcommand `launch`: the systems of the launch files, from wheels alone."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import fields
+from pathlib import Path
+from shutil import which
+
+from finforce.errors import MissingDependencyError
+from finforce.settings import describe
+from finforce.signals import StopSignals
+from finforce.systems.launch import default_text, find_share, missing, options_from_words
+from finforce.systems.live import bench_processes, robot_processes
+from finforce.systems.processes import (
+    BenchOptions,
+    Include,
+    Process,
+    ReplayOptions,
+    RobotOptions,
+    replay_processes,
+)
+from finforce_eval.errors import OptionError
+from finforce_eval.replay.processes import ProcessGroup
+
+SYSTEMS = {
+    "robot": (RobotOptions, robot_processes),
+    "bench": (BenchOptions, bench_processes),
+    "replay": (ReplayOptions, replay_processes),
+}
+_POLL = 0.2  # [s] between two looks at the processes
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the subcommand."""
+    parser.add_argument("system", choices=SYSTEMS, help="robot: both jaws; bench: one jaw; replay: a recording")
+    text = "argument of the launch file, such as sim:=true or object_mesh:=can.stl; lengths in metres"
+    parser.add_argument("words", nargs="*", metavar="NAME:=VALUE", help=text)
+    parser.add_argument("-s", "--show-args", action="store_true", help="list the arguments with their defaults and end")
+    parser.epilog = "example: finforce launch robot sim:=true"
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run the processes of a system until Ctrl-C, or until its recording ends; return the exit status."""
+    record, _ = SYSTEMS[options.system]
+    if options.show_args:
+        for entry in fields(record):
+            print(f"{entry.name}:={default_text(entry)}\n    {describe(entry)}")
+        return 0
+    processes = startable(list_parts(options.system, options.words))
+    with StopSignals() as stop, ProcessGroup(processes, {}, quiet=False) as group:
+        while not stop.wait(_POLL) and not group.has_finished():
+            pass
+    return 0
+
+
+def list_parts(system: str, words: Sequence[str]) -> list[Process | Include]:
+    """Return what a system starts, by words such as `sim:=true`.
+
+    Raises:
+        OptionError: a word names no argument, or its value cannot be used.
+    """
+    record, describe_parts = SYSTEMS[system]
+    try:
+        return describe_parts(options_from_words(record, words), share_folder())
+    except ValueError as error:
+        raise OptionError(str(error)) from error
+
+
+def share_folder() -> Path:
+    """Return the folder with the configuration files: that of the checkout, or of the installed package."""
+    checkout = Path(__file__).parents[2]
+    return checkout if (checkout / "config").is_dir() else Path(sys.prefix, "share", "finforce")
+
+
+def startable(parts: Sequence[Process | Include]) -> list[Process]:
+    """Return the processes that can be started without ROS 2's launch; what is optional and missing is left out.
+
+    Raises:
+        MissingDependencyError: one that is needed is missing, or a launch file of another package is needed.
+    """
+    processes = []
+    for part in parts:
+        if isinstance(part, Include):
+            raise MissingDependencyError(f"{part.package} needs ROS 2 from apt and `ros2 launch`; {part.advice}")
+        if part.package == "finforce" or (which("ros2") and find_share(part.package)):
+            processes.append(part)
+        elif part.optional:
+            print(f"note: {missing(part.package, part.advice)}", file=sys.stderr)
+        else:
+            raise MissingDependencyError(missing(part.package, part.advice))
+    return processes

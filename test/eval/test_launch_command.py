@@ -1,0 +1,96 @@
+"""Claims about `finforce launch`: the systems of the launch files, without `ros2`."""
+
+import sys
+from dataclasses import dataclass
+
+import pytest
+
+from finforce.errors import MissingDependencyError
+from finforce.systems.processes import executables_of
+from finforce_eval.cli import demo, launch
+from finforce_eval.cli.main import main
+
+
+@pytest.fixture(autouse=True)
+def no_ros2(monkeypatch):
+    """Only wheels, as after the recommended set-up."""
+    monkeypatch.setattr(launch, "which", lambda program: None)
+    monkeypatch.setattr(demo, "which", lambda program: None)
+
+
+def test_the_simulated_robot_needs_nothing_but_the_wheels(capsys):
+    processes = launch.startable(launch.list_parts("robot", ["sim:=true"]))
+    assert {process.package for process in processes} == {"finforce"}
+    stages = ["keypoint_detector", "contact_estimator", "ifea_solver", "ifea_solver"]
+    assert sorted(executables_of(processes)) == sorted(["twin_camera", "gripper_driver", *stages])
+    assert "robot_state_publisher is not installed" in capsys.readouterr().err
+    assert all("/config/robot_sim.yaml" in str(process.command()) for process in processes)
+
+
+@pytest.mark.parametrize(("words", "package"), [([], "realsense2_camera"), (["camera:=false", "rviz:=true"], "rviz2")])
+def test_what_the_wheels_have_not_is_said(words, package):
+    with pytest.raises(MissingDependencyError, match=f"^{package} .*; or "):
+        launch.startable(launch.list_parts("robot", words))
+
+
+def test_with_ros_from_apt_nodes_of_other_packages_are_started_too(monkeypatch):
+    monkeypatch.setattr(launch, "which", lambda program: program)
+    monkeypatch.setattr(launch, "find_share", lambda package: package)
+    started = [process.command() for process in launch.startable(launch.list_parts("robot", ["sim:=true"]))]
+    assert ["ros2", "run", "robot_state_publisher", "robot_state_publisher"] in [command[:4] for command in started]
+
+
+@pytest.mark.parametrize(
+    ("word", "reason"),
+    [
+        ("simm:=true", "'simm' is no option: did you mean sim?"),
+        ("sim", "'sim': expected sim:=VALUE"),
+        ("contact_height:=40", "contact_height: got 40.0, expected 0 to 0.5 m; 40 mm are 0.04 m"),
+        ("dof:=5", "expected one of 6, 7"),
+    ],
+)
+def test_a_word_that_cannot_be_used_is_one_line(word, reason, capsys):
+    assert main(["launch", "robot", word]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert reason in line
+
+
+def test_every_argument_is_listed_with_its_default(capsys):
+    assert main(["launch", "replay", "--show-args"]) == 0
+    assert "rate:=1.0\n    Speed of playing\n" in capsys.readouterr().out
+
+
+@dataclass(frozen=True)
+class Script:
+    """A process that runs a line of Python."""
+
+    code: str
+    ends_all: bool = False
+    label: str = "script"
+
+    def command(self):
+        return [sys.executable, "-c", self.code]
+
+
+def launch_scripts(monkeypatch, *scripts):
+    monkeypatch.setattr(launch, "startable", lambda parts: scripts)
+    return main(["launch", "replay"])
+
+
+WAIT = "import time; time.sleep(60)"
+
+
+def test_the_end_of_the_player_ends_all(monkeypatch):
+    assert launch_scripts(monkeypatch, Script(WAIT), Script("", ends_all=True)) == 0
+
+
+def test_a_process_that_fails_ends_all_and_is_named(monkeypatch, capsys):
+    assert launch_scripts(monkeypatch, Script(WAIT), Script("raise SystemExit(3)", label="solver")) == 2
+    assert capsys.readouterr().err == "finforce: solver ended with status 3\n"
+
+
+def test_the_demo_ends_with_the_command_that_comes_next(monkeypatch):
+    assert demo.next_command().endswith("finforce launch robot sim:=true")
+    monkeypatch.setattr(demo, "which", lambda program: program)
+    monkeypatch.setattr(demo, "find_share", lambda package: package)
+    assert demo.next_command() == "ros2 launch finforce robot.launch.py sim:=true"
