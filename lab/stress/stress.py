@@ -240,7 +240,7 @@ JUDGED = ("force_error", "stddev", "sigmas")
 PRINTED = {
     "n": ("n", 1),
     "converged": ("conv. %", 100),
-    "sure": ("sure %", 100),
+    "sure": ("trusted %", 100),
     "worst_residual": ("residual", 1),
     "worst_kkt": ("KKT", 1),
     "worst_error": ("error N", 1),
