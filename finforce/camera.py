@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import Any
@@ -28,6 +29,13 @@ class ImageError(FinforceError, ValueError):
 
 class IntrinsicsError(FinforceError, ValueError):
     """Intrinsics that no camera has."""
+
+
+def name_matrix(matrix: Sequence[float]) -> dict[str, float]:
+    """Return fx, fy, cx, cy of a camera's 3x3 matrix, row by row; raises IntrinsicsError where its axes are skew."""
+    if any(matrix[index] for index in (1, 3, 6, 7)):
+        raise IntrinsicsError(f"camera matrix {[*matrix]}: expected no skew, [fx 0 cx 0 fy cy 0 0 1]")
+    return {"fx": matrix[0], "fy": matrix[4], "cx": matrix[2], "cy": matrix[5]}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

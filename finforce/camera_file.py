@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from finforce.camera import EQUIDISTANT, PLUMB_BOB, RATIONAL, CameraIntrinsics, IntrinsicsError
+from finforce.camera import EQUIDISTANT, PLUMB_BOB, RATIONAL, CameraIntrinsics, IntrinsicsError, name_matrix
 from finforce.files import LARGEST_YAML, FileError, parse_json, parse_yaml, read_text
 
 INTRINSICS_FORMS = (
@@ -49,7 +49,7 @@ def read_camera(path: str | Path, shape: tuple[int, int] | None = None, name: st
 def camera_numbers(numbers: Sequence[float]) -> dict[str, Any]:
     """Return fx fy cx cy and perhaps four or five coefficients of the lens, or a 3x3 matrix, by name."""
     if len(numbers) == 9 and list(numbers[6:]) == [0.0, 0.0, 1.0]:
-        return _from_matrix(numbers)
+        return name_matrix(numbers)
     if len(numbers) not in (4, 8, 9):
         raise IntrinsicsError(f"{len(numbers)} numbers; expected {INTRINSICS_FORMS}")
     return {**dict(zip(_NAMES, numbers, strict=False)), "distortion": list(numbers[4:])}
@@ -128,7 +128,7 @@ def _name_entries(entries: Mapping[str, Any]) -> dict[str, Any]:
     matrix = next((each for each in (_numbers(entries.get(name)) for name in _MATRICES) if len(each) == 9), None)
     intrinsics = entries.get("intrinsics")
     if matrix:
-        named |= _from_matrix(matrix)
+        named |= name_matrix(matrix)
     elif isinstance(intrinsics, Mapping):
         return named | _from_openicc(intrinsics, str(entries.get("intrinsic_type")))
     elif intrinsics is not None:
@@ -138,13 +138,6 @@ def _name_entries(entries: Mapping[str, Any]) -> dict[str, Any]:
     named["distortion"] = next(filter(None, (_numbers(entries.get(name)) for name in _LENSES)), [])
     named["model"] = EQUIDISTANT if entries.get("fisheye_model") else entries.get("distortion_model")
     return named
-
-
-def _from_matrix(matrix: Sequence[Any]) -> dict[str, Any]:
-    """Return the entries of a 3x3 matrix, row by row."""
-    if any(matrix[index] for index in (1, 3, 6, 7)):
-        raise IntrinsicsError(f"camera matrix {list(matrix)}: expected no skew, [fx 0 cx 0 fy cy 0 0 1]")
-    return {"fx": matrix[0], "cx": matrix[2], "fy": matrix[4], "cy": matrix[5]}
 
 
 def _from_openicc(intrinsics: Mapping[str, Any], kind: str) -> dict[str, Any]:

@@ -45,18 +45,8 @@ def read_bytes(path: str | Path, largest: int = LARGEST) -> bytes:
     Raises:
         FileError: it is missing, no plain file, or larger than `largest` bytes.
     """
-    try:
-        handle = os.open(path, _OPEN)
-        with os.fdopen(handle, "rb") as file:
-            state = os.fstat(handle)
-            if not stat.S_ISREG(state.st_mode):
-                raise FileError("is no plain file")
-            allowed = raise_budget(largest)
-            content = file.read(min(allowed, state.st_size) + 1)
-    except (OSError, ValueError) as error:  # a name with a null byte is a ValueError
-        if isinstance(error, FileError):
-            raise
-        raise FileError(f"cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    allowed = raise_budget(largest)
+    content = _read_start(path, allowed + 1)
     if len(content) > allowed:
         raise FileError(f"has more than {allowed >> 10} KiB; {BUDGET}=10 would allow ten times as many")
     return content
@@ -68,15 +58,23 @@ def check_plain(path: Path) -> None:
     Raises:
         FileError: it is missing, no plain file, or stands for a file that Git LFS has not fetched.
     """
-    try:
-        is_plain = stat.S_ISREG(path.stat().st_mode)
-        head = path.open("rb").read(len(_POINTER)) if is_plain else b""
-    except (OSError, ValueError) as error:
-        raise FileError(f"cannot be read: {getattr(error, 'strerror', None) or error}") from error
-    if not is_plain:
-        raise FileError("is no plain file")
-    if head == _POINTER:
+    if _read_start(path, len(_POINTER)) == _POINTER:
         raise FileError("is the pointer of a file that Git LFS has not fetched: run `git lfs pull` in its repository")
+
+
+def _read_start(path: str | Path, most: int) -> bytes:
+    """Return the first bytes of a plain file, at most so many; raises FileError where it is none."""
+    try:
+        handle = os.open(path, _OPEN)
+        with os.fdopen(handle, "rb") as file:
+            state = os.fstat(handle)
+            if not stat.S_ISREG(state.st_mode):
+                raise FileError("is no plain file")
+            return file.read(min(most, state.st_size + 1))
+    except (OSError, ValueError) as error:  # a name with a null byte is a ValueError
+        if isinstance(error, FileError):
+            raise
+        raise FileError(f"cannot be read: {getattr(error, 'strerror', None) or error}") from error
 
 
 def check_inside(path: Path, folder: Path) -> Path:

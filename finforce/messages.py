@@ -24,10 +24,10 @@ from finforce.camera import (
     CameraIntrinsics,
     ImageError,
     ImageLayout,
-    IntrinsicsError,
     decode_color,
     decode_depth,
     decode_picture,
+    name_matrix,
     open_picture,
     unpack_rows,
 )
@@ -358,18 +358,10 @@ def camera_from_info(info: Any, frame: str) -> CameraIntrinsics:
     """
     check_frame(info, frame, "the camera info")
     model = FISHEYES.get(info.distortion_model, info.distortion_model) or PLUMB_BOB
-    k = info.k
-    if any(k[index] != 0.0 for index in (1, 3, 6, 7)):
-        raise IntrinsicsError(
-            f"camera matrix K {[float(number) for number in k]}: expected no skew, [fx 0 cx 0 fy cy 0 0 1]"
-        )
     return CameraIntrinsics(
         width=info.width,
         height=info.height,
-        fx=k[0],
-        fy=k[4],
-        cx=k[2],
-        cy=k[5],
+        **name_matrix([float(number) for number in info.k]),
         distortion=np.array(info.d),
         model=model,
     )
@@ -391,17 +383,6 @@ DEPTH_FORMAT = "16UC1; compressedDepth png"
 DEPTH_HEADER = 12  # bytes of compressed_depth_image_transport: an enum and two numbers for 32-bit depth
 _PNG = b"\x89PNG"
 _STEPPED = ("", "16UC1", "mono16")  # what a png of depth can be said to hold; of 32FC1 it holds inverse depths
-
-
-def depth_from_image(image: Any, frame: str, scale: float) -> NDArray:
-    """Return what `depth_from_message` does of an image in a frame.
-
-    Raises:
-        ObservationError: the frame is another one.
-        ImageError: encoding or size are wrong, or the data are damaged.
-    """
-    check_frame(image, frame, "the depth image")
-    return depth_from_message(image, scale)
 
 
 def depth_from_message(message: Any, scale: float = MILLIMETRE) -> NDArray[np.float32]:
@@ -436,19 +417,17 @@ def depth_steps(message: Any) -> NDArray[np.uint16]:
     return np.clip(image, 0, 65535).astype(np.uint16)
 
 
-def mask_from_image(image: Any, frame: str) -> NDArray[np.bool_]:
+def mask_from_message(message: Any) -> NDArray[np.bool_]:
     """Return the mask (h, w) of a sensor_msgs/Image of 8 bits, or a compressed one; not zero is the object.
 
     Raises:
-        ObservationError: the frame is another one.
         ImageError: encoding or size are wrong.
     """
-    check_frame(image, frame, "the mask")
-    if hasattr(image, "format"):
-        return decode_picture(image.data, f"mask {image.format!r}").any(axis=2)
-    if image.encoding not in MASKS:
-        raise ImageError(f"mask: encoding '{image.encoding}'; expected {' or '.join(MASKS)}")
-    return unpack_rows("mask", image.data, np.dtype(np.uint8), layout_of(image)) != 0
+    if hasattr(message, "format"):
+        return decode_picture(message.data, f"mask {message.format!r}").any(axis=2)
+    if message.encoding not in MASKS:
+        raise ImageError(f"mask: encoding '{message.encoding}'; expected {' or '.join(MASKS)}")
+    return unpack_rows("mask", message.data, np.dtype(np.uint8), layout_of(message)) != 0
 
 
 _STAMPED = 12  # bytes: the encapsulation's four, and the stamp's eight
@@ -476,23 +455,6 @@ def check_frame(message: Any, frame: str, what: str) -> None:
         raise ObservationError(f"{what} came in the frame '{message.header.frame_id}'; expected '{frame}'")
 
 
-class CameraFrame:
-    """The one frame of a camera's messages: the one named, else that of the first message.
-
-    Args:
-        name: of the frame; empty while it is not known.
-    """
-
-    def __init__(self, name: str = "") -> None:
-        self.name, self._is_sure = name, bool(name)
-
-    def of(self, message: Any, *, is_sure: bool = True) -> str:
-        """Return the frame, which is that of this message where none was known, or none for sure."""
-        if not self.name or (is_sure and not self._is_sure):
-            self.name, self._is_sure = message.header.frame_id, is_sure
-        return self.name
-
-
 def check_cloud(cloud: Any, frame: str, what: str) -> None:
     """Refuse a cloud of another frame, or one of several rows.
 
@@ -504,7 +466,7 @@ def check_cloud(cloud: Any, frame: str, what: str) -> None:
         raise ObservationError(f"{what} came as {cloud.height} x {cloud.width} points; expected height 1")
 
 
-def color_from_image(message: Any) -> NDArray[np.uint8]:
+def color_from_message(message: Any) -> NDArray[np.uint8]:
     """Return the colours (h, w, 3), red green blue, of a sensor_msgs/Image, without a copy where its bytes lie so.
 
     Of a sensor_msgs/CompressedImage the jpeg or png is decoded.
@@ -515,6 +477,63 @@ def color_from_image(message: Any) -> NDArray[np.uint8]:
     if hasattr(message, "format"):
         return decode_picture(message.data, f"colour image {message.format!r}")
     return decode_color(np.frombuffer(message.data, dtype=np.uint8), message.encoding, layout_of(message))
+
+
+class CameraStream:
+    """What one camera sends: messages of one frame, that which is named, else that of the first message.
+
+    Attributes:
+        frame: of the camera, empty while it is not known.
+        camera: its intrinsics, None until they came.
+
+    Args:
+        frame: of the camera; empty while it is not known.
+        depth_scale: a step of depth images of 16 bits [m].
+    """
+
+    def __init__(self, frame: str = "", depth_scale: float = MILLIMETRE) -> None:
+        self.frame, self._is_sure, self._depth_scale = frame, bool(frame), depth_scale
+        self.camera: CameraIntrinsics | None = None
+
+    def frame_of(self, message: Any, *, is_sure: bool = True) -> str:
+        """Return the frame, which is that of this message where none was known, or none for sure."""
+        if not self.frame or (is_sure and not self._is_sure):
+            self.frame, self._is_sure = message.header.frame_id, is_sure
+        return self.frame
+
+    def take_info(self, info: Any) -> bool:
+        """Take a sensor_msgs/CameraInfo and say whether it is another camera's than the last.
+
+        Raises:
+            ObservationError: the frame is another one.
+            IntrinsicsError: the numbers are no camera's.
+        """
+        camera = camera_from_info(info, self.frame_of(info))
+        is_new = not same_camera(self.camera, camera)
+        if is_new:
+            self.camera = camera
+        return is_new
+
+    def known_camera(self, topic: str) -> CameraIntrinsics:
+        """Return the intrinsics; raises ImageError where none came on their topic yet."""
+        if self.camera is None:
+            raise ImageError(f"images came, but no camera_info on {topic} yet")
+        return self.camera
+
+    def read_color(self, message: Any) -> NDArray[np.uint8]:
+        """Return the colours of an image as `color_from_message`; raises ObservationError for another frame."""
+        check_frame(message, self.frame_of(message), "the colour image")
+        return color_from_message(message)
+
+    def read_depth(self, message: Any) -> NDArray[np.float32]:
+        """Return the depth of an image as `depth_from_message`; raises ObservationError for another frame."""
+        check_frame(message, self.frame_of(message), "the depth image")
+        return depth_from_message(message, self._depth_scale)
+
+    def read_mask(self, message: Any) -> NDArray[np.bool_]:
+        """Return the mask of an image as `mask_from_message`; raises ObservationError for another frame."""
+        check_frame(message, self.frame_of(message), "the mask")
+        return mask_from_message(message)
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 
 from finforce.health import IDLE, Health, Idling, Level, Outcome, Report, Skips, StampGate
-from finforce.messages import SECOND, CameraFrame, stamp_of
+from finforce.messages import SECOND, CameraStream, stamp_of
 from finforce.ros import node as ros
 from finforce.settings import refresh_record
 from finforce.transforms import pose_numbers
@@ -34,13 +34,13 @@ class ContactOutputs:
     Args:
         stage: makes publishers and watches them.
         parameters: which jaws, and whether the object's poses are found here.
-        frame: of the camera.
+        stream: of the camera.
         skips: whether what nobody subscribes to is left out.
     """
 
-    def __init__(self, stage: ros.Stage, parameters: ContactParameters, frame: CameraFrame, skips: Skips) -> None:
+    def __init__(self, stage: ros.Stage, parameters: ContactParameters, stream: CameraStream, skips: Skips) -> None:
         cloud, sides = ros.PointCloud2, parameters.sides
-        self._frame, self._jaws, self._skips = frame, parameters.jaw_frame, skips
+        self._camera, self._jaws, self._skips = stream, parameters.jaw_frame, skips
         self.contact = {side: stage.publisher(cloud, f"{side}/contact", ros.RESULT) for side in sides}
         self.outline = {side: stage.publisher(cloud, f"{side}/object_outline", ros.RESULT) for side in sides}
         self.slip = {side: stage.publisher(ros.TwistStamped, f"{side}/slip", ros.RESULT) for side in sides}
@@ -70,7 +70,7 @@ class ContactOutputs:
     def send_pose(self, found: StampedPose) -> None:
         """Send the object's pose, unless it came by topic."""
         if self.pose is not None and ros.is_wanted(self.pose, self._skips):
-            header = ros.Header(stamp=ros.stamp_message(found.stamp), frame_id=self._frame.name)
+            header = ros.Header(stamp=ros.stamp_message(found.stamp), frame_id=self._camera.frame)
             self.pose.publish(ros.pose_message(header, pose_numbers(found.pose.T_camera_object)))
 
 
@@ -112,7 +112,7 @@ class ContactEstimatorNode(ros.ImageNode):
         self.health = {side: Health(source=f"{side}/jaw_pose", stale_after=age) for side in self.sides}
         ros.follow_settings(self, parameters, self._limit_age)
         self.stage = ros.Stage(self, pipeline)
-        self.out = ContactOutputs(self.stage, parameters, self.session.frame, self.skips)
+        self.out = ContactOutputs(self.stage, parameters, self.session.stream, self.skips)
         with self.rejections():
             self.get_logger().info(self.session.load_mesh(parameters))
         self._serve()

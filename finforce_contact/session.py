@@ -16,7 +16,7 @@ from finforce.errors import FinforceError, MissingDependencyError, ObservationEr
 from finforce.health import Skips
 from finforce.messages import (
     SECOND,
-    CameraFrame,
+    CameraStream,
     Stamped,
     Synchronizer,
     check_cloud,
@@ -244,7 +244,7 @@ class ContactSession:
         mesh: of the object, None while it is unknown.
         trouble: why there is no mesh, empty when there is nothing wrong with it.
         jaws: by side.
-        frame: of the camera, that of the first image or pose of a jaw unless the parameters name it.
+        stream: of the camera, in the frame of the first image or pose of a jaw unless the parameters name it.
         camera: finds the object's pose in depth images; None where it comes by topic.
 
     Args:
@@ -271,10 +271,11 @@ class ContactSession:
         }
         self.mesh: ObjectMesh | None = None
         self.trouble = ""
-        self.frame, self._frames = CameraFrame(parameters.camera_frame), parameters.jaw_frame
+        self.stream = CameraStream(parameters.camera_frame, parameters.depth_scale)
+        self._frames = parameters.jaw_frame
         self._origin = parameters.pose_origin
-        self._source = ExternalPoseSource(self.frame)
-        self.camera = DepthFeed(parameters, tracker, self.frame) if parameters.tracks else None
+        self._source = ExternalPoseSource(self.stream)
+        self.camera = DepthFeed(parameters, tracker, self.stream) if parameters.tracks else None
         self._lock = RLock()
 
     def load_mesh(self, parameters: ContactParameters) -> str:
@@ -327,7 +328,7 @@ class ContactSession:
         """Work with another object from now on, to be looked for near the guessed poses (4, 4)."""
         with self._lock:
             self.mesh, self.trouble = mesh, ""
-            self._source = ExternalPoseSource(self.frame, mesh=mesh, origin=self._origin)
+            self._source = ExternalPoseSource(self.stream, mesh=mesh, origin=self._origin)
             for jaw in self.jaws.values():
                 jaw.set_object(mesh)
             if self.camera:
@@ -360,7 +361,7 @@ class ContactSession:
         Raises:
             FinforceError: frame or numbers are wrong, or no contact can be found with what is known.
         """
-        told, frame = self.frame.name, self.frame.of(message)
+        told, frame = self.stream.frame, self.stream.frame_of(message)
         if told not in ("", frame):
             self.reset()  # poses of the object had come in another frame
         T_camera_jaw = pose_from_message(message, frame, f"the pose of the {side} jaw")
@@ -391,7 +392,7 @@ class ContactSession:
 
     def pass_over(self, side: str, message: Any) -> None:
         """Leave the image of a jaw's PoseStamped without a contact on that jaw."""
-        T_camera_jaw = pose_from_message(message, self.frame.of(message), f"the pose of the {side} jaw")
+        T_camera_jaw = pose_from_message(message, self.stream.frame_of(message), f"the pose of the {side} jaw")
         with self._lock:
             self.jaws[side].pass_over(stamp_of(message), T_camera_jaw)
 

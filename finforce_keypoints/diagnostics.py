@@ -43,7 +43,7 @@ def report_of_rest(alarms: Sequence[Outcome], values: Mapping[str, str]) -> Repo
 
 def describe(feed: RgbdFeed, method: str, found: JawKeypoints | None) -> dict[str, str]:
     """Return what is known of the camera, the pixel_detector and a jaw's last key points, as text."""
-    camera = feed.camera
+    camera = feed.stream.camera
     known = {
         "detection_method": method,
         "colour images": feed.topic or "none yet",

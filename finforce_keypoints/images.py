@@ -15,16 +15,11 @@ from numpy.typing import NDArray
 from finforce.camera import CameraIntrinsics, ImageError
 from finforce.messages import (
     SECOND,
-    CameraFrame,
+    CameraStream,
     Stamped,
     Synchronizer,
-    camera_from_info,
-    check_frame,
-    color_from_image,
-    depth_from_image,
     median_period,
     pairing_tolerance,
-    same_camera,
     stamp_of,
 )
 from finforce_keypoints.errors import BlackImageError, EmptyDepthError, FrozenImageError, SyncError
@@ -236,8 +231,7 @@ class RgbdFeed:
     is listened to, until it is silent.
 
     Attributes:
-        camera: intrinsics of both images, None until they came.
-        frame: of the camera, which all messages must have.
+        stream: of the camera, in whose frame all messages must be.
         passed: colour images that were overtaken while they waited.
         alone: colour images that were taken without depth.
         topic: the colour topic that is listened to, None before the first image.
@@ -249,8 +243,7 @@ class RgbdFeed:
 
     def __init__(self, parameters: DetectorParameters, clock: Callable[[], float] = monotonic) -> None:
         self._parameters, self._clock = parameters, clock
-        self.camera: CameraIntrinsics | None = None
-        self.frame = CameraFrame(parameters.camera_frame)
+        self.stream = CameraStream(parameters.camera_frame, parameters.depth_scale)
         self.passed = self.alone = 0
         self.topic: str | None = None
         self._heard = clock()
@@ -275,17 +268,6 @@ class RgbdFeed:
         self._stamps: deque[int] = deque(maxlen=_PERIODS + 1)
         self._late = 0
         self._alone = self._parameters.depth == NO_DEPTH
-
-    def take_info(self, info: Any) -> None:
-        """Take a sensor_msgs/CameraInfo.
-
-        Raises:
-            ObservationError: the frame is another one.
-            IntrinsicsError: the numbers are no camera's.
-        """
-        camera = camera_from_info(info, self.frame.of(info))
-        if not same_camera(self.camera, camera):
-            self.camera = camera
 
     def listens(self, topic: str) -> bool:
         """Say whether an image that has come on a colour topic is to be taken; after a silence another topic may be."""
@@ -332,7 +314,7 @@ class RgbdFeed:
             ImageError: it cannot be used.
         """
         stamp = stamp_of(message)
-        depth = depth_from_image(message, self.frame.of(message), self._parameters.depth_scale)
+        depth = self.stream.read_depth(message)
         is_empty = self._parameters.depth == AUTO and not np.isfinite(depth).any()
         self._alone = False
         self._late = max(self._late, max(self._stamps, default=stamp) - stamp)
@@ -373,11 +355,9 @@ class RgbdFeed:
 
     def _read_color(self, message: Any) -> RgbdImage:
         """Return the image of a colour image alone."""
-        if self.camera is None:
-            raise ImageError(f"images came, but no camera_info on {self._parameters.info_topic} yet")
-        check_frame(message, self.frame.of(message), "the colour image")
-        color = color_from_image(message)
-        return RgbdImage(stamp=SECOND * stamp_of(message), color=color, depth=None, camera=self.camera)
+        camera = self.stream.known_camera(self._parameters.info_topic)
+        color = self.stream.read_color(message)
+        return RgbdImage(stamp=SECOND * stamp_of(message), color=color, depth=None, camera=camera)
 
     def _missing_depth(self, stamp: int) -> SyncError:
         """Return the error of a colour image [ns] that has waited long enough."""

@@ -17,7 +17,7 @@ from sensor_msgs.msg import CameraInfo
 
 from finforce.errors import FinforceError, ObservationError
 from finforce.health import IDLE, STILL, UNHEARD, Health, Idling, Outcome, Report, Skips, StampGate
-from finforce.messages import CameraFrame, Stamped
+from finforce.messages import CameraStream, Stamped
 from finforce.processors import bind_caller
 from finforce.ros import node as ros
 from finforce.transforms import pose_numbers
@@ -54,7 +54,7 @@ class DetectorOutputs:
     Args:
         stage: makes publishers and watches them.
         parameters: which jaws, and the names of their frames.
-        frame: of the camera.
+        stream: of the camera.
         frames: by which the jaws' poses go to /tf.
         names: of the rows of the clouds; sent once, and kept for whoever comes later.
         detector: that finds them.
@@ -64,13 +64,13 @@ class DetectorOutputs:
         self,
         stage: ros.Stage,
         parameters: DetectorParameters,
-        frame: CameraFrame,
+        stream: CameraStream,
         frames: ros.Frames,
         names: Sequence[str],
         detector: KeypointDetector,
     ) -> None:
         sides, self._jaws = parameters.sides, parameters.jaw_frame
-        self._frame, self._skeleton = frame, build_skeleton(names)
+        self._camera, self._skeleton = stream, build_skeleton(names)
         self._frames = frames if parameters.publish_tf else None
         self.keypoints = {side: stage.publisher(ros.PointCloud2, f"{side}/keypoints", ros.RESULT) for side in sides}
         self.pose = {side: stage.publisher(ros.PoseStamped, f"{side}/jaw_pose", ros.RESULT) for side in sides}
@@ -88,7 +88,7 @@ class DetectorOutputs:
         """Send the key points of a jaw and its pose, of the image at `stamp` [ns]."""
         time = ros.stamp_message(stamp)
         # the pose goes first: the contact estimator and the solver work at the same time then
-        header = ros.Header(stamp=time, frame_id=self._frame.name)
+        header = ros.Header(stamp=time, frame_id=self._camera.frame)
         self.pose[side].publish(ros.pose_message(header, pose_numbers(found.T_camera_jaw)))
         here = ros.Header(stamp=time, frame_id=self._jaws(side))
         ros.send_cloud(self.keypoints[side], here, keypoint_columns(found))
@@ -99,7 +99,7 @@ class DetectorOutputs:
         """Send the image at `stamp` [ns], (h, w, 3), with what was found in it, while someone subscribes."""
         if not self.annotated.get_subscription_count():
             return
-        header = ros.Header(stamp=ros.stamp_message(stamp), frame_id=self._frame.name)
+        header = ros.Header(stamp=ros.stamp_message(stamp), frame_id=self._camera.frame)
         self.annotated.publish(ros.image_message(header, draw_keypoints(color, found.values(), self._skeleton)))
 
 
@@ -167,7 +167,7 @@ class KeypointDetectorNode(ros.ImageNode):
         self.found: Mapping[str, JawKeypoints] = {}
         self.rested, self.idling = float("-inf"), Idling()
         self.stage = ros.Stage(self, pipeline)
-        self.out = DetectorOutputs(self.stage, parameters, self.feed.frame, self.frames, names, self.detector)
+        self.out = DetectorOutputs(self.stage, parameters, self.feed.stream, self.frames, names, self.detector)
         self.detector.warm_up()  # before images come: those that came meanwhile would be lost
         self._serve()
         self._subscribe()
@@ -193,7 +193,7 @@ class KeypointDetectorNode(ros.ImageNode):
     def _on_info(self, message: CameraInfo) -> None:
         """Keep the camera's intrinsics."""
         with self.rejections():
-            self.feed.take_info(message)
+            self.feed.stream.take_info(message)
 
     def _on_color(self, topic: str, message: Any) -> None:
         """Take a colour image of the camera's topic."""
@@ -254,7 +254,7 @@ class KeypointDetectorNode(ros.ImageNode):
         Raises:
             ObservationError: /tf has not got it yet.
         """
-        names = self.parameters.base_frame, self.feed.frame.name
+        names = self.parameters.base_frame, self.feed.stream.frame
         T_gripper_camera, arrow = self.frames.find(*names), " <- ".join(names)
         self._asked = min(self._asked, monotonic())
         if T_gripper_camera is None and monotonic() - self._asked < TF_WAIT:

@@ -10,17 +10,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce.camera import CameraIntrinsics, ImageError
+from finforce.camera import ImageError
 from finforce.errors import PoseError
 from finforce.messages import (
     SECOND,
-    CameraFrame,
+    CameraStream,
     Synchronizer,
-    camera_from_info,
-    depth_from_image,
-    mask_from_image,
     pose_from_message,
-    same_camera,
     stamp_of,
 )
 from finforce_contact.mesh.object_mesh import ObjectMesh
@@ -46,14 +42,14 @@ class ExternalPoseSource:
         latest: the newest pose taken; a refused one does not replace it.
 
     Args:
-        frame: of the camera, in which the messages must be.
+        stream: of the camera, in whose frame the messages must be.
         mesh: the object, for the check that it is not around the camera; None to do without.
         origin: what the poses are of, one of `ORIGINS`.
     """
 
-    def __init__(self, frame: CameraFrame, *, mesh: ObjectMesh | None = None, origin: str = "mesh") -> None:
+    def __init__(self, stream: CameraStream, *, mesh: ObjectMesh | None = None, origin: str = "mesh") -> None:
         self.latest: ObjectPose | None = None
-        self._frame, self._mesh = frame, mesh
+        self._stream, self._mesh = stream, mesh
         self._back = np.zeros(3) if mesh is None else -ORIGINS[origin] * mesh.middle
 
     def reset(self) -> None:
@@ -81,7 +77,7 @@ class ExternalPoseSource:
             source = "Detection3DArray"
             message = SimpleNamespace(header=message.header, pose=_pose_of_detection(message.detections[0]))
         stamp = SECOND * stamp_of(message)
-        T_camera_object = pose_from_message(message, self._frame.of(message, is_sure=False), source)
+        T_camera_object = pose_from_message(message, self._stream.frame_of(message, is_sure=False), source)
         if self.latest is not None and stamp <= self.latest.stamp:
             raise PoseError(
                 f"{source}: got stamp {stamp:.6f} s, expected one after {self.latest.stamp:.6f} s; "
@@ -112,16 +108,15 @@ class DepthFeed:
     threads may call it.
 
     Args:
-        parameters: unit of depth and greatest distance of stamps.
+        parameters: topics, and greatest distance of stamps.
         settings: of the tracker.
-        frame: of the camera, in which all images must be.
+        stream: of the camera, from which all images must be.
     """
 
-    def __init__(self, parameters: ContactParameters, settings: TrackerSettings, frame: CameraFrame) -> None:
-        self._parameters, self._settings, self._frame = parameters, settings, frame
+    def __init__(self, parameters: ContactParameters, settings: TrackerSettings, stream: CameraStream) -> None:
+        self._settings, self._stream, self._info_topic = settings, stream, parameters.info_topic
         self._tolerance = round(parameters.pose_tolerance / SECOND)
         self._mesh: ObjectMesh | None = None
-        self._camera: CameraIntrinsics | None = None
         self._guesses: tuple[NDArray, ...] = ()
         self._lock = RLock()
         self.reset()
@@ -147,10 +142,9 @@ class DepthFeed:
             ObservationError: the frame is another one.
             IntrinsicsError: the numbers are no camera's.
         """
-        camera = camera_from_info(info, self._frame.of(info))
         with self._lock:
-            if not same_camera(self._camera, camera):
-                self._camera, self._tracker, self._lost = camera, None, True
+            if self._stream.take_info(info):
+                self._tracker, self._lost = None, True
 
     def take_depth(self, image: Any) -> StampedPose | None:
         """Take a depth image and return the object's pose in it; None while it waits for a mask.
@@ -171,8 +165,8 @@ class DepthFeed:
             if self._tracker is None or self.latest is None:
                 return None
             self._lost = True  # until it was found again
-            found = None if mask is None else self._decode_mask(mask.value)
-            self.latest = self._tracker.track(SECOND * stamp, self._decode_depth(image), found)
+            found = None if mask is None else self._stream.read_mask(mask.value)
+            self.latest = self._tracker.track(SECOND * stamp, self._stream.read_depth(image), found)
             self._lost = False
             return StampedPose(stamp, self.latest)
 
@@ -203,23 +197,18 @@ class DepthFeed:
                 have = " and ".join(f"{len(self._images.entries(name))} {name}" for name in (DEPTH, MASK))
                 raise ImageError(f"no depth image with its mask: {have} are here, expected a pair of equal stamps")
             depth, mask = (entry.value for entry in pair)
-            return DepthImage(self._decode_depth(depth), self._known_camera(), self._decode_mask(mask))
+            return DepthImage(
+                self._stream.read_depth(depth),
+                self._stream.known_camera(self._info_topic),
+                self._stream.read_mask(mask),
+            )
 
     def _locate(self, depth: Any, mask: Any) -> StampedPose:
-        tracker = self._tracker = self._tracker or PoseTracker(self._mesh, self._known_camera(), self._settings)
+        tracker = self._tracker = self._tracker or PoseTracker(
+            self._mesh, self._stream.known_camera(self._info_topic), self._settings
+        )
         stamp = stamp_of(depth)
-        found = self._decode_mask(mask)
-        self.latest = tracker.locate(SECOND * stamp, self._decode_depth(depth), found, self._guesses)
+        found = self._stream.read_mask(mask)
+        self.latest = tracker.locate(SECOND * stamp, self._stream.read_depth(depth), found, self._guesses)
         self._lost = False
         return StampedPose(stamp, self.latest)
-
-    def _decode_depth(self, image: Any) -> NDArray:
-        return depth_from_image(image, self._frame.of(image), self._parameters.depth_scale)
-
-    def _decode_mask(self, image: Any) -> NDArray:
-        return mask_from_image(image, self._frame.of(image))
-
-    def _known_camera(self) -> CameraIntrinsics:
-        if self._camera is None:
-            raise ImageError("a depth image came, but no camera_info yet")
-        return self._camera

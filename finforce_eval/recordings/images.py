@@ -24,7 +24,7 @@ from finforce.errors import ObservationError
 from finforce.messages import (
     DEPTH_HEADER,
     camera_from_info,
-    color_from_image,
+    color_from_message,
     depth_from_message,
     find_nearest,
     pairing_tolerance,
@@ -159,7 +159,7 @@ class ImageTrack:
             image = RgbdImage(
                 stamp=stamp * 1e-9,
                 depth_delay=late * 1e-9,
-                color=color_from_image(color),
+                color=color_from_message(color),
                 depth=None if depth is None else depth_from_message(depth, self.depth_scale),
                 camera=self.camera,
             )

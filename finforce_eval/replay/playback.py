@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from finforce.messages import color_from_image, depth_steps, read_stamp
+from finforce.messages import color_from_message, depth_steps, read_stamp
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.bags import BagReader, RawSample, bag_source, open_bag, restamp
 from finforce_eval.recordings.images import (
@@ -120,7 +120,7 @@ def _played_type(msgtype: str) -> str:
 def _decompress(bag: BagReader, raw: RawSample, topic: str) -> bytes:
     """Return the CDR bytes of a sensor_msgs/Image with the pixels of a compressed one."""
     message: Any = bag.decode(raw)
-    pixels = depth_steps(message) if topic == DEPTH_TOPIC else color_from_image(message)
+    pixels = depth_steps(message) if topic == DEPTH_TOPIC else color_from_message(message)
     fields = {
         "header": message.header,
         "height": pixels.shape[0],

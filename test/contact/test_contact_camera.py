@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, Image
 
 from finforce.health import Level
-from finforce.messages import depth_from_image, mask_from_image, stamp_of
+from finforce.messages import depth_from_message, mask_from_message, stamp_of
 from finforce.ros import node as ros
 from finforce_contact.mesh.object_mesh import load_object_mesh
 from finforce_contact.mesh.views import MeshView
@@ -84,7 +84,7 @@ class TrackingBench(ContactBench):
         depth, mask = scene
         feed, stamp = self.node.session.camera, time_ns()
         self.info.publish(camera_info(stamp, self.camera))
-        self.probe.wait_for(lambda: feed._camera is not None)
+        self.probe.wait_for(lambda: self.node.session.stream.camera is not None)
         self.depth.publish(depth_image(stamp, depth))
         self.probe.wait_for(lambda: any(kept.stamp == stamp for kept in feed._images.entries("depth images")))
         if masked:
@@ -174,10 +174,10 @@ def test_reconstruct_without_a_camera_says_so(probe):
 
 def test_padded_rows_and_metres_decode_alike(camera, scene):
     depth, mask = scene
-    plain = depth_from_image(depth_image(0, depth), CAMERA, 1e-3)
-    metres = depth_from_image(image(0, depth.astype(np.float32), "32FC1", padding=12), CAMERA, 1e-3)
+    plain = depth_from_message(depth_image(0, depth))
+    metres = depth_from_message(image(0, depth.astype(np.float32), "32FC1", padding=12))
     np.testing.assert_allclose(plain, metres, atol=5.1e-4)  # half a step
-    padded = mask_from_image(image(0, 255 * mask.astype(np.uint8), "mono8", padding=5), CAMERA)
+    padded = mask_from_message(image(0, 255 * mask.astype(np.uint8), "mono8", padding=5))
     np.testing.assert_array_equal(padded, mask)
 
 
@@ -186,7 +186,7 @@ def test_a_mask_of_another_kind_is_refused(scene, encoding, word):
     message = image(0, scene[1].astype(np.uint8), encoding)
     message.height += 1
     with pytest.raises(ValueError, match=word):
-        mask_from_image(message, CAMERA)
+        mask_from_message(message)
 
 
 def test_images_are_asked_for_reliably_and_those_of_best_effort_are_taken_too(probe, camera, scene):

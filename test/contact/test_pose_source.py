@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from finforce.errors import ObservationError, PoseError
-from finforce.messages import CameraFrame
+from finforce.messages import CameraStream
 from finforce_contact.mesh.object_mesh import ObjectMesh
 from finforce_contact.parameters import ContactParameters, ContactSettings, TrackerSettings
 from finforce_contact.pose.source import ExternalPoseSource
@@ -46,7 +46,7 @@ def detections(center=UNSET, results=()):
 
 @pytest.fixture
 def source():
-    return ExternalPoseSource(CameraFrame(FRAME), mesh=BOX)
+    return ExternalPoseSource(CameraStream(FRAME), mesh=BOX)
 
 
 def test_a_pose_is_taken_as_it_is_with_its_stamp(source):
@@ -70,7 +70,7 @@ def test_results_of_a_detection_stand_in_for_an_unset_box(source):
 
 def test_a_box_that_is_turned_but_not_moved_is_not_unset():
     turned = ((0.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
-    source = ExternalPoseSource(CameraFrame(FRAME))
+    source = ExternalPoseSource(CameraStream(FRAME))
     assert source.take(detections(turned)).T_camera_object[0, 0] == pytest.approx(-1.0)
 
 
@@ -132,9 +132,9 @@ def test_a_jaw_says_the_frame_where_nobody_has_named_it():
     """What had come of the object in another frame, before, is forgotten."""
     session = ContactSession(ContactParameters(), ContactSettings(), TrackerSettings())
     session.read_pose(stamped(stamp=1.0, frame="map"))
-    assert session.frame.name == "map" and session.pose is not None
+    assert session.stream.frame == "map" and session.pose is not None
     session.take_jaw_pose("left", stamped(stamp=1.1, frame="my_cam_optical"))
-    assert session.frame.name == "my_cam_optical" and session.pose is None
+    assert session.stream.frame == "my_cam_optical" and session.pose is None
     for take in (session.read_pose, lambda message: session.take_jaw_pose("left", message)):
         with pytest.raises(ObservationError, match="'map'; expected 'my_cam_optical'"):
             take(stamped(stamp=1.2, frame="map"))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from finforce.camera import ImageError
-from finforce.messages import color_from_image, depth_from_message
+from finforce.messages import color_from_message, depth_from_message
 from finforce_eval.evaluation.keypoint_source import count_reasons
 from finforce_eval.recordings.images import compress_depth, encode_color
 
@@ -34,7 +34,7 @@ def claim_size(width, height):
 
 @pytest.mark.parametrize("size", [(12_000, 12_000), (60_000, 60_000), (2**31 - 1, 2**31 - 1)])
 def test_a_small_file_that_claims_to_be_a_huge_picture_is_refused(size):
-    for read in (color_from_image, depth_from_message):
+    for read in (color_from_message, depth_from_message):
         with pytest.raises(ImageError, match="expected at most|damaged"):
             read(Compressed(claim_size(*size), "png"))
 
@@ -42,7 +42,7 @@ def test_a_small_file_that_claims_to_be_a_huge_picture_is_refused(size):
 @pytest.mark.parametrize("share", [0.0, 0.001, 0.01, 0.3, 0.9])
 def test_a_picture_that_was_cut_short_is_named_in_one_line(share):
     for read, data, said in (
-        (color_from_image, encode_color(COLOR), "rgb8; jpeg compressed bgr8"),
+        (color_from_message, encode_color(COLOR), "rgb8; jpeg compressed bgr8"),
         (depth_from_message, compress_depth(DEPTH), "16UC1; compressedDepth png"),
     ):
         with pytest.raises(ImageError) as caught:
@@ -53,7 +53,7 @@ def test_a_picture_that_was_cut_short_is_named_in_one_line(share):
 def test_other_kinds_of_pictures_and_odd_words_are_named():
     gif = b"GIF89a" + bytes(100)
     with pytest.raises(ImageError, match="neither jpeg nor png") as caught:
-        color_from_image(Compressed(gif, "a\x00\nb"))
+        color_from_message(Compressed(gif, "a\x00\nb"))
     assert "\n" not in str(caught.value)
 
 

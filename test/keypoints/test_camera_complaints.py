@@ -16,7 +16,7 @@ PERIOD = 33_333_333  # ns
 
 def feed_of(**parameters):
     feed = RgbdFeed(DetectorParameters(**parameters))
-    feed.take_info(camera_info())
+    feed.stream.take_info(camera_info())
     return feed
 
 
@@ -29,11 +29,11 @@ def test_the_camera_info_of_the_depth_camera_beside_aligned_depth_is_named():
     """xArm-Developer/xarm_ros2 159."""
     feed, info = RgbdFeed(DetectorParameters()), camera_info()
     info.header.frame_id = "camera_depth_optical_frame"
-    feed.take_info(info)
+    feed.stream.take_info(info)
     with pytest.raises(ObservationError, match="camera_color_optical_frame.*camera_depth_optical_frame"):
         feed.take_color(COLOR, color(1))
     feed = feed_of(depth="none")
-    feed.take_info(camera_info(WIDTH + 16, HEIGHT))
+    feed.stream.take_info(camera_info(WIDTH + 16, HEIGHT))
     (image,) = feed.take_color(COLOR, color(1))
     with pytest.raises(ImageError, match="camera_info"):
         check_image(image.value)

@@ -28,7 +28,7 @@ class Camera:
 
     def __post_init__(self):
         self.feed = RgbdFeed(DetectorParameters(depth=self.depth), lambda: self.now)
-        self.feed.take_info(camera_info())
+        self.feed.stream.take_info(camera_info())
 
     def shoot(self, topic, picture=None):
         """Whether an image of a topic became a whole one."""
@@ -117,7 +117,7 @@ def test_depth_of_an_unsynchronised_camera_is_paired_and_its_delay_known(shift):
 def test_a_stated_tolerance_is_kept():
     camera = Camera()
     camera.feed = RgbdFeed(DetectorParameters(sync_tolerance=0.005, depth="aligned"))
-    camera.feed.take_info(camera_info())
+    camera.feed.stream.take_info(camera_info())
     with pytest.raises(SyncError, match="within 5 ms"):
         pair_up(camera, [(kind, n, 9.0) for n in range(1, 9) for kind in ("color", "depth")])
 
@@ -147,8 +147,8 @@ def test_the_frame_is_that_of_the_first_message_and_no_other_is_taken_then():
     camera.feed = RgbdFeed(DetectorParameters(depth="none"))
     info, image = camera_info(), color_of(camera, 1)
     info.header.frame_id = image.header.frame_id = "my_cam_optical"
-    camera.feed.take_info(info)
-    assert camera.feed.take_color(COLOR, image) and camera.feed.frame.name == "my_cam_optical"
+    camera.feed.stream.take_info(info)
+    assert camera.feed.take_color(COLOR, image) and camera.feed.stream.frame == "my_cam_optical"
     with pytest.raises(ObservationError, match="expected 'my_cam_optical'"):
         camera.feed.take_color(COLOR, color_of(camera, 2))
 

@@ -74,7 +74,7 @@ def test_compressed_images_are_taken_where_nobody_sends_raw_ones(probe, transpor
     for publisher in (color, depth, info):
         probe.connected(publisher)
     info.publish(camera_info())
-    probe.wait_for(lambda: node.feed.camera is not None)
+    probe.wait_for(lambda: node.feed.stream.camera is not None)
     picture = cv2.imencode(".png", np.random.default_rng(0).integers(90, 160, (HEIGHT, WIDTH, 3), np.uint8))[1]
     stamp = time_ns()
     color.publish(CompressedImage(header=header(stamp), format="rgb8; png compressed bgr8", data=picture.tobytes()))
