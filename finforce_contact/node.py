@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 
+from finforce.camera_topics import COMPRESSED_DEPTH
 from finforce.health import IDLE, Health, Idling, Level, Outcome, Report, Skips, StampGate
 from finforce.messages import SECOND, CameraStream, stamp_of
 from finforce.ros import node as ros
@@ -162,7 +163,7 @@ class ContactEstimatorNode(ros.ImageNode):
         self.stage.subscription(ros.CameraInfo, self.parameters.info_topic, info, ros.SENSOR, callback_group=group)
         images = partial(ros.subscribe_to_images, self.stage, transport=transport, callback_group=group)
         images("object_mask", partial(self._on_image, camera.take_mask))
-        images(self.parameters.depth_topic, partial(self._on_image, camera.take_depth), end=ros.COMPRESSED_DEPTH)
+        images(self.parameters.depth_topic, partial(self._on_image, camera.take_depth), end=COMPRESSED_DEPTH)
 
     def _limit_age(self, changed: ContactParameters) -> None:
         """Take another greatest age of data."""

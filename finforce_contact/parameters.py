@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from finforce.camera_topics import AUTO, DEPTH_TOPIC, INFO_TOPIC, TRANSPORTS
 from finforce.errors import PoseError
 from finforce.settings import TimeParameters, check_bounds, setting
 from finforce_ifea.errors import ContactError
@@ -101,13 +102,9 @@ class ContactParameters(TimeParameters):
     pose_tolerance: float = setting(
         0.017, "Maximum stamp difference between a jaw pose and its object pose", "s", 0.0, 1.0
     )
-    depth_topic: str = setting(
-        "/camera/camera/aligned_depth_to_color/image_raw", "Topic of depth images, for the tracker", topic=True
-    )
-    info_topic: str = setting("/camera/camera/color/camera_info", "Topic of their camera's intrinsics", topic=True)
-    image_transport: str = setting(
-        "auto", "Images that are subscribed to, as for the detector", choices=("raw", "compressed", "auto")
-    )
+    depth_topic: str = setting(DEPTH_TOPIC, "Topic of depth images, for the tracker", topic=True)
+    info_topic: str = setting(INFO_TOPIC, "Topic of their camera's intrinsics", topic=True)
+    image_transport: str = setting(AUTO, "Images that are subscribed to, as for the detector", choices=TRANSPORTS)
     depth_scale: float = setting(0.001, "Unit of 16-bit depth images", "m", 1e-6, 0.01)
     reconstruct_method: str = setting(
         "",

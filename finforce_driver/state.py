@@ -148,6 +148,7 @@ class GraspStatus:
         period: between two images with a force, median [s].
         overshoot_bound: by which the set force is passed at most if the stiffness at most doubles on the way that no
             image has shown yet, and the force is off by two of its stated deviations [N].
+        hard_bound: by which it is passed at most if the object turns as hard as it may be: the motor stalls [N].
         peak: largest force measured while loaded [N]; 0 before.
         resolution: change of the force with one step of the gripper [N].
         target: opening that the jaws were told to go to [m]; NaN before the first move.
@@ -165,6 +166,7 @@ class GraspStatus:
     latency: float = shown("image to force [ms]", math.nan, 0, 1e3)
     period: float = shown("image period [ms]", math.nan, 0, 1e3)
     overshoot_bound: float = shown("overshoot bound [N]", math.nan, 3)
+    hard_bound: float = shown("overshoot bound on a hard object [N]", math.nan, 1)
     peak: float = shown("peak force [N]", 0.0, 3)
     resolution: float = shown("force of one step [N]", math.nan, 3)
     target: float = math.nan

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from rcl_interfaces.msg import ParameterDescriptor
 from sensor_msgs.msg import CameraInfo
 
+from finforce.camera_topics import COMPRESSED_DEPTH
 from finforce.errors import FinforceError, ObservationError
 from finforce.health import IDLE, STILL, UNHEARD, Health, Idling, Outcome, Report, Skips, StampGate
 from finforce.messages import CameraStream, Stamped
@@ -155,10 +156,11 @@ class KeypointDetectorNode(ros.ImageNode):
         self.skips = Skips(parameters.skip_off)
         ros.warn_first_start()
         self.detector = build(jaws, parameters, settings, dots, self.skips.allows(STILL))
-        ros.follow_settings(self, settings, lambda changed: self.detector.adjust(changed), "detector")
+        ros.follow_settings(self, settings, self._adjust, "detector")
         ros.follow_settings(self, parameters, lambda changed: self.gate.limit(changed.max_age))
         self.feed = RgbdFeed(parameters)
-        self.frames, self._build = ros.Frames(self), partial(build, jaws, settings=settings, dots=dots)
+        self.frames, self._settings = ros.Frames(self), settings
+        self._build = partial(build, jaws, dots=dots, rests=self.skips.allows(STILL))
         self._mounting = not ros.is_given(self, "T_gripper_camera") and self.frames.listen()
         self._asked = float("inf")
         self.gate = StampGate(max_age=parameters.max_age, restart_gap=parameters.restart_gap)
@@ -186,7 +188,7 @@ class KeypointDetectorNode(ros.ImageNode):
         self.stage.subscription(CameraInfo, parameters.info_topic, self._on_info, ros.SENSOR)
         images = partial(ros.subscribe_to_images, self.stage, transport=parameters.image_transport)
         if parameters.depth != NO_DEPTH:
-            images(parameters.depth_topic, self._on_depth, end=ros.COMPRESSED_DEPTH)
+            images(parameters.depth_topic, self._on_depth, end=COMPRESSED_DEPTH)
         for topic in parameters.color_topics:
             images(topic, self._on_color)
 
@@ -266,7 +268,13 @@ class KeypointDetectorNode(ros.ImageNode):
         self.get_logger().info(f"the camera's pose is that of /tf, {arrow}")
         if not np.allclose(T_gripper_camera, self.parameters.camera_pose, atol=1e-6):
             self.parameters = replace(self.parameters, T_gripper_camera=pose_numbers(T_gripper_camera))
-            self.detector = self._build(self.parameters, rests=self.skips.allows(STILL))
+            self.detector = self._build(self.parameters, settings=self._settings)
+            self.detector.warm_up()
+
+    def _adjust(self, settings: DetectorSettings) -> None:
+        """Go on with settings that were changed."""
+        self._settings = settings
+        self.detector.adjust(settings)
 
     def _publish(self, stamp: int, color: NDArray, began: float) -> None:
         """Publish the key points of an image, (h, w, 3), while they are fresh."""

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from numpy.typing import NDArray
 
+from finforce.camera_topics import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC, OLD_COLOR_TOPIC, TRANSPORTS
 from finforce.gripper_frames import ROBOT_CAMERA
 from finforce.settings import GripperParameters, check_bounds, setting
 from finforce.transforms import pose_from_quaternion, pose_numbers
@@ -16,12 +17,6 @@ from finforce_keypoints.errors import DetectorSettingsError
 if TYPE_CHECKING:
     from finforce_ifea.jaw.jaw import Jaw
 
-# as the RealSense driver calls them; the colour images of a D405 have had both names
-CAMERA = "/camera/camera"
-COLOR_TOPIC, OLD_COLOR_TOPIC = f"{CAMERA}/color/image_raw", f"{CAMERA}/color/image_rect_raw"
-DEPTH_TOPIC = f"{CAMERA}/aligned_depth_to_color/image_raw"
-INFO_TOPIC = f"{CAMERA}/color/camera_info"
-TRANSPORTS = ("raw", "compressed", "auto")
 DEPTHS = ALIGNED, AUTO, NO_DEPTH = ("aligned", "auto", "none")
 
 
@@ -161,11 +156,6 @@ class DetectorSettings:
             raise DetectorSettingsError(
                 f"opening_max: got {self.opening_max:g} m, expected more than opening_min, {self.opening_min:g} m"
             )
-
-
-def is_compressed(topic: str) -> bool:
-    """Say whether a colour topic is one of pictures, as image transport calls them."""
-    return topic.endswith("/compressed")
 
 
 def load_jaws(parameters: DetectorParameters) -> dict[str, Jaw]:

@@ -6,13 +6,11 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from rclpy.clock import Clock, ClockType
 from sensor_msgs.msg import CompressedImage, Image
 
-from finforce.ros.topics import Stage
+from finforce.camera_topics import COMPRESSED, COMPRESSED_COLOR, ENDS, RAW
+from finforce.ros.topics import STEADY_CLOCK, Stage
 
-RAW, COMPRESSED = "raw", "compressed"  # any other transport is auto
-ENDS = COMPRESSED_COLOR, COMPRESSED_DEPTH = ("/compressed", "/compressedDepth")
 _LOOKED_FOR = 0.5  # [s] between looks at who publishes
 
 
@@ -55,4 +53,4 @@ def subscribe_to_images(
             node.get_logger().info(f"nobody publishes {topic}: {packed} is taken")
             subscribe(CompressedImage, packed)
 
-    timer = node.create_timer(_LOOKED_FOR, look, clock=Clock(clock_type=ClockType.STEADY_TIME))
+    timer = node.create_timer(_LOOKED_FOR, look, clock=STEADY_CLOCK)

@@ -19,7 +19,6 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: F401 
 from geometry_msgs.msg import PoseStamped, TwistStamped, WrenchStamped  # noqa: F401 - for those who publish
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.callback_groups import CallbackGroup
-from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.expand_topic_name import expand_topic_name
@@ -40,7 +39,7 @@ from finforce.health import Health, Level, Outcome, Report
 from finforce.messages import NANOSECONDS
 from finforce.processors import free_caller
 from finforce.ros.frames import Frames  # noqa: F401 - for those with frames
-from finforce.ros.image_topics import COMPRESSED_DEPTH, subscribe_to_images  # noqa: F401 - for those with images
+from finforce.ros.image_topics import subscribe_to_images  # noqa: F401 - for those with images
 from finforce.ros.messages import (  # noqa: F401 - for those who publish
     cloud_message,
     force_stddev,
@@ -64,6 +63,7 @@ from finforce.ros.topics import (  # noqa: F401 - for those with topics
     REQUESTS,
     RESULT,
     SENSOR,
+    STEADY_CLOCK,
     Outlet,
     Pipeline,
     Stage,
@@ -75,7 +75,6 @@ from finforce.ros.transport import CHOICES, PROFILES, TRANSPORT, provide_transpo
 from finforce.settings import ParameterError, RecordT, bounds_of, check_value, constraints, describe, is_parameter
 
 _POLL_PERIOD = 0.1  # [s] of asking whether a node that is being built is still wanted
-STEADY_CLOCK = Clock(clock_type=ClockType.STEADY_TIME)
 
 provide_transport()  # read when the first context is made, whoever makes it
 

@@ -11,6 +11,7 @@ from time import perf_counter
 from typing import Any
 
 from numpy.typing import NDArray
+from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -24,6 +25,7 @@ from finforce.messages import CloudColumns
 from finforce.ros.messages import pack
 from finforce.ros.tracing import note
 
+STEADY_CLOCK = Clock(clock_type=ClockType.STEADY_TIME)
 SENSOR = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 BUFFERED = QoSProfile(depth=20, reliability=ReliabilityPolicy.BEST_EFFORT)  # a tenth of a second, and more
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)  # whoever is slow misses what was overtaken

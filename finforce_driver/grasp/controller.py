@@ -10,7 +10,7 @@ from statistics import median
 
 from finforce_driver.errors import BackOffError, GraspError, UnseenForceError
 from finforce_driver.grasp.load_watch import NOISE, ForceFeed, ForceSample, JawPosition, LoadWatch, TouchSample
-from finforce_driver.grasp.plan import MOTOR_MARGIN, GraspPlan
+from finforce_driver.grasp.plan import FRICTION, MOTOR_MARGIN, GraspPlan
 from finforce_driver.settings import GraspGoal, GraspSettings
 from finforce_driver.state import GraspPhase, GraspStatus, GripperState, MoveRequest, Phase
 
@@ -338,6 +338,7 @@ class ForceGrasp:
             latency=feed.latency,
             period=feed.period,
             overshoot_bound=self._plan.overshoot_bound(self.set_force),
+            hard_bound=self._motor_force + FRICTION - self.set_force,
             peak=load.peak,
             resolution=self._plan.force_per_step,
             target=self._plan.target,

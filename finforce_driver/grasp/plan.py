@@ -30,7 +30,7 @@ _SPEED_CHANGE = 1.25  # ratio at which a new speed is worth a command
 _CERTAIN = 0.15  # [N] stated deviation of the force above which the jaws go slower
 _CONTRADICTED = 0.5  # share of the speed while the contact estimator says that nothing touches
 _WITNESS_TIME = 0.15  # [s] from a force to the stop that the motor's current brings about
-_FRICTION = 1.0  # [N] by which the motor's current may tell too little
+FRICTION = 1.0  # [N] by which the motor's current, also at its limit, may tell too little
 _BEYOND_NOISE = 4.0  # deviations of one force, beyond which a step's change of it is no chance
 _DEVIATIONS = 2.0  # stated deviations of the force within which it is reckoned with
 _HYSTERESIS = 0.3  # [steps] of force beyond the tolerance before jaws at rest open again
@@ -137,7 +137,7 @@ class GraspPlan:
     @property
     def _blind_speed(self) -> float:
         """Speed [m/s] at which the motor's current tells early enough that something presses where nothing is seen."""
-        spare = max(0.0, self._settings.force_limit - MOTOR_MARGIN - _FRICTION)
+        spare = max(0.0, self._settings.force_limit - MOTOR_MARGIN - FRICTION)
         return max(_LEAST_SPEED, spare / (self._settings.largest_stiffness * _WITNESS_TIME))
 
     @property

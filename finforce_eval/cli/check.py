@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from finforce.camera_topics import COLOR_TOPIC, COMPRESSED_COLOR, DEPTH_TOPIC, INFO_TOPIC
 from finforce.errors import MissingDependencyError
 from finforce.messages import read_stamp
 from finforce_eval.cli.extrinsics import read_at_rest
@@ -17,7 +18,6 @@ from finforce_eval.evaluation.check import FAULT, check_recording
 from finforce_eval.recordings.images import CAMERA_INFO, COMPRESSED, IMAGE
 from finforce_eval.recordings.writer import Entry, typestore, write_entries
 from finforce_eval.tasks import progress_bar
-from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC, is_compressed
 
 PICTURE = "check.png"
 TIMEOUT = 15.0  # [s] after which no more images are waited for
@@ -79,7 +79,8 @@ def record_camera(topics: Sequence[str], count: int, folder: Path, domain: int |
     except ImportError as error:
         raise MissingDependencyError(f"listening to topics needs ROS 2: {error}") from error
     color, info = topics[:2]
-    kinds = dict(zip(topics, (COMPRESSED if is_compressed(color) else IMAGE, CAMERA_INFO, IMAGE), strict=False))
+    is_packed = color.endswith(COMPRESSED_COLOR)
+    kinds = dict(zip(topics, (COMPRESSED if is_packed else IMAGE, CAMERA_INFO, IMAGE), strict=False))
     heard, published = listen(kinds, lambda heard: len(heard[color]) >= count + MORE and heard[info], TIMEOUT, domain)
     if not heard[info] or len(heard[color]) < count:
         there = ", ".join(name for name, types in published.items() if {IMAGE, COMPRESSED} & set(types))
@@ -87,7 +88,7 @@ def record_camera(topics: Sequence[str], count: int, folder: Path, domain: int |
             f"{len(heard[color])} images on {color} and {len(heard[info])} camera_info on {info}; expected {count} and "
             f"1 within {TIMEOUT:g} s; images are published on {there or 'no topic at all'}"
         )
-    usual = (COLOR_TOPIC + ("/compressed" if is_compressed(color) else ""), INFO_TOPIC, DEPTH_TOPIC)
+    usual = (COLOR_TOPIC + (COMPRESSED_COLOR if is_packed else ""), INFO_TOPIC, DEPTH_TOPIC)
     names, decode = dict(zip(topics, usual, strict=False)), typestore().deserialize_cdr
     entries = [
         Entry(read_stamp(data), names[topic], decode(data, kinds[topic]))

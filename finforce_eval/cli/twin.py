@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce.camera_topics import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 from finforce.messages import DEPTH_FORMAT
 from finforce.optional import import_trimesh
 from finforce.transforms import pose_numbers, quaternion_from_pose
@@ -37,7 +38,6 @@ from finforce_eval.recordings.writer import (
     wrench_message,
     write_entries,
 )
-from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 from finforce_sim.footage import (
     FINGER,
     Footage,

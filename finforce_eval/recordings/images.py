@@ -20,6 +20,7 @@ from finforce.camera import (
     ImageError,
     IntrinsicsError,
 )
+from finforce.camera_topics import COMPRESSED_COLOR, ENDS
 from finforce.errors import ObservationError
 from finforce.messages import (
     DEPTH_HEADER,
@@ -40,7 +41,6 @@ from finforce_keypoints.images import RgbdImage, check_image
 # the ends of topics by which the images are found first, whatever the camera is called; the first that is there counts
 COLOR_ENDS = tuple(f"color/{name}{end}" for end in ("", "/compressed") for name in ("image_raw", "image_rect_raw"))
 DEPTH_ENDS = tuple(f"aligned_depth_to_color/image_raw{end}" for end in ("", "/compressedDepth", "/compressed"))
-TRANSPORTS = ("/compressed", "/compressedDepth")  # ends of topics with the same images in fewer bytes
 ALONE = -1  # instead of a depth image's stamp [ns], of a colour image without
 
 
@@ -280,7 +280,7 @@ def _look_at_images(bag: BagReader) -> dict[str, _FirstImage]:
 
 def _plain(topics: Collection[str]) -> list[str]:
     """Return topics without those that bring the same images compressed."""
-    return sorted(set(topics) - {topic + end for topic in topics for end in TRANSPORTS})
+    return sorted(set(topics) - {topic + end for topic in topics for end in ENDS})
 
 
 def _only_color(bag: BagReader, seen: Mapping[str, _FirstImage]) -> str:
@@ -302,7 +302,7 @@ def _find_info(bag: BagReader, color: str, frame: str) -> str:
     Raises:
         RecordingError: there is none.
     """
-    beside = color.removesuffix(TRANSPORTS[0]).rpartition("/")[0] + "/camera_info"
+    beside = color.removesuffix(COMPRESSED_COLOR).rpartition("/")[0] + "/camera_info"
     topics = {each.topic for each in bag.connections if each.msgtype == CAMERA_INFO and each.msgcount}
     if beside in topics:
         return beside

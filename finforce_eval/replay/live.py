@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce.camera_topics import COLOR_TOPIC, DEPTH_TOPIC
 from finforce.messages import NANOSECONDS, decode_columns, decode_keypoints, pose_from_message, stamp_of
 from finforce_eval.evaluation.forces import sight_columns, truth_columns
 from finforce_eval.evaluation.keypoint_source import with_detections
@@ -17,7 +18,6 @@ from finforce_eval.recordings.tracks import Recording
 from finforce_eval.table import ForceSeries, Snapshot, stddev_along
 from finforce_ifea.messages import contact_from_cloud, outline_from_cloud
 from finforce_keypoints.geometry.jaw_localizer import REASONS, JawKeypoints
-from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC
 
 
 class ReplayLog:

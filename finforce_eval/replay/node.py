@@ -21,12 +21,12 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 
+from finforce.camera_topics import COLOR_TOPIC
 from finforce.ros import node as ros
 from finforce.settings import setting
 from finforce_eval.recordings.tracks import JAWS
 from finforce_eval.replay.live import ReplayLog
 from finforce_eval.replay.playback import Playback, RawMessage, ReadAhead, read_playback
-from finforce_keypoints.parameters import COLOR_TOPIC
 
 # what is heard while messages are being sent waits its turn; nothing of it may be lost
 HEARD = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)

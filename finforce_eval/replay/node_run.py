@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import psutil
 
+from finforce.camera_topics import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 from finforce.errors import MissingDependencyError
 from finforce.ros.transport import free_domain
 from finforce.systems.processes import PIPELINE, executables_of
@@ -18,7 +19,6 @@ from finforce_eval.replay.live import ReplayLog
 from finforce_eval.replay.playback import Playback, RawMessage
 from finforce_eval.replay.processes import ProcessError, ProcessGroup, begin_shares, end_shares, resident_bytes
 from finforce_eval.tasks import progress_bar
-from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 
 if TYPE_CHECKING:
     from finforce.systems.processes import Process

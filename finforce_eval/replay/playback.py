@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from finforce.camera_topics import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 from finforce.messages import color_from_message, depth_steps, read_stamp
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.bags import BagReader, RawSample, bag_source, open_bag, restamp
@@ -18,7 +19,6 @@ from finforce_eval.recordings.images import (
     IMAGE,
     ImageTrack,
 )
-from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 
 HEADER = "std_msgs/msg/Header"
 # where the nodes listen -> the ends of the topics that are played there

@@ -9,6 +9,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
+from finforce.camera_topics import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 from finforce.health import IDLE
 from finforce.ros.tracing import FOLDER
 from finforce.systems.processes import Process, ReplayOptions, compose, replay_processes
@@ -26,7 +27,6 @@ from finforce_eval.replay.live import ReplayLog, live_result, with_heard_keypoin
 from finforce_eval.replay.node_run import run_nodes
 from finforce_eval.replay.playback import read_playback
 from finforce_ifea.jaw.jaw import Jaw
-from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 
 RESULTS = ("wrench", "wrench_stddev", "surface", "markers", "contact", "object_outline")
 

@@ -136,17 +136,19 @@ def test_an_object_stiffer_than_the_settings_say_is_held_or_let_go_and_never_cru
         assert course.forces[-1] < 3.1
 
 
-@pytest.mark.parametrize(("rise", "most"), [(10.0, 7.5), (30.0, 8.6)])
-def test_an_object_that_bottoms_out_gets_little_more_than_a_step_adds(variant, rise, most):
+@pytest.mark.parametrize(("rise", "force", "speed"), [(10.0, 5.0, 0.004), (30.0, 5.0, 0.004), (100.0, 2.0, 0.008)])
+def test_an_object_that_bottoms_out_stalls_the_motor_within_the_bound_that_is_shown(variant, rise, force, speed):
     def force_at(opening):
-        way = max(0.0, 0.025 - opening)
-        return 1000.0 * (min(way, 0.0025) + rise * max(0.0, way - 0.0025))
+        way, soft = max(0.0, 0.025 - opening), 0.5e-3 * force
+        return 1000.0 * (min(way, soft) + rise * max(0.0, way - soft))
 
     plant = Plant(name="bottoms out", force_at=force_at)
     world = World(
-        GraspCase(plant=plant, force=5.0, speed=0.004, latency=0.06, seed=1, variant=variant), NoisySensor(0.05, 1)
+        GraspCase(plant=plant, force=force, speed=speed, latency=0.06, seed=1, variant=variant), NoisySensor(0.05, 1)
     )
-    assert 3.0 < max(world.run().forces) < most  # it was 7 to 14 N
+    course = world.run()
+    bound = min(status.hard_bound for _, status in course.statuses)
+    assert 0.6 * force < max(course.forces) < force + bound <= 8.5  # it was 14 N
 
 
 def test_a_force_that_is_too_uncertain_to_be_reached_is_no_success():

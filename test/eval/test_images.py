@@ -10,6 +10,7 @@ from rgbd_fakes import CAMERA, FakeGripper, make_footage
 from scipy.spatial.transform import Rotation
 
 from finforce.camera import ImageError
+from finforce.camera_topics import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 from finforce.messages import DEPTH_HEADER, depth_from_message, depth_steps
 from finforce_eval.cli.twin import RecordingForm, footage_entries, write_footage
 from finforce_eval.errors import RecordingError
@@ -18,7 +19,6 @@ from finforce_eval.recordings.objects import find_mesh
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.writer import write_entries
 from finforce_eval.replay.playback import read_playback
-from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 from finforce_sim.footage import encode_depth
 
 FORMS = {

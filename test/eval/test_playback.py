@@ -8,11 +8,11 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 
+from finforce.camera_topics import COLOR_TOPIC
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.writer import write_recording
 from finforce_eval.replay.node import PlayerParameters, find_awaited
 from finforce_eval.replay.playback import RawMessage, ReadAhead, read_playback
-from finforce_keypoints.parameters import COLOR_TOPIC
 
 
 @pytest.fixture(scope="module", params=["mcap", "sqlite3"])

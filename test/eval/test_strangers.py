@@ -9,6 +9,7 @@ import pytest
 from eval_fakes import FakeEstimator, FakeJaw, evaluate_recording, make_recording
 from rgbd_fakes import CAMERA, FakeDetector, FakeGripper, make_footage
 
+from finforce.camera_topics import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 from finforce_contact.loop import GivenContact
 from finforce_eval.cli.main import main
 from finforce_eval.cli.twin import RecordingForm, footage_entries, write_footage
@@ -21,7 +22,6 @@ from finforce_eval.recordings.images import ImageChoice
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.writer import write_entries
 from finforce_eval.replay.playback import read_playback
-from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 
 OWN = {f"/left/{name}" for name in ("ground_truth_wrench", "ground_truth_keypoints", "ground_truth_jaw_pose")}
 USB = {COLOR_TOPIC: "/image_raw", INFO_TOPIC: "/camera_info"}

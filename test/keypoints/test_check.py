@@ -11,6 +11,7 @@ import pytest
 from node_fakes import ros_domain
 from sensor_msgs.msg import CameraInfo, CompressedImage
 
+from finforce.camera_topics import COLOR_TOPIC, INFO_TOPIC
 from finforce.gripper_frames import ROBOT_CAMERA
 from finforce.ros import node as ros
 from finforce.transforms import invert_pose, pose_numbers
@@ -21,7 +22,6 @@ from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.check import FAULT, OK, WARNING, judge_picture
 from finforce_eval.recordings.bags import open_bag
 from finforce_eval.recordings.images import CAMERA_INFO, COMPRESSED
-from finforce_keypoints.parameters import COLOR_TOPIC, INFO_TOPIC
 from finforce_sim.footage import build_footage
 from finforce_sim.scenarios import build_scenario
 

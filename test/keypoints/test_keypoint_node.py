@@ -30,12 +30,12 @@ from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 from std_msgs.msg import String
 
+from finforce.camera_topics import INFO_TOPIC
 from finforce.health import Level
 from finforce.messages import decode_columns, pose_from_message, stamp_of
 from finforce.ros import node as ros
 from finforce_keypoints.errors import DetectionError
 from finforce_keypoints.node import KeypointDetectorNode
-from finforce_keypoints.parameters import INFO_TOPIC
 
 COLUMNS = ("x", "y", "z", "likelihood", "u", "v", "valid", "reason", "stddev_x", "stddev_y", "stddev_z")
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from rgbd_fakes import CAMERA, MESH, FakeGripper, FakePhotographer
 
+from finforce.camera_topics import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 from finforce.gripper_frames import BENCH_CAMERA
 from finforce.messages import read_stamp
 from finforce_eval.cli.twin import write_footage
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.images import IMAGE
 from finforce_eval.replay.playback import RawMessage
-from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 from finforce_sim.footage import Footage
 from finforce_sim.photographer import SceneSetting
 from lab.bench.streams import (
