@@ -11,7 +11,6 @@ from finforce_driver.errors import TargetError
 
 LEAST_WATCHDOG = 0.2  # [s]
 LEAST_CURRENT = 0.15  # [A] below which the gripper is unstable
-FORCE_PER_CURRENT = 47.7  # [N/A], slope of the maker's curve of grip force
 PINION_RADIUS = 0.006  # [m] of the pinion between the two racks
 TICKS_PER_TURN = 16384  # of the encoder
 OPENING_PER_TICK = 4.0 * math.pi * PINION_RADIUS / TICKS_PER_TURN  # [m]: both racks move by the pinion's circumference
@@ -62,6 +61,9 @@ class GripperSettings(_Bounded):
     stroke: float = setting(0.048, "Stroke of the opening between the end stops", "m", 0.001, 0.5)
     closed_opening: float = setting(0.0, "Opening between the jaws' inner faces at the closed stop", "m", 0.0, 0.2)
     largest_current: float = setting(1.3, "Maximum current limit of a command", "A", 0.15, 1.5)
+    force_per_current: float = setting(
+        47.7, "Grip force per motor current; as measured, or the maker's", "N/A", 5.0, 500.0
+    )
     default_speed: float = setting(0.02, "Speed of the opening where a command names none", "m/s", 1e-4, 0.37)
     default_current: float = setting(0.5, "Current limit where a command names no force", "A", 0.15, 1.5)
     watchdog: float = setting(
@@ -149,8 +151,8 @@ class GripperSettings(_Bounded):
         return min(max(byte, SLOWEST_BYTE), LARGEST_BYTE)
 
     def force_of(self, current: float) -> float:
-        """Return the grip force [N] of a current [A] by the maker's curve; both positive when driving closed."""
-        return FORCE_PER_CURRENT * current
+        """Return the grip force [N] of a current [A]; both positive when driving closed."""
+        return self.force_per_current * current
 
     def force_for(self, current: float, force: float | None) -> float:
         """Return the grip force [N] that stands for a current limit [A].
@@ -166,7 +168,7 @@ class GripperSettings(_Bounded):
         return self.force_of(current)
 
     def current_of(self, force: float) -> int:
-        """Return the current limit [mA] of a grip force [N] by the maker's curve.
+        """Return the current limit [mA] of a grip force [N].
 
         Raises:
             TargetError: it is no number, or outside the range of the current limit.
@@ -177,7 +179,7 @@ class GripperSettings(_Bounded):
                 f"force: got {force:g} N, expected {low:.3g} to {high:.3g} N, the range of the current limit; "
                 "a smaller force needs vision"
             )
-        return round(1e3 * force / FORCE_PER_CURRENT)
+        return round(1e3 * force / self.force_per_current)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,6 +1,7 @@
 """Claims about grasps with forces that are uncertain, contradicted or refused, and about objects of any stiffness."""
 
 from dataclasses import replace
+from functools import partial
 
 import pytest
 from geometry_msgs.msg import Vector3, Wrench, WrenchStamped
@@ -8,7 +9,8 @@ from grasp_fakes import STEP, Bench, Camera, Fingers, Jaws, spring
 
 from finforce.errors import ObservationError
 from finforce.ros.messages import force_stddev
-from finforce_driver.settings import GraspGoal, GraspSettings
+from finforce_driver.gripper import Gripper
+from finforce_driver.settings import GraspGoal, GraspSettings, GripperSettings
 from finforce_driver.state import GraspPhase
 from lab.experiments.grasp_world import GraspCase, NoisySensor, Plant, World, build_spring
 
@@ -149,6 +151,17 @@ def test_an_object_that_bottoms_out_stalls_the_motor_within_the_bound_that_is_sh
     course = world.run()
     bound = min(status.hard_bound for _, status in course.statuses)
     assert 0.6 * force < max(course.forces) < force + bound <= 8.5  # it was 14 N
+
+
+@pytest.mark.parametrize(("force_per_current", "grasps"), [(47.7, False), (23.85, True)])
+def test_a_motor_of_half_the_makers_curve_grasps_once_the_settings_say_so(
+    variant, monkeypatch, force_per_current, grasps
+):
+    monkeypatch.setattr("finforce_sim.emulator.mechanism.FORCE_PER_CURRENT", 23.85)
+    settings = GripperSettings(force_per_current=force_per_current)
+    monkeypatch.setattr("lab.experiments.grasp_world.Gripper", partial(Gripper, settings=settings))
+    _, course = press(1300.0, variant, force=3.0)
+    assert bool(course.error) != grasps, course.error
 
 
 def test_a_force_that_is_too_uncertain_to_be_reached_is_no_success():
