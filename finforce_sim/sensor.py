@@ -148,24 +148,6 @@ def build_d405_vga() -> CameraIntrinsics:
     return CameraIntrinsics(width=640, height=480, fx=431.2, fy=430.0, cx=319.6, cy=241.3, distortion=distortion)
 
 
-def build_d405(*, distorted: bool = False, step: int = 1) -> CameraIntrinsics:
-    """Return the colour camera of a D405 at 848 x 480, to which its depth is aligned.
-
-    Args:
-        distorted: with the distortion of a real unit.
-        step: keep every `step`-th pixel only, for quick runs.
-    """
-    return CameraIntrinsics(
-        width=848 // step,
-        height=480 // step,
-        fx=431.2 / step,
-        fy=430.0 / step,
-        cx=424.6 / step,
-        cy=241.3 / step,
-        distortion=np.array(D405_DISTORTION) if distorted else np.zeros(5),
-    )
-
-
 D405, WEBCAM, FISHEYE = "d405", "webcam", "fisheye"
 # by name, at 640 x 480: a webcam calibrated with the rational model, and an action camera of 155 degrees across
 LENSES = {

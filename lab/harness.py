@@ -77,8 +77,6 @@ PARTS = {
     "chain": "Latency against force error of the whole chain",
     "start": "From a node's start until it is ready, and its memory",
     "images": "From images to forces on unseen scenes, beside true key points",
-    "driver_faults": "Random faults between the gripper driver and an emulated gripper",
-    "grasp_faults": "Grasps by force in which something goes wrong",
 }
 USUAL = ("solvers", "chain")  # measured when none is named
 

@@ -70,9 +70,11 @@ def freeze_stress(folder: Path) -> None:
 
 def freeze_driver(folder: Path) -> None:
     """Keep the tallies of faults between driver and gripper, alone and in grasps by force."""
-    from lab.bench import driver_faults, grasp_faults
+    sys.path.insert(0, str(ROOT / "test" / "driver"))
+    from fault_trials import run_all
+    from faulty_grasp_trials import play_all
 
-    for name, tally in (("driver_faults", driver_faults.run_all(2000)), ("grasp_faults", grasp_faults.play_all(400))):
+    for name, tally in (("driver_faults", run_all(2000)), ("grasp_faults", play_all(400))):
         write_figures(folder / f"{name}.json", {"seed": 1, **tally.plain()})
 
 

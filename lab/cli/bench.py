@@ -21,7 +21,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     text = "jaw files or shipped jaws of the part images, separated by commas"
     parser.add_argument("--jaw", metavar="NAME", help=text)
     parser.add_argument("--minutes", type=float, metavar="N", help="for which the part chain repeats one grasp")
-    text = "seeds of each scene of the part images; faults or grasps of others"
+    text = "seeds of each scene of the part images"
     parser.add_argument("--count", type=int, metavar="N", help=text)
     parser.add_argument("--model", metavar="FOLDER", help="network of the part images, in place of the shipped one")
     text = f"parts to measure: {', '.join(PARTS)}; without it those of `make bench`"

@@ -8,13 +8,12 @@ import numpy as np
 from chamfer_fakes import compute_chamfer
 from guess_fakes import GuessError, draw_guess, place_mesh
 from scipy.spatial.transform import Rotation
+from table_fakes import build_d405, draw_scene
 
 from finforce_contact.mesh.object_mesh import ObjectMesh, prepare_object_mesh
 from finforce_contact.reconstruction.evidence import collect_evidence
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_sim.objects import build_object
-from finforce_sim.sensor import build_d405
-from lab.table_scenes import draw_scene
 
 JAW = load_jaw("bench")
 FACE = JAW.inner_face_x

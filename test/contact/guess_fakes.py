@@ -9,10 +9,10 @@ from chamfer_fakes import compute_chamfer
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
+from table_fakes import TableScene
 
 from finforce_contact.mesh.object_mesh import ObjectMesh
 from finforce_contact.reconstruction.evidence import GeneratedMesh
-from lab.table_scenes import TableScene
 
 
 @dataclass(frozen=True, kw_only=True)

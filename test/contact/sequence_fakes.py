@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from table_fakes import table_depth
 
 from finforce.camera import CameraIntrinsics
 from finforce_contact.mesh.object_mesh import ObjectMesh
 from finforce_contact.mesh.views import MeshView
 from finforce_sim.sensor import DepthNoise, disturb_depth
-from lab.table_scenes import table_depth
 
 PERIOD = 1.0 / 30.0  # [s] from one image to the next
 PLATE_GAP = 0.012  # [m] from the plates to the object's nearest point

@@ -9,13 +9,13 @@ from geometry_msgs.msg import PoseStamped
 from rclpy.qos import ReliabilityPolicy
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, Image
+from table_fakes import build_d405
 
 from finforce.health import Level
 from finforce.messages import depth_from_message, mask_from_message, stamp_of
 from finforce.ros import node as ros
 from finforce_contact.mesh.object_mesh import load_object_mesh
 from finforce_contact.mesh.views import MeshView
-from finforce_sim.sensor import build_d405
 
 # from above and the side, 0.22 m away, so that the cylinder shows its wall and a lid
 T_CAMERA_JAW = np.eye(4)

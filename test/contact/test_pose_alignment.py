@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from table_fakes import build_d405
 
 from finforce.camera import compute_rays
 from finforce.transforms import move_pose
@@ -13,7 +14,6 @@ from finforce_contact.parameters import TrackerSettings
 from finforce_contact.pose.alignment import DepthImage, Effort, MeshAligner, Samples, Visibility
 from finforce_contact.pose.tracker import spread_rotations
 from finforce_sim.objects import build_object
-from finforce_sim.sensor import build_d405
 
 CAMERA = build_d405(step=2)
 

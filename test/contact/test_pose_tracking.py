@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from sequence_fakes import Motion, render_sequence
+from table_fakes import build_d405
 
 from finforce.camera import CameraIntrinsics, ImageError
 from finforce.errors import FinforceError, PoseError
@@ -14,7 +15,6 @@ from finforce_contact.errors import PoseLostError
 from finforce_contact.parameters import TrackerSettings
 from finforce_contact.pose.tracker import PoseTracker
 from finforce_sim.objects import build_object
-from finforce_sim.sensor import build_d405
 
 CAMERA = build_d405(step=2)
 # The aim is 1 mm and 2 degrees in the median; at this noise it is 0.2 mm and 0.5 degrees, the worst three times that.

@@ -4,6 +4,7 @@ from functools import lru_cache
 import numpy as np
 import pytest
 from contact_fakes import distance_mm, make_case
+from table_fakes import build_d405, draw_scene
 
 from finforce.optional import import_manifold3d
 from finforce_contact.errors import ReconstructionError
@@ -13,8 +14,6 @@ from finforce_contact.reconstruction import reconstruction
 from finforce_contact.reconstruction.evidence import collect_evidence, score_shape
 from finforce_contact.reconstruction.reconstruction import complete_surface, reconstruct
 from finforce_contact.reconstruction.shape_search import HANDICAP, build_primitive, fit_primitive, spread_directions
-from finforce_sim.sensor import build_d405
-from lab.table_scenes import draw_scene
 
 
 def make_ball(radius):

@@ -3,14 +3,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from table_fakes import build_d405, draw_scene
 
 from finforce.camera import project
 from finforce_contact.errors import ObjectMeshError
 from finforce_contact.mesh.views import MeshView
 from finforce_sim.objects import OBJECT_NAMES, build_object
 from finforce_sim.render import smooth_field
-from finforce_sim.sensor import DepthNoise, build_d405, disturb_depth
-from lab.table_scenes import draw_scene
+from finforce_sim.sensor import DepthNoise, disturb_depth
 
 CAMERA = build_d405(step=4)
 

@@ -1,11 +1,17 @@
-"""Claims about the driver under random faults, against the emulator's truth."""
+"""Claims about the driver and grasps by force under random faults, against the emulator's truth.
+
+FINFORCE_FAULTS is the number of faults and of grasps, 240 and 6 without it.
+"""
+
+import os
 
 import pytest
+from fault_trials import FaultRun, choose_kinds
+from faulty_grasp_trials import play_all
 
 from finforce_driver.machine.drive import Exchange
 from finforce_driver.machine.knowledge import ReplyFilter
 from finforce_sim.emulator.faults import FaultKind
-from lab.bench.driver_faults import FaultRun, choose_kinds
 
 
 def total(tally):
@@ -21,12 +27,21 @@ def total(tally):
 CLEAN = {"wrong": {}, "motion": {}, "crashes": {}, "hangs": 0, "unrecovered": 0}
 
 
-@pytest.mark.parametrize("seed", [3, 4, 5, 6])
+FAULTS = int(os.environ.get("FINFORCE_FAULTS", 0))
+
+
+@pytest.mark.parametrize("seed", range(3, 3 + max(4, FAULTS // 60)))
 def test_faults_never_become_wrong_states_hangs_crashes_or_motion(seed):
     tally = FaultRun(seed, 60, choose_kinds(seed)).run()
     assert sum(tally.faults.values()) >= 60
     assert tally.states > 500
     assert total(tally) == CLEAN
+
+
+def test_grasps_with_faults_stay_below_the_limit():
+    tally = play_all(FAULTS or 6)
+    assert tally.cases == len(tally.excess) == sum(tally.ends.values())
+    assert not tally.complaints and not tally.wrong
 
 
 def test_a_driver_that_believes_every_reply_is_found_out(monkeypatch):

@@ -1,25 +1,8 @@
-"""Claims about what further parts of the benchmark count: images, faults."""
+"""Claims about what further parts of the benchmark count: images."""
 
 import pytest
 
-from lab.bench import driver_faults, grasp_faults, images
-from lab.harness import format_figures
-
-
-def test_faults_between_driver_and_gripper_do_no_harm(monkeypatch):
-    monkeypatch.setattr(driver_faults, "run_all", lambda faults: driver_faults.FaultRun(1, 20, list(KINDS)).run())
-    text = format_figures(driver_faults.measure(True))
-    assert "wrong states" in text and "Largest differences" in text
-
-
-KINDS = driver_faults.LINE_FAULTS
-
-
-def test_grasps_with_faults_stay_below_the_limit():
-    tally = grasp_faults.play_all(6)
-    assert tally.cases == len(tally.excess) == 6
-    assert not tally.complaints and not tally.wrong
-    assert sum(tally.ends.values()) == 6
+from lab.bench import images
 
 
 def test_a_scene_without_a_force_is_noted_and_the_others_are_measured(tmp_path, monkeypatch):

@@ -23,8 +23,7 @@ from random import Random
 from typing import Any
 
 import numpy as np
-import pandas as pd
-from tqdm import tqdm
+from fault_trials import Tally
 
 from finforce_driver.errors import BackOffError, DriverError, GripperTimeoutError
 from finforce_driver.grasp.load_watch import ForceSample
@@ -33,9 +32,7 @@ from finforce_driver.settings import GraspGoal, GraspSettings
 from finforce_driver.state import GraspPhase, GraspStatus, GripperState, MoveOutcome, Phase
 from finforce_sim.emulator.control import Mode
 from finforce_sim.emulator.faults import FaultKind, PlannedFault
-from lab.bench.driver_faults import Tally
 from lab.experiments.grasp_world import GraspCase, NoisySensor, Plant, World, build_spring
-from lab.harness import Figures
 
 LIMIT = GraspSettings().force_limit  # [N]
 FAULTS_FROM, PERIOD, MOST = 1.2, 0.5, 6  # [s], [s], faults of the line and the gripper
@@ -47,33 +44,10 @@ SILENT = 0.15  # [s] without a believed reply after which the link counts as los
 SETTLED = 0.3  # [s] in which a stop may take effect, from when the link is there
 CREEP = 2.2  # [counts] of closing that are none
 # left out: another program that drives the jaws, a gripper that takes itself for none and lets go of them unseen (both
-# in driver_faults.py), and a calibration that finds no stop
+# in fault_trials.py), and a calibration that finds no stop
 _LEFT_OUT = (FaultKind.OTHER_MASTER, FaultKind.STUCK, FaultKind.SLIPPING)
 KINDS = tuple(kind for kind in FaultKind if kind not in _LEFT_OUT)
 CAMERA = ("sound", "blind", "frozen", "dead", "slow", "low", "jumping", "nonsense", "negative")
-
-
-COMPLAINTS = ("pressed", "holds something else", "ready in motion", "motion after stop", "not told")
-
-
-def measure(quick: bool, count: int = 10_000) -> Figures:
-    """Return what came of many grasps.
-
-    Args:
-        quick: 50 grasps.
-        count: grasps.
-    """
-    tally = play_all(50 if quick else count)
-    plain = tally.plain()
-    rows = [{"complaint": name, "n": tally.complaints[name]} for name in COMPLAINTS]
-    ends = [{"end": words, "n": number} for words, number in tally.ends.most_common()]
-    excess = ", ".join(f"{name} {value:.2f}" for name, value in plain["excess"].items())
-    notes = [
-        f"{tally.cases} grasps, {tally.faults.total()} faults. True force beyond the set one [N]: {excess}.",
-        f"Seeds with a complaint: {', '.join(map(str, tally.wrong)) or 'none'}.",
-    ]
-    tables = {"grasp_faults": pd.DataFrame(rows), "ends": pd.DataFrame(ends)}
-    return Figures(tables=tables, notes=notes, more={"tally": plain})
 
 
 class FaultyCamera:
@@ -285,6 +259,6 @@ def play_all(cases: int, seed: int = 1) -> GraspTally:
     """Return what came of many grasps."""
     tally = GraspTally()
     with np.errstate(all="ignore"):
-        for number in tqdm(range(seed, seed + cases), unit="grasp", disable=None, leave=False):
+        for number in range(seed, seed + cases):
             tally.add(FaultyGrasp(number).play())
     return tally

@@ -1,4 +1,4 @@
-"""An object on a table before the wrist camera."""
+"""An object on a table before the wrist camera, a D405."""
 
 from __future__ import annotations
 
@@ -11,9 +11,27 @@ from scipy.spatial.transform import Rotation
 from finforce.camera import CameraIntrinsics, compute_rays
 from finforce_contact.mesh.object_mesh import ObjectMesh
 from finforce_contact.mesh.views import MeshView
-from finforce_sim.sensor import DepthNoise, disturb_depth
+from finforce_sim.sensor import D405_DISTORTION, DepthNoise, disturb_depth
 
 FARTHEST = 1.0  # [m], where the table ends
+
+
+def build_d405(*, distorted: bool = False, step: int = 1) -> CameraIntrinsics:
+    """Return the colour camera of a D405 at 848 x 480, to which its depth is aligned.
+
+    Args:
+        distorted: with the distortion of a real unit.
+        step: keep every `step`-th pixel only, for quick runs.
+    """
+    return CameraIntrinsics(
+        width=848 // step,
+        height=480 // step,
+        fx=431.2 / step,
+        fy=430.0 / step,
+        cx=424.6 / step,
+        cy=241.3 / step,
+        distortion=np.array(D405_DISTORTION) if distorted else np.zeros(5),
+    )
 
 
 def table_depth(T: NDArray, height: float, camera: CameraIntrinsics) -> NDArray:

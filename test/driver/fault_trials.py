@@ -17,9 +17,6 @@ from dataclasses import dataclass, field, replace
 from random import Random
 from typing import Any
 
-import pandas as pd
-from tqdm import tqdm
-
 from finforce_driver.can.protocol import CanMessage, Command, Move, decode_move
 from finforce_driver.errors import DriverError
 from finforce_driver.gripper import Gripper
@@ -31,7 +28,6 @@ from finforce_sim.emulator.faults import LINE_FAULTS, FaultKind, FaultyAdapter, 
 from finforce_sim.emulator.firmware import EmulatedGripper, Fault
 from finforce_sim.emulator.mechanism import Jaws
 from finforce_sim.emulator.virtual import VirtualBus, VirtualClock
-from lab.harness import Figures
 
 PER_RUN = 100
 PERIOD = 0.4  # [s] in which one fault is injected
@@ -40,41 +36,6 @@ STANDSTILL = 200  # turns without time passing: a hang
 RECOVERY_TIME = 120.0  # [s] in which the gripper has to work again: a calibration may fail after 35 s and be repeated
 SPEEDS = (0.002, 0.004, 0.02, 0.1, 0.3)  # [m/s]
 LATENCIES = (0.0003, 0.001, 0.003, 0.012)  # [s]
-
-
-def measure(quick: bool, count: int = 10_000) -> Figures:
-    """Return what came of many faults.
-
-    Args:
-        quick: 300 faults.
-        count: faults.
-    """
-    tally = run_all(300 if quick else count)
-    plain = tally.plain()
-    counted = {
-        "faults injected": plain["faults"],
-        "states compared": plain["phases"],
-        "moves judged": plain["outcomes"],
-        "orders sent": tally.orders,
-        "wrong states": plain["wrong"],
-        "unintended orders": plain["motion"],
-        "hangs": tally.hangs,
-        "crashes": plain["crashes"],
-        "not back to work": tally.unrecovered,
-        "against good practice": plain["violations"],
-    }
-    rows = [
-        {
-            "what": what,
-            "n": sum(found.values()) if isinstance(found, dict) else found,
-            "which": ", ".join(f"{key} {number}" for key, number in found.items()) if isinstance(found, dict) else "",
-        }
-        for what, found in counted.items()
-    ]
-    worst = ", ".join(f"{name} {value:.3f}" for name, value in tally.worst.items())
-    return Figures(
-        tables={"driver_faults": pd.DataFrame(rows)}, notes=[f"Largest differences: {worst}."], more={"tally": plain}
-    )
 
 
 class _Complaints(logging.Handler):
@@ -264,11 +225,9 @@ def choose_kinds(seed: int) -> tuple[FaultKind, ...]:
 def run_all(faults: int, seed: int = 1) -> FaultTally:
     """Return the tally of enough runs for a number of faults."""
     tally = FaultTally()
-    with tqdm(total=faults, disable=None, leave=False) as bar:
-        for index in range(-(-faults // PER_RUN)):
-            run = FaultRun(seed + index, min(PER_RUN, faults - index * PER_RUN), choose_kinds(seed + index))
-            tally.add(run.run())
-            bar.update(PER_RUN)
+    for index in range(-(-faults // PER_RUN)):
+        run = FaultRun(seed + index, min(PER_RUN, faults - index * PER_RUN), choose_kinds(seed + index))
+        tally.add(run.run())
     return tally
 
 
