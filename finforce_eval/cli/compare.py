@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from finforce_eval.cli.parser import picture_file
 from finforce_eval.evaluate import read_evaluations
 from finforce_eval.evaluation.comparison import (
     BETTER,
@@ -34,14 +33,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("before", metavar="A", help="what finforce evaluate --json wrote, or the folder of its --out")
     parser.add_argument("after", metavar="B", help="the same of other settings, fingers or versions")
     parser.add_argument("--json", metavar="OUT", help="write the changes as JSON")
-    parser.add_argument(
-        "--figure", type=picture_file, metavar="PNG", help="draw the error of each recording before and after"
-    )
     parser.add_argument("--strict", action="store_true", help="exit with 1 where a recording got worse or is gone")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Compare two evaluations: print the table, write JSON and picture."""
+    """Compare two evaluations: print the table, write JSON."""
     before, after = (_read(Path(path)) for path in (options.before, options.after))
     changes = compare_evaluations(before, after)
     for name, (old, new) in differing_settings(before, after).items():
@@ -50,12 +46,6 @@ def run(options: argparse.Namespace) -> int:
     if options.json:
         rows = [asdict(change) for change in changes]
         write_json(options.json, without_nan({"changes": rows, "mean": asdict(total_change(changes))}))
-    if options.figure:
-        from finforce_eval.figures.comparison import draw_comparison
-
-        names = Path(options.before).stem, Path(options.after).stem
-        draw_comparison(changes, names).savefig(options.figure)
-        print(f"Picture: {options.figure}")
     return WORSE_FOUND if options.strict and any(change.verdict in (WORSE, LOST) for change in changes) else 0
 
 

@@ -22,7 +22,7 @@ FRAMES_PER_LEVEL = SETTLE_FRAMES + RECORD_FRAMES
 PERIOD = 33_333_333  # ns
 START = 1_000_000_000_000  # ns
 
-# The height at which the finger's shapes come closest to the pictures (tools/fit_steel_hinges.py). No force enters it.
+# The height at which the finger's shapes come closest to the pictures. No force enters it.
 CONTACT_HEIGHT = 66.0  # mm
 
 GROUND_TRUTH = "only the magnitude compares, the sensor's axes are its own: it is given along -x, without torque"

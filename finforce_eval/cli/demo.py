@@ -7,23 +7,18 @@ import json
 import os
 import sys
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 from shutil import rmtree, which
 from typing import Any
 
 from finforce.systems.launch import find_share
 from finforce_eval.annotation.bag import new_folder
+from finforce_eval.cli.main import parse
 from finforce_eval.cli.parser import CONTACT_HELP
-from finforce_eval.cli.replay import format_replay
 from finforce_eval.cli.twin import RecordingForm, record_scene
 from finforce_eval.errors import RecordingError
-from finforce_eval.evaluation.keypoint_source import IMAGES, KeypointSource
-from finforce_eval.evaluation.setup import make_setup
-from finforce_eval.figures.report import write_report
+from finforce_eval.evaluation.keypoint_source import IMAGES
 from finforce_eval.recordings.recording import DEMO, read_recording
-from finforce_eval.recordings.tracks import Recording
-from finforce_eval.replay.replay import Replay, replay
 from finforce_sim.footage import parse_size
 from finforce_sim.scenarios import build_scenario
 
@@ -31,7 +26,6 @@ CALIBRATION = "bench"
 # the synthetic scene of a run from images, and the calibration of its finger
 SCENE, SEED, FINGER, SCENE_CALIBRATION = "grasp_cylinder", 4, 0, "twin"
 SIZE = "640x480"
-FOLDER = "recording"  # in the folder of the report
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -41,9 +35,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--from", dest="source", default="images", choices=("images", "keypoints"), help=text)
     parser.add_argument("--contact", action="append", default=[], metavar="CONTACT", help=CONTACT_HELP)
     parser.add_argument("--report", default="report", metavar="DIR", help="folder of the report (report)")
-    parser.add_argument(
-        "--movie", metavar="FILE", help="also make a moving picture, FILE.webp or FILE.gif, of the images"
-    )
 
 
 def run(options: argparse.Namespace) -> None:
@@ -53,39 +44,15 @@ def run(options: argparse.Namespace) -> None:
         FinforceError: the scene cannot be rendered, or ROS 2 or another library is not installed.
         ProcessError: a node cannot be started, or ended early.
     """
-    from_images = options.source == IMAGES
-    recording = prepare_recording(Path(options.report) / FOLDER) if from_images else read_recording(DEMO)
-    calibration = SCENE_CALIBRATION if from_images else CALIBRATION
-    stamps = recording.images.stamps if from_images else recording.jaw("left").keypoints.stamps
-    way = "key point detector, contact estimator and solvers" if from_images else "contact estimator and solver"
-    print(f"Playing {recording.name}, {(stamps[-1] - stamps[0]) * 1e-9:.0f} s, through {way} ...", flush=True)
-    names = argparse.Namespace(
-        jaw="bench",
-        solver="default",
-        mesh="default",
-        contact=options.contact or (["estimate"] if from_images else []),
-        source=options.source,
-        calibration=calibration,
-    )
-    setup = make_setup(names)
-    keypoints = KeypointSource(source=options.source, jaw_file=names.jaw)
-    result = replay(recording, setup, calibration_file=calibration, keypoints=keypoints)
-    print(format_replay(result))
-    page = write_report(
-        result.evaluation,
-        options.report,
-        keypoint_names=setup.jaw.keypoint_names,
-        about=setup.about,
-        recordings=[result.recording],
-        title="From images to forces through the nodes" if from_images else "One loading cycle through the nodes",
-    )
-    if options.movie:
-        from finforce_eval.figures.movie import write_movie
-        from finforce_keypoints.diagnostics import build_skeleton
-
-        skeleton = build_skeleton(setup.jaw.keypoint_names)
-        write_movie(result.recording, list(result.evaluation.results.values()), options.movie, skeleton)
-    print(f"\n{format_summary(result)}\nReport: {page}\nNext, the simulated robot: {next_command()}")
+    bag, calibration, contacts = DEMO, CALIBRATION, options.contact
+    if options.source == IMAGES:
+        bag, calibration = prepare_recording(Path(options.report) / SCENE), SCENE_CALIBRATION
+        contacts = contacts or ["estimate"]
+    words = ["replay", str(bag), "--from", options.source, "--calibration", calibration, "--report", options.report]
+    replay = parse([*words, *(word for contact in contacts for word in ("--contact", contact))])
+    print(f"Playing {bag.name} through the nodes in real time ...", flush=True)
+    replay.run(replay)
+    print(f"Next, the simulated robot: {next_command()}")
 
 
 def next_command() -> str:
@@ -96,25 +63,8 @@ def next_command() -> str:
     return f"{program} launch robot sim:=true"
 
 
-def format_summary(result: Replay) -> str:
-    """Return the few figures that matter, one a line: error of the grasp force, pixel error, delay."""
-    score, sight = result.grasp_score, result.evaluation.total.sight
-    error, delay, lines = score.error, score.delay, []
-    if error.rmse_N is not None:
-        where = f"of {score.largest:.2f} N at most; {error.n} of {score.frames} images in the record phases answered"
-        lines.append(f"Grasp force: {error.rmse_N:.3f} N RMSE, {error.max_error_N:.3f} N largest error, {where}")
-    if sight["pixel_median_px"] is not None:
-        median, p95 = sight["pixel_median_px"], sight["pixel_p95_px"]
-        lines.append(f"Key points: {median:.2f} px off in the median, {p95:.2f} px at the 95th percentile")
-    if delay["n"]:
-        lines.append(f"Delay: the grasp force shows {delay['median_ms']:.0f} ms after its true onset")
-    elif delay["missed"]:
-        lines.append("Delay: the grasp force did not show within a second of its true onset")
-    return "\n".join(lines)
-
-
-def prepare_recording(folder: Path) -> Recording:
-    """Return the recording of the demo's scene in a folder, rendered unless it is there already.
+def prepare_recording(folder: Path) -> Path:
+    """Return the folder of the recording of the demo's scene, rendered unless it is there already.
 
     Raises:
         RecordingError: the folder holds something else than a recording of a synthetic scene.
@@ -130,10 +80,10 @@ def prepare_recording(folder: Path) -> Recording:
         )
     if (case.get("scene"), case.get("seed"), case.get("finger")) == (SCENE, SEED, FINGER):
         with suppress(RecordingError):
-            return replace(read_recording(folder, strict=True), name=SCENE)
+            return read_recording(folder, strict=True).path
     if folder.exists():
         rmtree(folder)
     print(f"Rendering the scene {SCENE} into {folder}, once ...", flush=True)
     with new_folder(folder) as new:
         record_scene(build_scenario(SCENE), SEED, new, camera=parse_size(SIZE), form=RecordingForm(), finger=FINGER)
-    return replace(read_recording(folder), name=SCENE)
+    return folder

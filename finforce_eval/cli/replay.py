@@ -17,26 +17,33 @@ from finforce_eval.replay.replay import Playing, Replay, replay
 
 
 def format_replay(result: Replay) -> str:
-    """Return the table of the score, with the state of the nodes below."""
+    """Return the table of the score, with the state of the nodes and the figures that matter below."""
     lines = [format_tables(result.evaluation), ""]
     began = "images" if any(case.has("detector_ms") for case in result.evaluation.results.values()) else "key points"
     lines.append(f"Step times are from {began} out to wrench in, over the middleware and back.")
     largest = max(result.grasp.values(), default=math.nan)
-    lines.append(f"grasp_wrench: {len(result.grasp)} messages, largest {largest:.2f} N{_shown(result)}.")
+    lines.append(f"grasp_wrench: {len(result.grasp)} messages, largest {largest:.2f} N.")
     for name, state in result.health.items():
         own = " / ".join(state.get(f"callback to published {part} [ms]", "-") for part in ("p50", "p95"))
         lines.append(f"{name}: {state['message']}; refused: {state.get('refused', '-')}; in the node {own} ms")
-    return "\n".join(lines)
+    return "\n".join([*lines, "", *format_summary(result)])
 
 
-def _shown(result: Replay) -> str:
-    """Return in words when the grasp force showed."""
-    delay = result.grasp_score.delay
-    if not delay["n"]:
-        return f", missed at {delay['missed']} onsets" if delay["missed"] else ""
-    return (
-        f", above 0.1 N {delay['median_ms']:.0f} ms (at most {delay['max_ms']:.0f} ms) after {delay['n']} true onsets"
-    )
+def format_summary(result: Replay) -> list[str]:
+    """Return the few figures that matter, one a line: error of the grasp force, pixel error, delay."""
+    score, sight = result.grasp_score, result.evaluation.total.sight
+    error, delay, lines = score.error, score.delay, []
+    if error.rmse_N is not None:
+        where = f"of {score.largest:.2f} N at most; {error.n} of {score.frames} images in the record phases answered"
+        lines.append(f"Grasp force: {error.rmse_N:.3f} N RMSE, {error.max_error_N:.3f} N largest error, {where}")
+    if sight["pixel_median_px"] is not None:
+        median, p95 = sight["pixel_median_px"], sight["pixel_p95_px"]
+        lines.append(f"Key points: {median:.2f} px off in the median, {p95:.2f} px at the 95th percentile")
+    if delay["n"]:
+        lines.append(f"Delay: the grasp force shows {delay['median_ms']:.0f} ms after its true onset")
+    elif delay["missed"]:
+        lines.append("Delay: the grasp force did not show within a second of its true onset")
+    return lines
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

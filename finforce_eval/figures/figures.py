@@ -126,23 +126,6 @@ def _phase_legend(figure: Figure, results: Sequence[ForceSeries]) -> None:
         figure.legend(handles=patches, loc="outside upper right", ncols=2, frameon=False, fontsize=9)
 
 
-def draw_errors(results: Sequence[ForceSeries]) -> Figure:
-    """Draw quartiles and the 5th and 95th percentile of the error per case, loading and unloading apart."""
-    figure = new_figure(max(4.2, 1.15 * len(results) + 1.4), 4.4)
-    axes = figure.subplots()
-    style_axes(axes)
-    axes.axhline(0.0, color=BLACK, linewidth=0.8)
-    for direction, colour, offset in (("load", BLUE, -0.2), ("unload", ORANGE, 0.2), ("", BLUE, 0.0)):
-        errors = [each.error[each.counted & (each.column("direction") == direction)] for each in results]
-        style = {"whis": (5, 95), "widths": 0.3, "showfliers": False, "manage_ticks": False}
-        lines = {part: {"color": colour} for part in ("boxprops", "medianprops", "whiskerprops", "capprops")}
-        axes.boxplot(errors, positions=np.arange(len(results)) + offset, **style, **lines)
-    axes.set(ylabel="estimate - measured [N]", xlim=(-0.6, len(results) - 0.4))
-    axes.set_xticks(range(len(results)), [result.name.replace("_", "\n") for result in results], fontsize=8)
-    _phase_legend(figure, results)
-    return figure
-
-
 def draw_keypoints(result: ForceSeries, names: Sequence[str]) -> Figure:
     """Draw which key points entered the estimate, over time.
 

@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_eval.evaluation.scoring import compare_detection
-from finforce_eval.figures.figures import BLUE, GREEN, GREY, ORANGE, new_figure, style_axes
+from finforce_eval.figures.figures import GREY, new_figure
 from finforce_eval.recordings.tracks import DetectionTrack, JawTrack, Recording
 from finforce_eval.table import ForceSeries
 from finforce_keypoints.diagnostics import COLORS, draw_keypoints
@@ -27,8 +26,6 @@ MEANING = {
     "workspace": "outside the workspace",
     "image": "outside the image",
 }
-# what is drawn over time, with the largest value that is shown
-LIMITS = {"pixel error [px]": 20.0, "key points": None, "likelihood": 1.05}
 WHITE, BLACK = "white", "black"
 
 
@@ -204,58 +201,3 @@ def _explain(figure: Any, reasons: Iterable[str], *, has_truth: bool) -> None:
     if entries:
         style = {"facecolor": GREY, "edgecolor": "none", "framealpha": 1.0, "fontsize": 9}
         figure.legend(handles=entries, loc="outside lower left", ncols=len(entries), **style)
-
-
-def draw_detection(recording: Recording) -> Any:
-    """Draw over time how far the key points found lie from the true ones, how many were used, and their likelihood.
-
-    Args:
-        recording: with images and detections.
-
-    Returns:
-        A matplotlib figure.
-    """
-    jaws = detected_jaws(recording)
-    curves = {side: _detection_curves(track) for side, track in jaws.items()}
-    drawn = [what for what in LIMITS if any(own[what] for own in curves.values())]
-    figure = new_figure(WIDTH, 1.8 * len(drawn) + 0.8)
-    panels = figure.subplots(len(drawn), len(jaws), sharex=True, sharey="row", squeeze=False)
-    begin = int(recording.images.stamps[0])
-    for column, side in zip(panels.T, jaws, strict=True):
-        for axes, what in zip(column, drawn, strict=True):
-            style_axes(axes)
-            for stamps, values, color, label in curves[side][what]:
-                axes.plot((stamps - begin) * 1e-9, values, color=color, linewidth=1.1, label=label)
-            axes.set(ylabel=what, ylim=(0.0, LIMITS[what]))
-            axes.label_outer()
-        column[0].set_title(f"{recording.name}, {side} jaw", loc="left", fontsize=10)
-        column[-1].set_xlabel("time [s]")
-    for axes in panels[:, 0]:
-        axes.legend(loc="best", ncols=2, frameon=False, fontsize=8)
-    return figure
-
-
-def _detection_curves(track: JawTrack) -> dict[str, list[tuple[NDArray, NDArray, str, str]]]:
-    """Return by the panels of `LIMITS` the curves of a jaw: stamps [ns], values, colour and label."""
-    detection, sight = track.detection, track.sight
-    errors, counts = [], []
-    if sight is not None:
-        times = np.intersect1d(detection.stamps, sight.stamps)
-        pixels = np.stack(compare_detection(detection, sight)["pixel_error"])
-        errors.append((times, _percentile(pixels, 95), ORANGE, "95th percentile"))
-        errors.append((times, _percentile(pixels, 50), BLUE, "median of the visible"))
-        counts.append((sight.stamps, sight.visible.sum(axis=1), GREY, "visible"))
-    counts.append((detection.stamps, detection.accepted.sum(axis=1), GREEN, "used"))
-    likelihood = np.where(detection.accepted, track.keypoints.likelihood, np.nan)
-    used = [(50, BLUE, "median of the used"), (0, GREY, "lowest")]
-    likelihoods = [(detection.stamps, _percentile(likelihood, part), color, label) for part, color, label in used]
-    return dict(zip(LIMITS, (errors, counts, likelihoods), strict=True))
-
-
-def _percentile(values: NDArray[np.float64], percent: float) -> NDArray[np.float64]:
-    """Return a percentile of what is finite in each row (n, k), NaN where nothing is."""
-    chosen = np.full(len(values), np.nan)
-    known = np.isfinite(values).any(axis=1)
-    if known.any():
-        chosen[known] = np.nanpercentile(values[known], percent, axis=1)
-    return chosen

@@ -74,13 +74,12 @@ def write_overview(evaluation: Evaluation, folder: str | Path, *, about: Mapping
     Returns:
         README.md, which shows the pictures.
     """
-    from finforce_eval.figures.figures import draw_errors, draw_unity
+    from finforce_eval.figures.figures import draw_unity
 
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     results = list(evaluation.results.values())
     draw_unity(results).savefig(folder / "unity.png")
-    draw_errors(results).savefig(folder / "errors.png")
     page = folder / "README.md"
     zooming = ["The same over time, to zoom: [report.html](report.html)", ""]
     head = [f"# {title}", "", *(f"- {key}: {value}" for key, value in about.items()), "", *zooming]
@@ -96,7 +95,7 @@ def write_overview(evaluation: Evaluation, folder: str | Path, *, about: Mapping
 
 
 # Pictures of a recording and of a case by the ends of their names, with what they show.
-IMAGES = {"images": "Key points in the images", "detection": "Key points found, over time"}
+IMAGES = {"images": "Key points in the images"}
 PICTURES = {
     "force": "Force over time",
     "jaw": "The jaw at the largest force",
@@ -140,7 +139,6 @@ def _overview(evaluation: Evaluation) -> list[str]:
         "Errors are norm of the estimate minus norm of the measured force, over the record phases.",
         "",
         "![Estimated against measured force](unity.png)",
-        "![Distribution of the error per case](errors.png)",
     ]
 
 
@@ -156,11 +154,10 @@ def _draw_images(
     stem = _forget_pictures(folder, recording.name, IMAGES)
     if recording.images is None or all(track.detection is None for track in recording.jaws.values()):
         return
-    from finforce_eval.figures.images import draw_detection, draw_images
+    from finforce_eval.figures.images import draw_images
     from finforce_keypoints.diagnostics import build_skeleton
 
     draw_images(recording, results, build_skeleton(keypoint_names)).savefig(folder / f"{stem}_images.png")
-    draw_detection(recording).savefig(folder / f"{stem}_detection.png")
 
 
 def _draw_case(result: ForceSeries, folder: Path, keypoint_names: Sequence[str]) -> None:
