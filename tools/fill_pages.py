@@ -85,10 +85,20 @@ def read_texts(path: Path) -> dict[str, str]:
 
 
 def fill(page: str, texts: Mapping[str, str]) -> str:
-    """Return a page with the texts that are known in their places."""
+    """Return a page with the texts that are known in their places; a table keeps the columns that the page shows."""
     return _BLOCK.sub(
-        lambda match: f"{match[1]}{texts[match['name']]}\n{match[3]}" if match["name"] in texts else match[0], page
-    )
+        lambda match: f"{match[1]}{select_columns(texts[match['name']], match[0])}\n{match[3]}"
+        if match["name"] in texts else match[0], page
+    )  # fmt: skip
+
+
+def select_columns(text: str, block: str) -> str:
+    """Return a table with those of its columns that a block of a page shows; all of them if it shows none."""
+    rows = [row.split("|") for row in text.splitlines()]
+    shown = [name.strip() for name in block.splitlines()[1].split("|")]
+    kept = [place for place, name in enumerate(rows[0]) if name.strip() in shown]
+    known = len(kept) > 2  # besides the ends of a row, which are empty
+    return "\n".join("|".join(row[place] for place in kept) if known and row[1:] else "|".join(row) for row in rows)
 
 
 def main() -> None:

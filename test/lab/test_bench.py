@@ -192,6 +192,12 @@ def test_page_takes_its_tables_from_the_figures_and_keeps_what_they_do_not_hold(
     assert fill_pages.fill(filled, texts) == filled
 
 
+def test_page_chooses_the_columns_of_its_tables(fill_pages):
+    page = "<!-- begin t -->\n| tier | error |\n|---|---:|\n| a | 9 |\n<!-- end t -->\n"
+    texts = {"t": "| tier | time | error |\n|---|---:|---:|\n| a | 1 | 2 |\nA note."}
+    assert fill_pages.fill(page, texts) == page.replace("| a | 9 |", "| a | 2 |\nA note.")
+
+
 def test_the_parameters_on_the_page_are_those_that_the_nodes_declare(fill_pages):
     page = (ROOT / "docs" / "interfaces.md").read_text(encoding="utf-8")
     texts = fill_pages.list_parameters()
