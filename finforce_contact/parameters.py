@@ -29,19 +29,19 @@ class ContactSettings:
 
     mode: str = setting(
         "estimate",
-        "Method that finds the contact: this package's own, the paper's, or the nearest point",
+        "Method of finding the contact: estimate, paper (Algorithm 1) or closest (nearest point)",
         choices=MODES,
     )
-    mesh: str = setting("default", "Mesh density of a drawn jaw, as the solver has it", choices=MESHES)
+    mesh: str = setting("default", "Mesh density of a drawn jaw, as in the solver", choices=MESHES)
     pose_noise: float = setting(0.3e-3, "Initial noise of object positions (1 sigma)", "m", 1e-6, 0.05)
     rotation_noise: float = setting(6e-3, "Initial noise of object rotations (1 sigma)", "rad", 1e-5, 0.5)
     pose_bias: float = setting(0.5e-3, "Constant error of object positions (1 sigma)", "m", 0.0, 0.05)
     rotation_bias: float = setting(5e-3, "Constant error of object rotations (1 sigma)", "rad", 0.0, 0.5)
-    slip_speed: float = setting(1.5e-3, "Minimum speed at which a held object counts as sliding", "m/s", 1e-4, 0.1)
+    slip_speed: float = setting(1.5e-3, "Minimum speed of a sliding object", "m/s", 1e-4, 0.1)
     symmetry: str = setting(
         "auto", "Object symmetry: auto, none, or turns such as 'x_180 z_full' about the axes of the mesh's frame"
     )
-    pose_timeout: float = setting(1.0, "Maximum object pose age, unless the grasp holds still", "s", 0.01, 60.0)
+    pose_timeout: float = setting(1.0, "Maximum object pose age, unless the grasp is at rest", "s", 0.01, 60.0)
 
     def __post_init__(self) -> None:
         """Refuse values out of bounds.
@@ -59,7 +59,7 @@ class TrackerSettings:
     points: int = setting(1000, "Object pixels compared per image", "1", 100, 20000)
     noise: float = setting(0.3e-3, "Minimum standard deviation of the depth", "m", 1e-5, 0.01)
     least_fitness: float = setting(0.6, "Minimum share of the visible object that agrees with the depth", "1", 0.1, 1.0)
-    least_visible: float = setting(0.1, "Minimum share of the object in view that nothing hides", "1", 0.01, 1.0)
+    least_visible: float = setting(0.1, "Minimum share of the object in view that is not occluded", "1", 0.01, 1.0)
     speed: float = setting(0.2, "Expected object speed (1 sigma)", "m/s", 0.001, 5.0)
     turn_rate: float = setting(1.0, "Expected object turn rate (1 sigma)", "rad/s", 0.01, 20.0)
 
@@ -79,13 +79,11 @@ IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 class ContactParameters(TimeParameters):
     """Parameters of a contact estimator node, in addition to the settings of its parts; metadata holds units."""
 
-    jaws: str = setting("left", "Jaws whose contacts are estimated", choices=("left", "right", "both"))
-    jaw_file: str = setting("bench", "Jaw file, or name of a shipped jaw")
-    calibration_file: str = setting("", "Calibration file or name of a shipped one, as for the solvers; empty for none")
-    camera_frame: str = setting("", "Frame of poses and images; empty for that of the first jaw pose or image")
-    object_mesh: str = setting(
-        "", "Mesh file of the object, read again by load_mesh; empty when it is unknown", settable=True
-    )
+    jaws: str = setting("left", "Jaws to estimate contacts for", choices=("left", "right", "both"))
+    jaw_file: str = setting("bench", "Jaw file, or name of an included jaw")
+    calibration_file: str = setting("", "Calibration file, or name of an included one, as for the solvers; empty: none")
+    camera_frame: str = setting("", "Frame of poses and images; empty: that of the first jaw pose or image")
+    object_mesh: str = setting("", "Mesh file of the object, reread by load_mesh; empty: unknown", settable=True)
     object_mesh_unit: str = setting("m", "Unit of the object mesh", choices=("m", "cm", "mm", "inch"), settable=True)
     pose_source: str = setting(
         "topic",
@@ -95,30 +93,29 @@ class ContactParameters(TimeParameters):
     )
     pose_origin: str = setting(
         "mesh",
-        "Origin of poses from other programs: that of the mesh, the middle of its box, or the origin with the middle "
-        "added where it should be subtracted, as isaac_ros_foundationpose does up to release 4.4",
+        "Origin of external poses: mesh, middle (of the bounding box), or added (the middle is added instead of "
+        "subtracted, as by isaac_ros_foundationpose up to release 4.4)",
         choices=tuple(ORIGINS),
     )
     pose_tolerance: float = setting(
         0.017, "Maximum stamp difference between a jaw pose and its object pose", "s", 0.0, 1.0
     )
-    depth_topic: str = setting(DEPTH_TOPIC, "Topic of depth images, for the tracker", topic=True)
-    info_topic: str = setting(INFO_TOPIC, "Topic of their camera's intrinsics", topic=True)
-    image_transport: str = setting(AUTO, "Images that are subscribed to, as for the detector", choices=TRANSPORTS)
+    depth_topic: str = setting(DEPTH_TOPIC, "Topic of depth images for the tracker", topic=True)
+    info_topic: str = setting(INFO_TOPIC, "Topic of the intrinsics of the depth images", topic=True)
+    image_transport: str = setting(AUTO, "Transport of images, as for the detector", choices=TRANSPORTS)
     depth_scale: float = setting(0.001, "Unit of 16-bit depth images", "m", 1e-6, 0.01)
     reconstruct_method: str = setting(
         "",
-        "Method of reconstruct; empty for robust with a generated mesh, else a primitive where it fits, else "
-        "completion",
+        "Method of reconstruct; empty: robust with a generated mesh, else primitive if it fits, else completion",
         choices=("", "robust", "paper", "primitive", "completion"),
         settable=True,
     )
-    generated_mesh: str = setting("", "Mesh file from a generator, for reconstruct; empty for none", settable=True)
+    generated_mesh: str = setting("", "Mesh file from a generator, for reconstruct; empty: none", settable=True)
     generated_pose: tuple[float, ...] = setting(
         IDENTITY, "Pose of the generated mesh in the camera frame: x, y, z [m], qx, qy, qz, qw", settable=True
     )
     generated_scale: float = setting(1.0, "Length of the generated mesh's unit", "m", 1e-6, 1e6, settable=True)
-    skip_off: tuple[str, ...] = setting(("",), "Skip rules that are not applied, as named in the diagnostics, or all")
+    skip_off: tuple[str, ...] = setting(("",), "Disabled skip rules, as named in the diagnostics, or all")
 
     @property
     def sides(self) -> tuple[str, ...]:

@@ -64,12 +64,10 @@ class GripperSettings(_Bounded):
     force_per_current: float = setting(
         47.7, "Grip force per motor current; as measured, or the maker's", "N/A", 5.0, 500.0
     )
-    default_speed: float = setting(0.02, "Speed of the opening where a command names none", "m/s", 1e-4, 0.37)
-    default_current: float = setting(0.5, "Current limit where a command names no force", "A", 0.15, 1.5)
-    watchdog: float = setting(
-        0.0, "Silence of the driver after which the gripper goes limp; 0: it keeps its last order", "s", 0, 60
-    )
-    release_on_stop: bool = setting(False, "Whether the jaws go limp when the driver ends; else they hold", "")
+    default_speed: float = setting(0.02, "Speed of the opening, if a command has none", "m/s", 1e-4, 0.37)
+    default_current: float = setting(0.5, "Current limit, if a command has no force", "A", 0.15, 1.5)
+    watchdog: float = setting(0.0, "Silence of the driver after which the gripper goes limp; 0: never", "s", 0, 60)
+    release_on_stop: bool = setting(False, "Whether the jaws go limp when the driver exits", "")
     telemetry_period: float = 1.0
 
     def __post_init__(self) -> None:
@@ -195,10 +193,10 @@ class JointSettings(_Bounded):
     open: float = setting(1.0, "Joint value of the open gripper, in the joint's unit", "", -1e4, 1e4)
     resolution: float = setting(0.0002, "Smallest step of the opening that the joint follows", "m", 1e-6, 0.01)
     rate: float = setting(
-        25.0, "Rate of setpoints on the way; 0: one command, the joint keeps the speed itself", "Hz", 0.0, 500.0
+        25.0, "Rate of setpoints during a move; 0: one command, and the joint controls the speed", "Hz", 0.0, 500.0
     )
     largest_speed: float = setting(0.1, "Maximum speed of the opening", "m/s", 1e-4, 2.0)
-    largest_force: float = setting(0.0, "Maximum effort of a command; 0: the joint takes none", "N", 0.0, 1000.0)
+    largest_force: float = setting(0.0, "Maximum effort of a command; 0: no effort", "N", 0.0, 1000.0)
     effort_is_force: bool = setting(
         False, "Whether the joint's effort is its grip force [N], as a check of the camera's", ""
     )
@@ -230,26 +228,24 @@ class GraspGoal(_Bounded):
 class GraspSettings(_Bounded):
     """Settings of `ForceGrasp`; each field's metadata says unit, bounds and meaning."""
 
-    force_limit: float = setting(8.0, "Grasp force that ends a grasp, and maximum set force", "N", 0.2, 30.0)
+    force_limit: float = setting(8.0, "Force that ends a grasp; also the maximum set force", "N", 0.2, 30.0)
     largest_stiffness: float = setting(
-        1400.0, "Maximum stiffness of jaws and object per opening, assumed until it is learnt", "N/m", 50.0, 1e5
+        1400.0, "Maximum stiffness of jaws and object per opening, assumed until it is learned", "N/m", 50.0, 1e5
     )
     approach_speed: float = setting(0.004, "Maximum speed of the opening before contact", "m/s", 1e-4, 0.1)
     reaction: float = setting(0.05, "Delay from a command to the motion of the gripper", "s", 0.0, 1.0)
     stale_after: float = setting(0.25, "Maximum age of the newest force; a grasp ends beyond it", "s", 0.05, 2.0)
     force_timeout: float = setting(
         1.0,
-        "Maximum wait for a force once the jaws touch; twice as long before",
+        "Maximum wait for a force after contact; doubled before contact",
         "s",
         0.1,
         10.0,
         alias="touch_timeout",
     )
-    slip_raise: float = setting(
-        0.0, "Share of the set force that is added while the object slides; 0: none", "", 0.0, 1.0
-    )
+    slip_raise: float = setting(0.0, "Share of the set force added while the object slides", "", 0.0, 1.0)
     motor_force: float = setting(
-        7.5, "Motor limit as grip force by the maker's curve; 1.5 times the set force if that is more", "N", 7.0, 62.0
+        7.5, "Motor limit as grip force by the vendor's curve, at least 1.5 times the set force", "N", 7.0, 62.0
     )
 
     def check_force(self, force: float) -> float:
@@ -275,19 +271,19 @@ class DriverParameters(GripperParameters):
         "Link to the gripper: slcan (serial adapter); joint_command, parallel_gripper_command or gripper_command "
         "(another gripper by the topic or action that `port` names); or a python-can interface",
     )
-    baud_rate: int = setting(115200, "Baud rate of the serial port; without effect on USB", "1/s", 1200, 10_000_000)
+    baud_rate: int = setting(115200, "Baud rate of the serial port; no effect on USB", "1/s", 1200, 10_000_000)
     joint_names: tuple[str, ...] = setting(
-        ("left_jaw_joint", "right_jaw_joint"), "Names of the jaw joints; the value of each is half the opening"
+        ("left_jaw_joint", "right_jaw_joint"), "Names of the jaw joints; each value is half the opening"
     )
     joint_effort: str = setting(
         "vision",
         "Source of the effort in joint_states: vision (fresh grasp_wrench), motor (motor current) or none",
         choices=("vision", "motor", "none"),
     )
-    grasp_force: float = setting(1.0, "Set force until grasp_goal names another", "N", 0.1, 30.0)
+    grasp_force: float = setting(1.0, "Set force until a grasp_goal changes it", "N", 0.1, 30.0)
     grasp_speed: float = setting(0.004, "Maximum speed of the opening in a grasp", "m/s", 1e-4, 0.1)
     grasp_time_limit: float = setting(20.0, "Maximum time for a grasp to reach its force", "s", 0.1, 3600.0)
-    motor_force: float = setting(10.0, "Grip force of grasp_without_vision, by the motor current", "N", 1.0, 100.0)
+    motor_force: float = setting(10.0, "Grip force of grasp_without_vision, from the motor current", "N", 1.0, 100.0)
     release_opening: float = setting(math.nan, "Opening of release; NaN: fully open", "m", 0.0, 0.5)
 
     def __post_init__(self) -> None:

@@ -18,23 +18,21 @@ if TYPE_CHECKING:
 class NodeParameters(GripperParameters):
     """Parameters of a solver node, in addition to the settings of its estimator; metadata holds units."""
 
-    jaw_name: str = setting("left", "Jaw that this node solves", choices=("left", "right"))
-    jaw_file: str = setting("bench", "Jaw file, or name of a shipped jaw")
-    calibration_file: str = setting(
-        "", "Calibration file, or name of a shipped one; empty for the material of the jaw file"
-    )
-    gravity_frame: str = setting("", "Upright frame that tells gravity by /tf, such as base_link; empty for the topic")
+    jaw_name: str = setting("left", "Jaw of this node", choices=("left", "right"))
+    jaw_file: str = setting("bench", "Jaw file, or name of an included jaw")
+    calibration_file: str = setting("", "Calibration file, or name of an included one; empty: material of the jaw file")
+    gravity_frame: str = setting("", "Upright frame on /tf for gravity, such as base_link; empty: from the topic")
     contact_height: float = setting(
         math.nan,
-        "Height of first touch above the clamped base; NaN when contacts come on <jaw_name>/contact",
+        "Height of first touch above the clamped base; NaN: contacts from <jaw_name>/contact",
         "m",
         0.0,
         1.0,
     )
-    contact_free: bool = setting(False, "Whether the solver may move a contact that came on the topic")
+    contact_free: bool = setting(False, "Whether the solver may move contacts from the topic")
     contact_timeout: float = setting(
         0.008,
-        "Maximum wait for the contact of an image, while contacts keep up with images",
+        "Maximum wait for the contact of an image",
         "s",
         0.0,
         1.0,
@@ -42,13 +40,13 @@ class NodeParameters(GripperParameters):
     )
     peer: str = setting(
         "",
-        "Other jaw, whose wrenches complete grasp_wrench and manipulation_wrench here; empty for none",
+        "Other jaw, whose wrenches complete grasp_wrench and manipulation_wrench; empty: none",
         choices=("", "left", "right"),
     )
-    paired: bool = setting(False, "Whether another jaw holds the same object, without a peer")
-    completes_grasp: bool = setting(False, "Whether this jaw's force is published as grasp_wrench, without a peer")
-    publish_surface: bool = setting(True, "Whether the deformed mesh vertices are published with every solved image")
-    skip_off: tuple[str, ...] = setting(("",), "Skip rules that are not applied, as named in the diagnostics, or all")
+    paired: bool = setting(False, "Whether another jaw holds the same object, if there is no peer")
+    completes_grasp: bool = setting(False, "Whether this jaw's force is published as grasp_wrench, if there is no peer")
+    publish_surface: bool = setting(True, "Whether the deformed mesh vertices are published")
+    skip_off: tuple[str, ...] = setting(("",), "Disabled skip rules, as named in the diagnostics, or all")
     marker_rate: float = setting(10.0, "Maximum rate of the markers", "Hz", 0.1, 60.0)
 
     @property

@@ -7,8 +7,8 @@ from finforce.settings import check_bounds, setting
 
 SOLVERS = ("default", "reduced", "solid", "frame", "plane", "linear", "paper")
 _SOLVER_MEANING = (
-    "mechanics: default is reduced, the stored equilibria of what the jaw file recommends (solid or frame); these in "
-    "full, the compliance at rest alone (linear), or the paper's"
+    "mechanics: reduced (default), stored equilibria of the model that the jaw file recommends; solid, plane or frame, "
+    "a full model; linear, the compliance of the unloaded jaw; paper, the published setting"
 )
 
 
@@ -21,19 +21,19 @@ class EstimatorSettings:
 
     solver: str = setting("default", _SOLVER_MEANING, choices=SOLVERS)
     mesh: str = setting("default", "mesh density of a drawing", choices=("coarse", "default", "fine"))
-    likelihood_threshold: float = setting(0.6, "likelihood below which a key point is hidden", "1", 0.0, 1.0)
-    ignored_keypoints: str = setting("", "names of key points that are never used, comma-separated")
+    likelihood_threshold: float = setting(0.6, "minimum likelihood of a used key point", "1", 0.0, 1.0)
+    ignored_keypoints: str = setting("", "names of unused key points, comma-separated")
     minimum_keypoints: int = setting(3, "minimum number of used key points for a force", "1", 1, 100)
     gate: float = setting(
         4.5, "residual at which a key point has a quarter of its weight", "sigma", 1.0, 100.0, parameter=False
     )
-    friction: float = setting(0.4, "expected coefficient of friction of an object that is not smooth", "1", 0.0, 2.0)
+    friction: float = setting(0.4, "expected coefficient of friction of a rough object", "1", 0.0, 2.0)
     friction_stddev: float = setting(
         0.2, "standard deviation of that coefficient (1 sigma)", "1", 1e-3, 2.0, parameter=False
     )
     smooth_share: float = setting(
         0.65,
-        "probability that an object is no rougher than those of the calibration",
+        "prior probability that the object is no rougher than those of the calibration",
         "1",
         0.0,
         1.0,
@@ -42,11 +42,11 @@ class EstimatorSettings:
     held: str = setting(
         "auto",
         "whether only the jaws hold the object, so that friction balances the inclination of their faces; either: "
-        "weighed by what the key points show; auto: either if there are two jaws, else no",
+        "weighed by the key points; auto: either with two jaws, else no",
         choices=("auto", "yes", "no", "either"),
     )
-    tare_frames: int = setting(45, "unloaded images before the first force", "images", 5, 10000)
-    automatic_tare: bool = setting(True, "automatic tare at the start while nothing presses")
+    tare_frames: int = setting(45, "number of unloaded images for the tare", "images", 5, 10000)
+    automatic_tare: bool = setting(True, "automatic tare at the start, while unloaded")
     height_stddev: float = setting(0.5e-3, "uncertainty of the stated height of first touch (1 sigma)", "m", 1e-6, 0.05)
     radius: float = setting(0.012, "expected radius of curvature of the object at the contact", "m", 0.002, 0.5)
     radius_log_stddev: float = setting(
@@ -55,7 +55,7 @@ class EstimatorSettings:
     iterations: int = setting(12, "maximum Newton iterations per image", "1", 1, 50, parameter=False)
     energy_weight: float = setting(1e-3, "energy weight epsilon of solver paper", "1", 0.0, 1e9)
     energy_form: str = setting(
-        "sofa", "energy term as the paper prints it or as SOFA scales it", choices=("paper", "sofa"), parameter=False
+        "sofa", "energy term as printed in the paper, or as scaled in SOFA", choices=("paper", "sofa"), parameter=False
     )
     force_axes: str = setting(
         "normal",

@@ -24,59 +24,55 @@ DEPTHS = ALIGNED, AUTO, NO_DEPTH = ("aligned", "auto", "none")
 class DetectorParameters(GripperParameters):
     """Parameters of a key point detector node, in addition to the settings of its parts."""
 
-    jaws: str = setting("both", "Jaws that are looked for", choices=("left", "right", "both"))
-    jaw_file: str = setting("bench", "Jaw file, or name of a shipped jaw")
-    camera_frame: str = setting("", "Frame of the images and of the jaw poses; empty for that of the first image")
+    jaws: str = setting("both", "Jaws to detect", choices=("left", "right", "both"))
+    jaw_file: str = setting("bench", "Jaw file, or name of an included jaw")
+    camera_frame: str = setting("", "Frame of the images and jaw poses; empty: that of the first image")
     T_gripper_camera: tuple[float, ...] = setting(
         pose_numbers(ROBOT_CAMERA),
-        "Pose of the colour camera in the gripper frame: x, y, z [m], qx, qy, qz, qw; while it is not set, that of "
-        "/tf where there is one",
+        "Pose of the colour camera in the gripper frame: x, y, z [m], qx, qy, qz, qw; if not set, from /tf if possible",
     )
-    publish_tf: bool = setting(True, "Whether the poses of the jaws go to /tf, where tf2_ros is installed")
+    publish_tf: bool = setting(True, "Whether jaw poses are published on /tf, if tf2_ros is installed")
     image_transport: str = setting(
         AUTO,
-        "Images that are subscribed to: raw, compressed (of a topic .../compressed, of depth .../compressedDepth), or "
-        "auto (compressed where nobody publishes raw ones)",
+        "Transport of images: raw, compressed (topics .../compressed and .../compressedDepth), or auto (compressed if "
+        "there are no raw images)",
         choices=TRANSPORTS,
     )
     color_topics: tuple[str, ...] = setting(
         (COLOR_TOPIC, OLD_COLOR_TOPIC),
-        "Colour image topics; the first one that brings an image is used until it is silent; .../compressed: jpeg, png",
+        "Colour image topics; the first one with an image is used until it is silent; .../compressed: jpeg, png",
         topic=True,
     )
-    depth_topic: str = setting(DEPTH_TOPIC, "Topic of depth images, aligned to the colour images", topic=True)
+    depth_topic: str = setting(DEPTH_TOPIC, "Topic of depth images aligned to the colour images", topic=True)
     depth: str = setting(
         AUTO,
-        "Use of depth: auto (where there is some), aligned (required for every colour image), none",
+        "Use of depth: auto (if available), aligned (required for every colour image), none",
         choices=DEPTHS,
     )
     info_topic: str = setting(INFO_TOPIC, "Topic of the colour camera's intrinsics", topic=True)
     detection_method: str = setting(
         "network",
-        "Pixel detector: network (sees the rectified side planes; the shipped one), frame (a DeepLabCut network that "
-        "sees the image), dots (printed dots, no network)",
+        "Pixel detector: network (on rectified side planes), frame (a DeepLabCut network on the whole image), dots "
+        "(printed dots, no network)",
         choices=("network", "frame", "dots"),
         alias="finder",
     )
-    model: str = setting("", "Folder of the network; empty: the shipped one for the finger")
+    model: str = setting("", "Folder of the network; empty: the included one for the finger")
     names: tuple[str, ...] = setting(
         ("",),
-        "Names of body parts of a frame network, each as BODYPART=NAME, as in 'finger one=left_inner_1'; '-' for what "
-        "is on no jaw",
+        "Body parts of a frame network, each as BODYPART=NAME, such as 'finger one=left_inner_1'; NAME '-' ignores it",
     )
-    allow_resize: bool = setting(False, "Whether a network may see images of another size than its training's, scaled")
+    allow_resize: bool = setting(False, "Whether images of another size than in training are scaled for the network")
     threads: int = setting(2, "Number of network threads", "1", 1, 64)
-    depth_scale: float = setting(0.001, "Depth unit of 16-bit depth images", "m", 1e-6, 0.01)
+    depth_scale: float = setting(0.001, "Unit of 16-bit depth images", "m", 1e-6, 0.01)
     sync_tolerance: float = setting(
         math.nan,
-        "Maximum difference between the stamps of a colour image and its depth image; NaN for half the camera's period",
+        "Maximum stamp difference between a colour image and its depth image; NaN: half the camera's period",
         "s",
         0.0,
         0.1,
     )
-    skip_off: tuple[str, ...] = setting(
-        ("",), "Skip rules that are off, by their names in the diagnostics after `skipped:`; all: every rule"
-    )
+    skip_off: tuple[str, ...] = setting(("",), "Disabled skip rules, as named in the diagnostics, or all")
 
     def __post_init__(self) -> None:
         """Refuse values that are not among their choices or out of their bounds.
@@ -104,11 +100,9 @@ class DetectorSettings:
     """Settings of `KeypointDetector`."""
 
     likelihood: float = setting(0.6, "Minimum likelihood of a key point", "1", 0.0, 1.0, settable=True)
-    plane_depth: bool = setting(
-        False, "Whether key points without depth are used, on the plane that the side of the jaw is known to be"
-    )
+    plane_depth: bool = setting(False, "Whether key points without depth are placed on the plane of the jaw's side")
     quantum: float = setting(1e-3, "Step of the depth image", "m", 0.0, 0.01)
-    scale_stddev: float = setting(0.015, "Relative error that all depths of a camera share (1 sigma)", "1", 0.0, 0.1)
+    scale_stddev: float = setting(0.015, "Common relative error of all depths of a camera (1 sigma)", "1", 0.0, 0.1)
     workspace_closing: float = setting(
         0.025, "Maximum displacement of a key point along the closing axis", "m", 1e-3, 0.5
     )
@@ -116,7 +110,7 @@ class DetectorSettings:
     workspace_length: float = setting(0.012, "Maximum displacement of a key point along the jaw's z", "m", 1e-3, 0.5)
     readout: float = setting(
         0.0,
-        "Readout time of a rolling shutter, from the first row's exposure to the last one's, the stamp",
+        "Readout time of a rolling shutter, from the exposure of the first row to that of the last, the stamp",
         "s",
         0.0,
         0.1,
@@ -137,13 +131,13 @@ class DetectorSettings:
     )
     rest_tolerance: float = setting(
         1.1e-3,
-        "Distance of key points at rest from the jaw file (RMS) above which a warning is given",
+        "Maximum distance of key points at rest from the jaw file (RMS) without a warning",
         "m",
         1e-4,
         0.1,
         settable=True,
     )
-    lost_images: int = setting(5, "Images without a jaw, or without its key points, until it is lost", "1", 1, 1000)
+    lost_images: int = setting(5, "Number of images without a jaw or its key points until it is lost", "1", 1, 1000)
 
     def __post_init__(self) -> None:
         """Refuse values out of bounds.

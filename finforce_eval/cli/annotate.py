@@ -23,12 +23,12 @@ from finforce_eval.tasks import OK, Line, Manifest, Task, choose_shard, run_task
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
     parser.add_argument("bags", nargs="+", metavar="BAG", help=BAG_HELP)
-    text = "folder of what is written: one folder per recording, and manifest.jsonl (annotated)"
+    text = "output folder, with one folder per recording and manifest.jsonl (annotated)"
     parser.add_argument("--out", default="annotated", metavar="DIR", help=text)
-    text = "of bags: write the new messages alone instead of a copy of the recording with them"
+    text = "bags only: write the new messages without a copy of the recording"
     parser.add_argument("--side-file", action="store_true", help=text)
     parser.add_argument("--images", dest="color", help=argparse.SUPPRESS)
-    text = "of datasets: what the names of the new features begin with (observation)"
+    text = "datasets only: prefix of the new features (observation)"
     parser.add_argument("--prefix", default="observation", metavar="NAME", help=text)
     add_run_options(parser)
     add_engine_options(parser)

@@ -15,7 +15,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
     parser.add_argument("bags", nargs="+", metavar="BAG", help=BAG_HELP)
     add_run_options(parser, calibration=False)
-    parser.add_argument("-o", "--output", required=True, metavar="FILE", help="calibration to be written")
+    parser.add_argument("-o", "--output", required=True, metavar="FILE", help="calibration file to write")
 
 
 def run(options: argparse.Namespace) -> None:

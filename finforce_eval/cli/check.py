@@ -28,12 +28,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
     parser.add_argument("bags", nargs="*", metavar="BAG", help=f"{BAG_HELP}, with images")
     text = (
-        "listen to a running camera instead: to the usual topics, or to those of colour images, camera_info and, "
-        "if there is any, aligned depth"
+        "check a running camera instead: its usual topics, or the given topics of colour images, camera_info and, "
+        "if available, aligned depth"
     )
     parser.add_argument("--topics", nargs="*", metavar="TOPIC", help=text)
     add_rest_options(parser, images=30)
-    parser.add_argument("--report", default=".", metavar="DIR", help=f"where {PICTURE} is written (here)")
+    parser.add_argument("--report", default=".", metavar="DIR", help=f"folder for {PICTURE} (current folder)")
 
 
 def run(options: argparse.Namespace) -> int:

@@ -30,10 +30,10 @@ WORSE_FOUND = 1
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
-    parser.add_argument("before", metavar="A", help="what finforce evaluate --json wrote, or the folder of its --out")
-    parser.add_argument("after", metavar="B", help="the same of other settings, fingers or versions")
+    parser.add_argument("before", metavar="A", help="output of finforce evaluate --json, or its --out folder")
+    parser.add_argument("after", metavar="B", help="the same with other settings, fingers or versions")
     parser.add_argument("--json", metavar="OUT", help="write the changes as JSON")
-    parser.add_argument("--strict", action="store_true", help="exit with 1 where a recording got worse or is gone")
+    parser.add_argument("--strict", action="store_true", help="exit with 1 if a recording got worse or is missing")
 
 
 def run(options: argparse.Namespace) -> int:

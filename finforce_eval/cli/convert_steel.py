@@ -92,9 +92,9 @@ def _phases(stamps: NDArray[np.int64], levels: NDArray[np.float64], name: str) -
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
-    parser.add_argument("output", metavar="FOLDER", help="recording to be written")
-    parser.add_argument("--source", metavar="FILE", help="measurement; without it the shipped one")
-    parser.add_argument("--storage", default="mcap", choices=("mcap", "sqlite3"), help="its format")
+    parser.add_argument("output", metavar="FOLDER", help="recording to write, a new folder")
+    parser.add_argument("--source", metavar="FILE", help="measurement (the included one)")
+    parser.add_argument("--storage", default="mcap", choices=("mcap", "sqlite3"), help="format of the recording (mcap)")
 
 
 def run(options: argparse.Namespace) -> None:

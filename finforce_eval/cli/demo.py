@@ -30,8 +30,8 @@ SIZE = "640x480"
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
-    text = "begin with images of a synthetic gripper, rendered into the report's folder at first use, or with the key "
-    text += "points of a bench (images)"
+    text = "start from rendered images, made in the report's folder at first use, or from the key "
+    text += "points of a bench recording (images)"
     parser.add_argument("--from", dest="source", default="images", choices=("images", "keypoints"), help=text)
     parser.add_argument("--contact", action="append", default=[], metavar="CONTACT", help=CONTACT_HELP)
     parser.add_argument("--report", default="report", metavar="DIR", help="folder of the report (report)")

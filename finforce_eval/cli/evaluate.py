@@ -19,14 +19,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
     parser.add_argument("bags", nargs="+", metavar="BAG", help=BAG_HELP)
     add_run_options(parser)
-    text = "leave out the images that the live chain would leave out: nothing moved, or the object is out of reach"
+    text = "skip the images that the nodes skip: nothing moved, or the object is out of reach"
     parser.add_argument("--as-live", action="store_true", help=text)
     parser.add_argument("--json", metavar="OUT", help="write the scores as JSON")
-    parser.add_argument("--report", metavar="DIR", help="write pictures and a page that shows them")
-    text = (
-        "write a table of every recording there (Parquet: a row for each image and jaw), and manifest.jsonl, by which "
-    )
-    text += "a run that was killed goes on where it was; finforce report shows the tables, finforce compare two of them"
+    parser.add_argument("--report", metavar="DIR", help="write a page with figures to this folder")
+    text = "write a Parquet table of every recording (one row per image and jaw) and manifest.jsonl, with which "
+    text += "a killed run resumes; finforce report shows the tables, finforce compare compares two folders"
     parser.add_argument("--out", metavar="DIR", help=text)
     add_engine_options(parser)
 

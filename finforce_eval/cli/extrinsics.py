@@ -24,9 +24,9 @@ from finforce_keypoints.geometry.extrinsics import Extrinsics, GridCamera, find_
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
-    text = f"{BAG_HELP}, with images; with --grid a picture"
+    text = f"{BAG_HELP}, with images; with --grid, an image"
     parser.add_argument("bags", nargs=1, metavar="BAG", help=text)
-    text = "the picture shows a table with holes this far apart [m]: find the camera's intrinsics and its pose above it"
+    text = "find intrinsics and pose of the camera from an image of a table with holes of this pitch [m]"
     parser.add_argument("--grid", type=float, metavar="PITCH", help=text)
     add_rest_options(parser, images=45)
 

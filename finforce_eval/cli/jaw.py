@@ -13,18 +13,18 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     from finforce_ifea.jaw.jaw_file import MATERIALS
     from finforce_ifea.jaw.section import UNITS
 
-    parser.add_argument("file", type=Path, help="the finger: .stl and other surfaces, .step, .dxf, .svg, .json")
-    parser.add_argument("-o", "--output", type=Path, help="the jaw file to write (default: the finger's name, .yaml)")
-    parser.add_argument("--name", help="of the finger (default: the file's)")
-    parser.add_argument("--unit", choices=tuple(UNITS), help="of the file (default: by the finger's size)")
-    parser.add_argument("--body", type=int, metavar="N", help="which one of several bodies, from 1")
-    parser.add_argument("--width", type=float, metavar="M", help="along y [m]; a drawing does not know it")
-    parser.add_argument("--material", default="tpu95a", choices=tuple(MATERIALS), help="what it is printed of")
-    parser.add_argument("--clamp", type=float, metavar="Z", help="height [m] below which the holder keeps it")
-    parser.add_argument("--face-x", type=float, metavar="X", help="x [m] of the inner face in the jaw frame")
-    parser.add_argument("--flip", action="store_true", help="base and tip are the other way round")
-    parser.add_argument("--other-face", action="store_true", help="the other side is the one that touches objects")
-    text = "the picture to draw (default: next to the jaw file, .png)"
+    parser.add_argument("file", type=Path, help="finger: .stl or another surface, .step, .dxf, .svg, .json")
+    parser.add_argument("-o", "--output", type=Path, help="jaw file to write (FILE.yaml)")
+    parser.add_argument("--name", help="name of the finger (that of the file)")
+    parser.add_argument("--unit", choices=tuple(UNITS), help="unit of the file (from the size of the finger)")
+    parser.add_argument("--body", type=int, metavar="N", help="number of the body, from 1")
+    parser.add_argument("--width", type=float, metavar="M", help="width along y [m], for drawings")
+    parser.add_argument("--material", default="tpu95a", choices=tuple(MATERIALS), help="material (tpu95a)")
+    parser.add_argument("--clamp", type=float, metavar="Z", help="height below which the finger is clamped [m]")
+    parser.add_argument("--face-x", type=float, metavar="X", help="x of the inner face in the jaw frame [m]")
+    parser.add_argument("--flip", action="store_true", help="swap base and tip")
+    parser.add_argument("--other-face", action="store_true", help="take the other side as the inner face")
+    text = "picture to draw (next to the jaw file, .png)"
     parser.add_argument("--picture", type=lambda name: Path(picture_file(name)), help=text)
 
 

@@ -38,7 +38,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("system", choices=SYSTEMS, help="robot: both jaws; bench: one jaw; replay: a recording")
     text = "argument of the launch file, such as sim:=true or object_mesh:=can.stl; lengths in metres"
     parser.add_argument("words", nargs="*", metavar="NAME:=VALUE", help=text)
-    parser.add_argument("-s", "--show-args", action="store_true", help="list the arguments with their defaults and end")
+    parser.add_argument("-s", "--show-args", action="store_true", help="list the arguments and their defaults")
     parser.epilog = "example: finforce launch robot sim:=true"
 
 

@@ -16,28 +16,28 @@ from finforce_eval.errors import OptionError
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 COMMANDS = {
-    "evaluate": "run the estimator over recordings offline and score it against the measured force",
-    "annotate": "write the forces into recordings that exist: the same messages, and wrenches between them",
-    "compare": "say which recordings got better or worse from one evaluation to another, beyond chance",
-    "view": "show a recording with its forces in Rerun: pictures, key points, bending jaws, contact, forces over time",
-    "replay": "play a recording through the real nodes in real time and score it",
-    "prepare": "compile and build ahead of time what a first start would have to wait for",
+    "evaluate": "estimate forces in recordings and score them against measured forces",
+    "annotate": "add forces to existing recordings and datasets",
+    "compare": "compare two evaluations and report changes beyond chance",
+    "view": "show a recording with images, key points, bending jaws, contact and forces in Rerun",
+    "replay": "play a recording through the nodes in real time and score the result",
+    "prepare": "compile code and build stored equilibria ahead of time",
     "launch": "start a whole system, such as the simulated robot, without `ros2`",
-    "pipeline": "find the grasp force in a camera's images, all stages in one process",
-    "trace": "show the way of a recording's images through the stages: who waits for whom, and where time goes",
-    "jaw": "make the jaw file of a printed finger from its STL, STEP, DXF or SVG file",
-    "calibrate": "identify the material from recordings with ground truth",
-    "weigh": "scale the stiffness of a finger by the readings of a kitchen scale, one for each steady hold",
-    "check": "say whether camera, jaw file, extrinsics and picture fit each other, before any force",
-    "extrinsics": "find where the camera is in the gripper, from images of jaws that are open, still and unloaded",
-    "twin": "make RGB-D recordings of a synthetic gripper, with the truth about everything in them",
-    "demo": "play a recording through the real nodes, from images to force, and write a report",
-    "bench": "measure run time against error of every solver tier and of what comes before it, and how cost grows",
-    "experiment": "run one of the paper's experiments on the twin or on recordings, with a page of its figures",
-    "stress": "give the estimators what no bench does: every answer is right within what it states, or not sure",
-    "report": "put forces over time on one HTML page with plots that zoom",
-    "convert-steel": "convert the pictures of the measured steel finger into a recording",
-    "reconstruct": "make an object's mesh in metres, and its pose, from a masked depth image",
+    "pipeline": "run all stages from camera images to grasp force in one process",
+    "trace": "show how long the images of a recording take in each stage",
+    "jaw": "make the jaw file of a finger from its STL, STEP, DXF or SVG file",
+    "calibrate": "calibrate a finger from recordings with measured forces",
+    "weigh": "calibrate the modulus of a finger with readings of a kitchen scale",
+    "check": "check that camera, jaw file, extrinsics and images match",
+    "extrinsics": "calibrate the camera pose from images of open, still, unloaded jaws",
+    "twin": "make RGB-D recordings of a simulated gripper with ground truth",
+    "demo": "run a simulated grasp through the nodes and write a report",
+    "bench": "measure run time and error of every stage",
+    "experiment": "repeat an experiment of the paper on the twin or on recordings",
+    "stress": "test the estimators with difficult input",
+    "report": "show forces over time on an HTML page",
+    "convert-steel": "convert the photographs of the steel finger into a recording",
+    "reconstruct": "make an object mesh and its pose from a masked depth image",
     "version": "print the version",
 }
 LAB = ("bench", "experiment", "stress")  # these judge the product, and are in its checkout alone
@@ -61,7 +61,7 @@ def load_command(name: str) -> ModuleType:
 
 def read_command(words: Sequence[str]) -> str:
     """Return the subcommand that the words of a command line begin with; without one, print what there is and exit."""
-    parser = Parser(prog="finforce", description="Grasp force from the key points of fin-ray jaws.")
+    parser = Parser(prog="finforce", description="Estimate the grasp force of fin-ray fingers from camera images.")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=Parser)
     for name, text in COMMANDS.items():
         commands.add_parser(name, help=text, add_help=False)

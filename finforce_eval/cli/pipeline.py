@@ -30,7 +30,7 @@ OTHER = ("bag", "rate", "rviz", "sim", "composed")  # of launch files, which sta
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
     names = ", ".join(entry.name for entry in fields(PipelineOptions) if entry.name not in OTHER)
-    text = f"as for the launch files, object_mesh:=can.stl; {names}. gripper:=true takes the driver into the process"
+    text = f"argument as of the launch files, such as object_mesh:=can.stl: {names}. gripper:=true includes the driver"
     parser.add_argument("words", nargs="*", metavar="NAME:=VALUE", help=text)
 
 

@@ -10,9 +10,9 @@ from finforce_eval.tasks import progress_bar
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
-    text = "jaw files, or shipped names, whose equilibria are built (bench)"
+    text = "jaw files or names of included jaws (bench)"
     parser.add_argument("jaws", nargs="*", default=["bench"], metavar="JAW", help=text)
-    text = "calibration of the fingers, a file or a shipped name; without it the jaw files' own materials"
+    text = "calibration file, or name of an included one (materials of the jaw files)"
     parser.add_argument("--calibration", default="", metavar="FILE", help=text)
 
 

@@ -27,23 +27,23 @@ OUTPUTS = (".stl", ".ply", ".glb")
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
     parser.add_argument("--depth", required=True, metavar="FILE", help="16-bit PNG [mm], or .npy [m]")
-    text = "one step of a 16-bit depth image [m]: 0.0002 of TUM, 0.0001 of many BOP sets (0.001)"
+    text = "unit of a 16-bit depth image [m]: 0.0002 for TUM, 0.0001 for many BOP sets (0.001)"
     parser.add_argument("--depth-scale", type=float, default=MILLIMETRE, metavar="METRES", help=text)
-    parser.add_argument("--mask", required=True, metavar="FILE", help="the object's pixels: picture or .npy")
+    parser.add_argument("--mask", required=True, metavar="FILE", help="mask of the object: image or .npy")
     intrinsics = "fx fy cx cy [k1 k2 p1 p2 k3] in pixels, or a file of ROS, OpenCV, kalibr, BOP or OpenICC"
     parser.add_argument("--intrinsics", required=True, nargs="+", metavar="NUMBER", help=intrinsics)
-    parser.add_argument("--color", metavar="FILE", help="colour picture, for the picture that is written")
+    parser.add_argument("--color", metavar="FILE", help="colour image, shown in --picture")
     parser.add_argument(
-        "--mesh", metavar="FILE", help="generated mesh (STL, OBJ, PLY, GLB), or splats (PLY), in any unit"
+        "--mesh", metavar="FILE", help="generated mesh (STL, OBJ, PLY, GLB) or splats (PLY), in any unit"
     )
-    pose = "JSON of its pose: rotation (w x y z), translation, scale as SAM-3D gives them, or a 4x4 matrix"
+    pose = "JSON with its pose: rotation (w x y z), translation and scale as from SAM-3D, or a 4x4 matrix"
     parser.add_argument("--pose", metavar="FILE", help=pose)
-    method = "default: robust with a generated mesh; without, a primitive where one fits, else a completion"
+    method = "method (robust with a generated mesh; otherwise primitive if one fits, else completion)"
     parser.add_argument("--method", choices=("robust", "paper", "primitive", "completion"), help=method)
-    parser.add_argument("-o", "--output", required=True, metavar="FILE", help="mesh: .stl, .ply or .glb, in metres")
     parser.add_argument(
-        "--picture", type=picture_file, metavar="PNG", help="write a picture of the mesh over the depth"
+        "-o", "--output", required=True, metavar="FILE", help="mesh to write: .stl, .ply or .glb, in metres"
     )
+    parser.add_argument("--picture", type=picture_file, metavar="PNG", help="draw the mesh over the depth image")
 
 
 def run(options: argparse.Namespace) -> None:

@@ -50,14 +50,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add what names the recording and how it is played."""
     parser.add_argument("bag", metavar="BAG", help=BAG_HELP)
     add_run_options(parser, settings=False)
-    parser.add_argument("--rate", type=float, default=1.0, help="speed; other than 1 on /clock (1)")
-    parser.add_argument("--sim-time", action="store_true", help="keep the stamps, give the time on /clock")
-    parser.add_argument(
-        "--domain", type=int, metavar="ID", help="ROS_DOMAIN_ID, to look on with RViz; else one by chance"
-    )
-    parser.add_argument("--params", default="", metavar="FILE", help="further ROS parameters of the solvers")
+    parser.add_argument("--rate", type=float, default=1.0, help="playback speed; other than 1 uses /clock (1)")
+    parser.add_argument("--sim-time", action="store_true", help="keep the stamps and publish /clock")
+    parser.add_argument("--domain", type=int, metavar="ID", help="ROS_DOMAIN_ID, for example to watch in RViz (random)")
+    parser.add_argument("--params", default="", metavar="FILE", help="YAML file with ROS parameters of the solvers")
     parser.add_argument("--json", metavar="OUT", help="write the scores as JSON")
-    parser.add_argument("--report", metavar="DIR", help="write pictures and a page that shows them")
+    parser.add_argument("--report", metavar="DIR", help="write a page with figures to this folder")
 
 
 def run(options: argparse.Namespace) -> None:

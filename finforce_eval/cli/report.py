@@ -16,11 +16,11 @@ from finforce_eval.tasks import is_manifest
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
-    text = "recordings or LeRobot datasets with forces, as annotate or the nodes write them, or folders of finforce "
-    text += "evaluate --out; the manifest next to them is passed over"
+    text = "recordings or LeRobot datasets with forces, or output folders of finforce "
+    text += "evaluate --out"
     parser.add_argument("sources", nargs="+", metavar="SOURCE", help=text)
-    parser.add_argument("-o", "--output", default="report.html", metavar="FILE", help="the page (report.html)")
-    parser.add_argument("--title", default="Forces", help="its heading (Forces)")
+    parser.add_argument("-o", "--output", default="report.html", metavar="FILE", help="page to write (report.html)")
+    parser.add_argument("--title", default="Forces", help="heading of the page (Forces)")
 
 
 def run(options: argparse.Namespace) -> None:

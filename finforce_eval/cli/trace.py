@@ -19,10 +19,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add what names the recording, and how the stages run."""
     parser.add_argument("bag", metavar="BAG", help=BAG_HELP)
     add_run_options(parser, settings=False)
-    parser.add_argument("--apart", action="store_true", help="every stage in a process of its own")
+    parser.add_argument("--apart", action="store_true", help="run every stage in its own process")
     parser.add_argument("--json", metavar="OUT", help="write the figures as JSON")
     parser.add_argument(
-        "--figure", type=picture_file, metavar="PNG", help="draw the way of one image, and how long all took"
+        "--figure", type=picture_file, metavar="PNG", help="draw the stages of one image and the durations of all"
     )
 
 

@@ -55,26 +55,26 @@ from finforce_sim.scenarios import SCENARIOS, Scenario, build_scenario, write_sc
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True, parser_class=Parser)
-    listing = actions.add_parser("list", help="name the scenes")
+    listing = actions.add_parser("list", help="list the scenes")
     listing.set_defaults(run=run_list)
     record = actions.add_parser("record", help="render a scene and write it", description="render a scene and write it")
-    record.add_argument("scene", metavar="SCENE", help="a name that `finforce twin list` prints")
-    record.add_argument("-o", "--output", required=True, metavar="BAG", help="recording to be written, a new folder")
-    record.add_argument("--seed", type=whole_number(0, 2**32), default=0, help="of textures, light and noise (0)")
-    finger = "seed of the jaws' material; calibration twin is of finger 0 (0)"
-    steps = "of the depth in mm: 1 as the ROS driver gives it, 0.1 as the camera itself does (1)"
+    record.add_argument("scene", metavar="SCENE", help="name from `finforce twin list`")
+    record.add_argument("-o", "--output", required=True, metavar="BAG", help="recording to write, a new folder")
+    record.add_argument("--seed", type=whole_number(0, 2**32), default=0, help="seed of textures, light and noise (0)")
+    finger = "seed of the jaw material; the calibration twin belongs to 0 (0)"
+    steps = "depth step [mm]: 1 as from the ROS driver, 0.1 as from the camera itself (1)"
     record.add_argument("--depth-step", type=float, default=1.0, choices=(1.0, 0.1), help=steps)
     record.add_argument("--finger", type=whole_number(0, 2**32), default=0, metavar="SEED", help=finger)
-    record.add_argument("--light", metavar="WORD", help="bright, dim or any; without it that of the scene")
-    record.add_argument("--object", metavar="NAME", help="shape by name, or mesh file; without it that of the scene")
-    record.add_argument("--jaw", metavar="NAME", help="shipped jaw or jaw file; without it that of the scene, bench")
-    text = "two jaws on the wrist or from beyond the tips, or one jaw on the bench"
+    record.add_argument("--light", metavar="WORD", help="bright, dim or any (that of the scene)")
+    record.add_argument("--object", metavar="NAME", help="name of a shape, or mesh file (that of the scene)")
+    record.add_argument("--jaw", metavar="NAME", help="jaw file, or name of an included jaw (that of the scene, bench)")
+    text = "camera: robot on the wrist, front beyond the tips, or bench with one jaw"
     record.add_argument("--camera", choices=("robot", "front", "bench"), help=text)
-    record.add_argument("--lens", default="d405", choices=("d405", "webcam", "fisheye"), help="of the camera (d405)")
-    record.add_argument("--size", default="640x480", metavar="WxH", help="of the images (640x480)")
-    text = "change a number of the scene, may be repeated; an unknown NAME lists them"
+    record.add_argument("--lens", default="d405", choices=("d405", "webcam", "fisheye"), help="camera lens (d405)")
+    record.add_argument("--size", default="640x480", metavar="WxH", help="size of the images (640x480)")
+    text = "set a number of the scene, repeatable; an unknown NAME lists all"
     record.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help=text)
-    text = "write plain images, 46 MB a second; without it jpeg colour and png depth"
+    text = "write uncompressed images, 46 MB per second, instead of jpeg colour and png depth"
     record.add_argument("--raw", action="store_true", help=text)
     record.add_argument("--storage", default="mcap", choices=("mcap", "sqlite3"), help="format of the recording")
     record.set_defaults(run=run_record)

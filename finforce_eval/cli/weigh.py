@@ -20,10 +20,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
     parser.add_argument("bags", nargs=1, metavar="BAG", help=BAG_HELP)
     add_run_options(parser)
-    parser.add_argument("--side", default="left", choices=("left", "right"), help="the jaw that pressed (left)")
-    text = "what the scale showed at the end of each hold, in their order; without it the holds are listed"
+    parser.add_argument("--side", default="left", choices=("left", "right"), help="jaw on the scale (left)")
+    text = "reading of the scale [g] at the end of each hold, in order; without readings, the holds are listed"
     parser.add_argument("--grams", nargs="+", type=float, metavar="G", help=text)
-    parser.add_argument("-o", "--output", metavar="FILE", help="calibration to be written; needs --grams")
+    parser.add_argument("-o", "--output", metavar="FILE", help="calibration file to write; needs --grams")
 
 
 def run(options: argparse.Namespace) -> None:

@@ -20,18 +20,19 @@ _FAULTS = 10_000  # planned ahead
 def build_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     parser = argparse.ArgumentParser(
-        prog="python -m finforce_sim.emulator", description="An emulated SSG-48 behind a pseudo-terminal (SLCAN)."
+        prog="python -m finforce_sim.emulator",
+        description="Emulate an SSG-48 behind a pseudo-terminal (SLCAN).",
     )
     parser.add_argument("--link", help="path of a symbolic link to the port")
-    parser.add_argument("--variant", choices=tuple(VARIANTS), default="new", help="of the firmware")
-    parser.add_argument("--node", type=int, default=0, help="of the gripper on the CAN bus, 0 to 15")
-    parser.add_argument("--object-mm", type=float, help="width of what is between the jaws [mm]; without: nothing")
-    parser.add_argument("--stiffness", type=float, help="of that object [N per mm of opening]; without: rigid")
-    parser.add_argument("--ack", choices=ACK_MODES, default="none", help="answers of the adapter")
-    parser.add_argument("--baud", type=int, help="that the other side must set; without: any")
-    parser.add_argument("--latency-ms", type=float, default=0.0, help="from the bus to the host [ms]")
-    parser.add_argument("--faults", type=float, default=0.0, help="random faults per minute, every kind")
-    parser.add_argument("--seed", type=int, default=0, help="of the random faults")
+    parser.add_argument("--variant", choices=tuple(VARIANTS), default="new", help="firmware variant (new)")
+    parser.add_argument("--node", type=int, default=0, help="CAN node of the gripper, 0 to 15 (0)")
+    parser.add_argument("--object-mm", type=float, help="width of the object between the jaws [mm] (no object)")
+    parser.add_argument("--stiffness", type=float, help="stiffness of the object [N per mm of opening] (rigid)")
+    parser.add_argument("--ack", choices=ACK_MODES, default="none", help="acknowledgements of the adapter (none)")
+    parser.add_argument("--baud", type=int, help="baud rate that the host must set (any)")
+    parser.add_argument("--latency-ms", type=float, default=0.0, help="latency from the bus to the host [ms] (0)")
+    parser.add_argument("--faults", type=float, default=0.0, help="random faults per minute, of all kinds (0)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the random faults (0)")
     return parser
 
 

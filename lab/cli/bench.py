@@ -16,20 +16,20 @@ from lab.harness import PARTS, draw_tradeoff, figures_json, format_figures, meas
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
-    text = "folder in which the part images keeps its recordings (a cache)"
+    text = "folder for recordings of the part images (a cache)"
     parser.add_argument("folder", nargs="?", metavar="FOLDER", help=text)
-    text = "jaw files or shipped jaws of the part images, separated by commas"
+    text = "jaw files or included jaws for the part images, comma-separated"
     parser.add_argument("--jaw", metavar="NAME", help=text)
-    parser.add_argument("--minutes", type=float, metavar="N", help="for which the part chain repeats one grasp")
-    text = "seeds of each scene of the part images"
+    parser.add_argument("--minutes", type=float, metavar="N", help="minutes for which the part chain repeats one grasp")
+    text = "number of seeds per scene of the part images"
     parser.add_argument("--count", type=int, metavar="N", help=text)
-    parser.add_argument("--model", metavar="FOLDER", help="network of the part images, in place of the shipped one")
-    text = f"parts to measure: {', '.join(PARTS)}; without it those of `make bench`"
+    parser.add_argument("--model", metavar="FOLDER", help="network for the part images (the included one)")
+    text = f"parts to measure: {', '.join(PARTS)} (those of `make bench`)"
     parser.add_argument("--parts", metavar="A,B", help=text)
     parser.add_argument("--json", metavar="OUT", help="write the figures as JSON")
-    text = "picture of the first part; those of further parts get the part's name added"
+    text = "picture of the first part; the name of the part is added for others"
     parser.add_argument("--figure", type=picture_file, metavar="PNG", help=text)
-    parser.add_argument("--quick", action="store_true", help="measure fewer cases, for a first impression")
+    parser.add_argument("--quick", action="store_true", help="measure fewer cases")
 
 
 def run(options: argparse.Namespace) -> None:

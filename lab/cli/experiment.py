@@ -34,16 +34,16 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("name", choices=tuple(EXPERIMENTS), metavar="NAME", help=names)
     text = "twin, or recordings with measured forces (twin)"
     parser.add_argument("--on", nargs="+", default=[TWIN], metavar="twin|BAG", help=text)
-    text = "folder for figures, pictures and a page; what is done there is not done again (report)"
+    text = "output folder; finished cases there are not repeated (report)"
     parser.add_argument("--report", default="report", metavar="DIR", help=text)
-    parser.add_argument("--quick", action="store_true", help="few, short and small cases: two minutes")
-    parser.add_argument("--from", dest="source", default="", choices=SOURCES, help="key points (images of the twin)")
-    parser.add_argument("--jaw", default="bench", metavar="FILE", help="jaw file, or a shipped name (bench)")
-    text = "calibration file, or a shipped name; empty for the jaw file's own material (twin; of recordings none)"
+    parser.add_argument("--quick", action="store_true", help="run few, short and small cases, in about two minutes")
+    parser.add_argument("--from", dest="source", default="", choices=SOURCES, help="key points (images for the twin)")
+    parser.add_argument("--jaw", default="bench", metavar="FILE", help="jaw file, or name of an included jaw (bench)")
+    text = "calibration file, or name of an included one; empty: material of the jaw file (twin; none for recordings)"
     parser.add_argument("--calibration", metavar="FILE", help=text)
-    parser.add_argument("--seed", type=int, default=100, help="of the first scene (100)")
-    parser.add_argument("--size", metavar="WxH", help="of the twin's images (640x480; 320x240 with --quick)")
-    parser.add_argument("--keep", action="store_true", help="keep the twin's recordings, some 20 MB a grasp")
+    parser.add_argument("--seed", type=int, default=100, help="seed of the first scene (100)")
+    parser.add_argument("--size", metavar="WxH", help="size of the rendered images (640x480; 320x240 with --quick)")
+    parser.add_argument("--keep", action="store_true", help="keep the rendered recordings, about 20 MB per grasp")
     add_engine_options(parser)
 
 

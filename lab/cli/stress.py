@@ -38,20 +38,20 @@ def read_seed(text: str) -> int:
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
-    parser.add_argument("--families", metavar="A,B", help="families of trials, all without; a wrong one lists them")
+    parser.add_argument("--families", metavar="A,B", help="families of trials (all); an unknown one lists them")
     parser.add_argument(
         "--count",
         type=whole_number(1, 10_000_000),
         metavar="N",
-        help="trials per family; without, as many as each takes",
+        help="trials per family (the default of each)",
     )
-    text = "of everything that is drawn (0); new: drawn, and printed"
+    text = "seed of the trials (0); new: a random one, which is printed"
     parser.add_argument("--seed", type=read_seed, default=0, metavar="N|new", help=text)
-    parser.add_argument("--solver", default="default", choices=SOLVERS, help="model and objective")
+    parser.add_argument("--solver", default="default", choices=SOLVERS, help="mechanics of the solver")
     parser.add_argument("--mesh", default="default", choices=MESHES, help="mesh density")
-    parser.add_argument("--jaw", default="bench", metavar="FILE", help="shipped jaw or jaw file (bench)")
+    parser.add_argument("--jaw", default="bench", metavar="FILE", help="jaw file, or name of an included jaw (bench)")
     parser.add_argument("--json", metavar="OUT", help="write the figures as JSON")
-    parser.add_argument("--report", metavar="DIR", help="write a page with every family by level")
+    parser.add_argument("--report", metavar="DIR", help="write a page with all families by level")
 
 
 def choose_families(names: str | None) -> list[Family]:
