@@ -48,6 +48,7 @@ def describe(feed: RgbdFeed, method: str, found: JawKeypoints | None) -> dict[st
         "detection_method": method,
         "colour images": feed.topic or "none yet",
         "camera": "no camera_info yet" if camera is None else f"{camera.width} x {camera.height}",
+        "stamps of colour images": feed.rhythm,
         "overtaken while waiting for depth": str(feed.passed),
         "taken without depth": str(feed.alone),
     }

@@ -38,6 +38,7 @@ LONGEST_WAIT = 500_000_000  # [ns] the same, at most
 _MOST_WAITING = 32  # colour images in memory
 _FIRST_TOLERANCE = 8_000_000  # [ns] while the camera's period is not known
 _KNOWN, _PERIODS = 2, 15  # periods from which on it is, and over which it is learnt
+_HASTY, _BURSTS = 0.3, 0.15  # of the mean period, closer than a camera takes images; share of them that tells
 _COLOR, _DEPTH = "color", "depth"
 _LIVELY = 0.2  # share of a part's pixels between these, from which on it has to change
 
@@ -259,6 +260,22 @@ class RgbdFeed:
         """The newest `RgbdImage` without depth that waits for it."""
         waiting = self._images.entries(_COLOR)
         return waiting[-1] if waiting else None
+
+    @property
+    def rhythm(self) -> str:
+        """How far apart the stamps of colour images are, and whether they come in bursts, as those of arrivals do."""
+        if len(self._stamps) <= _KNOWN:
+            return "not known yet"
+        gaps = np.diff(self._stamps)
+        mean = float(gaps.mean())
+        hasty = int((gaps < _HASTY * mean).sum())
+        apart, near = f"{1e3 * SECOND * mean:.1f} ms apart", f"{1e3 * SECOND * _HASTY * mean:.1f} ms"
+        if hasty < _BURSTS * len(gaps):
+            return apart
+        return (
+            f"{apart} on average, {hasty} of {len(gaps)} within {near} of the one before: stamped on arrival, not at "
+            "capture? Forces lag by the delay that the stamps hide"
+        )
 
     def reset(self) -> None:
         """Forget all images; intrinsics, frame and topic stay."""

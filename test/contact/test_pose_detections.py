@@ -38,6 +38,7 @@ def test_turns_that_map_an_object_onto_itself_are_found(name, turns):
 
 @pytest.mark.parametrize("name", ["cylinder", "cube", "bottle"])
 def test_a_flipped_pose_is_turned_back_and_looks_the_same(name):
+    """FoundationPoseROS2 18."""
     mesh, random = build_object(name), np.random.default_rng(3)
     symmetry = read_symmetry("auto", mesh)
     last = np.eye(4)

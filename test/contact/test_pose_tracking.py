@@ -145,6 +145,7 @@ def test_a_face_that_slides_between_plates_is_known_to_slide():
 
 
 def test_a_hidden_object_is_lost_and_found_again(tracker, frames):
+    """FoundationPose 325."""
     kept = tracker.latest
     with pytest.raises(PoseLostError, match="'asymmetric' is not found"):
         tracker.track(frames[1].stamp, np.full_like(frames[1].depth, 0.1))

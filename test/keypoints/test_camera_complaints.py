@@ -1,5 +1,7 @@
 """Claims about cameras as users of comparable packages complain of them, by the public thread that tells of it."""
 
+import re
+
 import numpy as np
 import pytest
 from keypoint_node_fakes import COLOR, HEIGHT, WIDTH, camera_info, image_of
@@ -21,8 +23,8 @@ def feed_of(**parameters):
 
 
 def color(number, **options):
-    noise = np.random.default_rng(number).integers(90, 160, (HEIGHT, WIDTH, 3), dtype=np.uint8)
-    return image_of(number * PERIOD, noise, "rgb8", **options)
+    noise = np.random.default_rng(int(10 * number)).integers(90, 160, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+    return image_of(round(number * PERIOD), noise, "rgb8", **options)
 
 
 def test_the_camera_info_of_the_depth_camera_beside_aligned_depth_is_named():
@@ -48,6 +50,22 @@ def test_without_an_aligned_topic_colour_alone_is_used_or_the_driver_option_is_n
     with pytest.raises(SyncError, match="align_depth.enable:=true"):
         for number in range(1, 12):
             feed.take_color(COLOR, color(number))
+
+
+@pytest.mark.parametrize(
+    ("times", "words"),
+    [
+        (range(16), "33.3 ms apart$"),
+        ((0, 1, 2, 4, 5, 7, 8, 9, 10, 12, 13), "apart$"),  # some are lost
+        ((0, 0.1, 0.2, 3, 3.1, 3.2, 6, 6.1, 6.2, 9, 9.1), "7 of 10 within 9.1 ms .* stamped on arrival"),
+    ],
+)
+def test_late_images_under_fresh_stamps_are_told_by_their_bursts(times, words):
+    """realsense-ros 1581."""
+    feed = feed_of(depth="none")
+    for number in times:
+        feed.take_color(COLOR, color(1 + number))
+    assert re.search(words, feed.rhythm)
 
 
 def test_depth_that_is_zero_everywhere_counts_as_none():
