@@ -10,7 +10,7 @@ STRESS_JAWS ?= bench umi ssg48_fin_ray_1 xlerobot
 DESCRIBED := setup.py setup.cfg pyproject.toml $(SET_UP)
 ROS := $(if $(AMENT_PREFIX_PATH),ament,plain)
 
-.PHONY: demo test lint bench stress docs build clean
+.PHONY: demo test lint bench stress docs build dist clean
 
 demo: .venv/.$(ROS)-run
 	$(PYTHON) -m finforce_eval.cli.main demo --report report
@@ -41,9 +41,14 @@ docs: .venv/.$(ROS)-docs
 build: .venv/.$(ROS)-build
 	$(PYTHON) -m colcon build --event-handlers console_cohesion+
 
+# Wheel and sdist in dist/, tried in an empty environment without this checkout.
+dist: .venv/.$(ROS)-dist
+	rm -rf dist && $(PYTHON) -m build && $(PYTHON) -m twine check --strict dist/*
+	tools/check_dist.sh $(PYTHON) dist/*.whl
+
 .venv/.$(ROS)-%: $(DESCRIBED)
 	$(SET_UP) $* $@
 
 clean:
-	rm -rf .venv build install log report site *.egg-info .pytest_cache .ruff_cache .hypothesis
+	rm -rf .venv build dist install log report site *.egg-info .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -prune -exec rm -rf {} +

@@ -1,6 +1,7 @@
 """Packages, executables and installed files; name and version stand in package.xml, too."""
 
 from glob import glob
+from pathlib import Path
 
 from setuptools import find_packages, setup
 
@@ -10,10 +11,24 @@ setup(
     name=NAME,
     version="0.1.0",
     description="Grasp force from the key points of fin-ray jaws, by a mechanical model of the jaw.",
+    long_description=Path("README.md").read_text(encoding="utf-8"),
+    long_description_content_type="text/markdown",
+    author="finforce developers",
     license="Apache-2.0",
+    keywords=["robotics", "soft gripper", "fin-ray", "force estimation", "inverse finite elements", "ROS 2"],
+    classifiers=[
+        "Development Status :: 4 - Beta",
+        "Intended Audience :: Science/Research",
+        "Operating System :: POSIX :: Linux",
+        "Programming Language :: Python :: 3",
+        *(f"Programming Language :: Python :: 3.{minor}" for minor in range(10, 14)),
+        "Topic :: Scientific/Engineering",
+        "Typing :: Typed",
+    ],
     python_requires=">=3.10",
     packages=find_packages(include=["finforce", "finforce.*", "finforce_*"]),
     package_data={
+        "": ["py.typed", "*.pyi"],
         "finforce.ros": ["fastdds.xml"],
         "finforce_ifea.jaw": ["jaws/*", "calibrations/*"],
         "finforce_eval": ["data/*", "data/*/*", "data/*/*/*"],

@@ -2,43 +2,34 @@
 
 `from finforce import NAME` gives what most programs need, and loads its package only then:
 
-- the force: `load_jaw`, `load_calibration`, `JawEstimator`, `Observation`, `Contact`, `Solution`;
+- images to forces: `ForceSensor` and what it returns, `GripperForces`; `CameraIntrinsics`, `read_camera`;
+- the force: `ForceEstimator`, `Observation`, `Contact`, `Solution`, `load_jaw`;
+- the material: `load_calibration`, `save_calibration`, `calibrate_with_scale`;
 - the contact: `load_object_mesh`, `ContactEstimator`, and `ForceLoop`, contact and force together;
 - the images: `KeypointDetector`, `build_detector`, `RgbdImage`;
 - the gripper: `Gripper`, `build_bus`; `GripperClient`, for a driver node that runs elsewhere;
-- recordings: `read_recording`, `play`, `find_mesh`, `DEMO`, the one that comes with finforce.
+- recordings: `read_recording`, `iter_frames`, `find_mesh`, `DEMO`, the one that comes with finforce.
 """
 
+import ast
+import warnings
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
-_HOMES = {
-    "Contact": "finforce_ifea.observation",
-    "ContactEstimator": "finforce_contact.estimator",
-    "DEMO": "finforce_eval.recordings.recording",
-    "ForceLoop": "finforce_contact.loop",
-    "Gripper": "finforce_driver.gripper",
-    "GripperClient": "finforce.ros.client",
-    "JawEstimator": "finforce_ifea.estimator",
-    "KeypointDetector": "finforce_keypoints.detector",
-    "Observation": "finforce_ifea.observation",
-    "RgbdImage": "finforce_keypoints.images",
-    "Solution": "finforce_ifea.observation",
-    "build_bus": "finforce_driver.can",
-    "build_detector": "finforce_keypoints.build",
-    "find_mesh": "finforce_eval.recordings.objects",
-    "load_calibration": "finforce_ifea.jaw.calibration",
-    "load_jaw": "finforce_ifea.jaw.jaw",
-    "load_object_mesh": "finforce_contact.mesh.object_mesh",
-    "play": "finforce_eval.recordings.objects",
-    "read_recording": "finforce_eval.recordings.recording",
-}
+# the stub, which editors read, says where every name is
+_STUB = ast.parse(Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8"))
+_HOMES = {entry.names[0].name: entry.module for entry in _STUB.body if isinstance(entry, ast.ImportFrom)}
+_FORMER = {"JawEstimator": "ForceEstimator", "play": "iter_frames"}  # for one release
 
 __all__ = sorted(_HOMES)
 
 
 def __getattr__(name: str) -> Any:
     """Load what was asked for from its package; it stays."""
+    if name in _FORMER:
+        warnings.warn(f"finforce.{name} is now finforce.{_FORMER[name]}", DeprecationWarning, stacklevel=2)
+        return __getattr__(_FORMER[name])
     if name not in _HOMES:
         raise AttributeError(f"module 'finforce' has no attribute {name!r}; it has {', '.join(__all__)}")
     value = globals()[name] = getattr(import_module(_HOMES[name]), name)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from finforce.errors import PoseError
-from finforce.transforms import invert_pose, pose_from_quaternion
+from finforce.transforms import check_pose, invert_pose, pose_from_quaternion
 
 SIDES = ("left", "right")
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # about z: left and right change places
@@ -83,3 +83,26 @@ _BENCH_JAW = pose_from_quaternion(
     (0.0293674, 0.02565352, 0.11204665), (-0.21179348, -0.35564507, 0.90650751, 0.08309176)
 )
 BENCH_CAMERA = jaw_in_gripper("left", BENCH_ORIGIN_X) @ invert_pose(_BENCH_JAW)
+CAMERAS = {"robot": ROBOT_CAMERA, "bench": BENCH_CAMERA}
+
+
+def read_extrinsics(camera: str | ArrayLike) -> NDArray:
+    """Return T_gripper_camera (4, 4) of a camera by its name, its matrix (4, 4), or x, y, z [m], qx, qy, qz, qw.
+
+    Raises:
+        PoseError: it is none of these.
+    """
+    forms = "robot, bench, x y z qx qy qz qw, or a (4, 4) matrix"
+    if isinstance(camera, str):
+        if camera in CAMERAS:
+            return CAMERAS[camera]
+        camera = camera.replace(",", " ").split()
+    try:
+        numbers = np.asarray(camera, dtype=float)
+    except (TypeError, ValueError):
+        raise PoseError(f"extrinsics {camera!r}: expected {forms}") from None
+    if numbers.shape == (7,):
+        return pose_from_quaternion(numbers[:3], numbers[3:])
+    if numbers.shape != (4, 4):
+        raise PoseError(f"extrinsics: {numbers.size} numbers; expected {forms}")
+    return check_pose(numbers, "extrinsics")

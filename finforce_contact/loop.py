@@ -14,7 +14,7 @@ from finforce.errors import FinforceError
 from finforce.messages import SECOND
 from finforce_contact.estimator import ContactEstimate, ContactEstimator
 from finforce_contact.mesh.object_mesh import ObjectMesh
-from finforce_ifea.estimator import JawEstimator
+from finforce_ifea.estimator import ForceEstimator
 from finforce_ifea.observation import Contact, Observation, Solution
 from finforce_ifea.tracking.influence import is_out_of_reach
 
@@ -218,7 +218,7 @@ class ForceLoop:
         force: the solver of that jaw, with the same mesh density.
     """
 
-    def __init__(self, contact: ContactEstimator | ContactSource, force: JawEstimator) -> None:
+    def __init__(self, contact: ContactEstimator | ContactSource, force: ForceEstimator) -> None:
         self.contact = ContactLoop(contact) if isinstance(contact, ContactEstimator) else contact
         self.force, self.given = force, None
         self.contact_ms = self.force_ms = 0.0

@@ -49,12 +49,12 @@ def prepare(jaws: Sequence[str], calibration: str) -> Iterator[str]:
 
 def compile_solver() -> None:
     """Compile the solver with a jaw that is taken to be linear, which needs no equilibria."""
-    from finforce_ifea.estimator import JawEstimator
+    from finforce_ifea.estimator import ForceEstimator
     from finforce_ifea.jaw.jaw import load_jaw
     from finforce_ifea.settings import EstimatorSettings
 
     for held in ("no", "yes"):
-        JawEstimator(load_jaw("bench"), settings=EstimatorSettings(solver="linear", held=held)).warm_up()
+        ForceEstimator(load_jaw("bench"), settings=EstimatorSettings(solver="linear", held=held)).warm_up()
 
 
 def _load(name: str, calibration: str) -> Jaw:

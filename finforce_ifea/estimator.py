@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from math import hypot
+from pathlib import Path
 
 import numpy as np
 from numba import njit
@@ -13,8 +14,8 @@ from numpy.typing import NDArray
 from finforce.errors import ObservationError
 from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics
 from finforce_ifea.errors import ContactError, NotEnoughDataError, UnobservableError
-from finforce_ifea.jaw.calibration import Calibration
-from finforce_ifea.jaw.jaw import Jaw
+from finforce_ifea.jaw.calibration import Calibration, load_calibration
+from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_ifea.mechanics import build_chosen
 from finforce_ifea.observation import (
     Contact,
@@ -46,7 +47,7 @@ _EXTRAPOLATED = 0.015
 _LINEAR = 0.05
 
 
-class JawEstimator:
+class ForceEstimator:
     """Estimates the force on one jaw; deterministic, one thread.
 
     Attributes:
@@ -55,23 +56,24 @@ class JawEstimator:
 
     def __init__(
         self,
-        jaw: Jaw,
+        jaw: Jaw | str | Path,
         *,
         settings: EstimatorSettings | None = None,
-        calibration: Calibration | None = None,
+        calibration: Calibration | str | Path | None = None,
     ) -> None:
         """Build the mechanics of the jaw as the calibration describes it.
 
         Args:
-            jaw: as its file has it.
+            jaw: as its file has it, that file, or the name of a shipped jaw.
             settings: of this estimator.
-            calibration: of the finger, None for the jaw as it is.
+            calibration: of the finger, its file or a shipped name; None for the jaw as it is.
 
         Raises:
             FinforceError: Jaw, settings and calibration do not fit each other.
         """
         self.settings = settings or EstimatorSettings()
-        self.calibration = calibration
+        self.calibration = calibration = None if calibration is None else load_calibration(calibration)
+        jaw = jaw if isinstance(jaw, Jaw) else load_jaw(jaw)
         self.jaw = calibration.apply(jaw) if calibration else jaw
         self.mechanics: Mechanics = build_chosen(self.jaw, self.settings)
         torsion = measure_torsion(self.jaw, self.mechanics.mesh)

@@ -19,7 +19,7 @@ from scipy.optimize import least_squares
 from finforce_ifea.contact_mechanics.indenter import DEPTH, ExpectedObject, expect_object
 from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics, limit_step
 from finforce_ifea.errors import CalibrationError, JawFileError, MeshError
-from finforce_ifea.estimator import JawEstimator, KeypointGate
+from finforce_ifea.estimator import ForceEstimator, KeypointGate
 from finforce_ifea.jaw.calibration import Calibration, make_calibration
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE, Jaw
 from finforce_ifea.mechanics import build_mechanics, choose_full
@@ -541,7 +541,7 @@ def _track_force(
     jaw: Jaw, case: CalibrationCase, settings: EstimatorSettings, calibration: Calibration
 ) -> _ForceHistory:
     """Estimate the elastic force of every frame."""
-    estimator = JawEstimator(jaw, settings=settings, calibration=calibration.changed(relaxation=()))
+    estimator = ForceEstimator(jaw, settings=settings, calibration=calibration.changed(relaxation=()))
     solutions = [estimator.update(observation, case.contact) for observation in case.observations]
     trusted = [solution for solution in solutions if solution.trusted]
     if sum(solution.status == "ok" for solution in trusted) < _CORRELATED_FRAMES:
@@ -585,7 +585,7 @@ def identify_friction(
     known = [case for case in cases if case.contact.outline is not None]
     if not known or settings.solver == "paper":
         return None
-    estimator = JawEstimator(jaw, calibration=calibration, settings=replace(settings, smooth_share=0.0))
+    estimator = ForceEstimator(jaw, calibration=calibration, settings=replace(settings, smooth_share=0.0))
     information, vector = 0.0, 0.0
     for case in known:
         estimator.forget()

@@ -38,7 +38,7 @@ from finforce_ifea.parameters import NodeParameters, build_estimator
 from finforce_ifea.settings import EstimatorSettings
 
 if TYPE_CHECKING:
-    from finforce_ifea.estimator import JawEstimator
+    from finforce_ifea.estimator import ForceEstimator
 
 _SLOW = 4.0  # s of preparation, after which somebody may wonder
 
@@ -92,7 +92,7 @@ class SolverOutputs:
             torque = (0.0, 0.0, 0.0) if grasp.torque is None else grasp.torque
             self.manipulation.publish(ros.wrench_message(header, grasp.manipulation, torque))
 
-    def send_shape(self, header: Any, observation: Observation, solution: Solution, estimator: JawEstimator) -> None:
+    def send_shape(self, header: Any, observation: Observation, solution: Solution, estimator: ForceEstimator) -> None:
         """Send the deformed surface, and markers at their own rate; markers only to listeners, whatever the rules."""
         if self._parameters.publish_surface and ros.is_wanted(self.surface, self._skips):
             ros.send_cloud(self.surface, header, ros.xyz_columns(estimator.surface()))
@@ -109,7 +109,7 @@ _UNUSED = (0.9, 0.2, 0.1, 1.0)
 _KEYPOINT_DIAMETER = 0.003
 
 
-def _build_markers(header: Any, observation: Observation, solution: Solution, estimator: JawEstimator) -> list[Any]:
+def _build_markers(header: Any, observation: Observation, solution: Solution, estimator: ForceEstimator) -> list[Any]:
     """Return the markers of one image, in the jaw frame: contact and force only where they are trusted."""
     triangles = np.asarray(estimator.surface())[np.asarray(estimator.surface_triangles)].reshape(-1, 3)
     seen = np.isfinite(observation.points).all(axis=1)
@@ -150,7 +150,7 @@ def outcome_of_solution(solution: Solution) -> Outcome:
     return Outcome(level=level, reason=solution.status, text=solution.message or solution.status)
 
 
-def describe_friction(estimator: JawEstimator) -> str:
+def describe_friction(estimator: ForceEstimator) -> str:
     """Return the object's coefficient of friction as far as it is known, and how full the cone is."""
     mean, stddev = estimator.friction
     return f"{mean:.2f} ± {stddev:.2f}, cone used to {100.0 * abs(estimator.mobilised):.0f} %"

@@ -28,7 +28,7 @@ class Observation:
     Attributes:
         stamp: image capture time [s].
         points: (K, 3) [m], jaw frame; NaN where there is no depth.
-        likelihood: (K,) in [0, 1].
+        likelihood: (K,) in [0, 1]; None: every point that is there is certain.
         stddev: (K, 3) [m] of each point along the axes of the jaw frame, above zero where there is a point; None when
             the detector states none.
         gravity: unit vector (3,) along which things fall, jaw frame; None where unknown. Who gives it says that
@@ -37,9 +37,13 @@ class Observation:
 
     stamp: float
     points: NDArray
-    likelihood: NDArray
+    likelihood: NDArray | None = None
     stddev: NDArray | None = None
     gravity: NDArray | None = None
+
+    def __post_init__(self) -> None:
+        if self.likelihood is None:
+            object.__setattr__(self, "likelihood", np.ones(len(self.points)))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from finforce.settings import GripperParameters, setting
 
 if TYPE_CHECKING:
-    from finforce_ifea.estimator import JawEstimator
+    from finforce_ifea.estimator import ForceEstimator
     from finforce_ifea.jaw.jaw import Jaw
     from finforce_ifea.settings import EstimatorSettings
 
@@ -55,17 +55,17 @@ class NodeParameters(GripperParameters):
         return self.jaw_frame(self.jaw_name)
 
 
-def build_estimator(jaw: Jaw, parameters: NodeParameters, settings: EstimatorSettings) -> JawEstimator:
-    """Build the estimator of a node, compiled and ready for the first image; see `JawEstimator`.
+def build_estimator(jaw: Jaw, parameters: NodeParameters, settings: EstimatorSettings) -> ForceEstimator:
+    """Build the estimator of a node, compiled and ready for the first image; see `ForceEstimator`.
 
     Raises:
         FinforceError: the calibration or the settings do not fit the jaw.
     """
-    from finforce_ifea.estimator import JawEstimator
+    from finforce_ifea.estimator import ForceEstimator
     from finforce_ifea.jaw.calibration import load_calibration
 
     file = parameters.calibration_file
     calibration = load_calibration(file) if file else None
-    estimator = JawEstimator(jaw, settings=settings, calibration=calibration)
+    estimator = ForceEstimator(jaw, settings=settings, calibration=calibration)
     estimator.warm_up()
     return estimator

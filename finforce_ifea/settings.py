@@ -14,7 +14,7 @@ _SOLVER_MEANING = (
 
 @dataclass(frozen=True, kw_only=True)
 class EstimatorSettings:
-    """Settings of `JawEstimator`; each field's metadata says unit, bounds and meaning.
+    """Settings of `ForceEstimator`; each field's metadata says unit, bounds and meaning.
 
     Those with `parameter=False` are no ROS parameters: they are for experiments.
     """

@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
 # Makes or refreshes the virtual environment .venv for one purpose:
-#   tools/setup_venv.sh lint|docs|run|test|build [STAMP]
+#   tools/setup_venv.sh lint|docs|run|test|build|dist [STAMP]
 # A sourced ROS 2 is used as it is; without one, ROS 2 Jazzy comes from wheels. Needs nothing but Python.
 set -euo pipefail
 cd "$(dirname "$0")/.."
-purpose=${1:?lint, docs, run, test or build}
+purpose=${1:?lint, docs, run, test, build or dist}
 stamp=${2:-.venv/.$purpose}
 venv=.venv
 
@@ -124,6 +124,7 @@ case $purpose in
   run) check_system_libraries; install_product ""; prepare ;;
   test) check_system_libraries; install_product test; install_generators; install_browser; prepare ;;
   build) install_product ""; install colcon-common-extensions ;;
+  dist) check_system_libraries; install build twine ;;
   *) fail "unknown purpose $purpose" ;;
 esac
 touch "$stamp"

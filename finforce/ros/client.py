@@ -21,6 +21,7 @@ from finforce.ros import node as ros
 
 FRESH = 0.5  # [s] for which a force or an opening is what there is
 DISCOVERY = 10.0  # [s] in which the driver is found
+FOUND = 2.0  # [s] after which a publisher that there is has been found
 TOLD = 0.2  # [s] in which a goal reaches a driver before it is asked to grasp
 LONGEST = 120.0  # [s] that a service may take
 
@@ -38,6 +39,7 @@ class GripperClient:
         if self._owned:
             rclpy.init()
         self._node = rclpy.create_node("gripper_client", context=context)
+        self._began = monotonic()
         self._force: tuple[float, float] = (-math.inf, math.nan)  # when [s], and how much [N]
         self._opening: tuple[float, float] = (-math.inf, math.nan)
         self._grasp = ""
@@ -69,7 +71,13 @@ class GripperClient:
 
     @property
     def force(self) -> float | None:
-        """The grasp force [N]; None while none comes that is trusted."""
+        """The grasp force [N]; None while none comes that is trusted. A warning says if nobody publishes any."""
+        topic = self._node.resolve_topic_name("grasp_wrench")
+        if monotonic() - self._began > FOUND and not self._node.count_publishers(topic):
+            text = (
+                f"nobody publishes {topic}: no solver runs in this domain; start one with finforce launch or pipeline"
+            )
+            self._node.get_logger().warning(text, throttle_duration_sec=5.0)
         return _fresh(self._force)
 
     @property

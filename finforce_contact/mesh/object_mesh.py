@@ -209,11 +209,11 @@ def _sum_solid_angles(corners):
     return total
 
 
-def load_object_mesh(path: Path | str, *, unit: str = "m", triangle_limit: int = 20000) -> ObjectMesh:
+def load_object_mesh(path: Path | str | ObjectMesh, *, unit: str = "m", triangle_limit: int = 20000) -> ObjectMesh:
     """Read an object's mesh, refuse what is no graspable object, repair and decimate the rest.
 
     Args:
-        path: a file of `FORMATS`; the parts of a scene are put together by their transforms.
+        path: a file of `FORMATS`; the parts of a scene are put together by their transforms. Or a mesh, which is kept.
         unit: of the file's coordinates, one of `UNITS`; GLB is in metres by its standard, STL mostly in millimetres.
         triangle_limit: the most triangles that are kept.
 
@@ -225,6 +225,8 @@ def load_object_mesh(path: Path | str, *, unit: str = "m", triangle_limit: int =
             has no usable surface.
         MissingDependencyError: trimesh, manifold3d or open3d is not installed.
     """
+    if isinstance(path, ObjectMesh):
+        return path
     path = Path(path)
     if unit not in UNITS:
         raise ObjectMeshError(f"{path.name}: got unit {unit!r}, expected one of {', '.join(UNITS)}")

@@ -1,18 +1,22 @@
 """The stiffness of a finger from a kitchen scale: held forces against the readings of the scale, in their order.
 
 For a given shape the force is proportional to the modulus; one factor is all that a scale can tell. Shape, relaxation
-and clamp stay as they were. Knows no files and no options.
+and clamp stay as they were.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from finforce_eval.errors import RecordingError
+from finforce_ifea.errors import CalibrationError
+from finforce_ifea.jaw.calibration import Calibration, load_calibration, name_mechanics
+from finforce_ifea.jaw.jaw import Jaw, load_jaw
 
 GRAVITY = 9.80665  # [m/s^2] by which kitchen scales turn weight into grams
 LEAST_HOLD = 1.5  # [s]
@@ -21,6 +25,7 @@ _WINDOW = 1.0  # [s] of the end of a hold, when the scale is read
 _DRIFT, _DRIFT_FLOOR = 0.04, 0.02  # of the force and [N] in one window: relaxation is slower, pressing is faster
 _SCALE_ERROR = 0.02  # [N]: two grams
 _RELATIVE_ERROR = 0.02  # of one reading, by the height at which it was pressed
+_FORCE_ERRORS = 0.005, 0.5  # [-] least and largest relative deviation of forces that a weighing can leave
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,6 +95,67 @@ def find_holds(times: NDArray[np.float64], pressing: NDArray[np.float64]) -> lis
 def _last(times: NDArray, pressing: NDArray) -> float:
     """Return the mean of the last second of a hold [N]."""
     return float(pressing[times >= times[-1] - _WINDOW].mean())
+
+
+def calibrate_with_scale(
+    times: ArrayLike,
+    forces: ArrayLike,
+    grams: Sequence[float],
+    *,
+    jaw: Jaw | str | Path,
+    calibration: Calibration | str | Path | None = None,
+    solver: str = "default",
+    force: bool = False,
+) -> Calibration:
+    """Return the calibration of a finger by a kitchen scale, read at the end of each of some steady presses.
+
+    Args:
+        times: (n,) of the images [s], rising.
+        forces: (n,) estimated along the closing direction [N], either sign, or vectors (n, 3); NaN where unknown.
+        grams: what the scale showed at the end of each press, at zero before; in their order.
+        jaw: that the forces were estimated with, its file or its name.
+        calibration: that they were estimated with; None for the material of the jaw file.
+        solver: that they were estimated with.
+        force: take a modulus, too, that the material of the jaw file has not got.
+
+    Raises:
+        RecordingError: another number of presses than of readings, or readings that no scale shows.
+        CalibrationError: the modulus found cannot be that of the finger.
+    """
+    jaw, forces = load_jaw(jaw), np.asarray(forces, dtype=float)
+    holds = find_holds(np.asarray(times, dtype=float), np.abs(forces if forces.ndim == 1 else forces[:, 0]))
+    base = None if calibration is None else load_calibration(calibration)
+    return scale_calibration(weigh(holds, grams), jaw, base, solver=solver, force=force)
+
+
+def scale_calibration(
+    weighing: Weighing, jaw: Jaw, base: Calibration | None, *, solver: str = "default", force: bool = False
+) -> Calibration:
+    """Return the calibration that forces were estimated with, scaled by a weighing; see `calibrate_with_scale`."""
+    base = base or Calibration(young_modulus=jaw.material.young_modulus, jaw=jaw.name, finger=jaw.digest)
+    scaled = base.changed(
+        solver=name_mechanics(jaw, solver),
+        young_modulus=base.young_modulus * weighing.factor,
+        force_error=float(np.clip(max(weighing.misfit, base.force_error), *_FORCE_ERRORS)),
+    )
+    if not force:
+        try:
+            scaled.check_modulus(jaw)
+        except CalibrationError as error:
+            raise CalibrationError(f"{error}{_suspect_newtons(scaled, weighing, jaw)}") from None
+    stddev = scaled.young_modulus * weighing.stddev / weighing.factor
+    return scaled.changed(uncertainty={"young_modulus": stddev})
+
+
+def _suspect_newtons(scaled: Calibration, weighing: Weighing, jaw: Jaw) -> str:
+    """Return a hint where the readings make sense as newtons."""
+    try:
+        scaled.changed(young_modulus=scaled.young_modulus / (1e-3 * GRAVITY)).check_modulus(jaw)
+    except CalibrationError:
+        return ""
+    newtons = weighing.weights / (1e-3 * GRAVITY)
+    grams = " ".join(f"{reading / (1e-3 * GRAVITY):.0f}" for reading in newtons)
+    return f"; the readings look like newtons, in grams they are {grams}"
 
 
 def weigh(holds: Sequence[Hold], grams: Sequence[float], name: str = "the recording") -> Weighing:

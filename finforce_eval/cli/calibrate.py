@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from finforce_eval.cli.parser import BAG_HELP, add_run_options
+from finforce_eval.cli.parser import BAG_HELP, FORCE_HELP, add_run_options
 from finforce_eval.evaluation.forces import truth_sides
 from finforce_eval.evaluation.setup import make_setup, read_keypoints
 from finforce_ifea.jaw.calibration import name_mechanics, save_calibration
@@ -16,6 +16,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("bags", nargs="+", metavar="BAG", help=BAG_HELP)
     add_run_options(parser, calibration=False)
     parser.add_argument("-o", "--output", required=True, metavar="FILE", help="calibration file to write")
+    parser.add_argument("--force", action="store_true", help=FORCE_HELP)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -32,6 +33,8 @@ def run(options: argparse.Namespace) -> None:
     Path(options.output).parent.mkdir(parents=True, exist_ok=True)
     fit = calibrate(cases, jaw, setup.settings)
     print(format_fit(fit, cases))
+    if not options.force:
+        fit.calibration.check_modulus(jaw)
     solver = name_mechanics(jaw, setup.settings.solver)
     save_calibration(fit.calibration.changed(solver=solver, uncertainty=fit.uncertainty), options.output)
     print(f"Calibration: {options.output}")

@@ -65,7 +65,8 @@ def read_command(words: Sequence[str]) -> str:
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=Parser)
     for name, text in COMMANDS.items():
         commands.add_parser(name, help=text, add_help=False)
-    return parser.parse_args(words[:1]).command
+    parser.add_argument("--version", dest="command", action="store_const", const="version", help=COMMANDS["version"])
+    return "version" if list(words[:1]) == ["--version"] else parser.parse_args(words[:1]).command
 
 
 def parse(words: Sequence[str]) -> argparse.Namespace:

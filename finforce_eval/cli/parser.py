@@ -21,6 +21,7 @@ CONTACT_HELP = (
     "the clamped base [mm]; fixed:case, from the case.json next to each recording; NAME=Z_MM, for one "
     "recording, repeatable (estimate with mesh and poses, else fixed:case)"
 )
+FORCE_HELP = "accept a modulus more than a factor of 3 off the jaw file's, or outside 5 to 200 MPa for TPU"
 PICTURES = (".png", ".jpg", ".svg", ".pdf")
 
 

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from finforce_eval.calibration.weighing import find_holds, format_weighing, weigh
-from finforce_eval.cli.parser import BAG_HELP, add_run_options
+from finforce_eval.calibration.weighing import find_holds, format_weighing, scale_calibration, weigh
+from finforce_eval.cli.parser import BAG_HELP, FORCE_HELP, add_run_options
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.forces import estimate_forces
 from finforce_eval.evaluation.setup import make_setup, read_keypoints
 from finforce_eval.tasks import progress_bar
-from finforce_ifea.jaw.calibration import Calibration, name_mechanics, save_calibration
+from finforce_ifea.jaw.calibration import save_calibration
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -24,6 +24,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     text = "reading of the scale [g] at the end of each hold, in order; without readings, the holds are listed"
     parser.add_argument("--grams", nargs="+", type=float, metavar="G", help=text)
     parser.add_argument("-o", "--output", metavar="FILE", help="calibration file to write; needs --grams")
+    parser.add_argument("--force", action="store_true", help=FORCE_HELP)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -43,14 +44,10 @@ def run(options: argparse.Namespace) -> None:
         return
     weighing = weigh(holds, options.grams, recording.name)
     print(format_weighing(weighing))
-    base = setup.calibration or Calibration(young_modulus=setup.jaw.material.young_modulus, jaw=setup.jaw.name)
-    scaled = base.changed(
-        solver=name_mechanics(setup.jaw, setup.settings.solver),
-        young_modulus=base.young_modulus * weighing.factor,
-        force_error=float(np.clip(max(weighing.misfit, base.force_error), 0.005, 0.5)),
+    scaled = scale_calibration(
+        weighing, setup.jaw, setup.calibration, solver=setup.settings.solver, force=options.force
     )
     if options.output:
         Path(options.output).parent.mkdir(parents=True, exist_ok=True)
-        stddev = scaled.young_modulus * weighing.stddev / weighing.factor
-        save_calibration(scaled.changed(uncertainty={"young_modulus": stddev}), options.output)
+        save_calibration(scaled, options.output)
         print(f"Calibration: {options.output}")

@@ -34,7 +34,7 @@ LEAST_ANSWERED = 0.1  # share of the images with a force, below which there is n
 
 
 class Estimator(Protocol):
-    """What is asked of an estimator; `JawEstimator` satisfies it.
+    """What is asked of an estimator; `ForceEstimator` satisfies it.
 
     Attributes:
         surface_triangles: (t, 3) vertex indices.

@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.camera import ImageError
-from finforce.errors import FinforceError
+from finforce.errors import FinforceError, PoseError, suggest
+from finforce.gripper_frames import read_extrinsics
 from finforce.health import Idling
 from finforce.messages import NANOSECONDS
-from finforce.transforms import quaternion_from_pose
+from finforce.transforms import pose_numbers, quaternion_from_pose
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.recordings.images import DEPTH_ENDS, ImageChoice, ImageTrack
 from finforce_eval.recordings.tracks import DetectionTrack, JawTrack, KeypointTrack, PoseTrack, Recording
@@ -247,19 +248,10 @@ def _parse_parameters(texts: Sequence[str]) -> dict[str, Any]:
 
 def _parse_extrinsics(text: str) -> list[float]:
     """Return x, y, z [m], qx, qy, qz, qw of a camera by its name or its numbers."""
-    from finforce.gripper_frames import BENCH_CAMERA, ROBOT_CAMERA
-    from finforce.transforms import pose_numbers
-
-    known = {"bench": BENCH_CAMERA, "robot": ROBOT_CAMERA}
-    if text in known:
-        return list(pose_numbers(known[text]))
     try:
-        numbers = [float(part) for part in text.split(",")]
-    except ValueError:
-        numbers = []
-    if len(numbers) != 7:
-        raise OptionError(f"--extrinsics {text}: expected robot, bench, or x,y,z,qx,qy,qz,qw")
-    return numbers
+        return list(pose_numbers(read_extrinsics(text)))
+    except PoseError as error:
+        raise OptionError(f"--{error}") from error
 
 
 def parse_changes(option: str, kind: str, texts: Sequence[str], defaults: Mapping[str, Any]) -> dict[str, Any]:
@@ -278,7 +270,7 @@ def parse_changes(option: str, kind: str, texts: Sequence[str], defaults: Mappin
     for text in texts:
         name, _, value = text.partition("=")
         if name not in defaults:
-            raise OptionError(f"{option} {text}: unknown {kind}; expected one of {', '.join(defaults)}")
+            raise OptionError(f"{option} {text}: unknown {kind}; {suggest(name, defaults)}")
         changes[name] = _parse_value(f"{option} {text}", value, defaults[name])
     return changes
 

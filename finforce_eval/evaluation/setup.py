@@ -20,7 +20,7 @@ from finforce_eval.recordings.bags import name_recordings
 from finforce_eval.recordings.images import ImageChoice
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.tracks import JAWS, Recording
-from finforce_ifea.estimator import JawEstimator
+from finforce_ifea.estimator import ForceEstimator
 from finforce_ifea.jaw.calibration import Calibration, load_calibration
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_ifea.settings import EstimatorSettings
@@ -43,7 +43,7 @@ class EvaluationSetup:
     about: Mapping[str, str]
     as_live: bool = False
     _sides: dict[str, EvaluationSetup] = field(default_factory=dict, init=False, repr=False, compare=False)
-    _estimators: dict[bool, JawEstimator] = field(default_factory=dict, init=False, repr=False, compare=False)
+    _estimators: dict[bool, ForceEstimator] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def side(self, side: str) -> EvaluationSetup:
         """Return the setup of the left or the right jaw; a jaw file describes the left one."""
@@ -53,13 +53,13 @@ class EvaluationSetup:
             self._sides[side] = replace(self, jaw=self.jaw.mirrored())
         return self._sides[side]
 
-    def estimator(self, held: bool = False) -> JawEstimator:
+    def estimator(self, held: bool = False) -> ForceEstimator:
         """Return the estimator of this jaw, which forgets what it has seen; `held` where both jaws hold an object."""
         if held in self._estimators:
             self._estimators[held].forget()
             return self._estimators[held]
         settings = self.settings.resolve_held(both=held)
-        estimator = JawEstimator(self.jaw, settings=settings, calibration=self.calibration)
+        estimator = ForceEstimator(self.jaw, settings=settings, calibration=self.calibration)
         estimator.warm_up()
         self._estimators[held] = estimator
         return estimator

@@ -15,6 +15,7 @@ from finforce.errors import PoseError
 from finforce.messages import SECOND, find_nearest
 from finforce.transforms import invert_pose, pose_from_quaternion
 from finforce_eval.errors import RecordingError
+from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.tracks import PoseTrack, Recording
 from finforce_ifea.observation import Observation
 
@@ -126,12 +127,17 @@ class RecordedImage(NamedTuple):
     observation: Observation
 
 
-def play(recording: Recording, side: str = "left") -> Iterator[RecordedImage]:
+def iter_frames(recording: Recording | str | Path, side: str = "left") -> Iterator[RecordedImage]:
     """Yield the images of one jaw with the poses of the object between them, as they came.
+
+    Args:
+        recording: with key points, or its path.
+        side: "left" or "right".
 
     Raises:
         RecordingError: there are no key points of that jaw, or no poses; see `track_object`.
     """
+    recording = recording if isinstance(recording, Recording) else read_recording(recording)
     track, objects = recording.jaw(side).keypoints, track_object(recording, side)
     known = 0
     for index, stamp in enumerate(track.stamps):

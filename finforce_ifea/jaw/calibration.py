@@ -9,6 +9,7 @@ import numpy as np
 import yaml
 from pydantic import BeforeValidator, Field
 
+from finforce.errors import suggest
 from finforce.typed_yaml import FileModel, Number, parse_model, read_model
 from finforce_ifea.errors import CalibrationError
 from finforce_ifea.jaw.drawing import Band, Drawing
@@ -18,6 +19,9 @@ from finforce_ifea.relaxation import RelaxationTerm
 _MECHANICS = ("solid", "frame", "plane", "paper")
 # Forces of the solid and the frame of one finger differ by 1 to 3 % up to 10 mm.
 _MODELS_DIFFER = 0.03
+
+# [Pa] of the TPU that fingers are printed of, over all its hardnesses; and how far off a data sheet is at most.
+_SOFT, _DATASHEET_FACTOR = (5e6, 200e6), 3.0
 
 Factor = Annotated[Number, Field(ge=0.3, le=3.0)]
 
@@ -55,6 +59,12 @@ class Calibration(FileModel):
         """
         return make_calibration(**{**dict(self), **values})
 
+    @property
+    def is_of_shape(self) -> bool:
+        """Whether it changes the shape of a finger, and not only the material."""
+        factors = self.inner_thickness_factor, self.outer_thickness_factor, self.rib_thickness_factor
+        return factors != (1.0, 1.0, 1.0) or self.clamped_z > 0.0
+
     def apply(self, jaw: Jaw) -> Jaw:
         """Return the jaw as it is.
 
@@ -68,6 +78,11 @@ class Calibration(FileModel):
                 f"the calibration belongs to a finger of another shape ({self.finger}, the jaw {jaw.name!r} is "
                 f"{jaw.digest}): calibrate this one"
             )
+        if self.jaw and not self.finger and self.is_of_shape:
+            raise CalibrationError(
+                f"the calibration has thicknesses or a clamp and no `finger`, expected the shape that it belongs to; "
+                f"add `finger: {jaw.digest}` to its file if that was this jaw {jaw.name!r}, else calibrate this one"
+            )
         material = jaw.material.model_copy(update={"young_modulus": self.young_modulus})
         if jaw.drawing is None:
             return replace(jaw, material=material)
@@ -79,6 +94,22 @@ class Calibration(FileModel):
             clamped_z=max(jaw.drawing.clamped_z, self.clamped_z),
         )
         return replace(jaw, drawing=drawing, material=material)
+
+    def check_modulus(self, jaw: Jaw) -> None:
+        """Refuse a modulus that no part printed as the jaw file says has.
+
+        Raises:
+            CalibrationError: It is off the jaw file's by more than a factor of 3, or not that of a soft material.
+        """
+        drawn, found = jaw.material.young_modulus, self.young_modulus
+        low, high = drawn / _DATASHEET_FACTOR, drawn * _DATASHEET_FACTOR
+        if _SOFT[0] <= drawn <= _SOFT[1]:
+            low, high = max(low, _SOFT[0]), min(high, _SOFT[1])
+        if not low <= found <= high:
+            raise CalibrationError(
+                f"modulus {1e-6 * found:.4g} MPa, expected {1e-6 * low:.4g} to {1e-6 * high:.4g} MPa: the jaw file "
+                f"of {jaw.name!r} says {1e-6 * drawn:.4g} MPa; check units, contact and finger, or give --force"
+            )
 
     def expect_error(self, jaw: Jaw, solver: str) -> float:
         """Return the relative standard deviation of forces that is left with a solver.
@@ -116,12 +147,14 @@ def _thicken(band: Band, factor: float, drawing: Drawing) -> Band:
     return replace(band, base=base, tip=tip, thickness=band.thickness * factor)
 
 
-def load_calibration(name_or_path: str | Path) -> Calibration:
-    """Load a calibration from its YAML file or a shipped one by its name.
+def load_calibration(name_or_path: str | Path | Calibration) -> Calibration:
+    """Load a calibration from its YAML file or a shipped one by its name; a calibration is returned as it is.
 
     Raises:
         CalibrationError: The file is missing, is no calibration, or has unknown keys.
     """
+    if isinstance(name_or_path, Calibration):
+        return name_or_path
     path = _find_file(name_or_path)
     try:
         return read_model(path, Calibration, CalibrationError)
@@ -134,7 +167,9 @@ def _find_file(name_or_path: str | Path) -> Path:
     shipped = Path(str(folder.joinpath(f"{name_or_path}.yaml")))
     path = shipped if "/" not in str(name_or_path) and shipped.is_file() else Path(name_or_path)
     if not path.is_file():
-        raise CalibrationError(f"there is no calibration file {str(name_or_path)!r}")
+        shipped = [file.name.removesuffix(".yaml") for file in folder.iterdir()]
+        advice = suggest(str(name_or_path), sorted(shipped))
+        raise CalibrationError(f"there is no calibration file {str(name_or_path)!r}: {advice}, or a path")
     return path
 
 

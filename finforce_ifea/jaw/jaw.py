@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce.errors import suggest
 from finforce.typed_yaml import read_model
 from finforce_ifea.errors import JawFileError, MeshError
 from finforce_ifea.jaw.attachment import attach_points, attach_surface_points, check_distances
@@ -25,6 +26,7 @@ __all__ = ["Jaw", "Material", "list_shipped_jaws", "load_jaw"]
 # How far a key point may lie outside the jaw, and a candidate off its surface [m].
 KEYPOINT_DISTANCE = 3e-3
 _CANDIDATE_DISTANCE = 1e-4
+_SHAPES = (".stl", ".obj", ".3mf", ".step", ".stp", ".dxf", ".svg")  # taken for jaw files by mistake
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -149,11 +151,11 @@ def list_shipped_jaws() -> tuple[str, ...]:
     return tuple(sorted(file.name.removesuffix(".yaml") for file in files if file.name.endswith(".yaml")))
 
 
-def load_jaw(name_or_path: str | Path, side: Literal["left", "right"] = "left") -> Jaw:
+def load_jaw(name_or_path: str | Path | Jaw, side: Literal["left", "right"] = "left") -> Jaw:
     """Load a jaw from its YAML file, see docs/your_finger.md.
 
     Args:
-        name_or_path: a shipped name ("bench", "steel") or the path of a file.
+        name_or_path: a shipped name ("bench", "steel"), the path of a file, or a jaw.
         side: a file describes the left jaw; "right" gives its mirror image.
 
     Returns:
@@ -166,6 +168,8 @@ def load_jaw(name_or_path: str | Path, side: Literal["left", "right"] = "left") 
     """
     if side not in ("left", "right"):
         raise JawFileError(f"side: got {side!r}, expected 'left' or 'right'")
+    if isinstance(name_or_path, Jaw):
+        return name_or_path if name_or_path.side == side else name_or_path.mirrored()
     path = _find_file(name_or_path)
     try:
         jaw = _build_jaw(read_model(path, JawEntry, JawFileError), path)
@@ -182,9 +186,10 @@ def _find_file(name_or_path: str | Path) -> Path:
     path = Path(name_or_path)
     if not path.is_file():
         raise JawFileError(
-            f"there is no jaw file {str(name_or_path)!r}; expected the path of a YAML file or one of "
-            f"{', '.join(shipped)}"
+            f"there is no jaw file {str(name_or_path)!r}: {suggest(str(name_or_path), shipped)}, or a path"
         )
+    if path.suffix.lower() in _SHAPES:
+        raise JawFileError(f"{path.name} is a shape, not a jaw file; make one: finforce jaw {path} -o {path.stem}.yaml")
     return path
 
 

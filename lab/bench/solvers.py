@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from finforce.errors import FinforceError
 from finforce_eval.evaluation.scoring import rms
-from finforce_ifea.estimator import JawEstimator
+from finforce_ifea.estimator import ForceEstimator
 from finforce_ifea.fem.solid import SolidModel
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_ifea.settings import SOLVERS, EstimatorSettings
@@ -154,7 +154,7 @@ def run_tier(
     Raises:
         FinforceError: the tier does not exist, or cannot describe the jaw.
     """
-    estimator = JawEstimator(jaw, settings=tier.settings())
+    estimator = ForceEstimator(jaw, settings=tier.settings())
     estimator.warm_up()
     _run_press(tier, estimator, presses[0], WARM_UP_FRAMES)
     runs = []
@@ -164,7 +164,7 @@ def run_tier(
     return runs
 
 
-def _run_press(tier: Tier, estimator: JawEstimator, press: ReplayedPress, frames: int | None = None) -> Run:
+def _run_press(tier: Tier, estimator: ForceEstimator, press: ReplayedPress, frames: int | None = None) -> Run:
     """Return what an estimator that starts anew makes of the first frames of a press."""
     estimator.reset()
     force = np.full(press.force.shape, np.nan)

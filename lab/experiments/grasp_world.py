@@ -24,7 +24,7 @@ from finforce_driver.grasp.session import hold_force
 from finforce_driver.gripper import Gripper
 from finforce_driver.settings import GraspGoal, GraspSettings
 from finforce_driver.state import GraspPhase, GraspStatus, Phase
-from finforce_ifea.estimator import JawEstimator
+from finforce_ifea.estimator import ForceEstimator
 from finforce_ifea.grasp_force import R_GRIPPER_JAW
 from finforce_ifea.jaw.calibration import load_calibration
 from finforce_ifea.observation import Observation, Solution
@@ -269,7 +269,7 @@ class JawSensor:
 
     def __init__(self, pressed: PressedGrasp, side: str) -> None:
         self._side = side
-        solver = JawEstimator(
+        solver = ForceEstimator(
             pressed.jaws[side],
             settings=EstimatorSettings(held="yes"),  # as the nodes have it for two jaws
             calibration=load_calibration("twin"),

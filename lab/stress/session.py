@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
 from finforce_ifea.errors import ContactError
-from finforce_ifea.estimator import JawEstimator
+from finforce_ifea.estimator import ForceEstimator
 from finforce_ifea.jaw.calibration import Calibration
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_ifea.mechanics import build_mechanics
@@ -35,7 +35,7 @@ class SessionStep:
         stamp: [s].
         points: (K, 3) [m].
         likelihood: (K,).
-        contact: as for `JawEstimator.update`.
+        contact: as for `ForceEstimator.update`.
         force: true (3,) [N].
         torque: true (3,) [N m].
         level: see `Trial`.
@@ -219,7 +219,7 @@ class Bench:
             young_modulus=modulus * jaw.material.young_modulus, force_error=FORCE_ERROR, clamped_z=0.0
         )
         chosen = EstimatorSettings(solver=plan.solver, mesh=plan.mesh, **settings)
-        self.estimator = JawEstimator(jaw, settings=chosen, calibration=calibration)
+        self.estimator = ForceEstimator(jaw, settings=chosen, calibration=calibration)
         self.estimator.warm_up()
         self.jaw = self.estimator.jaw
         own, full = plan.solver in OWN_MECHANICS, replace(chosen, solver=self.jaw.model)

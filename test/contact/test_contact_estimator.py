@@ -16,7 +16,7 @@ from finforce_eval.recordings.objects import track_object
 from finforce_eval.recordings.recording import DEMO as RECORDING
 from finforce_eval.recordings.recording import read_recording
 from finforce_ifea.errors import ContactError, MeshError
-from finforce_ifea.estimator import JawEstimator
+from finforce_ifea.estimator import ForceEstimator
 from finforce_ifea.jaw.calibration import load_calibration
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.observation import Observation
@@ -424,7 +424,7 @@ def demo():
     """The first seconds of the recording that comes with the package, through solver and contact estimator."""
     recording = read_recording(RECORDING)
     track, seen = recording.jaw("left"), track_object(recording, "left")
-    solver = JawEstimator(load_jaw("bench"), calibration=load_calibration("bench"))
+    solver = ForceEstimator(load_jaw("bench"), calibration=load_calibration("bench"))
     estimator = ContactEstimator(solver.jaw, mesh=load_object_mesh(RECORDING.parent / recording.case["mesh"]))
     stamps = track.keypoints.stamps[:300]
     poses, wrench, estimates = iter(zip(seen.stamps, seen.poses, strict=True)), None, []

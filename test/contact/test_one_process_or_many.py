@@ -37,7 +37,7 @@ class Detector(Node):
 def read_images():
     """The demo's grasp as seen by the left jaw: poses of the object that came before each image, and the image."""
     recording = ff.read_recording(ff.DEMO)
-    return ff.find_mesh(recording), list(ff.play(recording, side="left"))[:IMAGES]
+    return ff.find_mesh(recording), list(ff.iter_frames(recording, side="left"))[:IMAGES]
 
 
 def solve(probe, composed, mesh, images, shift):

@@ -7,7 +7,7 @@ from finforce.gripper_frames import jaw_in_gripper
 from finforce.transforms import invert_pose
 from finforce_contact.estimator import ContactEstimator
 from finforce_contact.loop import ForceLoop
-from finforce_ifea.estimator import JawEstimator
+from finforce_ifea.estimator import ForceEstimator
 from finforce_ifea.jaw.calibration import load_calibration
 from finforce_ifea.observation import Observation
 from finforce_ifea.settings import EstimatorSettings
@@ -22,7 +22,7 @@ NOISE = 0.05e-3  # [m] of key points
 def course(request):
     """Time [s], true and found force (3,) [N], true and found height of the pressure [m], image by image."""
     gripper, random = TwinGripper(build_scenario(request.param), 0), np.random.default_rng(2)
-    force = JawEstimator(
+    force = ForceEstimator(
         gripper.jaws["left"], settings=EstimatorSettings(held="yes"), calibration=load_calibration("twin")
     )
     loop, rows = ForceLoop(ContactEstimator(force.jaw, mesh=gripper.object_mesh), force), []

@@ -30,6 +30,32 @@ def test_an_unknown_name_is_refused_with_the_known_ones():
         finforce.load_jaws  # noqa: B018 - the look-up is the claim
 
 
+def test_former_names_still_work_and_say_the_new_one():
+    for former, name in (("JawEstimator", "ForceEstimator"), ("play", "iter_frames")):
+        with pytest.warns(DeprecationWarning, match=f"finforce.{former} is now finforce.{name}"):
+            assert getattr(finforce, former) is getattr(finforce, name)
+
+
+def test_names_of_files_do_where_objects_are_expected():
+    jaw, calibration = finforce.load_jaw("bench"), finforce.load_calibration("bench")
+    assert finforce.load_jaw(jaw) is jaw and finforce.load_jaw(jaw, "right").side == "right"
+    assert finforce.load_calibration(calibration) is calibration
+    assert finforce.ForceEstimator("bench", calibration="bench").jaw.name == "bench"
+    assert next(finforce.iter_frames(str(finforce.DEMO))).observation.points.shape == (15, 3)
+    with pytest.raises(ValueError, match="no jaw file 'bnch': did you mean bench?"):
+        finforce.ForceEstimator("bnch")
+    with pytest.raises(ValueError, match="no calibration file 'twinn': did you mean twin?"):
+        finforce.load_calibration("twinn")
+
+
+def test_a_shape_is_no_jaw_file(tmp_path):
+    (tmp_path / "finger.stl").write_bytes(b"solid")
+    with pytest.raises(
+        ValueError, match=r"a shape, not a jaw file; make one: finforce jaw .*finger.stl -o finger.yaml"
+    ):
+        finforce.load_jaw(tmp_path / "finger.stl")
+
+
 def test_the_example_of_the_front_page_runs_and_says_what_it_prints(capsys):
     code, printed = re.search(r"```python\n(.*?)```\n.*?```text\n(.*?)```", README.read_text("utf-8"), re.S).groups()
     assert len(code.splitlines()) <= 12

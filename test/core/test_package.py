@@ -92,6 +92,11 @@ def test_every_module_is_installed(described):
     assert set(described["packages"]) == folders
 
 
+def test_every_package_says_that_it_is_typed(described):
+    for package in (name for name in described["packages"] if "." not in name):
+        assert (ROOT / package / "py.typed").is_file()
+
+
 def test_the_driver_imports_none_of_the_other_packages():
     own = {"finforce_driver"}
     strangers = {
@@ -120,9 +125,10 @@ def test_launch_configuration_and_marker_files_are_installed(described):
 
 
 def test_shipped_data_are_installed(described):
+    everywhere = described["package_data"].pop("")
     for package, patterns in described["package_data"].items():
         folder = ROOT / package.replace(".", "/")
-        matched = {path for pattern in patterns for path in folder.glob(pattern) if path.is_file()}
+        matched = {path for pattern in [*patterns, *everywhere] for path in folder.glob(pattern) if path.is_file()}
         shipped = {
             path
             for path in folder.rglob("*")

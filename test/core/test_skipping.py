@@ -11,7 +11,7 @@ from estimator_fakes import BENCH, CALIBRATION, PERIOD, magnitudes, ramp, record
 
 from finforce.health import ALL, IDLE, RULES, STILL, Idling, SkippingError, Skips
 from finforce_contact.estimator import ContactEstimator
-from finforce_ifea.estimator import JawEstimator
+from finforce_ifea.estimator import ForceEstimator
 from finforce_ifea.observation import Contact, ObjectOutline
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tracking.influence import AWAY, is_out_of_reach
@@ -97,7 +97,7 @@ def watched(*, far=True, near=NEAR):
     """Solutions of a press whose object is known to be far away at first, and in which images the jaw was idle."""
     settings = EstimatorSettings(solver="frame")
     recording = record(DEPTHS)
-    estimator = JawEstimator(BENCH, settings=settings, calibration=CALIBRATION)
+    estimator = ForceEstimator(BENCH, settings=settings, calibration=CALIBRATION)
     away, solutions, idle = circle(FAR if far else 1e-3), [], []
     for frame, (observation, depth) in enumerate(zip(recording.observations, DEPTHS, strict=True)):
         contact = away if frame < near else circle(-depth if depth > 0.0 else 1e-3)

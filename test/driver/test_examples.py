@@ -158,3 +158,11 @@ def beside_error(bench, call):
 
     beside(bench, caught)
     raise found[0]
+
+
+def test_a_client_that_nobody_tells_a_force_says_so(monkeypatch, capfd):
+    monkeypatch.setattr("finforce.ros.client.FOUND", 0.0)
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    with watching(free_domain()) as client:
+        assert client.force is None and client.opening is None
+    assert "nobody publishes /grasp_wrench: no solver runs in this domain" in capfd.readouterr().err

@@ -32,7 +32,7 @@ def bag(tmp_path):
 def exact(monkeypatch):
     """Estimates that are a tenth above the truth."""
     forces = bench_recording().jaws["left"].truth.force * 1.1
-    monkeypatch.setattr("finforce_eval.evaluation.setup.JawEstimator", lambda *_, **__: FakeEstimator(forces))
+    monkeypatch.setattr("finforce_eval.evaluation.setup.ForceEstimator", lambda *_, **__: FakeEstimator(forces))
 
 
 def assert_refused(capsys, arguments, reason):
@@ -224,7 +224,7 @@ def test_settings_take_the_type_of_their_default():
 
 
 def test_all_key_points_hidden_is_refused(capsys, tmp_path, monkeypatch):
-    monkeypatch.setattr("finforce_eval.evaluation.setup.JawEstimator", lambda *_, **__: FakeEstimator([None] * 60))
+    monkeypatch.setattr("finforce_eval.evaluation.setup.ForceEstimator", lambda *_, **__: FakeEstimator([None] * 60))
     bag = write_recording(bench_recording(), tmp_path / "bag")
     assert_refused(capsys, ["evaluate", bag], "none of the frames to be scored was solved")
 

@@ -265,7 +265,7 @@ def test_what_needs_a_clock_is_refused_offline_and_reaches_the_node_of_a_replay(
         ("detector.readout=9", "readout: got 9.0, expected"),
         ("dots.kind=green", "kind: got 'green', expected"),
         ("threads=many", "'many' is no int"),
-        ("treads=2", "unknown parameter; expected one of max_age"),
+        ("treads=2", "unknown parameter; did you mean threads?"),
     ],
 )
 def test_a_parameter_of_the_detector_that_cannot_be_is_one_line_and_two(capsys, change, reason):

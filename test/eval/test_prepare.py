@@ -27,10 +27,10 @@ START = dedent("""
 
     event.register("numba:compile", Listener())
     from finforce_eval import preparation
-    from finforce_ifea.estimator import JawEstimator
+    from finforce_ifea.estimator import ForceEstimator
     from finforce_ifea.jaw.jaw import load_jaw
 
-    JawEstimator(load_jaw("bench")).warm_up()
+    ForceEstimator(load_jaw("bench")).warm_up()
     preparation.compile_contact()
     preparation.compile_detector()
     print(compiled)

@@ -5,11 +5,13 @@ from importlib import resources
 import numpy as np
 import pytest
 
-from finforce_eval.calibration.weighing import GRAVITY, Hold, find_holds, weigh
+from finforce_eval.calibration.weighing import GRAVITY, Hold, calibrate_with_scale, find_holds, weigh
 from finforce_eval.cli.main import main
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.recording import read_recording
+from finforce_ifea.errors import CalibrationError
 from finforce_ifea.jaw.calibration import load_calibration, save_calibration
+from finforce_ifea.jaw.jaw import load_jaw
 
 RECORDING = resources.files("finforce_eval").joinpath("data", "bench_cyl25_middle")
 RATE = 30.0
@@ -88,6 +90,26 @@ def test_a_wrong_modulus_is_mended_by_weights(tmp_path, capsys):
     assert main([*options, "--grams", *grams, "-o", str(mended)]) == 0
     # the estimates of this recording are 2 % off
     assert load_calibration(mended).young_modulus == pytest.approx(base.young_modulus, rel=0.04)
+
+
+def test_the_calibration_is_that_of_the_finger_with_its_modulus_scaled():
+    times, forces = staircase([1.0, 3.0, 0.0, 2.0])
+    calibration = calibrate_with_scale(times, -forces, [145.3, 436.0, 290.6], jaw="bench")
+    assert calibration.young_modulus == pytest.approx(1.5 * 26e6, rel=0.01)
+    assert (calibration.jaw, calibration.finger) == ("bench", load_jaw("bench").digest)
+    vectors = np.stack([forces, 0.1 * forces, 0.0 * forces], axis=1)
+    assert calibrate_with_scale(times, vectors, [145.3, 436.0, 290.6], jaw="bench") == calibration
+
+
+def test_newtons_given_as_grams_are_refused_and_named():
+    times, forces = staircase([1.0, 3.0, 0.0, 2.0])
+    newtons = [1.425, 4.275, 2.85]
+    with pytest.raises(
+        CalibrationError, match="modulus 0.38.* MPa.* look like newtons, in grams they are 145 436 291$"
+    ):
+        calibrate_with_scale(times, forces, newtons, jaw="bench")
+    taken = calibrate_with_scale(times, forces, newtons, jaw="bench", force=True)
+    assert taken.young_modulus == pytest.approx(1.5 * 26e6 * 1e-3 * GRAVITY, rel=0.01)
 
 
 def test_an_output_without_readings_is_refused(tmp_path, capsys):

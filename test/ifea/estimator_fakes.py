@@ -12,7 +12,7 @@ from mechanics_fakes import BENCH, MODULUS, bench_mechanics
 from scipy.interpolate import PchipInterpolator
 
 from finforce_ifea.contact_mechanics.indenter import OutlineIndenter, flat_profile
-from finforce_ifea.estimator import JawEstimator
+from finforce_ifea.estimator import ForceEstimator
 from finforce_ifea.jaw.calibration import Calibration
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE
 from finforce_ifea.observation import Contact, ObjectOutline, Observation, Solution
@@ -89,7 +89,7 @@ def record(depths, *, diameter=25, height=40, seed=0, noise=1.0, offsets=1.0, co
 
 
 def make_estimator(jaw=BENCH, *, calibration=CALIBRATION, **options):
-    return JawEstimator(jaw, settings=EstimatorSettings(**options), calibration=calibration)
+    return ForceEstimator(jaw, settings=EstimatorSettings(**options), calibration=calibration)
 
 
 def run(recording, estimator=None, contact=None, **options):

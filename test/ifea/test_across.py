@@ -15,7 +15,7 @@ from estimator_fakes import BENCH, PERIOD, circle
 from scipy.interpolate import interp1d
 
 from finforce_ifea.errors import ContactError
-from finforce_ifea.estimator import JawEstimator
+from finforce_ifea.estimator import ForceEstimator
 from finforce_ifea.jaw.calibration import Calibration, load_calibration
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.observation import Contact, ObjectOutline, Observation
@@ -59,7 +59,7 @@ def play(name, seed=0, across=None, deepest=None):
     course = np.concatenate([np.zeros(75), np.arange(0.0, last, 2.0 * PERIOD), np.full(90, last)])
     points, true = interp1d(depths, moved, axis=0)(course), interp1d(depths, force, axis=0)(course)
     random = np.random.default_rng(seed)
-    estimator = JawEstimator(BENCH, calibration=CALIBRATION, settings=EstimatorSettings(smooth_share=1.0))
+    estimator = ForceEstimator(BENCH, calibration=CALIBRATION, settings=EstimatorSettings(smooth_share=1.0))
     where = np.array([[BENCH.inner_face_x, 0.0, SHAPES[name][1]]])
     contact = Contact(points=where, weights=np.ones(1), outline=outline_of(name, across))
     solutions = []
@@ -137,7 +137,7 @@ def test_an_upright_box_is_answered_where_no_stored_shape_is_near():
 
 
 def test_going_back_the_stored_shapes_take_over_again():
-    estimator = JawEstimator(BENCH, calibration=CALIBRATION)
+    estimator = ForceEstimator(BENCH, calibration=CALIBRATION)
     depths = np.r_[0.0, TRUTH["box50_z42_depth"]]
     moved = 1e-3 * (TRUTH["box50_z42_keypoints"] - TRUTH["keypoints0"])
     way = np.concatenate([np.zeros(60), np.arange(0, 8, 0.1), np.arange(8, 0, -0.1), np.zeros(30)])

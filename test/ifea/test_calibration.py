@@ -1,5 +1,7 @@
 """Claims about calibrations: what they change on a jaw, and their files."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import yaml
@@ -19,6 +21,7 @@ FULL = Calibration(
     relaxation=(RelaxationTerm(share=0.1, time_constant=2.5), RelaxationTerm(share=0.05, time_constant=20.0)),
     force_error=0.018,
     jaw="bench",
+    finger=load_jaw("bench").digest,
 )
 PLAIN = {"young_modulus": 30.0e6}
 
@@ -146,7 +149,38 @@ def test_calibration_of_another_jaw_is_refused_with_both_names():
 
 
 def test_calibration_without_a_name_fits_any_jaw():
-    assert FULL.changed(jaw="").apply(load_jaw("steel")).material.young_modulus == 31.5e6
+    assert FULL.changed(jaw="", finger="").apply(load_jaw("steel")).material.young_modulus == 31.5e6
+
+
+@pytest.mark.parametrize("name", ["bench", "twin"])
+def test_a_shipped_calibration_is_refused_on_a_finger_with_other_ribs(name):
+    drawing = BENCH.drawing
+    other = replace(BENCH, drawing=replace(drawing, ribs=drawing.ribs[:-1]))
+    assert load_calibration(name).apply(BENCH)
+    with pytest.raises(CalibrationError, match="finger of another shape"):
+        load_calibration(name).apply(other)
+
+
+def test_thicknesses_of_an_unnamed_finger_are_refused_and_a_modulus_is_not():
+    with pytest.raises(CalibrationError, match=f"add `finger: {BENCH.digest}`"):
+        FULL.changed(finger="").apply(BENCH)
+    assert Calibration(young_modulus=30e6, jaw="bench").apply(BENCH).material.young_modulus == 30e6
+
+
+@pytest.mark.parametrize("modulus", [9.9e6, 91e6])
+def test_a_modulus_that_no_such_print_has_is_refused(modulus):
+    Calibration(young_modulus=33e6).check_modulus(BENCH)
+    with pytest.raises(CalibrationError, match="expected 10 to 90 MPa.*says 30 MPa.*--force"):
+        Calibration(young_modulus=modulus).check_modulus(BENCH)
+
+
+def test_a_soft_finger_is_never_softer_or_harder_than_tpu():
+    soft = replace(BENCH, material=BENCH.material.model_copy(update={"young_modulus": 12e6}))
+    hard = replace(BENCH, material=BENCH.material.model_copy(update={"young_modulus": 110e6}))
+    for jaw, modulus in ((soft, 4.5e6), (hard, 220e6)):
+        with pytest.raises(CalibrationError, match="MPa, expected"):
+            Calibration(young_modulus=modulus).check_modulus(jaw)
+    Calibration(young_modulus=400e9).check_modulus(load_jaw("steel"))
 
 
 def test_calibration_fits_both_sides():

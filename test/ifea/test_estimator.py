@@ -1,4 +1,4 @@
-"""Claims about `JawEstimator`: key points and a contact in, force out."""
+"""Claims about `ForceEstimator`: key points and a contact in, force out."""
 
 from dataclasses import replace
 from functools import cache

@@ -1,4 +1,4 @@
-"""Claims about the contacts, observations, settings and jaws that `JawEstimator` takes and refuses."""
+"""Claims about the contacts, observations, settings and jaws that `ForceEstimator` takes and refuses."""
 
 from dataclasses import fields, replace
 
@@ -23,7 +23,7 @@ from mechanics_fakes import BENCH
 
 from finforce.errors import ObservationError
 from finforce_ifea.errors import CalibrationError, ContactError, JawFileError
-from finforce_ifea.estimator import JawEstimator
+from finforce_ifea.estimator import ForceEstimator
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE, load_jaw
 from finforce_ifea.mechanics import build_mechanics
 from finforce_ifea.observation import Contact, Observation, check_observation
@@ -258,18 +258,18 @@ def test_every_setting_says_its_unit_and_meaning():
 
 def test_calibration_of_another_jaw_is_refused():
     with pytest.raises(CalibrationError, match="bench"):
-        JawEstimator(load_jaw("steel"), calibration=CALIBRATION.changed(jaw="bench"))
+        ForceEstimator(load_jaw("steel"), calibration=CALIBRATION.changed(jaw="bench"))
 
 
 def test_steel_finger_is_no_solid():
     with pytest.raises(JawFileError, match="frame"):
-        JawEstimator(load_jaw("steel"), settings=EstimatorSettings(solver="solid"))
+        ForceEstimator(load_jaw("steel"), settings=EstimatorSettings(solver="solid"))
 
 
 def test_steel_finger_works_with_the_same_estimator():
     """Key points that the model itself has at 12 mm of depth, with a little noise: 3.5 N to a tenth."""
     jaw = load_jaw("steel")
-    maker, mechanics = JawEstimator(jaw), build_mechanics(jaw, EstimatorSettings())
+    maker, mechanics = ForceEstimator(jaw), build_mechanics(jaw, EstimatorSettings())
     results = press_jaw(
         mechanics.model,
         mechanics.contact.surface,

@@ -1,4 +1,4 @@
-"""Claims about gross errors, hidden points, gaps, jumps and garbage in what `JawEstimator` gets."""
+"""Claims about gross errors, hidden points, gaps, jumps and garbage in what `ForceEstimator` gets."""
 
 from dataclasses import replace
 

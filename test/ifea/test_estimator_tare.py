@@ -1,4 +1,4 @@
-"""Claims about what `JawEstimator` does with a jaw that is not loaded, or should not be."""
+"""Claims about what `ForceEstimator` does with a jaw that is not loaded, or should not be."""
 
 import re
 

@@ -15,7 +15,7 @@ from scipy.interpolate import interp1d
 
 from finforce_ifea.contact_mechanics.friction import Friction, constant_traction
 from finforce_ifea.contact_mechanics.indenter import OutlineIndenter, RoundIndenter
-from finforce_ifea.estimator import JawEstimator
+from finforce_ifea.estimator import ForceEstimator
 from finforce_ifea.jaw.calibration import Calibration, load_calibration
 from finforce_ifea.mechanics import build_chosen
 from finforce_ifea.observation import Observation
@@ -153,7 +153,7 @@ def play(truth, place, seed=0, **settings):
     course = np.concatenate([np.zeros(75), held, held])
     points, true = interp1d(way, moved, axis=0)(course), interp1d(way, forces, axis=0)(course)
     random = np.random.default_rng(seed)
-    estimator = JawEstimator(BENCH, calibration=CALIBRATION, settings=EstimatorSettings(**settings))
+    estimator = ForceEstimator(BENCH, calibration=CALIBRATION, settings=EstimatorSettings(**settings))
     contact, offsets = contact_with(circle(0.0125), HEIGHTS[place]), 0.3e-3 * random.standard_normal((15, 3))
     solutions = []
     for number, point in enumerate(points):
@@ -271,7 +271,7 @@ class TestHeld:
             held.force = weight
 
         def find_forces():
-            estimator = JawEstimator(BENCH, calibration=CALIBRATION, settings=EstimatorSettings(held="yes"))
+            estimator = ForceEstimator(BENCH, calibration=CALIBRATION, settings=EstimatorSettings(held="yes"))
             forces = []
             for number, seen in enumerate(points):
                 if number == one.stop:

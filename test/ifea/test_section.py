@@ -11,7 +11,7 @@ from mechanics_fakes import compute_volume
 from section_fakes import BASE, LENGTH, MILLIMETRE, TPU, draw_keypoints, draw_polygon, make_section, write_section_jaw
 
 from finforce_ifea.errors import CalibrationError, JawFileError, MeshError
-from finforce_ifea.estimator import JawEstimator
+from finforce_ifea.estimator import ForceEstimator
 from finforce_ifea.fem.plane import PlaneModel
 from finforce_ifea.fem.solid import SolidModel
 from finforce_ifea.jaw.calibration import Calibration
@@ -258,7 +258,7 @@ def test_force_on_a_curved_face_is_estimated(curved, height):
     """Key points of the plane model under a rod, by stored equilibria: within 3 % and three deviations."""
     settings = EstimatorSettings(solver="reduced", mesh="coarse", radius=0.0125, radius_log_stddev=0.05)
     modelled = replace(curved, material=curved.material.model_copy(update={"spread": 0.0}))
-    estimator = JawEstimator(modelled, settings=settings)
+    estimator = ForceEstimator(modelled, settings=settings)
     mechanics = build_mechanics(modelled, replace(settings, solver="plane"))
     probe = mechanics.model.attach(curved.keypoints, 3e-3)
     depths = np.linspace(0.25e-3, 4e-3, 16)
@@ -369,7 +369,7 @@ def test_elements_too_small_are_refused():
 
 def test_material_by_name_has_its_spread(jaw):
     assert jaw.material == MATERIALS["tpu95a"]
-    estimator = JawEstimator(jaw, settings=EstimatorSettings(solver="plane", mesh="coarse"))
+    estimator = ForceEstimator(jaw, settings=EstimatorSettings(solver="plane", mesh="coarse"))
     assert estimator._force_error == pytest.approx(jaw.material.spread)
 
 

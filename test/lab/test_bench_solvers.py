@@ -42,7 +42,7 @@ def test_only_solved_steps_are_timed_and_untrusted_forces_are_none(monkeypatch):
             status = ("ok", "unloaded", "unobservable", "waiting")[self.steps % 4]
             return SimpleNamespace(status=status, trusted=status in ("ok", "unloaded"), force=np.ones(3))
 
-    monkeypatch.setattr(bench, "JawEstimator", Estimator)
+    monkeypatch.setattr(bench, "ForceEstimator", Estimator)
     run = run_tier(bench.TIERS[0], JAW, PRESSES[:1])[0]
     frames = len(PRESSES[0].observations)
     assert len(run.seconds) == len(run.cpu) == frames // 4

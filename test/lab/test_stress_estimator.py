@@ -8,7 +8,7 @@ import pytest
 from pydantic import ValidationError
 
 from finforce_ifea.errors import CalibrationError
-from finforce_ifea.estimator import JawEstimator
+from finforce_ifea.estimator import ForceEstimator
 from finforce_ifea.jaw.calibration import Calibration
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.observation import Contact
@@ -126,7 +126,7 @@ MODULUS = load_jaw("bench").material.young_modulus
 
 def estimator_of(made_for, solver):
     calibration = Calibration(young_modulus=MODULUS, force_error=0.01, solver=made_for)
-    return JawEstimator(load_jaw("bench"), settings=EstimatorSettings(solver=solver), calibration=calibration)
+    return ForceEstimator(load_jaw("bench"), settings=EstimatorSettings(solver=solver), calibration=calibration)
 
 
 @pytest.mark.parametrize(("made_for", "solver"), [("solid", "paper"), ("frame", "paper"), ("paper", "default")])

@@ -1,0 +1,180 @@
+"""Images in, forces of the gripper out: the whole chain for a program without nodes and without a recording."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from finforce.camera import CameraIntrinsics, decode_depth
+from finforce.camera_file import build_camera, camera_numbers, read_camera
+from finforce.gripper_frames import SIDES, read_extrinsics
+from finforce.transforms import check_pose, invert_pose, pose_numbers
+from finforce_contact.estimator import ContactEstimator
+from finforce_contact.loop import ForceLoop, GivenContact
+from finforce_contact.mesh.object_mesh import ObjectMesh, load_object_mesh
+from finforce_eval.errors import OptionError
+from finforce_ifea.estimator import ForceEstimator
+from finforce_ifea.grasp_force import Wrench, combine_wrenches, single_jaw_grasp
+from finforce_ifea.jaw.calibration import Calibration
+from finforce_ifea.jaw.jaw import Jaw, load_jaw
+from finforce_ifea.observation import Contact, Observation, Solution
+from finforce_ifea.settings import EstimatorSettings
+from finforce_keypoints.build import build_detector
+from finforce_keypoints.geometry.jaw_localizer import JawKeypoints
+from finforce_keypoints.images import RgbdImage
+from finforce_keypoints.parameters import DetectorParameters
+
+Camera = CameraIntrinsics | str | Path | Sequence[float]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class GripperForces:
+    """The forces in one image; vectors of the gripper are in `gripper_base`.
+
+    Attributes:
+        stamp: of the image [s].
+        jaws: side -> force, torque, deviations and status of that jaw, in its frame; one that was not seen is absent.
+        status: "ok", else what keeps the force of which jaw from being trusted; there is no grasp force then.
+        grasp: how hard the object is held [N], NaN unless `status` is "ok".
+        grasp_stddev: standard deviation of the grasp force [N].
+        manipulation: (3,) net force that the object applies to the gripper [N].
+        manipulation_stddev: (3,) its standard deviation [N].
+    """
+
+    stamp: float
+    jaws: Mapping[str, Solution]
+    status: str
+    grasp: float
+    grasp_stddev: float
+    manipulation: NDArray
+    manipulation_stddev: NDArray
+
+
+class ForceSensor:
+    """Finds the forces on a gripper in the images of its wrist camera, one after the other.
+
+    Args:
+        jaw: name of a shipped jaw, jaw file, or a left jaw.
+        camera: intrinsics, a file of them, or the numbers fx, fy, cx, cy [px] and perhaps k1, k2, p1, p2, k3.
+        extrinsics: the camera in `gripper_base`: (4, 4), the seven numbers x, y, z [m], qx, qy, qz, qw, or "robot" or
+            "bench" for those of the simulator.
+        contact_height: of first touch above the clamped base [m].
+        object_mesh: mesh of the object in metres, or its file; `update` then needs its poses. Give one of these two.
+        calibration: of the finger; None for the material of the jaw file.
+        sides: jaws in the images.
+
+    Raises:
+        FinforceError: one of these cannot be used.
+    """
+
+    def __init__(
+        self,
+        jaw: str | Path | Jaw = "bench",
+        *,
+        camera: Camera,
+        extrinsics: str | ArrayLike,
+        contact_height: float | None = None,
+        object_mesh: str | Path | ObjectMesh | None = None,
+        calibration: str | Path | Calibration | None = None,
+        sides: Sequence[str] = SIDES,
+    ) -> None:
+        if (contact_height is None) == (object_mesh is None):
+            raise OptionError(
+                "expected contact_height [m] or object_mesh, one of the two, to know where the jaw is touched"
+            )
+        self._camera = camera
+        jaws = {side: load_jaw(jaw, side) for side in sides}
+        pose = pose_numbers(read_extrinsics(extrinsics))
+        self._detector = build_detector(jaws, DetectorParameters(T_gripper_camera=pose))
+        settings = EstimatorSettings().resolve_held(both=len(sides) == len(SIDES))
+        mesh = None if object_mesh is None else load_object_mesh(object_mesh)
+        self._loops: dict[str, ForceLoop] = {}
+        for side, own in jaws.items():
+            force = ForceEstimator(own, settings=settings, calibration=calibration)
+            contact = (
+                GivenContact(Contact.fixed(force.jaw, contact_height))
+                if mesh is None
+                else ContactEstimator(force.jaw, mesh=mesh)
+            )
+            self._loops[side] = ForceLoop(contact, force)
+
+    def update(
+        self, rgb: NDArray, depth: NDArray | None, stamp: float, T_camera_object: ArrayLike | None = None
+    ) -> GripperForces:
+        """Return the forces in an image.
+
+        The first images, 45 unless the settings say otherwise, have to show the jaws unloaded.
+
+        Args:
+            rgb: (h, w, 3) uint8.
+            depth: (h, w) aligned to the colours, in metres, or uint16 in millimetres; None without.
+            stamp: image capture time [s], rising.
+            T_camera_object: (4, 4) pose of the object's mesh in this image, where it is known.
+
+        Raises:
+            ImageError: the image has another shape, shows nothing, or its stamp does not rise.
+            PoseError: the pose makes no sense.
+        """
+        if not isinstance(self._camera, CameraIntrinsics):
+            self._camera = _intrinsics(self._camera, rgb.shape[:2])
+        if depth is not None:
+            depth = decode_depth(depth, "16UC1" if np.asarray(depth).dtype == np.uint16 else "32FC1")
+        seen = self._detector.detect(RgbdImage(stamp=stamp, color=rgb, depth=depth, camera=self._camera))
+        T = None if T_camera_object is None else check_pose(T_camera_object, "T_camera_object")
+        found = {side: self._solve(self._loops[side], points, T) for side, points in seen.items()}
+        return combine_solutions(stamp, {side: found.get(side) for side in self._loops})
+
+    def _solve(self, loop: ForceLoop, seen: JawKeypoints, T_camera_object: NDArray | None) -> Solution:
+        """Return the force on one jaw."""
+        points = np.where(seen.valid[:, None], seen.points, np.nan)
+        stddev = np.where(np.isfinite(points), seen.stddev, np.nan)
+        observation = Observation(stamp=seen.stamp, points=points, likelihood=seen.likelihood, stddev=stddev)
+        if T_camera_object is None:
+            return loop.update(observation)
+        return loop.update(observation, [(seen.stamp, invert_pose(seen.T_camera_jaw) @ T_camera_object)])
+
+
+def combine_solutions(stamp: float, found: Mapping[str, Solution | None]) -> GripperForces:
+    """Return what the solutions of one jaw or two in one image, None where a jaw was not seen, say of the gripper."""
+    jaws = {side: solution for side, solution in found.items() if solution is not None}
+    wrong = {
+        side: "not seen" if each is None else f"{each.status}: {each.message}"
+        for side, each in found.items()
+        if each is None or not each.trusted
+    }
+    if wrong:
+        unknown = np.full(3, np.nan)
+        status = "; ".join(f"{side} jaw {text}".strip(": ") for side, text in wrong.items())
+        return GripperForces(
+            stamp=stamp,
+            jaws=jaws,
+            status=status,
+            grasp=np.nan,
+            grasp_stddev=np.nan,
+            manipulation=unknown,
+            manipulation_stddev=unknown,
+        )
+    wrenches = {side: Wrench(each.force, each.torque) for side, each in jaws.items()}
+    side, weakest = min(jaws.items(), key=lambda jaw: float(np.linalg.norm(jaw[1].force)))
+    both = len(jaws) == len(SIDES)
+    grasp = combine_wrenches(**wrenches, distance=None) if both else single_jaw_grasp(wrenches[side], side)
+    return GripperForces(
+        stamp=stamp,
+        jaws=jaws,
+        status="ok",
+        grasp=float(grasp.grasp[0]),
+        grasp_stddev=weakest.magnitude_stddev,
+        manipulation=grasp.manipulation,
+        manipulation_stddev=np.sqrt(sum(each.force_stddev**2 for each in jaws.values())),
+    )
+
+
+def _intrinsics(camera: str | Path | Sequence[float], shape: tuple[int, int]) -> CameraIntrinsics:
+    """Return the camera of a file or of numbers for images of some height and width."""
+    if isinstance(camera, str | Path):
+        return read_camera(camera, shape)
+    return build_camera(camera_numbers([float(number) for number in camera]), shape)

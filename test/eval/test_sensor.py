@@ -1,0 +1,64 @@
+"""Claims about `ForceSensor`: forces of the gripper from the images of a program of one's own."""
+
+import numpy as np
+import pytest
+
+import finforce as ff
+from finforce.gripper_frames import BENCH_CAMERA, ROBOT_CAMERA, read_extrinsics
+from finforce.transforms import pose_numbers
+from finforce_eval.sensor import combine_solutions
+from finforce_ifea.observation import blank_solution
+
+INTRINSICS = (430.0, 430.0, 320.0, 240.0)
+
+
+def pressed(force, status="ok"):
+    solution = blank_solution(1.0, status, "why", np.ones(3, bool))
+    return solution._replace(force=np.array(force), force_stddev=np.array([0.3, 0.1, 0.0]), magnitude_stddev=0.2)
+
+
+def test_two_jaws_are_a_grasp_and_a_net_force_with_their_deviations():
+    forces = combine_solutions(1.0, {"left": pressed([-3.0, 0.0, 0.0]), "right": pressed([-2.0, 0.0, 1.0])})
+    assert (forces.status, forces.grasp, forces.grasp_stddev) == ("ok", pytest.approx(5.0**0.5), 0.2)
+    np.testing.assert_allclose(forces.manipulation, [-1.0, 0.0, 1.0])  # the right jaw is turned about z
+    np.testing.assert_allclose(forces.manipulation_stddev, np.sqrt(2.0) * np.array([0.3, 0.1, 0.0]))
+    assert combine_solutions(1.0, {"right": pressed([-2.0, 0.0, 0.0])}).manipulation[0] == pytest.approx(2.0)
+
+
+def test_a_jaw_that_is_not_trusted_leaves_no_grasp_and_is_named():
+    forces = combine_solutions(1.0, {"left": pressed([-3.0, 0.0, 0.0]), "right": None})
+    assert forces.status == "right jaw not seen" and np.isnan(forces.grasp) and set(forces.jaws) == {"left"}
+    waiting = combine_solutions(1.0, {"left": pressed([0.0, 0.0, 0.0], "waiting")})
+    assert waiting.status == "left jaw waiting: why" and np.isnan(waiting.manipulation).all()
+
+
+def test_arrays_go_through_the_detector_to_both_jaws():
+    sensor = ff.ForceSensor("bench", camera=INTRINSICS, extrinsics="robot", contact_height=0.04, calibration="bench")
+    rgb = np.random.default_rng(1).integers(0, 255, (480, 640, 3), dtype=np.uint8)
+    forces = sensor.update(rgb, np.full((480, 640), 150, np.uint16), stamp=1.0)
+    assert set(forces.jaws) <= {"left", "right"} and np.isnan(forces.grasp)
+    assert forces.status and sensor._camera.fx == 430.0
+    with pytest.raises(ValueError, match="rising stamps"):
+        sensor.update(rgb, None, stamp=0.5)
+
+
+@pytest.mark.parametrize(
+    ("given", "reason"),
+    [
+        ({}, "expected contact_height .* or object_mesh"),
+        ({"contact_height": 0.04, "object_mesh": "can.stl"}, "one of the two"),
+        ({"contact_height": 40.0}, "contact height 40000 mm, expected"),
+        ({"contact_height": 0.04, "extrinsics": "wrist"}, "expected robot, bench"),
+        ({"contact_height": 0.04, "extrinsics": [1.0, 2.0]}, "2 numbers; expected robot"),
+    ],
+)
+def test_what_cannot_be_used_is_said(given, reason):
+    with pytest.raises(ValueError, match=reason):
+        ff.ForceSensor("bench", **{"camera": INTRINSICS, "extrinsics": "robot", **given})
+
+
+def test_a_camera_pose_is_read_in_every_form():
+    numbers = pose_numbers(ROBOT_CAMERA)
+    for form in ("robot", ROBOT_CAMERA, numbers, ",".join(map(str, numbers)), " ".join(map(str, numbers))):
+        np.testing.assert_allclose(read_extrinsics(form), ROBOT_CAMERA, atol=1e-12)
+    np.testing.assert_array_equal(read_extrinsics("bench"), BENCH_CAMERA)
