@@ -3,9 +3,20 @@
 from __future__ import annotations
 
 import argparse
+import os
+from collections.abc import Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, as_completed, wait
+from contextlib import suppress
+from multiprocessing import get_context
+from typing import TYPE_CHECKING
 
-from finforce_eval.preparation import COMPILED, prepare
+from finforce.errors import MissingDependencyError
+from finforce.processors import ALL
 from finforce_eval.tasks import progress_bar
+
+if TYPE_CHECKING:
+    from finforce_ifea.jaw.jaw import Jaw
+    from finforce_ifea.reduced.build import Share
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -23,3 +34,104 @@ def run(options: argparse.Namespace) -> None:
         for done in prepare(options.jaws, options.calibration):
             bar.update()
             bar.write(done)
+
+
+_MOST = 8  # processes, each of some 300 MB
+
+
+def prepare(jaws: Sequence[str], calibration: str) -> Iterator[str]:
+    """Compile everything and build the equilibria of jaws in as many processes as there are processors, up to eight.
+
+    Args:
+        jaws: files or shipped names.
+        calibration: of the fingers, a file or a shipped name; none when empty.
+
+    Yields:
+        What is done.
+
+    Raises:
+        FinforceError: a jaw or the calibration cannot be used.
+    """
+    found = [_load(jaw, calibration) for jaw in jaws]
+    workers = min(len(ALL) or os.cpu_count() or 1, _MOST)
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        try:
+            running = {pool.submit(work): done for work, done in COMPILED.items()}
+            wait(running, return_when=FIRST_COMPLETED)  # else this process compiles what the first of these does
+            for jaw in found:
+                yield _store_equilibria(jaw, pool.map)
+            for future in as_completed(running):
+                future.result()
+                yield running[future]
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def compile_solver() -> None:
+    """Compile the solver with a jaw that is taken to be linear, which needs no equilibria."""
+    from finforce_ifea.estimator import ForceEstimator
+    from finforce_ifea.jaw.jaw import load_jaw
+    from finforce_ifea.settings import EstimatorSettings
+
+    for held in ("no", "yes"):
+        ForceEstimator(load_jaw("bench"), settings=EstimatorSettings(solver="linear", held=held)).warm_up()
+
+
+def _load(name: str, calibration: str) -> Jaw:
+    """Return a jaw with its calibration, an empty one being none; raises FinforceError where one cannot be used."""
+    from finforce_ifea.jaw.calibration import load_calibration
+    from finforce_ifea.jaw.jaw import load_jaw
+    from finforce_ifea.settings import EstimatorSettings
+
+    jaw = load_jaw(name)
+    if not calibration:
+        return jaw
+    found = load_calibration(calibration)
+    found.expect_error(jaw, EstimatorSettings().solver)
+    return found.apply(jaw)
+
+
+def _store_equilibria(jaw: Jaw, share: Share) -> str:
+    """Build the stored equilibria of a jaw; return what came of it."""
+    from finforce_ifea.errors import ContactError
+    from finforce_ifea.mechanics import build_mechanics, choose_full
+    from finforce_ifea.reduced.cache import store_manifold
+    from finforce_ifea.settings import EstimatorSettings
+
+    try:
+        store_manifold(build_mechanics(jaw, choose_full(EstimatorSettings())), jaw, share)
+    except ContactError as error:
+        return f"no equilibria of {jaw.name}, every step is slower: {error}"
+    return f"equilibria of {jaw.name} stored"
+
+
+def compile_contact() -> None:
+    """Compile the contact estimator with the object of the recording that comes with finforce."""
+    from finforce_contact.estimator import ContactEstimator
+    from finforce_contact.loop import ContactLoop
+    from finforce_contact.mesh.object_mesh import load_object_mesh
+    from finforce_eval.recordings.objects import find_mesh
+    from finforce_eval.recordings.recording import DEMO, read_recording
+    from finforce_ifea.jaw.jaw import load_jaw
+
+    mesh = load_object_mesh(find_mesh(read_recording(DEMO)))
+    ContactLoop(ContactEstimator(load_jaw("bench"))).set_object(mesh)
+
+
+def compile_detector() -> None:
+    """Compile the geometry of the key point detector, with the network of one finger and with that of any."""
+    from finforce_keypoints.build import ANY_FINGER, BENCH, build_detector
+    from finforce_keypoints.parameters import DetectorParameters, load_jaws
+
+    for network in (BENCH, ANY_FINGER):
+        parameters = DetectorParameters(model=str(network))
+        with suppress(MissingDependencyError):  # without its library it is not used either
+            build_detector(load_jaws(parameters), parameters).warm_up()
+
+
+# The longest first.
+COMPILED = {
+    compile_solver: "solver compiled",
+    compile_detector: "detector compiled",
+    compile_contact: "contact estimator compiled",
+}

@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import argparse
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
+import numpy as np
+import pandas as pd
+
+from finforce.errors import FinforceError
 from finforce_eval.cli.parser import BAG_HELP, add_run_options, picture_file
 from finforce_eval.evaluation.keypoint_source import parse_source
 from finforce_eval.evaluation.setup import make_setup, sides_of
 from finforce_eval.machine import write_figures
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.replay.replay import Playing, play_to_nodes
-from finforce_eval.replay.trace import Trace, draw_way, format_trace, read_spans, stage_figures
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -57,3 +64,141 @@ def run(options: argparse.Namespace) -> None:
         Path(options.figure).parent.mkdir(parents=True, exist_ok=True)
         draw_way(trace, options.figure)
         print(f"Picture: {options.figure}")
+
+
+WAY = "image out to grasp force in"
+PERCENTS = (50, 95, 99)
+OTHER_WORK = ("/diagnostics", "/clock", "/camera/camera/color/camera_info")
+
+
+class TraceError(FinforceError, ValueError):
+    """Nothing was noted, or nothing that belongs to an image."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Trace:
+    """The ways of the images of a recording.
+
+    Attributes:
+        spans: see `read_spans`.
+        late: stamp -> from the image's leaving to the grasp force's arrival [ms]; of answered images.
+        images: stamps of all images.
+        lost: reason -> how many images no grasp force came of, as the nodes say.
+    """
+
+    spans: pd.DataFrame
+    late: Mapping[int, float]
+    images: Sequence[int]
+    lost: Mapping[str, str]
+
+
+def read_spans(folder: Path, offset: int, sent: Mapping[int, float]) -> pd.DataFrame:
+    """Return what processes have noted of images, a row for each callback in the order of their beginnings.
+
+    Args:
+        folder: of their files.
+        offset: by which stamps were later than they were recorded [ns].
+        sent: when each image left, by its recorded stamp [s, monotonic].
+
+    Returns:
+        `image`, its recorded stamp [ns]; `stage`, node and topic in a few words; `begin` and `end` after the image had
+        left [ms]; `own` time in which the callback did not wait for another stage that it had called [ms].
+
+    Raises:
+        TraceError: there is nothing.
+    """
+    rows = []
+    for path in sorted(folder.glob("*.json")):
+        noted = json.loads(path.read_text(encoding="utf-8"))
+        owned = _own_times([(begin, end) for *_, begin, end in noted])
+        for (node, topic, stamp, begin, end), own in zip(noted, owned, strict=True):
+            left = sent.get(stamp - offset)
+            if left is not None and topic not in OTHER_WORK:
+                stage = f"{node}: {topic.lstrip('/').removeprefix('camera/camera/')}"
+                rows.append((stamp - offset, stage, 1e-6 * begin - 1e3 * left, 1e-6 * end - 1e3 * left, 1e-6 * own))
+    if not rows:
+        raise TraceError("no stage has noted anything of an image; expected at least one image to be answered")
+    return pd.DataFrame(rows, columns=["image", "stage", "begin", "end", "own"]).sort_values(["image", "begin"])
+
+
+def _own_times(spans: Sequence[tuple[int, int]]) -> list[int]:
+    """Return how long each of nested spans (begin, end) was at work itself."""
+    own = [end - begin for begin, end in spans]
+    order = sorted(range(len(spans)), key=lambda i: (spans[i][0], -spans[i][1]))
+    around: list[int] = []
+    for index in order:
+        begin, end = spans[index]
+        while around and spans[around[-1]][1] <= begin:
+            around.pop()
+        if around:
+            own[around[-1]] -= end - begin
+        around.append(index)
+    return own
+
+
+def stage_figures(trace: Trace) -> dict[str, dict[str, Any]]:
+    """Return by stage how often it was at work, for how long itself, and when it began [ms], and the whole way."""
+    found = {
+        stage: {"n": len(rows), "own_ms": _percentiles(rows["own"]), "begin_ms": _percentiles(rows["begin"])}
+        for stage, rows in trace.spans.groupby("stage", sort=False)
+    }
+    ordered = dict(sorted(found.items(), key=lambda entry: entry[1]["begin_ms"][0]))
+    late = list(trace.late.values())
+    return {**ordered, WAY: {"n": len(late), "own_ms": _percentiles(late), "begin_ms": [0.0] * len(PERCENTS)}}
+
+
+def _percentiles(values: Sequence[float]) -> list[float]:
+    return np.percentile(values, PERCENTS).tolist() if len(values) else [float("nan")] * len(PERCENTS)
+
+
+def format_trace(trace: Trace) -> str:
+    """Return a table of the stages in Markdown, and what was lost."""
+    lines = ["| stage | images | begins at p50/ms | takes p50/ms | p95 | p99 |", "|---|---:|---:|---:|---:|---:|"]
+    for name, figures in stage_figures(trace).items():
+        times = " | ".join(f"{value:.2f}" for value in (figures["begin_ms"][0], *figures["own_ms"]))
+        lines.append(f"| {name} | {figures['n']} | {times} |")
+    lines += ["", f"{len(trace.late)} of {len(trace.images)} images answered. Where the others went, by the nodes "
+              "themselves:"]  # fmt: skip
+    return "\n".join([*lines, *(f"- {name}: {why}" for name, why in trace.lost.items())])
+
+
+def median_image(trace: Trace) -> int:
+    """Return the stamp [ns] of the image that was answered in the median time.
+
+    Raises:
+        TraceError: none was answered.
+    """
+    noted = set(trace.spans["image"])
+    known = sorted((late, stamp) for stamp, late in trace.late.items() if stamp in noted)
+    if not known:
+        raise TraceError("no image was answered; expected one at least")
+    return known[len(known) // 2][1]
+
+
+def draw_way(trace: Trace, path: Path | str) -> None:
+    """Draw who was at work when for the image in the middle of all, and how long images took in all."""
+    from finforce_eval.figures.figures import BLACK, BLUE, GREY, ORANGE, new_figure, style_axes
+
+    stamp = median_image(trace)
+    spans = trace.spans[trace.spans["image"] == stamp]
+    height = 0.28 * len(spans)
+    figure = new_figure(10.0, height + 3.4)
+    way, all_of_them = figure.subplots(2, 1, height_ratios=[height + 0.6, 1.6])
+    way.barh(range(len(spans)), spans["end"] - spans["begin"], left=spans["begin"], height=0.7, color=BLUE, alpha=0.85)
+    for row, (end, own) in enumerate(zip(spans["end"], spans["own"], strict=True)):
+        way.text(end + 0.1, row, f"{own:.2f} ms", va="center", fontsize=7, color=BLACK)
+    way.set_yticks(range(len(spans)), spans["stage"], fontsize=7)
+    way.invert_yaxis()
+    way.axvline(trace.late[stamp], color=ORANGE, linewidth=1.2)
+    way.text(trace.late[stamp], -0.9, "grasp force", color=ORANGE, ha="center", fontsize=8)
+    way.set_xlabel("after the image left [ms]; next to each bar the time of the stage itself")
+    way.set_xlim(left=0.0, right=1.15 * max(trace.late[stamp], spans["end"].max()))
+    late = np.array(list(trace.late.values()))
+    all_of_them.hist(late, bins=np.linspace(0.0, max(40.0, float(late.max())), 80), color=GREY)
+    for percent in PERCENTS:
+        all_of_them.axvline(np.percentile(late, percent), color=ORANGE, linewidth=1.0)
+    all_of_them.set_xlabel(f"{WAY} [ms]; lines: 50, 95 and 99 %")
+    all_of_them.set_ylabel("images")
+    for axes in (way, all_of_them):
+        style_axes(axes)
+    figure.savefig(path)

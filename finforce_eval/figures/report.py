@@ -162,9 +162,7 @@ def _draw_images(
 
 def _draw_case(result: ForceSeries, folder: Path, keypoint_names: Sequence[str]) -> None:
     """Draw one case."""
-    from finforce_eval.figures.contact import draw_contact
-    from finforce_eval.figures.figures import draw_force, draw_keypoints
-    from finforce_eval.figures.jaw import draw_jaw
+    from finforce_eval.figures.figures import draw_contact, draw_force, draw_jaw, draw_keypoints
 
     stem = _forget_pictures(folder, result.name, PICTURES)
     draw_force(result).savefig(folder / f"{stem}_force.png")

@@ -5,11 +5,10 @@ The first start compiles and builds into an empty folder, which later ones find 
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from time import monotonic, sleep
 from typing import Any
@@ -21,7 +20,6 @@ from tqdm import tqdm
 from finforce.ros.transport import free_domain
 from finforce.systems.processes import (
     PIPELINE,
-    SINGLE_THREAD,
     Process,
     ReplayOptions,
     executables_of,
@@ -30,7 +28,7 @@ from finforce.systems.processes import (
 )
 from finforce_eval.recordings.objects import find_mesh
 from finforce_eval.recordings.recording import DEMO, read_recording
-from finforce_eval.replay.processes import PATIENCE, ProcessError, last_words, resident_bytes
+from finforce_eval.replay.processes import ProcessError, ProcessGroup, resident_bytes
 from lab.harness import Figures
 
 READY = b" ready"  # every node says so once, when it takes messages
@@ -80,11 +78,11 @@ def _start(
     process: Process, times: int, folder: str, progress: Callable[[], Any], *, compiled: bool = True
 ) -> dict[str, Any]:
     """Start a process several times, one after the other, with a folder for what it keeps."""
-    environment = {**os.environ, **SINGLE_THREAD, "FINFORCE_CACHE": folder, "NUMBA_CACHE_DIR": ""}
+    environment = {"FINFORCE_CACHE": folder, "NUMBA_CACHE_DIR": ""}
     name = "all in one process" if process.executable == PIPELINE else process.executable
     seconds, memory = [], []
     for _ in range(times):
-        took, taken = time_start(process.command(), len(executables_of([process])), environment)
+        took, taken = time_start(process, environment)
         seconds.append(took)
         memory.append(1e-6 * taken)
         progress()
@@ -98,13 +96,12 @@ def _start(
     }
 
 
-def time_start(command: Sequence[str], nodes: int, environment: Mapping[str, str]) -> tuple[float, int]:
-    """Start a command and end it as soon as it is ready.
+def time_start(process: Process, environment: Mapping[str, str]) -> tuple[float, int]:
+    """Start a process and end it as soon as all its nodes are ready.
 
     Args:
-        command: that runs nodes.
-        nodes: of these, how many.
-        environment: its environment.
+        process: that runs nodes.
+        environment: variables in addition to those of this process.
 
     Returns:
         The time until then [s], and its resident memory [bytes].
@@ -112,27 +109,11 @@ def time_start(command: Sequence[str], nodes: int, environment: Mapping[str, str
     Raises:
         ProcessError: it ended, or was not ready after ten minutes.
     """
-    environment = {**environment, "ROS_DOMAIN_ID": str(free_domain())}
-    # read by its name: what it is opened with is where the child writes
-    with tempfile.NamedTemporaryFile() as log:
-        begin = monotonic()
-        child = subprocess.Popen(command, env=environment, stdout=log, stderr=subprocess.STDOUT)
-        try:
-            while _count_ready(Path(log.name)) < nodes:
-                if child.poll() is not None or monotonic() - begin > LONGEST:
-                    raise ProcessError(f"{' '.join(command[1:4])} is not ready: {last_words(log)}")
-                sleep(POLL)
-            return monotonic() - begin, resident_bytes(child.pid)
-        finally:
-            for number, patience in PATIENCE:
-                child.send_signal(number)
-                try:
-                    child.wait(patience)
-                    break
-                except subprocess.TimeoutExpired:
-                    continue
-
-
-def _count_ready(log: Path) -> int:
-    """Return how many nodes have logged that they are ready."""
-    return sum(READY in line for line in log.read_bytes().splitlines())
+    begin, nodes = monotonic(), len(executables_of([process]))
+    with ProcessGroup([process], {**environment, "ROS_DOMAIN_ID": str(free_domain())}) as group:
+        while group.count_lines(READY) < nodes:
+            group.check()
+            if monotonic() - begin > LONGEST:
+                raise ProcessError(f"{process.label} is not ready after {LONGEST:g} s")
+            sleep(POLL)
+        return monotonic() - begin, resident_bytes(*group.pids.values())

@@ -1,4 +1,4 @@
-"""Judge an exported network on labelled pictures: `python -m lab.training.evaluate FOLDER DATASET --worst worst.png`.
+"""Judge an exported network on labelled pictures: `python -m lab.training.evaluate FOLDER DATASET`.
 
 Knows no PyTorch: it runs the network as the product does.
 """
@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from finforce_eval.figures.figures import new_figure
 from finforce_keypoints.networks.side_network import SideNetwork
 from lab.training.commands import CheckpointError, one_line_errors
 from lab.training.pictures import MARGIN, VALIDATION, FingerPictures, load_pictures
@@ -25,18 +24,16 @@ BATCH = 16
 THRESHOLDS = (0.2, 0.4, 0.6, 0.8, 0.9)
 # mean of all colours; a D405 in its own exposure is near 100
 LIGHT_LEVELS = {"dark (below 15)": (0.0, 15.0), "dim (15 to 50)": (15.0, 50.0), "bright (above 50)": (50.0, 256.0)}
-WORST, COLUMNS = 20, 5  # pictures of a sheet, and in a row of it
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Print the scores of a network as a table, write them as JSON, and draw the worst pictures."""
+    """Print the scores of a network as a table, and write them as JSON."""
     parser = argparse.ArgumentParser(prog="python -m lab.training.evaluate", description=__doc__)
     parser.add_argument("network", type=Path, help="folder of an exported network")
     parser.add_argument("dataset", type=Path, help="folder of shards")
     parser.add_argument("--part", default=VALIDATION, help=f"which shards ({VALIDATION})")
     parser.add_argument("--limit", type=int, help="judge on the first so many pictures only")
     parser.add_argument("--threshold", type=float, default=THRESHOLD, help=f"likelihood to accept ({THRESHOLD})")
-    parser.add_argument("--worst", type=Path, help="picture file for the worst pictures")
     parser.add_argument("--json", type=Path, help="file for the scores")
     options = parser.parse_args(arguments)
     with one_line_errors():
@@ -47,9 +44,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print(format_scores(scores))
     if options.json:
         options.json.write_text(json.dumps({name: score.as_row() for name, score in scores.items()}, indent=1))
-    if options.worst:
-        worst = find_worst(detections, WORST, options.threshold)
-        draw_sheet(options.worst, pictures.middle[worst], detections.take(worst), options.threshold)
 
 
 def detect(network: SideNetwork, pictures: FingerPictures) -> Detections:
@@ -193,38 +187,8 @@ def fit_shift(detections: Detections, lost: float, threshold: float = THRESHOLD)
     return float(np.log(threshold / (1.0 - threshold)) - np.log(last / (1.0 - last)))
 
 
-def find_worst(detections: Detections, count: int, threshold: float = THRESHOLD) -> NDArray:
-    """Return the indices (count,) of the pictures with the largest error of an accepted point, hidden ones included."""
-    accepted = detections.likelihood >= threshold
-    lost = np.where(detections.visible & ~accepted, 5.0, 0.0)
-    wrong = np.where(accepted & ~detections.visible & detections.counts, 10.0, 0.0)
-    errors = np.where(accepted & detections.visible, np.nan_to_num(detections.errors), 0.0)
-    return np.argsort(-(errors + lost + wrong).max(axis=1), kind="stable")[:count]
-
-
 def _mean(values: NDArray) -> float:
     return float(values.mean()) if values.size else float("nan")
-
-
-def draw_sheet(path: Path, pictures: NDArray, detections: Detections, threshold: float) -> None:
-    """Draw pictures (n, h, w, 3) uint8 side by side, dark ones brightened, with their points.
-
-    True points are green circles, hidden ones grey, accepted ones red crosses, refused ones blue.
-    """
-    rows = -(-len(pictures) // COLUMNS)
-    figure = new_figure(3.0 * COLUMNS, 3.8 * rows)
-    for number, axes in enumerate(figure.subplots(rows, COLUMNS, squeeze=False).flat):
-        axes.set_axis_off()
-        if number >= len(pictures):
-            continue
-        picture, found = pictures[number], detections.take([number])
-        axes.imshow(np.clip(picture * max(1.0, 90.0 / max(float(picture.mean()), 1.0)), 0, 255).astype(np.uint8))
-        known = found.counts[0] & np.isfinite(found.points[0]).all(axis=1)
-        seen, accepted = found.visible[0], found.likelihood[0] >= threshold
-        rings = {"edgecolors": np.where(seen, "lime", "grey")[known], "facecolors": "none", "s": 30}
-        axes.scatter(*found.points[0, known].T, **rings)
-        axes.scatter(*found.pixels[0, known].T, marker="x", c=np.where(accepted, "red", "dodgerblue")[known], s=20)
-    figure.savefig(path)
 
 
 if __name__ == "__main__":

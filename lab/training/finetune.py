@@ -6,22 +6,235 @@
 from __future__ import annotations
 
 import argparse
+import csv
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pandas as pd
+import yaml
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from finforce.gripper_frames import SIDES
+from finforce.camera import PLUMB_BOB, CameraIntrinsics
+from finforce.gripper_frames import SIDES, jaw_in_camera, jaw_in_gripper
 from finforce.optional import import_cv2
-from finforce_ifea.jaw.jaw import load_jaw
+from finforce.transforms import pose_from_quaternion
+from finforce_ifea.jaw.jaw import Jaw, load_jaw
+from finforce_keypoints.geometry.side_picture import find_side, intersect_plane, map_picture, take_picture
+from finforce_keypoints.geometry.template import draw_template, find_shape, fit_grid
 from finforce_keypoints.networks.metadata import build_name_map, parse_mapping
 from finforce_keypoints.networks.side_network import SideNetwork
 from lab.training.commands import LabelFileError, one_line_errors
 from lab.training.evaluate import detect, format_scores, score_detections
-from lab.training.labels import CameraView, LabelledImage, Labels, read_camera, read_labels, rectify
-from lab.training.pictures import TRAIN, FingerPictures, load_pictures
+from lab.training.pictures import MARGIN, TRAIN, FingerPictures, load_pictures
+
+SCORER, INDIVIDUALS, BODYPARTS, COORDS = HEADERS = ("scorer", "individuals", "bodyparts", "coords")
+FOLDER = "labeled-data"  # how the index of a frame begins
+_SINGLE = "single"  # DeepLabCut's individual for body parts that are there once
+BASE_PART = 0.3  # of the jaw's length: key points nearer to the base hardly move when the jaw bends
+NUMBERS = ("width", "height", "fx", "fy", "cx", "cy")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Labels:
+    """Points that somebody marked in n images.
+
+    Attributes:
+        images: (n,) paths relative to the DeepLabCut project, with slashes: labeled-data/VIDEO/img0001.png.
+        names: (K,) of the body parts; INDIVIDUAL_BODYPART where there are several individuals.
+        points: (n, K, 2) column and row [px]; NaN where a point was not marked because it is hidden.
+    """
+
+    images: tuple[str, ...]
+    names: tuple[str, ...]
+    points: NDArray
+
+
+def read_labels(path: str | Path) -> Labels:
+    """Read a label file.
+
+    Args:
+        path: a CSV file whose index is one column (labeled-data/VIDEO/IMAGE) or three (labeled-data, VIDEO, IMAGE);
+            the row `individuals` of multi-animal projects, backslashes and empty cells are understood.
+
+    Raises:
+        LabelFileError: the file cannot be read, lacks a header or its rows do not fit it.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8-sig")
+        rows = [[cell.strip() for cell in row] for row in csv.reader(text.splitlines())]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise LabelFileError(f"{path}: {error}; expected DeepLabCut's CollectedData_SCORER.csv") from error
+    rows = [row for row in rows if any(row)]
+    try:
+        if len({len(row) for row in rows}) != 1:
+            raise LabelFileError("rows of different lengths; expected a cell for every column of the header")
+        return parse_labels(pd.DataFrame(rows))
+    except LabelFileError as error:
+        raise LabelFileError(f"{Path(path).name}: {error}") from error
+
+
+def parse_labels(cells: pd.DataFrame) -> Labels:
+    """Return the labels of a file's cells, texts; see `read_labels`.
+
+    Raises:
+        LabelFileError: a header row is missing, or the columns are not those of points.
+    """
+    is_head = cells[0].isin(HEADERS)
+    head, frames = cells[is_head].set_index(0), cells[~is_head]
+    for needed in (BODYPARTS, COORDS):
+        if needed not in head.index:
+            raise LabelFileError(f"no row '{needed}'; expected the header rows scorer, bodyparts and coords")
+    if frames.empty:
+        raise LabelFileError("no frame after the header; expected a row per image")
+    index = 3 if frames.iat[0, 0] == FOLDER else 1
+    head = head.iloc[:, index - 1 :]
+    names = _name_points(head)
+    pairs = list(zip(names, head.loc[COORDS], strict=True))
+    if len(set(pairs)) != len(pairs) or {(name, axis) for name in names for axis in "xy"} - set(pairs):
+        raise LabelFileError("the columns are not one x and one y of every body part")
+    try:
+        values = frames.iloc[:, index:].replace("", "nan").astype(float)
+    except ValueError as error:
+        raise LabelFileError(f"{error}; expected numbers of pixels, or nothing") from error
+    values.columns = pd.MultiIndex.from_tuples(pairs)
+    kinds = list(dict.fromkeys(names))
+    points = np.stack([values[name][["x", "y"]].to_numpy() for name in kinds], axis=1)
+    points[~np.isfinite(points).all(axis=2)] = np.nan
+    images = pd.Series(["/".join(row).replace("\\", "/") for row in frames.iloc[:, :index].to_numpy()])
+    if images.duplicated().any():
+        image = images[images.duplicated()].iloc[0]
+        raise LabelFileError(f"{image} stands in {(images == image).sum()} rows; expected one row per image")
+    return Labels(images=tuple(images), names=tuple(kinds), points=points)
+
+
+def _name_points(head: pd.DataFrame) -> list[str]:
+    """Return the names of the columns' points: INDIVIDUAL_BODYPART where there are several individuals."""
+    parts = head.loc[BODYPARTS].tolist()
+    people = head.loc[INDIVIDUALS].tolist() if INDIVIDUALS in head.index else [_SINGLE] * len(parts)
+    several = len(set(people) - {_SINGLE}) > 1
+    return [
+        f"{person}_{part}" if several and person != _SINGLE else part
+        for person, part in zip(people, parts, strict=True)
+    ]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CameraView:
+    """A camera and its place: intrinsics and T_gripper_camera (4, 4)."""
+
+    camera: CameraIntrinsics
+    T_gripper_camera: NDArray
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LabelledImage:
+    """An image (h, w, 3) uint8 RGB with the points (K, 2) [px] of one jaw, the reference point last; NaN if hidden."""
+
+    image: NDArray
+    points: NDArray
+
+
+def read_camera(path: str | Path) -> CameraView:
+    """Read a camera from YAML: width, height, fx, fy, cx, cy [px], distortion, T_gripper_camera [x y z qx qy qz qw].
+
+    The lens is that of `distortion_model`, plumb_bob without it.
+
+    Raises:
+        LabelFileError: the file cannot be read or lacks one of these.
+        IntrinsicsError: no camera has such numbers.
+    """
+    try:
+        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+        return parse_camera(content)
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError) as error:
+        raise LabelFileError(
+            f"{path}: {error!r}; expected {', '.join(NUMBERS)}, distortion and T_gripper_camera [x y z qx qy qz qw]"
+        ) from error
+
+
+def parse_camera(content: Mapping[str, Any]) -> CameraView:
+    """Return the camera of a file's content; see `read_camera`."""
+    numbers = {name: content[name] for name in NUMBERS}
+    pose = np.array(content["T_gripper_camera"], dtype=float)
+    if pose.shape != (7,):
+        raise LabelFileError(f"T_gripper_camera: got {pose.tolist()}, expected x y z [m] qx qy qz qw")
+    lens = np.array(content.get("distortion", ()), dtype=float)
+    model = str(content.get("distortion_model", PLUMB_BOB))
+    return CameraView(
+        camera=CameraIntrinsics(**numbers, distortion=lens, model=model),
+        T_gripper_camera=pose_from_quaternion(pose[:3], pose[3:]),
+    )
+
+
+def find_origin(points: NDArray, jaw: Jaw, side: str, view: CameraView) -> float | None:
+    """Return where a jaw's origin is on the closing axis [m], from its labels.
+
+    The reference point tells it; where it is hidden, the mean of the key points near the base does.
+
+    Args:
+        points: (K + 1, 2) labels [px], the reference point last.
+        jaw: in its own frame, right jaws mirrored.
+        side: "left" or "right".
+        view: camera and its place.
+
+    Returns:
+        The place, None when neither the reference point nor one near the base is labelled.
+    """
+    rest = np.vstack((jaw.keypoints, jaw.reference_point))
+    chosen = np.isfinite(points).all(axis=1)
+    if chosen[-1]:
+        chosen = np.arange(len(points)) == len(points) - 1
+    else:
+        chosen &= rest[:, 2] < BASE_PART * jaw.keypoints[:, 2].max()
+    if not chosen.any():
+        return None
+    at_zero = jaw_in_camera(view.T_gripper_camera, side, 0.0)
+    places = intersect_plane(points[chosen], find_side(jaw), at_zero, view.camera)
+    along = float((places[:, 0] - rest[chosen, 0]).mean())
+    return along * float(jaw_in_gripper(side, 0.0)[0, 0])
+
+
+def rectify(labelled: LabelledImage, jaw: Jaw, side: str, view: CameraView) -> FingerPictures | None:
+    """Return the picture of one jaw's side plane with its points, as training takes it; None if the jaw is not found.
+
+    Raises:
+        LabelFileError: the image has another size than the camera.
+    """
+    height, width = labelled.image.shape[:2]
+    if (width, height) != (view.camera.width, view.camera.height):
+        raise LabelFileError(
+            f"an image of {width}x{height}; expected {view.camera.width}x{view.camera.height}, the camera's"
+        )
+    origin = find_origin(labelled.points, jaw, side, view)
+    if origin is None:
+        return None
+    return cut_picture(labelled, jaw, jaw_in_camera(view.T_gripper_camera, side, origin), view.camera)
+
+
+def cut_picture(labelled: LabelledImage, jaw: Jaw, T_camera_jaw: NDArray, camera: CameraIntrinsics) -> FingerPictures:
+    """Return the picture of the side plane of a jaw at T_camera_jaw (4, 4) with its labelled points, the mark first."""
+    shape, side = find_shape(jaw), find_side(jaw)
+    grid = fit_grid(shape)
+    padded = grid.padded(MARGIN)
+    rest = np.vstack((jaw.reference_point, jaw.keypoints))[:, [0, 2]]
+    points = np.roll(labelled.points, 1, axis=0)
+    visible = np.isfinite(points).all(axis=1)
+    place = np.full((len(visible), 2), np.nan, dtype=np.float32)
+    place[visible] = padded.pixels(intersect_plane(points[visible], side, T_camera_jaw, camera))
+    return FingerPictures(
+        picture=take_picture(labelled.image, map_picture(padded, side, T_camera_jaw, camera))[None],
+        rest=grid.pixels(rest).astype(np.float32)[None],
+        place=place[None],
+        visible=visible[None],
+        keypoints=np.array([len(rest)]),
+        template=draw_template(shape, grid)[None],
+        finger=np.zeros(1, dtype=int),
+    )
+
 
 FEWEST = 3  # labelled pictures
 HELD_BACK = 6  # every sixth picture judges, the others teach; of fewer than twelve every second one

@@ -129,8 +129,7 @@ print(json.dumps(said))
 """
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_commands_say_what_is_wrong_in_one_line(command, tmp_path):
+def test_commands_say_what_is_wrong_in_one_line(tmp_path):
     from finforce_eval.recordings.recording import DEMO
 
     orders = {}
@@ -139,7 +138,8 @@ def test_commands_say_what_is_wrong_in_one_line(command, tmp_path):
         file.parent.mkdir()
         file.write_text(bomb)
         places = {"FILE": str(file), "BAG": str(DEMO)}
-        orders[name] = [places.get(word, word.replace("FOLDER", str(file.parent))) for word in COMMANDS[command]]
+        for command, words in COMMANDS.items():
+            orders[f"{command}, {name}"] = [places.get(w, w.replace("FOLDER", str(file.parent))) for w in words]
     process = subprocess.run(
         [sys.executable, "-c", SAY_ALL, json.dumps(orders)],
         capture_output=True,

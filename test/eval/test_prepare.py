@@ -7,7 +7,7 @@ from textwrap import dedent
 
 import pytest
 
-from finforce_eval import preparation
+from finforce_eval.cli import prepare as preparation
 from finforce_eval.cli.main import main
 from finforce_ifea.errors import ContactError
 from finforce_ifea.jaw import calibration
@@ -26,7 +26,7 @@ START = dedent("""
             pass
 
     event.register("numba:compile", Listener())
-    from finforce_eval import preparation
+    from finforce_eval.cli import prepare as preparation
     from finforce_ifea.estimator import ForceEstimator
     from finforce_ifea.jaw.jaw import load_jaw
 
@@ -41,7 +41,7 @@ GRASP = dedent("""
 
     from numba.core.dispatcher import Dispatcher
 
-    from finforce_eval import preparation
+    from finforce_eval.cli import prepare as preparation
     from finforce_eval.cli.main import main
     from finforce_eval.recordings.recording import DEMO
 

@@ -9,7 +9,7 @@ from geometry_msgs.msg import PoseStamped
 from std_msgs.msg import Header
 
 from finforce.ros import tracing
-from finforce_eval.replay.trace import (
+from finforce_eval.cli.trace import (
     WAY,
     Trace,
     TraceError,

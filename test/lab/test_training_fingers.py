@@ -9,10 +9,8 @@ import shapely
 pytest.importorskip("open3d", reason="scenes are rendered with Open3D: pip install open3d")
 pytest.importorskip("cv2", reason="pictures need OpenCV: pip install opencv-contrib-python-headless")
 
-from finforce_ifea.jaw.jaw import load_jaw
 from lab.training.commands import read_share
-from lab.training.fingers import FIRST_VALIDATION, SEED, BentFinger, draw_finger, outline
-from lab.training.jaw_files import write_jaws
+from lab.training.fingers import BentFinger, draw_finger, outline
 from lab.training.pictures import MARGIN, FingerPictures
 from lab.training.scenes import ANYWHERE, KEYPOINTS, STATES, FingerScenes, load_textures
 
@@ -103,16 +101,3 @@ def test_textures_are_there_with_their_sources():
     folder = __import__("lab.training.scenes", fromlist=["TEXTURES"]).TEXTURES
     said = (folder / "SOURCES.md").read_text(encoding="utf-8")
     assert all(path.stem in said for path in folder.glob("*.jpg"))
-
-
-def test_random_fingers_become_jaw_files_as_those_of_a_user_do(tmp_path, capsys):
-    paths = write_jaws(tmp_path, 2, 30_000)
-    assert [path.name for path in paths] == ["random_30002.yaml", "random_30010.yaml"]
-    assert capsys.readouterr().out.split() == [str(path) for path in paths]
-    for path in paths:
-        finger = draw_finger(np.random.default_rng((SEED, FIRST_VALIDATION + int(path.stem.split("_")[1]))))
-        jaw = load_jaw(path)
-        assert jaw.section.clamped_z == pytest.approx(finger.clamped_z, abs=1e-4)
-        away = np.linalg.norm(np.diff(jaw.keypoints[:, [0, 2]], axis=0), axis=1)
-        drawn = finger.keypoints[finger.keypoints[:, 1] > finger.clamped_z + 1e-3]
-        assert len(jaw.keypoints) == len(drawn) and away.min() > 1e-3

@@ -16,11 +16,11 @@ from finforce_keypoints.errors import NamingError
 from finforce_keypoints.geometry.side_picture import find_side, project_plane
 from finforce_keypoints.geometry.template import find_shape, fit_grid
 from lab.training.commands import LabelFileError
-from lab.training.finetune import load_project
-from lab.training.labels import (
+from lab.training.finetune import (
     CameraView,
     LabelledImage,
     find_origin,
+    load_project,
     parse_camera,
     read_camera,
     read_labels,

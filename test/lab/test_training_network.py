@@ -25,11 +25,19 @@ from lab.training.commands import CheckpointError, DatasetError, RecipeError
 from lab.training.evaluate import Detections, fit_factor, fit_shift, score_detections
 from lab.training.export import load_checkpoint, read_network, save_checkpoint, shift_likelihoods, write_network
 from lab.training.export import main as export_main
-from lab.training.losses import COVERED, choose_points, compute_losses
 from lab.training.network import FingerNetwork, NetworkShape, fold_batch_norm
 from lab.training.pictures import MARGIN, TRAIN, VALIDATION, FingerPictures, load_pictures, save_shard
 from lab.training.quantize import quantize_network
-from lab.training.train import CHECKPOINT, FingerTraining, Recipe, compute_rate, detect
+from lab.training.train import (
+    CHECKPOINT,
+    COVERED,
+    FingerTraining,
+    Recipe,
+    choose_points,
+    compute_losses,
+    compute_rate,
+    detect,
+)
 from lab.training.train import main as train_main
 
 STILL = AugmentSettings(
