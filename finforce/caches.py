@@ -85,7 +85,7 @@ def keep_compiled() -> None:
         folder = cache_folder() / "compiled" / _name_sources(ROOT)
         refuse_foreign(folder)
     except CacheError as error:
-        print(f"finforce: {error}; compiled code is kept for this process alone", file=sys.stderr)
+        print(f"finforce: {error}; compiled code is kept for this process only", file=sys.stderr)
         folder = Path(mkdtemp(prefix="finforce_"))
         atexit.register(shutil.rmtree, folder, ignore_errors=True)
     with suppress(OSError, RuntimeError):

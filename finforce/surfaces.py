@@ -91,7 +91,7 @@ def _load_cells(path: Path) -> tuple[NDArray, Cells]:
 def _refuse_other_kinds(content: bytes) -> None:
     """Refuse by name what has the ending of a mesh and is none, or one of a version that is not read."""
     if content[:4] == b"glTF" and content[4:8] == b"\1\0\0\0":
-        raise FileError("is glTF 1.0, expected 2.0: export it anew, from Blender as one")
+        raise FileError("is glTF 1.0, expected 2.0: export it again, from Blender as one")
     header, end, _ = content.partition(b"end_header")
     if content[:3] == b"ply" and end and b"element vertex 0" not in header:
         if b"f_dc_0" in header:

@@ -43,7 +43,7 @@ def check_pose(T: ArrayLike, what: str = "pose") -> NDArray:
     error = float(np.abs(scaling - _UNIT).max())
     if not error <= _TOLERANCE or turned < 0.0 or np.abs(T[3] - _LAST).max() > 1e-9:
         raise PoseError(
-            f"{what}: got a matrix that is no rigid motion (R^T R off by {error:.2g}, det R {turned:.4g}, "
+            f"{what}: got a matrix that is not a rigid motion (R^T R off by {error:.2g}, det R {turned:.4g}, "
             f"last row {T[3].tolist()}), expected [[R, t], [0, 1]] without scale or mirroring"
         )
     for _ in range(_STEPS if error > _ROUNDING else 0):

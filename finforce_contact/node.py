@@ -119,7 +119,7 @@ class ContactEstimatorNode(ros.ImageNode):
         self._serve()
         self.idling = {side: Idling() for side in self.sides}
         self._subscribe()
-        self.get_logger().info(f"jaws: {parameters.jaws}, ready, object poses by {parameters.pose_source}")
+        self.get_logger().info(f"jaws: {parameters.jaws}, ready, object poses from {parameters.pose_source}")
 
     def _serve(self) -> None:
         """Offer services, whose long work holds up nothing else, and diagnostics."""
@@ -188,7 +188,7 @@ class ContactEstimatorNode(ros.ImageNode):
                 return
             if self.gates[side].enter(stamp, self.now()):
                 self.session.restart(side)
-                self.get_logger().warning("the stamps went back: a new recording; poses and contacts are forgotten")
+                self.get_logger().warning("the stamps jumped back: poses and contacts are cleared")
             self.idling[side].end()
             self._send(side, began, self.session.take_jaw_pose(side, pose))
             self.idling[side].note(stamp, self.session.jaws[side].loop.is_idle and self.skips.allows(IDLE))

@@ -342,7 +342,7 @@ class ContactSession:
                 jaw.reset()
             if self.camera:
                 self.camera.reset()
-        return "contacts and poses are forgotten; the object stays"
+        return "contacts and poses are cleared; the object is kept"
 
     def restart(self, side: str) -> None:
         """Forget a jaw's contact and the object's pose: their stamps belong to an earlier recording."""

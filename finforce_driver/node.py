@@ -205,7 +205,7 @@ class GripperDriverNode(Node):
         except MissingDependencyError:
             kind = None
         if kind is None:
-            self.get_logger().info(f"no action {topic}: control_msgs, or its {name}, is not installed")
+            self.get_logger().info(f"action {topic} is not available: {name} of control_msgs is not installed")
             return None
         read, fill = move_from_gripper_command, fill_gripper_command
         if name == "ParallelGripperCommand":

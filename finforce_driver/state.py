@@ -190,12 +190,12 @@ SILENT = (
     "the adapter's baud_rate"
 )
 OTHER_NODE = "no gripper answers at node {node}, but one does at node {other}: set node_id to {other}"
-LOST = "{what}; the jaws were stopped, and where they are is not known: stop other programs, clear the jaws, calibrate"
+LOST = "{what}; the jaws were stopped at an unknown opening: stop other programs, clear the jaws, calibrate"
 OTHER_MASTER = "another program commands this gripper ({what}): stop it, then command again"
 REBOOTED = "the gripper lost its calibration, it was probably restarted: calibrate it"
 UNCALIBRATED = "the gripper is not calibrated: keep the jaws clear, then calibrate"
 HALF_CALIBRATED = "a calibration was cut short: calibrate again, which restarts the gripper and takes 3 s longer"
-STOP_PENDING = "emergency stop pending: the gripper has not confirmed it, its jaws may go on moving; it is sent again"
+STOP_PENDING = "emergency stop pending: the gripper has not confirmed it, its jaws may still move; the stop is repeated"
 STOPPED = "emergency stop: make the place safe, then clear the errors"
 FAULTS = {
     "temperature": "the motor is too hot: let it cool, use less force, then clear the errors",

@@ -218,7 +218,7 @@ class ForceEstimator:
             return ""
         found = np.round(1e3 * heights, 1).tolist()
         where = f"contact at heights {found} mm, expected {1e3 * low:g} to {1e3 * high:g} mm"
-        return f"{where}: beyond, key points tell no force"
+        return f"{where}: beyond, key points show no force"
 
     def _await_tare(self) -> str:
         """Return what is missing for the first tare, empty when it is done or not due."""

@@ -107,7 +107,7 @@ def build_chosen(jaw: Jaw, settings: EstimatorSettings) -> Mechanics:
     except ContactError as error:
         if chosen is settings:
             raise
-        logging.getLogger(__name__).warning("no stored equilibria of %s (%s); every step is slower", jaw.name, error)
+        logging.getLogger(__name__).warning("no stored equilibria for %s (%s); every step is slower", jaw.name, error)
         return build_mechanics(jaw, settings)
 
 
@@ -122,7 +122,7 @@ def _reduce(jaw: Jaw, settings: EstimatorSettings) -> Mechanics:
 
     if settings.force_axes != "normal":
         raise JawFileError(
-            f"solver {settings.solver} knows forces in the jaw's plane alone; expected force_axes normal"
+            f"solver {settings.solver} supports only forces in the jaw's plane; expected force_axes normal"
         )
     full = build_mechanics(jaw, choose_full(settings))
     return reduce_mechanics(full, jaw, linear=settings.solver == "linear")

@@ -363,7 +363,7 @@ class IfeaSolverNode(ros.ImageNode):
 
     def _restart(self, reason: str) -> str:
         self.estimator.reset()
-        self.get_logger().warning(f"{reason}; the estimator begins anew")
+        self.get_logger().warning(f"{reason}; the estimator restarts")
         return reason
 
     def _report(self, alarms: list[Outcome]) -> Report:

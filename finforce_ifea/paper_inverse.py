@@ -234,7 +234,7 @@ def solve_program(hessian: NDArray, gradient: NDArray, lower: NDArray) -> tuple[
     H, g = hessian / np.outer(scale, scale), gradient / scale
     if np.linalg.eigvalsh(H)[0] < _SINGULAR:
         raise UnobservableError(
-            "the active key points do not tell the forces apart; give an energy weight or fewer contacts"
+            "the active key points do not distinguish the forces; give an energy weight or fewer contacts"
         )
     size = np.abs(g).max()
     if size == 0.0:

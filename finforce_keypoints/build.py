@@ -88,7 +88,7 @@ def _build_whole_image_detector(jaws: Mapping[str, Jaw], parameters: DetectorPar
     """
     if not parameters.model:
         raise ModelError(
-            "detection_method frame: got no model, and the shipped network sees rectified side planes; expected the "
+            "detection_method frame: got no model, and the included network needs rectified side planes; expected the "
             "folder of a DeepLabCut network as `model`, or detection_method network"
         )
     model = KeypointModel(parameters.model, threads=parameters.threads)

@@ -38,7 +38,7 @@ def report_of_rest(alarms: Sequence[Outcome], values: Mapping[str, str]) -> Repo
     """Return the state of a node that nobody listens to: standing faults, and values."""
     level = max((alarm.level for alarm in alarms), default=Level.OK)
     said = [alarm.text for alarm in alarms]
-    return Report(level=level, message="; ".join([*said, "rests: nobody subscribes to the key points"]), values=values)
+    return Report(level=level, message="; ".join([*said, "idle: no subscriber on the key points"]), values=values)
 
 
 def describe(feed: RgbdFeed, method: str, found: JawKeypoints | None) -> dict[str, str]:

@@ -173,7 +173,7 @@ class KeypointDetectorNode(ros.ImageNode):
         self.detector.warm_up()  # before images come: those that came meanwhile would be lost
         self._serve()
         self._subscribe()
-        self.get_logger().info(f"jaws: {parameters.jaws}, ready, key points by {self.detector.name}")
+        self.get_logger().info(f"jaws: {parameters.jaws}, ready, key points from {self.detector.name}")
 
     def _serve(self) -> None:
         """Offer services and diagnostics."""
@@ -263,9 +263,9 @@ class KeypointDetectorNode(ros.ImageNode):
             raise ObservationError(f"waiting for the camera's pose on /tf, {arrow}, or set T_gripper_camera")
         self._mounting = False
         if T_gripper_camera is None:
-            self.get_logger().warning(f"/tf has no {arrow}: T_gripper_camera is that of the shipped mount")
+            self.get_logger().warning(f"/tf has no transform {arrow}: using the default T_gripper_camera")
             return
-        self.get_logger().info(f"the camera's pose is that of /tf, {arrow}")
+        self.get_logger().info(f"camera pose taken from /tf, {arrow}")
         if not np.allclose(T_gripper_camera, self.parameters.camera_pose, atol=1e-6):
             self.parameters = replace(self.parameters, T_gripper_camera=pose_numbers(T_gripper_camera))
             self.detector = self._build(self.parameters, settings=self._settings)
@@ -293,7 +293,7 @@ class KeypointDetectorNode(ros.ImageNode):
         self.detector.reset()
         self.feed.reset()
         self.found = {}
-        self.get_logger().warning(f"{reason}; images and jaws are forgotten")
+        self.get_logger().warning(f"{reason}; images and jaws are cleared")
         return reason
 
     def _report(self, side: str, alarms: list[Outcome]) -> Report:

@@ -220,7 +220,7 @@ class TwinParameters:
     finger: int = setting(0, "Seed of the jaws' material", "", 0, 2**31 - 1)
     light: str = setting("", "Light: bright, dim or any; empty: that of the scene")
     object: str = setting("", "Object, by the name of a shape or a mesh file; empty: that of the scene")
-    jaw_file: str = setting("", "Jaw, by the name of a shipped one or a jaw file; empty: that of the scene")
+    jaw_file: str = setting("", "Jaw file, or name of an included jaw; empty: that of the scene")
     size: str = setting("640x480", "Size of the images, WIDTHxHEIGHT [px]")
     depth_step: float = setting(0.001, "Resolution of the depth image", "m", 1e-5, 0.01)
     loop: bool = setting(True, "Whether the scene is repeated; else the node ends with it")

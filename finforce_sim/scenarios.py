@@ -38,7 +38,7 @@ class Scenario:
     """
 
     name: str
-    jaw: str = setting("bench", "Jaw, by the name of a shipped one or a jaw file", "")
+    jaw: str = setting("bench", "Jaw file, or name of an included jaw", "")
     object: str = setting("rod25", "Object, by a name of finforce_sim.objects or a mesh file; empty for none", "")
     unit: str = setting("m", "Unit of a mesh file", choices=("m", "mm", "cm", "inch"))
     scale: float = setting(1.0, "Scale of the object", "", 0.05, 20.0)

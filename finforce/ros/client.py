@@ -103,7 +103,7 @@ class GripperClient:
 
         The driver goes on holding the force, until something else is asked for.
         """
-        missing = f"{self._driver}: nobody listens to its grasp_goal; is the driver running?"
+        missing = f"{self._driver}: no subscriber on its grasp_goal; is the driver running?"
         _await(lambda: self._goals.get_subscription_count() > 0, DISCOVERY, missing)
         self._goals.publish(JointState(effort=[float(force)], velocity=[] if speed is None else [float(speed)]))
         sleep(TOLD)

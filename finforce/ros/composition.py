@@ -83,7 +83,7 @@ def _spin_apart(node: Node) -> None:
         pass
     except Exception:
         if node.context.ok():
-            node.get_logger().error(f"this node has stopped, the others go on\n{traceback.format_exc()}")
+            node.get_logger().error(f"this node has stopped; the others continue\n{traceback.format_exc()}")
 
 
 def main(args: Sequence[str] | None = None) -> int:

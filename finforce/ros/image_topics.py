@@ -50,7 +50,7 @@ def subscribe_to_images(
             timer.cancel()
         elif node.count_publishers(packed):
             timer.cancel()
-            node.get_logger().info(f"nobody publishes {topic}: {packed} is taken")
+            node.get_logger().info(f"no publisher on {topic}: using {packed}")
             subscribe(CompressedImage, packed)
 
     timer = node.create_timer(_LOOKED_FOR, look, clock=STEADY_CLOCK)

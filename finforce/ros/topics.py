@@ -265,7 +265,7 @@ class Stage:
         if not self.node.context.ok():
             raise error
         self.fault = f"{type(error).__name__}: {error}"
-        self.node.get_logger().error(f"this stage has stopped, the others go on\n{traceback.format_exc()}")
+        self.node.get_logger().error(f"this stage has stopped; the others continue\n{traceback.format_exc()}")
 
     def guard_taker(self, topic: str, callback: Callable) -> Callable:
         """Return a guarded callback for a topic's messages, after which others of the process may have their turn."""
@@ -324,7 +324,7 @@ class Stage:
 
         def take_as_it_comes(_: Any) -> None:
             if made:
-                self.node.get_logger().warning(f"{topic} comes with best effort: large messages may be lost")
+                self.node.get_logger().warning(f"{topic} is published best effort: large messages may be lost")
                 self.node.destroy_subscription(made.pop())
                 # the overrides now hold what was asked for at first
                 self.subscription(kind, topic, callback, SENSOR, qos_overriding_options=None, **options)

@@ -286,10 +286,8 @@ class SolverOptions:
     Each option is an argument of the launch files, where none stands for an empty text.
     """
 
-    jaw_file: str = setting("", "Jaw file or name of a shipped jaw; none: bench")
-    calibration_file: str = setting(
-        "", "Calibration file or name of a shipped calibration; none: material of the jaw file"
-    )
+    jaw_file: str = setting("", "Jaw file or name of an included jaw; none: bench")
+    calibration_file: str = setting("", "Calibration file or name of an included one; none: material of the jaw file")
     contact_height: float = setting(
         math.nan, "Height of first touch above the clamped base; nan: contacts come by topic", "m", 0.0, 0.5
     )
@@ -349,11 +347,9 @@ class RobotOptions(GripperOptions):
     camera_name: str = setting(
         "wrist_camera", "Topics /camera/NAME/..., frames NAME_...; none: topics and frame of the parameter file"
     )
-    camera_config: str = setting("", "YAML file with parameters of realsense2_camera; none: the shipped d405.yaml")
+    camera_config: str = setting("", "YAML file with parameters of realsense2_camera; none: the included d405.yaml")
     arm: bool = setting(False, "Start of the arm, a Kinova Gen3, by kortex_bringup; with sim one that is not there")
-    arm_description: str = setting(
-        "", "xacro file of arm and gripper; none: the shipped one, the gripper on the flange of a Gen3"
-    )
+    arm_description: str = setting("", "xacro file of arm and gripper; none: the gripper on the flange of a Gen3")
     robot_ip: str = setting("192.168.1.10", "Address of the arm")
     dof: int = setting(7, "Joints of the arm", choices=(6, 7))
 
@@ -362,7 +358,7 @@ class RobotOptions(GripperOptions):
 class StackOptions:
     """What is asked of a gripper that a manipulation stack drives."""
 
-    description: str = setting("", "xacro or URDF file of the robot; none: the gripper alone")
+    description: str = setting("", "xacro or URDF file of the robot; none: only the gripper")
     semantics: str = setting("", "SRDF file of the robot, for MoveIt; none: that of the gripper")
     controllers: str = setting("", "YAML file of the controllers; none: those of the gripper")
     gripper: bool = setting(True, "Start of the gripper driver")

@@ -366,7 +366,7 @@ class OrderWatch:
             self.heard, self._odd = True, 0
             return ""
         self._odd = (self._odd + 1) % LASTING
-        return "" if self._odd else "the gripper does not do what it was told last"
+        return "" if self._odd else "the gripper does not follow its last command"
 
     def strays(self, reply: Reply) -> bool:
         """Return whether the jaws are off their way, and the motor does not push them back to it."""

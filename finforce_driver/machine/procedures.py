@@ -215,7 +215,7 @@ class Travel:
         if travel + unseen < least:
             return f"{words}: is something between them? Take it out, then calibrate again"
         if travel < least:
-            return f"{words}, and too many replies were lost to tell whether that is all: calibrate again"
+            return f"{words}, and too many replies were lost to be sure: calibrate again"
         return ""
 
 

@@ -57,7 +57,7 @@ def run(options: argparse.Namespace) -> int:
                 lines.append(Task(name=name, key="", work=_run_dataset).line(one_line(error)))
                 _print_outcome(lines[-1])
     annotated = sum(map(_has_force, lines))
-    print(f"{annotated} of {len(lines)} annotated in {out}; {manifest.path.name} tells of each")
+    print(f"{annotated} of {len(lines)} annotated in {out}; {manifest.path.name} lists them")
     return 2 if not annotated or any(line["status"] != OK for line in lines) else 0
 
 

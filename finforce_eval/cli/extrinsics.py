@@ -53,7 +53,7 @@ def read_at_rest(options: argparse.Namespace) -> tuple[KeypointSource, Recording
     """
     options.source = "images"
     if options.images < 5:
-        raise OptionError(f"--images {options.images}: expected at least 5, the mean of which is taken")
+        raise OptionError(f"--images {options.images}: expected at least 5, which are averaged")
     source = parse_source(options)
     sides = sides_of(options)
     (recording,) = read_recordings(options.bags, source.choice, sides, strict=source.strict)

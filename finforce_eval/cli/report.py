@@ -39,7 +39,7 @@ def run(options: argparse.Namespace) -> None:
         tables += files
         recorded += [] if files else read_forces(source)
     if not tables and not recorded:
-        raise OptionError(f"{' '.join(options.sources)}: a manifest alone; expected the recordings next to it")
+        raise OptionError(f"{' '.join(options.sources)}: only a manifest; expected the recordings next to it")
     if tables and recorded:
         raise OptionError("recordings and folders of evaluations: expected the one or the other")
     if tables:

@@ -105,7 +105,7 @@ def judge_picture(color: NDArray) -> list[Finding]:
     tiles = [part for row in np.array_split(grey, TILES) for part in np.array_split(row, TILES, axis=1)]
     flat = 100.0 * np.mean([part.std() < FLAT for part in tiles])
     if flat > 100.0 * COVERED:
-        text = f"{flat:.0f} % of the picture show nothing at all: is the lens partly covered?"
+        text = f"{flat:.0f} % of the image are empty: is the lens partly covered?"
         findings.append(Finding(WARNING, text))
     return findings or [Finding(OK, f"brightness {level:.0f} of 255, fine detail {sharpness:.2f} of coarse")]
 
@@ -141,13 +141,11 @@ def _describe_camera(recording: Recording, depth: str) -> Iterator[Finding]:
     )
     aspect = camera.fx / camera.fy
     if not 0.97 < aspect < 1.03:
-        yield Finding(
-            WARNING, f"fx / fy is {aspect:.3f}; expected 1: are the intrinsics those of a picture of another size?"
-        )
+        yield Finding(WARNING, f"fx / fy is {aspect:.3f}; expected 1: are the intrinsics those of another image size?")
     aside = np.hypot(camera.cx - 0.5 * (camera.width - 1), camera.cy - 0.5 * (camera.height - 1))
     if aside > 0.1 * camera.width:
         yield Finding(
-            WARNING, f"principal point {aside:.0f} px off the middle: was the picture cut, and the intrinsics not?"
+            WARNING, f"principal point {aside:.0f} px off the middle: was the image cropped, but not the intrinsics?"
         )
 
 
@@ -210,7 +208,7 @@ def _find_reasons(mean: RgbdImage, source: KeypointSource, recording: Recording,
     return [
         Finding(
             WARNING,
-            "no better upside down, mirrored, with other conventions of the extrinsics or with another shipped finger: "
+            "no better upside down, mirrored, with other conventions of the extrinsics or another included finger: "
             "are the jaws in view, lit, and within some 15 mm of where the extrinsics say?",
         )
     ]
@@ -242,8 +240,8 @@ def _readings(image: RgbdImage, source: KeypointSource, T: NDArray) -> Iterator[
     """Yield other readings: in words, and the image, the extrinsics and the jaw file by them."""
     own = source.jaw_file
     turned, mirrored = _flip(image, rows=True, columns=True), _flip(image, rows=False, columns=True)
-    yield "the picture is turned upside down: rotate it, or turn T_gripper_camera by 180 degrees", turned, T, own
-    yield "the picture is mirrored: switch that off in the camera's driver", mirrored, T, own
+    yield "the image is upside down: rotate it, or turn T_gripper_camera by 180 degrees", turned, T, own
+    yield "the image is mirrored: disable that in the camera's driver", mirrored, T, own
     body = _pose_of(Rotation.from_matrix([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]))
     poses = {
         "T_gripper_camera is inverted, the gripper in the camera's frame: give its inverse": invert_pose(T),

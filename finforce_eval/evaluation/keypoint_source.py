@@ -333,7 +333,7 @@ def detect_keypoints(
         commonest = max(reasons, key=reasons.get, default="")
         why = commonest or "; ".join(warnings) or "no jaw stands where it could be; another --extrinsics?"
         raise RecordingError(f"{recording.name}: no key points in {len(images)} images: {why}")
-    notes = [f"{count} images refused: {text}" for text, count in reasons.items()] + warnings
+    notes = [f"{count} images rejected: {text}" for text, count in reasons.items()] + warnings
     notes += [f"the {side} jaw is in none of the images" for side, seen in found.items() if not seen]
     recording = replace(recording, notes=(*recording.notes, *notes))
     return with_detections(recording, found, dict.fromkeys(found, step_ms), passed)

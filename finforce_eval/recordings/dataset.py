@@ -374,7 +374,7 @@ class EpisodeImages:
             if isinstance(stored, dict):
                 data = stored.get("bytes")
             if not isinstance(data, bytes):
-                raise RecordingError(f"{what} is no picture")
+                raise RecordingError(f"{what} is not an image")
             try:
                 picture = decode_picture(data, what, formats=None)
             except ImageError as error:

@@ -97,7 +97,7 @@ def read_recording(
     known = [side for side in JAWS if _has_jaw(samples, side, images is not None) or (images and side in sides)]
     if images and not known:
         known = JAWS
-        notes.append("no topic tells which jaws its images show: both are looked for; --jaws left or right names one")
+        notes.append("no topic states which jaws its images show: looking for both; --jaws left or right selects one")
     jaws = {side: _jaw_track(samples, side, name) for side in known}
     if not jaws:
         what = "/left/keypoints and /right/keypoints have no messages; no colour images either"
@@ -197,7 +197,7 @@ def _keypoint_track(samples: Sequence[Any], side: str, name: str) -> KeypointTra
     infinite = np.isinf(points).any(axis=(1, 2))
     if infinite.any():
         first = int(np.argmax(infinite))
-        raise RecordingError(f"{name}: {topic} message {first} has infinite coordinates; NaN says 'no point'")
+        raise RecordingError(f"{name}: {topic} message {first} has infinite coordinates; use NaN for 'no point'")
     likelihood, stated = np.stack([c.likelihood for c in clouds]), [c.stddev is not None for c in clouds]
     if any(stated) and not all(stated):
         first = stated.index(not stated[0])

@@ -193,7 +193,7 @@ def play_recording(node: PlayerNode, _: Executor) -> None:
     node.offer(messages)
     awaited = find_awaited(messages.types, parameters)
     if not node.wait_for(lambda: node.has_listeners(awaited), parameters.patience):
-        node.get_logger().warning(f"nobody listens to one of {', '.join(awaited)}; all are played all the same")
+        node.get_logger().warning(f"no subscriber on one of {', '.join(awaited)}; playing anyway")
     node.play(messages, rate=parameters.rate)
     node.spin_until(monotonic() + 0.5)
 

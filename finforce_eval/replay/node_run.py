@@ -83,7 +83,7 @@ def _await_listeners(player: PlayerNode, nodes: ProcessGroup, topics: Collection
         return player.has_listeners(topics)
 
     if not player.wait_for(ready, PATIENCE):
-        raise ProcessError(f"nobody listens to {' or '.join(topics)} after {PATIENCE:g} s")
+        raise ProcessError(f"no subscriber on {' or '.join(topics)} after {PATIENCE:g} s")
 
 
 def run_nodes(

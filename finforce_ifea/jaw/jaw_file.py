@@ -303,5 +303,5 @@ class JawEntry(FileModel):
         if source == "drawing" and self.inner_face_x is not None:
             raise ValueError("inner_face_x: a drawing has its own, expected none")
         if source == "mesh" and self.inner_face_x is None:
-            raise ValueError("inner_face_x is missing; a mesh does not tell it")
+            raise ValueError("inner_face_x is missing; it is required with a mesh")
         return self

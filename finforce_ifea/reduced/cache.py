@@ -63,7 +63,7 @@ def fetch_manifold(key: str, build: Callable[[], Manifold]) -> Manifold:
     try:
         path = cache_folder() / f"{key}.npz"
     except CacheError as error:
-        _LOG.warning("%s; the equilibria are built anew", error)
+        _LOG.warning("%s; the equilibria are rebuilt", error)
         return build()
     found = _read(path)
     if found is not None:
@@ -87,7 +87,7 @@ def _read(path: Path) -> Manifold | None:
     except FileNotFoundError:
         return None
     except _UNREADABLE as error:
-        _LOG.warning("the stored equilibria %s cannot be read (%s); they are built anew", path.name, error)
+        _LOG.warning("the stored equilibria %s cannot be read (%s) and are rebuilt", path.name, error)
         return None
     values["young_modulus"] = float(values["young_modulus"])
     return Manifold(**values)
@@ -116,7 +116,7 @@ def _write(path: Path, manifold: Manifold) -> None:
     except OSError as error:
         with suppress(OSError):
             part.unlink(missing_ok=True)
-        _LOG.warning("the equilibria cannot be stored in %s (%s); the next start builds them anew", path.parent, error)
+        _LOG.warning("the equilibria cannot be stored in %s (%s); the next start rebuilds them", path.parent, error)
 
 
 def reduce_mechanics(full: Mechanics, jaw: Jaw, *, linear: bool = False) -> Mechanics:

@@ -74,7 +74,7 @@ class ModelMetadata(FileModel):
     bodyparts: tuple[str, ...] = _key("metadata.bodyparts", ..., "Names in the order of the heatmaps", min_length=1)
     individuals: tuple[str, ...] = _key("metadata.individuals", (), "Names of the animals")
     colormode: Colours = _key("data.colormode", "RGB", "Order of the colours that the network was trained on")
-    normalize_images: StrictBool = _key("data.inference.normalize_images", True, "Whether ImageNet's mean is taken off")
+    normalize_images: StrictBool = _key("data.inference.normalize_images", True, "Whether ImageNet's mean is removed")
     pad_height_divisor: Side = _key(f"{_PADDING}.pad_height_divisor", 1, "Heights are padded to its multiples [px]")
     pad_width_divisor: Side = _key(f"{_PADDING}.pad_width_divisor", 1, "Widths are padded to its multiples [px]")
     type: str = _key(f"{_HEAD}.predictor.type", _PREDICTOR, "Kind of decoding")

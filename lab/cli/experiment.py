@@ -19,11 +19,11 @@ QUICK_SIZE = "320x240"
 # what each does, and the module in which it stands under its name in capitals
 EXPERIMENTS = {
     "bench": ("Table I: nine cylinders pressed on one jaw", "paper_tables"),
-    "places": ("Table II: what knowing the place is worth", "paper_tables"),
+    "places": ("Table II: value of knowing the contact location", "paper_tables"),
     "grasp": ("27 grasps: three objects, places and forces, both jaws", "grasp"),
     "manipulation": ("a held weight of 100 g that is turned, in two lights", "manipulation"),
-    "chip": ("what breaks at 5.43 N, grasped to 5 N by force, position and current", "chip"),
-    "network": ("an end-to-end network on what it has seen and what it has not", "network"),
+    "chip": ("an object that breaks at 5.43 N, grasped to 5 N by force, position and current", "chip"),
+    "network": ("an end-to-end network on familiar and unfamiliar grasps", "network"),
     "pose": ("poses of the object that are late, flipped or lost", "pose"),
 }
 

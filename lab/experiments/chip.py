@@ -32,7 +32,7 @@ STRONG = 0.5  # [A], with which the jaws go to an opening
 WAYS = {
     "force": "force feedback",
     "position": "position alone",
-    "current": "the motor's current alone",
+    "current": "only the motor's current",
 }
 SPREAD = ("least", "mean", "largest")
 DRAWN_EVERY = 20  # milliseconds

@@ -140,7 +140,7 @@ def find(options: RunOptions, figures: Mapping[str, Mapping[str, Any]], folder: 
     )
     each = grasps[["case", *GRASP_COLUMNS]].rename(columns={"case": "grasp", **GRASP_COLUMNS})
     return Figures(
-        tables={"By what the network has seen": groups, "Each grasp": each},
+        tables={"By familiarity of the grasp to the network": groups, "Each grasp": each},
         notes=[note],
         drawn={"Measured force (dashed), finforce (blue), network (orange)": "network.png"},
     )

@@ -228,10 +228,10 @@ BENCH = Experiment(
 )
 PLACES = Experiment(
     name="places",
-    title="Table II: what knowing the place is worth",
+    title="Table II: value of knowing the contact location",
     about=(
         "The paper presses a cylinder of 15 mm at three places and solves each with the place fixed at all three, and "
-        "with its contact estimator. A place at which the key points do not fit is refused here, rather than answered; "
+        "with its contact estimator. A location that the key points do not fit is rejected here instead of answered; "
         "such a cell shows what was answered."
     ),
     list_cases=list_places,

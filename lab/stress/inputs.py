@@ -473,7 +473,7 @@ FAMILIES = (
     press_family("stamps", "stamps that stall, jitter, repeat or leap", same(*STAMPS), stamp_otherwise, rounds=8),
     Family(name="long", what="one in ten of many steps without a new start", run=run_long),
     press_family("contacts", "another contact in every image", list_changes, switch_contacts, rounds=8),
-    press_family("wrong", "contacts said to be where they are not", same(*WRONG), tell_contact, rounds=12, ruled=False),
+    press_family("wrong", "wrong contact locations", same(*WRONG), tell_contact, rounds=12, ruled=False),
     press_family("right", "contacts in every form there is", same(*RIGHT), tell_contact, rounds=12),
     press_family(
         "axes",

@@ -257,7 +257,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--camera", type=Path, required=True, help="YAML of intrinsics and T_gripper_camera")
     parser.add_argument("--network", type=Path, required=True, help="folder of the exported network to begin with")
     parser.add_argument("-o", "--output", type=Path, required=True, help="folder of the fine-tuned network")
-    parser.add_argument("--jaw", default="bench", help="jaw file, or the name of a shipped jaw")
+    parser.add_argument("--jaw", default="bench", help="jaw file, or name of an included jaw")
     parser.add_argument("--sides", nargs="+", choices=SIDES, default=SIDES, help="labelled jaws (both)")
     parser.add_argument("--map", nargs="*", default=[], help="BODYPART=NAME for body parts with names of their own")
     parser.add_argument("--dataset", type=Path, help="shards of training.scenes, mixed in against forgetting")
@@ -300,7 +300,7 @@ def load_project(
         labels: of its images.
         folder: that holds them.
         view: of their camera.
-        jaw: jaw file, or the name of a shipped jaw.
+        jaw: jaw file, or name of an included jaw.
         sides: which jaws are labelled.
         mapping: names of the jaw's points by body part, where they differ.
 

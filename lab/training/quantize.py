@@ -38,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("network", type=Path, help="folder of the network, with pytorch_config.yaml")
     parser.add_argument("recordings", nargs="+", help="recordings with images")
     parser.add_argument("-o", "--output", type=Path, required=True, help="folder of the network in bytes")
-    parser.add_argument("--jaw", default="bench", help="jaw file, or the name of a shipped jaw")
+    parser.add_argument("--jaw", default="bench", help="jaw file, or name of an included jaw")
     parser.add_argument("--method", choices=("network", "frame"), default="network", help="what shows it pictures")
     options = parser.parse_args(arguments)
     with one_line_errors():

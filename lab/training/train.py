@@ -339,7 +339,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, help="folder of the run")
     parser.add_argument("--limit", type=int, help="train on the first so many pictures only")
     parser.add_argument("--network", type=Path, help="begin with the weights of an exported network")
-    parser.add_argument("--resume", action="store_true", help="go on from the checkpoint in the folder of the run")
+    parser.add_argument("--resume", action="store_true", help="resume from the checkpoint in the run folder")
     add_settings(parser, Recipe)
     options = parser.parse_args(arguments)
     with one_line_errors():

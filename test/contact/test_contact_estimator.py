@@ -90,7 +90,7 @@ class TestWhatIsNotKnown:
             T[entry] = value
             with pytest.raises(PoseError):
                 estimator.take_pose(FRAME, T)
-        with pytest.raises(PoseError, match="no rigid motion"):
+        with pytest.raises(PoseError, match="not a rigid motion"):
             estimator.take_pose(FRAME, np.diag([2.0, 2.0, 2.0, 1.0]))
         assert estimator.update(2 * FRAME, pressed(1 * MM)[1]).status == "touching"
 

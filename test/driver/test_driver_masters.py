@@ -54,7 +54,7 @@ def test_a_gripper_that_another_program_switched_off_stays_off(rig):
     rig.emulated.handle(OFF)
     rig.live(2.0)
     begin = rig.clock.now()
-    assert "does not do what it was told last" in rig.state.message
+    assert "does not follow its last command" in rig.state.message
     assert (rig.state.phase, rig.state.activated) == (Phase.READY, False)
     rig.live(1.0)
     assert rig.orders(begin) == []

@@ -269,7 +269,7 @@ def test_key_point_that_no_force_moves_tells_nothing():
 
 def test_two_forces_at_one_place_cannot_be_told_apart():
     loaded = load_finger("solid", [0.040, 0.040], lambda normals: -0.3 * normals)
-    with pytest.raises(UnobservableError, match="tell the forces apart"):
+    with pytest.raises(UnobservableError, match="distinguish the forces"):
         recover(loaded)
 
 

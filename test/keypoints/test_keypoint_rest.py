@@ -30,7 +30,7 @@ def test_without_a_listener_images_are_not_looked_at_and_with_the_first_they_are
         bench.shoot()
     probe.wait_for(lambda: counted(bench, UNHEARD) == "3")
     assert not bench.node.detector.images
-    state = bench.diagnosis(level=Level.OK, word="rests: nobody subscribes")
+    state = bench.diagnosis(level=Level.OK, word="idle: no subscriber")
     assert int({entry.key: entry.value for entry in state.values}[f"skipped: {UNHEARD}"]) > 0
     probe.hear("left/keypoints", PointCloud2)
     probe.wait_for(lambda: bench.node.out.are_heard)

@@ -170,7 +170,7 @@ def _describe_finger(finger: RecognizedFinger, section: str, name: str) -> list[
         f"  file: {section}  # polygons in the x-z plane",
         f"  width: {finger.width:.5g}" + ("  # at x = z = 0" if tapers else ""),
         *([f"  taper: [{finger.taper[0]:.5f}, {finger.taper[1]:.5f}]  # of the width, by x and z"] if tapers else []),
-        f"  clamped: {{{clamped}}}  # what the holder keeps from moving; circles: [x, z, radius] about bolts",
+        f"  clamped: {{{clamped}}}  # held by the holder; circles: [x, z, radius] about bolts",
         f"inner_face_x: {finger.face_x:.5g}",
         f"material: {name}  # {1e-6 * material.young_modulus:.3g} MPa +- {material.spread:.0%}, until it is calibrated",
         "keypoints:  # on the side that the camera sees: where ribs meet bands, of few also between, and the tip",
