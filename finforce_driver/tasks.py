@@ -88,8 +88,8 @@ class GripperTasks:
             self._gripper.wait(lambda state: not state.stop_pending, STOP_TIMEOUT)
         if self._gripper.state.phase in ABSENT or self._gripper.state.stop_pending:
             raise GripperStateError(
-                "emergency stop pending: no link to the gripper, whose jaws may go on moving; it is sent once one "
-                "answers, until clear_errors ends it"
+                "emergency stop pending: no link to the gripper, whose jaws may still move; the stop is sent once "
+                "it answers, until clear_errors ends it"
             )
         return "emergency stop: the jaws are limp; clear_errors ends it"
 

@@ -135,8 +135,8 @@ class KeypointDetector:
                 )
         if self._off_centre > _OFF_CENTRE:
             text = (
-                f"the jaws' middle lies {1e3 * self._off_centre:.0f} mm off the gripper's: is the picture cut and "
-                "camera_info not, or the camera elsewhere?"
+                f"the jaws' middle lies {1e3 * self._off_centre:.0f} mm off the gripper's: is the image cropped "
+                "without camera_info, or has the camera moved?"
             )
             said = {side: [*texts, text] for side, texts in said.items()}
         return {side: "; ".join(texts) for side, texts in said.items() if texts}

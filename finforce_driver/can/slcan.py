@@ -211,8 +211,8 @@ class SerialBus(Bus):
             )
         if self._parser.refused >= _SUSPICIOUS_REFUSALS:
             return (
-                f"the adapter at {self._name} refuses what is sent (BELL): does it know 1 Mbit/s? its queue also fills "
-                "when no gripper listens: check 24 V, CANH/CANL"
+                f"the adapter at {self._name} rejects messages (BELL): does it support 1 Mbit/s? Its queue also fills "
+                "when no gripper answers: check 24 V, CANH/CANL"
             )
         return ""
 

@@ -62,7 +62,7 @@ def test_an_image_without_the_jaw_has_no_key_points_and_no_pose(recording):
 
 def test_what_a_detector_refuses_is_counted_and_the_rest_goes_on(recording):
     found, _ = detect(recording, refused=(2, 3))
-    assert found.notes[-1] == "2 images refused: no picture for this detector"
+    assert found.notes[-1] == "2 images rejected: no picture for this detector"
     assert is_found(found.jaws["left"]).sum() == 10
 
 
@@ -86,7 +86,7 @@ class WithoutDepth(FakeDetector):
 
 def test_images_without_depth_are_a_note(recording):
     found = detect_keypoints(recording, WithoutDepth(recording))
-    assert found.notes[-1].startswith("2 images refused: the depth image is empty")
+    assert found.notes[-1].startswith("2 images rejected: the depth image is empty")
     assert is_found(found.jaws["left"]).tolist() == [False, False] + [True] * 10
 
 

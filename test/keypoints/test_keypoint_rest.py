@@ -49,7 +49,7 @@ def test_a_node_that_is_told_to_looks_at_images_that_nobody_asks_for(probe):
 def test_a_resting_node_that_hears_no_images_any_more_is_stale(probe):
     bench = CameraBench(probe, heard=False)
     bench.shoot()
-    bench.diagnosis(level=Level.OK, word="rests")
+    bench.diagnosis(level=Level.OK, word="idle")
     bench.diagnosis(level=Level.STALE, word="nothing has arrived")
 
 
