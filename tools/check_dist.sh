@@ -25,5 +25,5 @@ force = ff.ForceEstimator("bench", calibration="bench")
 poses, image = next(ff.iter_frames(recording, side="left"))
 print(ff.ForceLoop(ff.ContactEstimator(force.jaw, mesh=ff.load_object_mesh(ff.find_mesh(recording))), force).update(image))
 PY
-"$bin/finforce" convert-steel steel
-"$bin/finforce" evaluate steel --jaw steel --set automatic_tare=no | tail -n 2
+steel=$("$bin/python" -c 'import finforce; print(finforce.DEMO.with_name("steel_r20"))')
+"$bin/finforce" evaluate "$steel" --jaw steel --set automatic_tare=no | tail -n 2

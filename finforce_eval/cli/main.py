@@ -36,7 +36,6 @@ COMMANDS = {
     "experiment": "repeat an experiment of the paper on the twin or on recordings",
     "stress": "test the estimators with difficult input",
     "report": "show forces over time on an HTML page",
-    "convert-steel": "convert the photographs of the steel finger into a recording",
     "reconstruct": "make an object mesh and its pose from a masked depth image",
     "version": "print the version",
 }
@@ -51,7 +50,7 @@ def load_command(name: str) -> ModuleType:
         OptionError: The installed package comes without the lab.
     """
     if name not in LAB:
-        return import_module(f"{__package__}.{name.replace('-', '_')}")
+        return import_module(f"{__package__}.{name}")
     if not (CHECKOUT / "lab" / "cli").is_dir():
         raise OptionError(f"finforce {name} needs a checkout of the repository: clone it and run `make bench` there")
     if str(CHECKOUT) not in sys.path:

@@ -25,20 +25,8 @@ def import_onnx() -> ModuleType:
     return import_library("onnx", PURPOSE)
 
 
-class LabelFileError(FinforceError, ValueError):
-    """A label file is none of DeepLabCut's, or does not fit the jaw."""
-
-
-class DatasetError(FinforceError, ValueError):
-    """Shards are missing, or hold something else than pictures with their points."""
-
-
-class CheckpointError(FinforceError, ValueError):
-    """A checkpoint is missing, or of another network."""
-
-
-class RecipeError(FinforceError, ValueError):
-    """A setting of the training has a value that it cannot have."""
+class TrainingError(FinforceError, ValueError):
+    """Labels, shards, a checkpoint or a setting of the training cannot be used."""
 
 
 def add_settings(parser: ArgumentParser, record: type) -> None:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from finforce_keypoints.networks.side_network import SideNetwork
-from lab.training.commands import CheckpointError, one_line_errors
+from lab.training.commands import TrainingError, one_line_errors
 from lab.training.pictures import MARGIN, VALIDATION, FingerPictures, load_pictures
 
 THRESHOLD = 0.6  # DeepLabCut's cut-off of the likelihood
@@ -170,11 +170,11 @@ def fit_factor(detections: Detections, threshold: float = THRESHOLD) -> float:
     tails, and the larger factor counts.
 
     Raises:
-        CheckpointError: not one visible point is accepted.
+        TrainingError: not one visible point is accepted.
     """
     good = detections.visible & (detections.likelihood >= threshold)
     if not good.any():
-        raise CheckpointError(
+        raise TrainingError(
             f"no visible point is accepted at a likelihood of {threshold:g}; expected a longer training"
         )
     ratio = detections.errors[good] / detections.stddev[good]

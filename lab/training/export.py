@@ -25,7 +25,7 @@ from finforce_keypoints.networks.side_network import (
     METADATA,
     SideNetwork,
 )
-from lab.training.commands import CheckpointError, import_onnx, import_torch, one_line_errors, read_share
+from lab.training.commands import TrainingError, import_onnx, import_torch, one_line_errors, read_share
 from lab.training.evaluate import detect, fit_factor, fit_shift
 from lab.training.network import PIECE, ExportedCoarse, ExportedFine, FingerNetwork, NetworkShape, fold_batch_norm
 from lab.training.pictures import VALIDATION, load_pictures
@@ -145,7 +145,7 @@ def load_checkpoint(path: str | Path) -> dict[str, Any]:
     """Read a checkpoint: what `Training.save` has written.
 
     Raises:
-        CheckpointError: the file is missing, or no checkpoint.
+        TrainingError: the file is missing, or no checkpoint.
     """
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
@@ -153,7 +153,7 @@ def load_checkpoint(path: str | Path) -> dict[str, Any]:
         return content
     except Exception as error:  # torch raises whatever its unpickler does
         reason = str(error).partition("\n")[0]
-        raise CheckpointError(f"{path}: {reason}; expected a checkpoint written by training") from error
+        raise TrainingError(f"{path}: {reason}; expected a checkpoint written by training") from error
 
 
 def shape_from(content: Mapping[str, Any]) -> NetworkShape:
@@ -165,13 +165,13 @@ def build_averaged(content: Mapping[str, Any]) -> FingerNetwork:
     """Return the averaged network of a checkpoint, in evaluation mode.
 
     Raises:
-        CheckpointError: it is of another kind of network.
+        TrainingError: it is of another kind of network.
     """
     try:
         network = FingerNetwork(shape_from(content["shape"]))
         network.load_state_dict(content["averaged"])
     except (KeyError, RuntimeError) as error:
-        raise CheckpointError(f"{error!r}; expected a checkpoint of lab.training.train") from error
+        raise TrainingError(f"{error!r}; expected a checkpoint of lab.training.train") from error
     return network.eval()
 
 
@@ -179,14 +179,14 @@ def read_network(folder: Path) -> tuple[FingerNetwork, float]:
     """Return the network of an exported folder, with biases where batch norm was, and its factor of deviations.
 
     Raises:
-        CheckpointError: files are missing, or of another network.
+        TrainingError: files are missing, or of another network.
     """
     onnx, weights, said = import_onnx(), {}, {}
     for name, (there, here) in _PLACES.items():
         try:
             model = onnx.load(str(folder / name))
         except Exception as error:  # onnx raises whatever protobuf does
-            raise CheckpointError(f"{folder / name}: {error}; expected a network exported by training") from error
+            raise TrainingError(f"{folder / name}: {error}; expected a network exported by training") from error
         said = {entry.key: entry.value for entry in model.metadata_props}
         arrays = {item.name: onnx.numpy_helper.to_array(item) for item in model.graph.initializer}
         arrays |= _read_bytes(model, arrays)
@@ -203,11 +203,11 @@ def read_network(folder: Path) -> tuple[FingerNetwork, float]:
         network = FingerNetwork(shape_from(content["network"] | {"folded": True}))
         factor = float(content["stddev_factor"])
     except (KeyError, TypeError, ValueError) as error:
-        raise CheckpointError(f"{folder}: {error!r}; expected a network exported by training") from error
+        raise TrainingError(f"{folder}: {error!r}; expected a network exported by training") from error
     own = network.state_dict()
     missing = [name for name, _ in network.named_parameters() if name not in weights]
     if missing:
-        raise CheckpointError(f"{folder}: no weights for {', '.join(missing[:3])}; expected an untouched export")
+        raise TrainingError(f"{folder}: no weights for {', '.join(missing[:3])}; expected an untouched export")
     network.load_state_dict(own | {name: weights[name] for name, _ in network.named_parameters()})
     return network, factor
 

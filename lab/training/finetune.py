@@ -10,24 +10,22 @@ import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
-import yaml
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from finforce.camera import PLUMB_BOB, CameraIntrinsics
-from finforce.gripper_frames import SIDES, jaw_in_camera, jaw_in_gripper
+from finforce.camera import CameraIntrinsics
+from finforce.camera_file import read_camera
+from finforce.gripper_frames import SIDES, jaw_in_camera, jaw_in_gripper, read_extrinsics
 from finforce.optional import import_cv2
-from finforce.transforms import pose_from_quaternion
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_keypoints.geometry.side_picture import find_side, intersect_plane, map_picture, take_picture
 from finforce_keypoints.geometry.template import draw_template, find_shape, fit_grid
 from finforce_keypoints.networks.metadata import build_name_map, parse_mapping
 from finforce_keypoints.networks.side_network import SideNetwork
-from lab.training.commands import LabelFileError, one_line_errors
+from lab.training.commands import TrainingError, one_line_errors
 from lab.training.evaluate import detect, format_scores, score_detections
 from lab.training.pictures import MARGIN, TRAIN, FingerPictures, load_pictures
 
@@ -35,7 +33,6 @@ SCORER, INDIVIDUALS, BODYPARTS, COORDS = HEADERS = ("scorer", "individuals", "bo
 FOLDER = "labeled-data"  # how the index of a frame begins
 _SINGLE = "single"  # DeepLabCut's individual for body parts that are there once
 BASE_PART = 0.3  # of the jaw's length: key points nearer to the base hardly move when the jaw bends
-NUMBERS = ("width", "height", "fx", "fy", "cx", "cy")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -61,45 +58,45 @@ def read_labels(path: str | Path) -> Labels:
             the row `individuals` of multi-animal projects, backslashes and empty cells are understood.
 
     Raises:
-        LabelFileError: the file cannot be read, lacks a header or its rows do not fit it.
+        TrainingError: the file cannot be read, lacks a header or its rows do not fit it.
     """
     try:
         text = Path(path).read_text(encoding="utf-8-sig")
         rows = [[cell.strip() for cell in row] for row in csv.reader(text.splitlines())]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise LabelFileError(f"{path}: {error}; expected DeepLabCut's CollectedData_SCORER.csv") from error
+        raise TrainingError(f"{path}: {error}; expected DeepLabCut's CollectedData_SCORER.csv") from error
     rows = [row for row in rows if any(row)]
     try:
         if len({len(row) for row in rows}) != 1:
-            raise LabelFileError("rows of different lengths; expected a cell for every column of the header")
+            raise TrainingError("rows of different lengths; expected a cell for every column of the header")
         return parse_labels(pd.DataFrame(rows))
-    except LabelFileError as error:
-        raise LabelFileError(f"{Path(path).name}: {error}") from error
+    except TrainingError as error:
+        raise TrainingError(f"{Path(path).name}: {error}") from error
 
 
 def parse_labels(cells: pd.DataFrame) -> Labels:
     """Return the labels of a file's cells, texts; see `read_labels`.
 
     Raises:
-        LabelFileError: a header row is missing, or the columns are not those of points.
+        TrainingError: a header row is missing, or the columns are not those of points.
     """
     is_head = cells[0].isin(HEADERS)
     head, frames = cells[is_head].set_index(0), cells[~is_head]
     for needed in (BODYPARTS, COORDS):
         if needed not in head.index:
-            raise LabelFileError(f"no row '{needed}'; expected the header rows scorer, bodyparts and coords")
+            raise TrainingError(f"no row '{needed}'; expected the header rows scorer, bodyparts and coords")
     if frames.empty:
-        raise LabelFileError("no frame after the header; expected a row per image")
+        raise TrainingError("no frame after the header; expected a row per image")
     index = 3 if frames.iat[0, 0] == FOLDER else 1
     head = head.iloc[:, index - 1 :]
     names = _name_points(head)
     pairs = list(zip(names, head.loc[COORDS], strict=True))
     if len(set(pairs)) != len(pairs) or {(name, axis) for name in names for axis in "xy"} - set(pairs):
-        raise LabelFileError("the columns are not one x and one y of every body part")
+        raise TrainingError("the columns are not one x and one y of every body part")
     try:
         values = frames.iloc[:, index:].replace("", "nan").astype(float)
     except ValueError as error:
-        raise LabelFileError(f"{error}; expected numbers of pixels, or nothing") from error
+        raise TrainingError(f"{error}; expected numbers of pixels, or nothing") from error
     values.columns = pd.MultiIndex.from_tuples(pairs)
     kinds = list(dict.fromkeys(names))
     points = np.stack([values[name][["x", "y"]].to_numpy() for name in kinds], axis=1)
@@ -107,7 +104,7 @@ def parse_labels(cells: pd.DataFrame) -> Labels:
     images = pd.Series(["/".join(row).replace("\\", "/") for row in frames.iloc[:, :index].to_numpy()])
     if images.duplicated().any():
         image = images[images.duplicated()].iloc[0]
-        raise LabelFileError(f"{image} stands in {(images == image).sum()} rows; expected one row per image")
+        raise TrainingError(f"{image} stands in {(images == image).sum()} rows; expected one row per image")
     return Labels(images=tuple(images), names=tuple(kinds), points=points)
 
 
@@ -128,46 +125,6 @@ class CameraView:
 
     camera: CameraIntrinsics
     T_gripper_camera: NDArray
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class LabelledImage:
-    """An image (h, w, 3) uint8 RGB with the points (K, 2) [px] of one jaw, the reference point last; NaN if hidden."""
-
-    image: NDArray
-    points: NDArray
-
-
-def read_camera(path: str | Path) -> CameraView:
-    """Read a camera from YAML: width, height, fx, fy, cx, cy [px], distortion, T_gripper_camera [x y z qx qy qz qw].
-
-    The lens is that of `distortion_model`, plumb_bob without it.
-
-    Raises:
-        LabelFileError: the file cannot be read or lacks one of these.
-        IntrinsicsError: no camera has such numbers.
-    """
-    try:
-        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-        return parse_camera(content)
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError) as error:
-        raise LabelFileError(
-            f"{path}: {error!r}; expected {', '.join(NUMBERS)}, distortion and T_gripper_camera [x y z qx qy qz qw]"
-        ) from error
-
-
-def parse_camera(content: Mapping[str, Any]) -> CameraView:
-    """Return the camera of a file's content; see `read_camera`."""
-    numbers = {name: content[name] for name in NUMBERS}
-    pose = np.array(content["T_gripper_camera"], dtype=float)
-    if pose.shape != (7,):
-        raise LabelFileError(f"T_gripper_camera: got {pose.tolist()}, expected x y z [m] qx qy qz qw")
-    lens = np.array(content.get("distortion", ()), dtype=float)
-    model = str(content.get("distortion_model", PLUMB_BOB))
-    return CameraView(
-        camera=CameraIntrinsics(**numbers, distortion=lens, model=model),
-        T_gripper_camera=pose_from_quaternion(pose[:3], pose[3:]),
-    )
 
 
 def find_origin(points: NDArray, jaw: Jaw, side: str, view: CameraView) -> float | None:
@@ -198,35 +155,44 @@ def find_origin(points: NDArray, jaw: Jaw, side: str, view: CameraView) -> float
     return along * float(jaw_in_gripper(side, 0.0)[0, 0])
 
 
-def rectify(labelled: LabelledImage, jaw: Jaw, side: str, view: CameraView) -> FingerPictures | None:
+def rectify(image: NDArray, points: NDArray, jaw: Jaw, side: str, view: CameraView) -> FingerPictures | None:
     """Return the picture of one jaw's side plane with its points, as training takes it; None if the jaw is not found.
 
+    Args:
+        image: (h, w, 3) uint8 RGB.
+        points: (K, 2) [px] of one jaw, the reference point last; NaN if hidden.
+        jaw: in its own frame, right jaws mirrored.
+        side: "left" or "right".
+        view: camera and its place.
+
     Raises:
-        LabelFileError: the image has another size than the camera.
+        TrainingError: the image has another size than the camera.
     """
-    height, width = labelled.image.shape[:2]
+    height, width = image.shape[:2]
     if (width, height) != (view.camera.width, view.camera.height):
-        raise LabelFileError(
+        raise TrainingError(
             f"an image of {width}x{height}; expected {view.camera.width}x{view.camera.height}, the camera's"
         )
-    origin = find_origin(labelled.points, jaw, side, view)
+    origin = find_origin(points, jaw, side, view)
     if origin is None:
         return None
-    return cut_picture(labelled, jaw, jaw_in_camera(view.T_gripper_camera, side, origin), view.camera)
+    return cut_picture(image, points, jaw, jaw_in_camera(view.T_gripper_camera, side, origin), view.camera)
 
 
-def cut_picture(labelled: LabelledImage, jaw: Jaw, T_camera_jaw: NDArray, camera: CameraIntrinsics) -> FingerPictures:
+def cut_picture(
+    image: NDArray, points: NDArray, jaw: Jaw, T_camera_jaw: NDArray, camera: CameraIntrinsics
+) -> FingerPictures:
     """Return the picture of the side plane of a jaw at T_camera_jaw (4, 4) with its labelled points, the mark first."""
     shape, side = find_shape(jaw), find_side(jaw)
     grid = fit_grid(shape)
     padded = grid.padded(MARGIN)
     rest = np.vstack((jaw.reference_point, jaw.keypoints))[:, [0, 2]]
-    points = np.roll(labelled.points, 1, axis=0)
+    points = np.roll(points, 1, axis=0)
     visible = np.isfinite(points).all(axis=1)
     place = np.full((len(visible), 2), np.nan, dtype=np.float32)
     place[visible] = padded.pixels(intersect_plane(points[visible], side, T_camera_jaw, camera))
     return FingerPictures(
-        picture=take_picture(labelled.image, map_picture(padded, side, T_camera_jaw, camera))[None],
+        picture=take_picture(image, map_picture(padded, side, T_camera_jaw, camera))[None],
         rest=grid.pixels(rest).astype(np.float32)[None],
         place=place[None],
         visible=visible[None],
@@ -254,7 +220,8 @@ def build_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m lab.training.finetune", description=__doc__)
     parser.add_argument("labels", type=Path, help="CollectedData_SCORER.csv")
     parser.add_argument("--project", type=Path, help="folder that holds labeled-data (two above the label file)")
-    parser.add_argument("--camera", type=Path, required=True, help="YAML of intrinsics and T_gripper_camera")
+    parser.add_argument("--camera", type=Path, required=True, help="intrinsics: file of ROS, OpenCV, kalibr, ...")
+    parser.add_argument("--extrinsics", default="robot", help="the camera in the gripper: x,y,z,qx,qy,qz,qw (robot)")
     parser.add_argument("--network", type=Path, required=True, help="folder of the exported network to begin with")
     parser.add_argument("-o", "--output", type=Path, required=True, help="folder of the fine-tuned network")
     parser.add_argument("--jaw", default="bench", help="jaw file, or name of an included jaw")
@@ -277,7 +244,8 @@ def run(options: argparse.Namespace) -> None:
     """Fine-tune as the options say."""
     # PyTorch is only wanted once the labels are known to be usable
     folder = options.project or options.labels.resolve().parent.parent.parent
-    labels, view = read_labels(options.labels), read_camera(options.camera)
+    labels, T_gripper_camera = read_labels(options.labels), read_extrinsics(options.extrinsics)
+    view = CameraView(camera=read_camera(options.camera), T_gripper_camera=T_gripper_camera)
     pictures = load_project(labels, folder, view, options.jaw, options.sides, parse_mapping(options.map))
     from lab.training.train import refine
 
@@ -305,7 +273,7 @@ def load_project(
         mapping: names of the jaw's points by body part, where they differ.
 
     Raises:
-        LabelFileError: an image is missing or of another size, or hardly any picture shows a labelled jaw.
+        TrainingError: an image is missing or of another size, or hardly any picture shows a labelled jaw.
         NamingError: the body parts are not the jaws' key points.
     """
     left = load_jaw(jaw)
@@ -315,11 +283,10 @@ def load_project(
     for number, name in enumerate(tqdm(labels.images, desc="images", leave=False)):
         image = read_image(folder / name)
         for side, own in jaws.items():
-            labelled = LabelledImage(image=image, points=labels.points[number, rows[side]])
-            found.append(rectify(labelled, own, side, view))
+            found.append(rectify(image, labels.points[number, rows[side]], own, side, view))
     usable = [picture for picture in found if picture is not None]
     if len(usable) < FEWEST:
-        raise LabelFileError(
+        raise TrainingError(
             f"{len(usable)} of {len(found)} pictures show a jaw with its reference point or a key point near its base; "
             f"expected at least {FEWEST}, better 50 to 300"
         )
@@ -330,12 +297,12 @@ def read_image(path: Path) -> NDArray:
     """Return an image file as (h, w, 3) uint8 RGB.
 
     Raises:
-        LabelFileError: the file is missing, or no image.
+        TrainingError: the file is missing, or no image.
     """
     cv2 = import_cv2()
     image = cv2.imread(str(path), cv2.IMREAD_COLOR) if path.is_file() else None
     if image is None:
-        raise LabelFileError(f"{path}: no image there; expected it below the project's folder (--project)")
+        raise TrainingError(f"{path}: no image there; expected it below the project's folder (--project)")
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from finforce_eval.tasks import OK, EngineOptions, Manifest, Task, run_tasks
-from lab.training.commands import DatasetError
+from lab.training.commands import TrainingError
 
 MARGIN = 28  # px of padding all round, room for shifting and turning a picture
 TRAIN, VALIDATION = "train", "val"  # how the names of shards begin
@@ -60,7 +60,7 @@ class FingerPictures:
         """Return the same with as many points a picture: those that are missing are its own once more."""
         have = self.rest.shape[1]
         if have > points:
-            raise DatasetError(f"{have} points a picture; expected at most {points}")
+            raise TrainingError(f"{have} points a picture; expected at most {points}")
         own = np.arange(points) % have
         columns = {name: getattr(self, name)[:, own] for name in ("rest", "place", "visible")}
         others = {name: getattr(self, name) for name in _COLUMNS if name not in columns}
@@ -81,10 +81,10 @@ class FingerPictures:
             picture: their pictures one after the other, where that is so already.
 
         Raises:
-            DatasetError: their pictures differ in size or in the number of points.
+            TrainingError: their pictures differ in size or in the number of points.
         """
         if len({(part.picture.shape[1:], part.rest.shape[1:]) for part in parts}) != 1:
-            raise DatasetError("shards of several kinds (size, number of points); expected one kind")
+            raise TrainingError("shards of several kinds (size, number of points); expected one kind")
         starts = np.cumsum([0, *(len(part.template) for part in parts[:-1])])
         fingers = [part.finger + start for part, start in zip(parts, starts, strict=True)]
         columns = {"finger": np.concatenate(fingers)} | ({} if picture is None else {"picture": picture})
@@ -105,7 +105,7 @@ def load_shard(path: Path) -> FingerPictures:
     """Read one shard.
 
     Raises:
-        DatasetError: the file cannot be read, or lacks an array.
+        TrainingError: the file cannot be read, or lacks an array.
     """
     with _reading(path), np.load(path, allow_pickle=False) as content:
         return FingerPictures(**{name: content[name] for name in _COLUMNS})
@@ -117,7 +117,7 @@ def _reading(path: Path) -> Iterator[None]:
     try:
         yield
     except (OSError, EOFError, ValueError, KeyError, BadZipFile) as error:
-        raise DatasetError(f"{path}: {error}; expected a shard with {', '.join(_COLUMNS)}") from error
+        raise TrainingError(f"{path}: {error}; expected a shard with {', '.join(_COLUMNS)}") from error
 
 
 def load_pictures(folder: Path, part: str, limit: int | None = None) -> FingerPictures:
@@ -129,11 +129,11 @@ def load_pictures(folder: Path, part: str, limit: int | None = None) -> FingerPi
         limit: the number of pictures that is enough; all when absent.
 
     Raises:
-        DatasetError: there is no shard of this part, or one cannot be used, or they are of several kinds.
+        TrainingError: there is no shard of this part, or one cannot be used, or they are of several kinds.
     """
     paths = sorted(folder.glob(f"{part}_*.npz"))
     if not paths:
-        raise DatasetError(f"{folder}: no shard {part}_*.npz; make some with python -m lab.training.scenes")
+        raise TrainingError(f"{folder}: no shard {part}_*.npz; make some with python -m lab.training.scenes")
     counts = [_count_pictures(path) for path in paths]
     if limit is not None:
         paths = paths[: int(np.searchsorted(np.cumsum(counts), limit)) + 1]
@@ -143,7 +143,7 @@ def load_pictures(folder: Path, part: str, limit: int | None = None) -> FingerPi
         if not shards:  # filled as shards come: joined afterwards they would need twice the memory
             pictures = np.empty((ends[-1], *shard.picture.shape[1:]), np.uint8)
         if shard.picture.shape[1:] != pictures.shape[1:]:
-            raise DatasetError(
+            raise TrainingError(
                 f"{path}: pictures {shard.picture.shape[1:]}, expected {pictures.shape[1:]} as before it"
             )
         own = pictures[end - len(shard) : end]
@@ -169,10 +169,10 @@ def make_all(tasks: Sequence[Task], engine: EngineOptions, folder: Path, shard: 
         unit: what a task is, for the bar.
 
     Raises:
-        DatasetError: one of them failed; which, and how many.
+        TrainingError: one of them failed; which, and how many.
     """
     lines = run_tasks(tasks, engine, Manifest(folder, shard), unit=unit)
     failed = [line for line in lines if line["status"] != OK]
     if failed:
-        raise DatasetError(f"{len(failed)} of {len(lines)} failed, {failed[0]['name']} with: {failed[0]['error']}")
+        raise TrainingError(f"{len(failed)} of {len(lines)} failed, {failed[0]['name']} with: {failed[0]['error']}")
     return lines

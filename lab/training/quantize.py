@@ -24,7 +24,7 @@ from finforce_eval.recordings.recording import read_recording
 from finforce_keypoints.networks.metadata import METADATA_FILE
 from finforce_keypoints.networks.model import KeypointModel
 from finforce_keypoints.networks.side_network import COARSE, COARSE_LAYOUT, FINE, SideNetwork
-from lab.training.commands import DatasetError, import_onnx, one_line_errors
+from lab.training.commands import TrainingError, import_onnx, one_line_errors
 from lab.training.pictures import FingerPictures
 
 PICTURES = 48  # by which the ranges of the activations are measured
@@ -49,7 +49,7 @@ def run(options: argparse.Namespace) -> None:
     """Quantize as the options say.
 
     Raises:
-        DatasetError: the recordings showed the network too little.
+        TrainingError: the recordings showed the network too little.
     """
     before = KeypointModel(options.network)
     parameters = {"model": str(options.network), "detection_method": options.method}
@@ -59,7 +59,7 @@ def run(options: argparse.Namespace) -> None:
             KeypointSource(source="images", jaw_file=options.jaw, parameters=parameters).apply(recording)
     shown, judged = batches[::EVERY], batches[EVERY // 2 :: EVERY]
     if len(judged) < 2:
-        raise DatasetError(f"{len(batches)} pictures were shown to the network, expected some {4 * EVERY} or more")
+        raise TrainingError(f"{len(batches)} pictures were shown to the network, expected some {4 * EVERY} or more")
     name = import_onnx().load(str(before.path)).graph.input[0].name
     inputs = [{name: before.preprocess(batch[[row]]).copy()} for batch in shown for row in range(len(batch))]
     options.output.mkdir(parents=True, exist_ok=True)

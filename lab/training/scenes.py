@@ -433,7 +433,7 @@ def make_shards(
     """Render the pictures of fingers and write them as `NAME_SEED.npz`, several fingers a file.
 
     Raises:
-        DatasetError: one could not be made or written.
+        TrainingError: one could not be made or written.
     """
     parts = [seeds[begin : begin + fingers] for begin in range(0, len(seeds), fingers)]
     tasks = []

@@ -17,8 +17,7 @@ from tqdm import tqdm
 from finforce.settings import check_bounds, setting
 from lab.training.batches import AugmentSettings, Batch, load_batches
 from lab.training.commands import (
-    CheckpointError,
-    RecipeError,
+    TrainingError,
     add_settings,
     import_torch,
     one_line_errors,
@@ -158,7 +157,7 @@ class Recipe:
     validation: int = setting(1000, "pictures that an evaluation uses", "", 1, 1_000_000)
 
     def __post_init__(self) -> None:
-        check_bounds(self, RecipeError)
+        check_bounds(self, TrainingError)
 
 
 def compute_rate(progress: float, recipe: Recipe) -> float:
@@ -221,11 +220,11 @@ class FingerTraining:
         """Go on from a checkpoint.
 
         Raises:
-            CheckpointError: it is of another network.
+            TrainingError: it is of another network.
         """
         told = shape_from(checkpoint["shape"])
         if told != self.network.shape:
-            raise CheckpointError(f"got a checkpoint of {told}, expected one of {self.network.shape}")
+            raise TrainingError(f"got a checkpoint of {told}, expected one of {self.network.shape}")
         for name, part in self.parts.items():
             part.load_state_dict(checkpoint[name])
         self.step, self.elapsed = int(checkpoint["step"]), float(checkpoint["elapsed"])

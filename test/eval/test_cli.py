@@ -1,7 +1,6 @@
 """Claims about the `finforce` command: what it writes, and that bad input costs one line and status 2."""
 
 import json
-import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -245,19 +244,6 @@ def test_output_that_cannot_be_written_is_refused(capsys, bag, exact, tmp_path):
     assert capsys.readouterr().err.count("\n") == 1
 
 
-def test_steel_measurement_is_converted(tmp_path, capsys):
-    assert main(["convert-steel", str(tmp_path / "steel")]) == 0
-    assert (tmp_path / "steel" / "metadata.yaml").exists()
-    assert_refused(capsys_cleared(capsys), ["convert-steel", tmp_path / "steel"], "exists already")
-    (tmp_path / "bad.json").write_text("{")
-    assert_refused(capsys, ["convert-steel", tmp_path / "x", "--source", tmp_path / "bad.json"], "no valid JSON")
-
-
-def capsys_cleared(capsys):
-    capsys.readouterr()
-    return capsys
-
-
 def run_command(*arguments):
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-m", "finforce_eval.cli.main", *arguments]
@@ -281,7 +267,7 @@ def test_help_needs_no_heavy_import():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=False)
     assert done.returncode == 0, done.stderr
-    for command in ("evaluate", "calibrate", "replay", "demo", "bench", "convert-steel", "version"):
+    for command in ("evaluate", "calibrate", "replay", "demo", "bench", "version"):
         assert command in done.stdout
 
 

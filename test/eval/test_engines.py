@@ -9,7 +9,7 @@ from finforce_eval.cli.main import main
 from finforce_eval.recordings.recording import DEMO, read_recording
 from finforce_eval.recordings.writer import write_recording
 from finforce_eval.tasks import EngineOptions, Task
-from lab.training.commands import DatasetError
+from lab.training.commands import TrainingError
 from lab.training.pictures import make_all
 
 
@@ -59,7 +59,7 @@ def test_an_experiment_goes_to_processes(tmp_path):
 
 def write_number(number, path):
     if number == 3:
-        raise DatasetError("three cannot be made")
+        raise TrainingError("three cannot be made")
     with open(path, "w", encoding="utf-8") as file:
         file.write(str(number))
     return {"numbers": 1}
@@ -74,7 +74,7 @@ def test_files_of_a_data_set_are_made_once_and_what_fails_is_named(tmp_path):
         ]
 
     engine = EngineOptions(engine="processes", workers=2)
-    with pytest.raises(DatasetError, match="1 of 5 failed, 3 with: three cannot be made"):
+    with pytest.raises(TrainingError, match="1 of 5 failed, 3 with: three cannot be made"):
         make_all(tasks(range(5)), engine, tmp_path, "", "file")
     before = (tmp_path / "2.txt").stat().st_mtime_ns
     (tmp_path / "1.txt").unlink()

@@ -1,43 +1,27 @@
 """Label files of DeepLabCut come in whole, and their points land on the right place of the jaw's picture."""
 
-import re
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 
-import lab.training
 from finforce.gripper_frames import ROBOT_CAMERA, jaw_in_camera
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints.errors import NamingError
 from finforce_keypoints.geometry.side_picture import find_side, project_plane
 from finforce_keypoints.geometry.template import find_shape, fit_grid
-from lab.training.commands import LabelFileError
+from finforce_sim.sensor import build_d405_vga
+from lab.training.commands import TrainingError
 from lab.training.finetune import (
     CameraView,
-    LabelledImage,
     find_origin,
     load_project,
-    parse_camera,
-    read_camera,
     read_labels,
     rectify,
 )
 from lab.training.pictures import MARGIN
 
-CAMERA = {
-    "width": 640,
-    "height": 480,
-    "fx": 431.2,
-    "fy": 430.0,
-    "cx": 319.6,
-    "cy": 241.3,
-    "distortion": [-0.05, 0.06, 0.0005, 0.0004, -0.02],
-    "T_gripper_camera": [0.0, 0.0, -0.1, 0.0, 0.0, 0.0, 1.0],
-}
 OLD = """scorer,me,me,me,me
 bodyparts,tip,tip,inner_1,inner_1
 coords,x,y,x,y
@@ -65,7 +49,7 @@ def read(text, tmp_path):
 
 
 def view_of_robot():
-    return CameraView(camera=parse_camera(CAMERA).camera, T_gripper_camera=ROBOT_CAMERA)
+    return CameraView(camera=build_d405_vga(), T_gripper_camera=ROBOT_CAMERA)
 
 
 def mark(jaw, side, origin_x, view):
@@ -116,12 +100,12 @@ def test_half_a_point_is_no_point(tmp_path):
     ],
 )
 def test_what_is_no_label_file_is_refused(text, message, tmp_path):
-    with pytest.raises(LabelFileError, match=message):
+    with pytest.raises(TrainingError, match=message):
         read(text, tmp_path)
 
 
 def test_a_missing_file_is_refused(tmp_path):
-    with pytest.raises(LabelFileError, match=r"CollectedData_SCORER.csv"):
+    with pytest.raises(TrainingError, match=r"CollectedData_SCORER.csv"):
         read_labels(tmp_path / "none.csv")
 
 
@@ -151,7 +135,7 @@ def test_labels_land_where_the_points_are_in_the_picture(side, origin_x):
         if k != hidden:
             cv2.circle(image, (round(column * 16), round(row * 16)), 24, (255, 255, 255), -1, shift=4)
     points[hidden] = np.nan
-    found = rectify(LabelledImage(image=image, points=points), jaw, side, view)
+    found = rectify(image, points, jaw, side, view)
     np.testing.assert_array_equal(np.flatnonzero(~found.visible[0]), [hidden + 1])  # the mark is the first
     rest = np.vstack((jaw.reference_point, jaw.keypoints))[:, [0, 2]]
     grid = fit_grid(find_shape(jaw))
@@ -167,15 +151,6 @@ def test_a_point_that_is_marked_nowhere_is_refused(tmp_path):
         load_project(read(OLD, tmp_path), tmp_path, view_of_robot(), "bench", ("left",), {})
 
 
-def test_a_camera_without_a_place_is_refused(tmp_path):
-    path = tmp_path / "camera.yaml"
-    path.write_text(yaml.safe_dump(CAMERA))
-    assert read_camera(path).camera.fx == 431.2
-    path.write_text(yaml.safe_dump({key: value for key, value in CAMERA.items() if key != "T_gripper_camera"}))
-    with pytest.raises(LabelFileError, match="T_gripper_camera"):
-        read_camera(path)
-
-
 def test_labels_need_no_torch():
     code = "import lab.training.finetune, lab.training.evaluate, sys; sys.exit('torch' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
@@ -186,9 +161,3 @@ def test_absent_torch_is_told_with_the_command_that_installs_it():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode != 0
     assert "MissingDependencyError: training of key point networks needs torch: pip install torch" in done.stderr
-
-
-def test_the_camera_of_the_instructions_is_the_robots():
-    page = Path(lab.training.__file__).with_name("README.md").read_text(encoding="utf-8")
-    view = parse_camera(yaml.safe_load(re.search(r"```yaml\n(.*?)```", page, re.DOTALL)[1]))
-    np.testing.assert_allclose(view.T_gripper_camera, ROBOT_CAMERA, atol=2e-6)  # six decimals of a quaternion

@@ -21,7 +21,7 @@ from training_fakes import KEYPOINTS, POINTS, draw_ladders, write_ladders
 import lab.training.evaluate
 from finforce_keypoints.networks.side_network import COARSE, FINE, SideNetwork
 from lab.training.batches import AugmentSettings, augment, choose_pictures, load_batches
-from lab.training.commands import CheckpointError, DatasetError, RecipeError
+from lab.training.commands import TrainingError
 from lab.training.evaluate import Detections, fit_factor, fit_shift, score_detections
 from lab.training.export import load_checkpoint, read_network, save_checkpoint, shift_likelihoods, write_network
 from lab.training.export import main as export_main
@@ -118,7 +118,7 @@ def test_shifted_likelihoods_lose_the_wanted_share_and_move_no_point(tmp_path):
 
 
 def test_what_is_no_export_cannot_be_trained_further(tmp_path):
-    with pytest.raises(CheckpointError, match="expected a network exported by training"):
+    with pytest.raises(TrainingError, match="expected a network exported by training"):
         read_network(tmp_path)
 
 
@@ -260,7 +260,7 @@ def test_a_short_training_lowers_the_loss_and_can_go_on(tmp_path):
     again = FingerTraining(recipe)
     again.resume(checkpoint)
     assert again.progress == 1.0
-    with pytest.raises(CheckpointError, match="expected one of"):
+    with pytest.raises(TrainingError, match="expected one of"):
         FingerTraining(recipe, FingerNetwork(NetworkShape(fine=(16, 16)))).resume(checkpoint)
     given = [str(tmp_path / "run" / CHECKPOINT), "-o", str(tmp_path / "network"), "--dataset", str(dataset)]
     checkpoint["averaged"]["fine.judge.2.bias"][0] = -20.0
@@ -297,7 +297,7 @@ def test_an_exported_network_is_trained_on(tmp_path):
 def test_a_broken_checkpoint_is_refused(tmp_path):
     path = tmp_path / "checkpoint.pt"
     path.write_bytes(b"no checkpoint")
-    with pytest.raises(CheckpointError, match="expected a checkpoint written by training"):
+    with pytest.raises(TrainingError, match="expected a checkpoint written by training"):
         load_checkpoint(path)
 
 
@@ -341,20 +341,20 @@ def test_the_rate_rises_and_falls():
 
 @pytest.mark.parametrize("change", [{"minutes": 0.0}, {"rate": 2.0}, {"average": 1.0}, {"batch": 0}])
 def test_a_recipe_out_of_bounds_is_refused(change):
-    with pytest.raises(RecipeError):
+    with pytest.raises(TrainingError):
         Recipe(**change)
 
 
 def test_shards_that_are_missing_broken_or_of_another_size_are_refused(tmp_path):
     good = vars(draw_ladders(1, 2, 1))
-    with pytest.raises(DatasetError, match="no shard"):
+    with pytest.raises(TrainingError, match="no shard"):
         load_pictures(tmp_path, TRAIN)
     (tmp_path / "train_0.npz").write_bytes(b"")
-    with pytest.raises(DatasetError, match="expected a shard"):
+    with pytest.raises(TrainingError, match="expected a shard"):
         load_pictures(tmp_path, TRAIN)
     save_shard(tmp_path / "train_0.npz", FingerPictures(**good))
     save_shard(tmp_path / "train_1.npz", FingerPictures(**{**good, "picture": good["picture"][:, 1:]}))
-    with pytest.raises(DatasetError, match="train_1"):
+    with pytest.raises(TrainingError, match="train_1"):
         load_pictures(tmp_path, TRAIN)
 
 
