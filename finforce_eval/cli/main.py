@@ -68,14 +68,18 @@ def read_command(words: Sequence[str]) -> str:
     return "version" if list(words[:1]) == ["--version"] else parser.parse_args(words[:1]).command
 
 
-def parse(words: Sequence[str]) -> argparse.Namespace:
-    """Return the options of a command line, with `run`, the function that carries it out."""
-    command = read_command(words)
+def build_parser(command: str) -> Parser:
+    """Return the parser of a subcommand's options."""
     module = load_command(command)
-    parser = Parser(prog=f"finforce {command}", description=COMMANDS[command])
+    parser = Parser(prog=f"finforce {command}", description=COMMANDS[command], epilog=getattr(module, "EXAMPLES", None))
     parser.set_defaults(run=getattr(module, "run", None))
     module.add_options(parser)
-    return parser.parse_args(words[1:])
+    return parser
+
+
+def parse(words: Sequence[str]) -> argparse.Namespace:
+    """Return the options of a command line, with `run`, the function that carries it out."""
+    return build_parser(read_command(words)).parse_args(words[1:])
 
 
 def main(argv: Sequence[str] | None = None) -> int:
