@@ -1,6 +1,7 @@
 """Claims about the `finforce` command: what it writes, and that bad input costs one line and status 2."""
 
 import json
+import os
 import subprocess
 import sys
 from dataclasses import replace
