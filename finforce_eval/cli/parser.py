@@ -46,7 +46,7 @@ def add_run_options(parser: argparse.ArgumentParser, *, calibration: bool = True
     parser.add_argument("--solver", default="default", choices=SOLVERS, help="mechanics of the solver")
     parser.add_argument("--mesh", default="default", choices=MESHES, help="mesh density")
     parser.add_argument("--contact", action="append", default=[], metavar="CONTACT", help=CONTACT_HELP)
-    mesh = "object mesh, STL, OBJ, PLY or GLB (that of the case.json)"
+    mesh = "mesh file of the object (that of the case.json)"
     parser.add_argument("--object", metavar="MESH", help=mesh)
     parser.add_argument("--object-unit", default="m", choices=UNITS, help="unit of the mesh (m)")
     text = "key points: from images, keypoints as recorded, or truth of a simulated recording "
