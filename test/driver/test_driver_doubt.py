@@ -113,7 +113,7 @@ def press(stiffness, variant, *, force=3.0, speed=0.04, largest=None, latency=0.
     return world, world.run()
 
 
-@pytest.mark.parametrize("force", [1.0, 3.0, 5.0])
+@pytest.mark.parametrize("force", [1.0, 5.0])
 def test_a_stiff_object_at_forty_millimetres_a_second_is_pressed_no_harder_than_a_step_adds(variant, force):
     _, course = press(10_000.0, variant, force=force, largest=12_000.0)
     assert max(course.forces) < max(force + 0.15, 10_000.0 * STEP)
@@ -128,7 +128,7 @@ def test_a_bound_that_is_too_large_costs_time_and_not_the_force(variant, stiffne
     assert max(course.forces) < 4.25
 
 
-@pytest.mark.parametrize("latency", [0.03, 0.06, 0.1])
+@pytest.mark.parametrize("latency", [0.03, 0.1])
 def test_an_object_stiffer_than_the_settings_say_is_held_or_let_go_and_never_crushed(variant, latency):
     world, course = press(10_000.0, variant, latency=latency)
     assert max(course.forces) < 3.0 + 0.9 * 10_000.0 * STEP  # less than a step of the gripper beyond; it was 5.5 N
@@ -138,7 +138,7 @@ def test_an_object_stiffer_than_the_settings_say_is_held_or_let_go_and_never_cru
         assert course.forces[-1] < 3.1
 
 
-@pytest.mark.parametrize(("rise", "force", "speed"), [(10.0, 5.0, 0.004), (30.0, 5.0, 0.004), (100.0, 2.0, 0.008)])
+@pytest.mark.parametrize(("rise", "force", "speed"), [(10.0, 5.0, 0.004), (100.0, 2.0, 0.008)])
 def test_an_object_that_bottoms_out_stalls_the_motor_within_the_bound_that_is_shown(variant, rise, force, speed):
     def force_at(opening):
         way, soft = max(0.0, 0.025 - opening), 0.5e-3 * force

@@ -27,50 +27,23 @@ START = dedent("""
 
     event.register("numba:compile", Listener())
     from finforce_eval.cli import prepare as preparation
-    from finforce_ifea.estimator import ForceEstimator
-    from finforce_ifea.jaw.jaw import load_jaw
-
-    ForceEstimator(load_jaw("bench")).warm_up()
-    preparation.compile_contact()
-    preparation.compile_detector()
-    print(compiled)
-""")
-
-GRASP = dedent("""
-    import sys
-
-    from numba.core.dispatcher import Dispatcher
-
-    from finforce_eval.cli import prepare as preparation
     from finforce_eval.cli.main import main
     from finforce_eval.recordings.recording import DEMO
 
-
-    def count_compiled():
-        modules = [module for name, module in list(sys.modules.items()) if name.startswith("finforce")]
-        functions = {value for module in modules for value in vars(module).values() if isinstance(value, Dispatcher)}
-        return {function.py_func.__qualname__: len(function.overloads) for function in functions}
-
-
     preparation.compile_solver()
-    preparation._store_equilibria(preparation._load("bench", "bench"), map)
     preparation.compile_contact()
-    before = count_compiled()
-    assert main(["evaluate", str(DEMO), "--contact", "estimate", "--set", "held=yes", "--engine", "sequential"]) == 0
-    print([name for name, count in count_compiled().items() if count > before.get(name, 0)])
+    preparation.compile_detector()
+    words = ["--contact", "estimate", "--calibration", "bench", "--set", "held=yes", "--engine", "sequential"]
+    assert main(["evaluate", str(DEMO), *words]) == 0
+    print(compiled)
 """)
 
 
-def test_after_it_a_start_compiles_nothing(capsys):
-    assert main(["prepare"]) == 0
+def test_after_it_a_start_and_a_first_grasp_that_is_held_compile_nothing(capsys):
+    assert main(["prepare", "--calibration", "bench"]) == 0
     said = capsys.readouterr().out
     assert all(word in said for word in ("solver compiled", "equilibria of bench", "contact estimator", "detector"))
     done = subprocess.run([sys.executable, "-c", START], capture_output=True, text=True, timeout=300, check=True)
-    assert done.stdout.strip() == "[]"
-
-
-def test_a_first_grasp_that_is_held_needs_nothing_more():
-    done = subprocess.run([sys.executable, "-c", GRASP], capture_output=True, text=True, timeout=300, check=True)
     assert done.stdout.splitlines()[-1] == "[]"
 
 

@@ -75,10 +75,9 @@ def test_mesh_pose_and_picture_are_written(files, capsys):
     assert orange.sum() > 1000
 
 
-@pytest.mark.parametrize("ending", ["ply", "glb"])
-def test_other_endings_hold_the_same_mesh(files, ending):
-    assert run(files, "-o", files / f"out.{ending}") == 0
-    vertices, _ = read_triangles(files / f"out.{ending}")
+def test_another_ending_holds_the_same_mesh(files):
+    assert run(files, "-o", files / "out.glb") == 0
+    vertices, _ = read_triangles(files / "out.glb")
     np.testing.assert_allclose(np.sort(np.ptp(vertices, axis=0)), [0.05, 0.05, 0.1], atol=2e-3)
 
 

@@ -1,15 +1,17 @@
 """Claims about `finforce view`: the file holds pictures, jaws and forces as they were found, at their times."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 pytest.importorskip("rerun")
 chunk = pytest.importorskip("rerun.chunk")
 
-from finforce_eval.cli.main import main, parse  # noqa: E402
+from finforce_eval.cli import view  # noqa: E402
+from finforce_eval.cli.main import main  # noqa: E402
 from finforce_eval.evaluation.forces import estimate_forces  # noqa: E402
-from finforce_eval.evaluation.setup import make_setup  # noqa: E402
-from finforce_eval.recordings.recording import read_recording  # noqa: E402
+from finforce_eval.recordings.recording import DEMO, read_recording  # noqa: E402
 from lab.scenes import GRASP, find_scene  # noqa: E402
 
 
@@ -18,12 +20,23 @@ def scene(tmp_path_factory):
     """A rendered grasp in Rerun: recording, and the rows of each entity."""
     source = find_scene(GRASP)
     file = tmp_path_factory.mktemp("view") / "grasp.rrd"
-    words = ["--from", "images", "--calibration", "twin"]
-    assert main(["view", str(source), "--save", str(file), *words]) == 0
+    shapes, found = {"left": [], "right": []}, {}
+
+    def estimate(recording, setup, *, watch, **options):
+        def see(side, stamp, estimator):
+            shapes[side].append(np.array(estimator.surface()))
+            watch(side, stamp, estimator)
+
+        found.update(estimate_forces(recording, setup, watch=see, **options))
+        return found
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(view, "estimate_forces", estimate)
+        assert main(["view", str(source), "--save", str(file), "--from", "images", "--calibration", "twin"]) == 0
     rows = {}
     for piece in chunk.RrdReader(str(file)).stream().to_chunks():
         rows.setdefault(piece.entity_path, []).append(piece.to_record_batch())
-    return source, words, rows
+    return SimpleNamespace(source=source, rows=rows, forces=found, shapes=shapes)
 
 
 def column(batches, ending):
@@ -40,7 +53,7 @@ def column(batches, ending):
 
 
 def test_every_picture_is_there_at_its_time(scene):
-    source, _, rows = scene
+    source, rows = scene.source, scene.rows
     times, pictures = column(rows["/camera"], "blob")
     np.testing.assert_allclose(times, read_recording(source).images.all_colors().stamps, atol=1000)
     assert all(bytes(picture[0])[:2] == b"\xff\xd8" for picture in pictures)
@@ -49,17 +62,7 @@ def test_every_picture_is_there_at_its_time(scene):
 
 
 def test_jaws_bend_and_forces_are_those_that_were_found(scene):
-    source, words, rows = scene
-    options = parse(["view", str(source), "--save", "x.rrd", *words])
-    from finforce_eval.evaluation.setup import read_keypoints
-
-    (recording,) = read_keypoints(options)
-    shapes = {"left": [], "right": []}
-
-    def watch(side, stamp, estimator):
-        shapes[side].append(np.array(estimator.surface()))
-
-    forces = estimate_forces(recording, make_setup(options), watch=watch)
+    forces, shapes, rows = scene.forces, scene.shapes, scene.rows
     for side in ("left", "right"):
         times, values = column(rows[f"/forces/{side}"], "scalars")
         expected = np.linalg.norm(forces[side].force, axis=1)
@@ -74,17 +77,17 @@ def test_jaws_bend_and_forces_are_those_that_were_found(scene):
 
 
 def test_an_arrow_stands_where_something_presses_and_only_there(scene):
-    _, _, rows = scene
+    rows = scene.rows
     _, values = column(rows["/forces/left"], "scalars")
     pressed = np.nan_to_num([value[0] for value in values]) > 0.0
     times, _ = column(rows["/jaws/left/force/arrow"], "vectors")
     assert len(times) == pressed.sum() > 20
 
 
-def test_another_ending_or_a_folder_that_is_none_is_refused(scene, tmp_path, capsys):
-    source, _, _ = scene
-    assert main(["view", str(source), "--save", str(tmp_path / "x.mp4")]) == 2
+def test_another_ending_or_a_folder_that_is_none_is_refused(tmp_path, capsys):
+    assert main(["view", str(DEMO), "--save", str(tmp_path / "x.mp4")]) == 2
     assert "ends in .rrd" in capsys.readouterr().err
     (tmp_path / "file").write_text("")
-    assert main(["view", str(source), "--save", str(tmp_path / "file" / "x.rrd"), "--calibration", "twin"]) == 2
+    words = ["--contact", "fixed:40", "--calibration", "bench"]
+    assert main(["view", str(DEMO), "--save", str(tmp_path / "file" / "x.rrd"), *words]) == 2
     assert "Traceback" not in capsys.readouterr().err

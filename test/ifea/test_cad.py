@@ -50,8 +50,9 @@ def check_found(finger):
     assert finger.clamped_z == pytest.approx((5.0 + 3 * 1.5) * MILLIMETRE, abs=3e-4)
 
 
-@pytest.mark.parametrize("unit", ["mm", "m", "inch"])
-@pytest.mark.parametrize("turn", [[0.0, 0.0, 0.0], [90.0, 0.0, 0.0], [17.0, -41.0, 133.0]])
+@pytest.mark.parametrize(
+    ("unit", "turn"), [("m", [0.0, 0.0, 0.0]), ("inch", [90.0, 0.0, 0.0]), ("mm", [17.0, -41.0, 133.0])]
+)
 def test_a_finger_is_found_in_any_unit_and_any_way_round(tmp_path, surface, unit, turn):
     mesh = surface.copy()
     mesh.apply_scale({"mm": 1.0, "m": 1e-3, "inch": 1.0 / 25.4}[unit])
@@ -141,8 +142,7 @@ def taper_surface(surface, slope, lean):
     return trimesh.Trimesh(points, mesh.faces, process=True)
 
 
-@pytest.mark.parametrize("lean", [0.0, 0.1])
-@pytest.mark.parametrize("turn", [[0.0, 0.0, 0.0], [90.0, 0.0, 0.0], [90.0, 40.0, 0.0]])
+@pytest.mark.parametrize(("turn", "lean"), [([0.0, 0.0, 0.0], 0.1), ([90.0, 0.0, 0.0], 0.0), ([90.0, 40.0, 0.0], 0.1)])
 def test_a_tapered_finger_is_taken_as_symmetric_about_its_middle(tmp_path, surface, turn, lean):
     mesh = taper_surface(surface, 0.12, lean)
     volume = mesh.volume
