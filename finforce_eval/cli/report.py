@@ -7,9 +7,8 @@ from pathlib import Path
 
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluate import read_evaluations
-from finforce_eval.figures.html_report import write_html
 from finforce_eval.figures.recorded_forces import read_forces
-from finforce_eval.figures.report import write_page
+from finforce_eval.figures.report import write_html, write_page
 from finforce_eval.machine import version
 from finforce_eval.tasks import is_manifest
 

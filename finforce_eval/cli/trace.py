@@ -1,4 +1,4 @@
-"""`finforce trace`: the way of a recording's images through the stages, in a table and a picture."""
+"""`finforce trace`: the way of a recording's images through the stages, in a table."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from finforce.errors import FinforceError
-from finforce_eval.cli.parser import BAG_HELP, add_run_options, picture_file
+from finforce_eval.cli.parser import BAG_HELP, add_run_options
 from finforce_eval.evaluation.keypoint_source import parse_source
 from finforce_eval.evaluation.setup import make_setup, sides_of
 from finforce_eval.machine import write_figures
@@ -28,9 +28,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add_run_options(parser, settings=False)
     parser.add_argument("--apart", action="store_true", help="run every stage in its own process")
     parser.add_argument("--json", metavar="OUT", help="write the figures as JSON")
-    parser.add_argument(
-        "--figure", type=picture_file, metavar="PNG", help="draw the stages of one image and the durations of all"
-    )
 
 
 def run(options: argparse.Namespace) -> None:
@@ -60,10 +57,6 @@ def run(options: argparse.Namespace) -> None:
     print(format_trace(trace))
     if options.json:
         write_figures(options.json, {"stages": stage_figures(trace), "images": len(trace.images), "lost": trace.lost})
-    if options.figure:
-        Path(options.figure).parent.mkdir(parents=True, exist_ok=True)
-        draw_way(trace, options.figure)
-        print(f"Picture: {options.figure}")
 
 
 WAY = "image out to grasp force in"
@@ -160,45 +153,3 @@ def format_trace(trace: Trace) -> str:
     lines += ["", f"{len(trace.late)} of {len(trace.images)} images answered. Where the others went, by the nodes "
               "themselves:"]  # fmt: skip
     return "\n".join([*lines, *(f"- {name}: {why}" for name, why in trace.lost.items())])
-
-
-def median_image(trace: Trace) -> int:
-    """Return the stamp [ns] of the image that was answered in the median time.
-
-    Raises:
-        TraceError: none was answered.
-    """
-    noted = set(trace.spans["image"])
-    known = sorted((late, stamp) for stamp, late in trace.late.items() if stamp in noted)
-    if not known:
-        raise TraceError("no image was answered; expected one at least")
-    return known[len(known) // 2][1]
-
-
-def draw_way(trace: Trace, path: Path | str) -> None:
-    """Draw who was at work when for the image in the middle of all, and how long images took in all."""
-    from finforce_eval.figures.figures import BLACK, BLUE, GREY, ORANGE, new_figure, style_axes
-
-    stamp = median_image(trace)
-    spans = trace.spans[trace.spans["image"] == stamp]
-    height = 0.28 * len(spans)
-    figure = new_figure(10.0, height + 3.4)
-    way, all_of_them = figure.subplots(2, 1, height_ratios=[height + 0.6, 1.6])
-    way.barh(range(len(spans)), spans["end"] - spans["begin"], left=spans["begin"], height=0.7, color=BLUE, alpha=0.85)
-    for row, (end, own) in enumerate(zip(spans["end"], spans["own"], strict=True)):
-        way.text(end + 0.1, row, f"{own:.2f} ms", va="center", fontsize=7, color=BLACK)
-    way.set_yticks(range(len(spans)), spans["stage"], fontsize=7)
-    way.invert_yaxis()
-    way.axvline(trace.late[stamp], color=ORANGE, linewidth=1.2)
-    way.text(trace.late[stamp], -0.9, "grasp force", color=ORANGE, ha="center", fontsize=8)
-    way.set_xlabel("after the image left [ms]; next to each bar the time of the stage itself")
-    way.set_xlim(left=0.0, right=1.15 * max(trace.late[stamp], spans["end"].max()))
-    late = np.array(list(trace.late.values()))
-    all_of_them.hist(late, bins=np.linspace(0.0, max(40.0, float(late.max())), 80), color=GREY)
-    for percent in PERCENTS:
-        all_of_them.axvline(np.percentile(late, percent), color=ORANGE, linewidth=1.0)
-    all_of_them.set_xlabel(f"{WAY} [ms]; lines: 50, 95 and 99 %")
-    all_of_them.set_ylabel("images")
-    for axes in (way, all_of_them):
-        style_axes(axes)
-    figure.savefig(path)

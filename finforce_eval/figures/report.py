@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import re
+from base64 import b64encode
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from finforce_eval.evaluation.scoring import Evaluation
 from finforce_eval.evaluation.tables import markdown_tables, score_table
-from finforce_eval.figures.html_report import write_html
-from finforce_eval.recordings.tracks import Recording
+from finforce_eval.recordings.tracks import DIRECTIONS, Recording
 from finforce_eval.table import ForceSeries
 
 TITLE = "Force from key points"
@@ -181,3 +186,95 @@ def _forget_pictures(folder: Path, name: str, pictures: Mapping[str, str]) -> st
     for end in pictures:
         (folder / f"{stem}_{end}.png").unlink(missing_ok=True)
     return stem
+
+
+TEMPLATE = Path(__file__).parents[1] / "data" / "page" / "report.html"
+_PLACE = "@DATA@"
+_MOST_WORDS = 255
+
+
+def write_html(
+    series: Sequence[ForceSeries],
+    path: Path,
+    *,
+    title: str,
+    about: Mapping[str, str],
+    columns: Sequence[str] = (),
+    rows: Sequence[Sequence[str]] = (),
+) -> Path:
+    """Write the page.
+
+    Args:
+        series: one plot each.
+        path: of the page.
+        title: its heading.
+        about: what was run, name by name.
+        columns: of a table above the plots; the first holds names.
+        rows: of the table: one for each series, in their order, and any after them; without one, images and answers.
+
+    Returns:
+        The page.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    if not rows:
+        columns, rows = _count_answers(series)
+    content = {
+        "title": title,
+        "about": dict(about),
+        "columns": list(columns),
+        "rows": [list(row) for row in rows],
+        "items": [_describe(each) for each in series],
+    }
+    # no text in it can end the script that holds it
+    data = json.dumps(content).replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(TEMPLATE.read_text(encoding="utf-8").replace(_PLACE, data), encoding="utf-8")
+    return path
+
+
+def _count_answers(series: Sequence[ForceSeries]) -> tuple[list[str], list[list[str]]]:
+    """Return columns and rows that tell of images, answers and the largest force."""
+    rows = []
+    for each in series:
+        known = each.magnitude[each.solved]
+        answered = f"{100.0 * len(known) / max(len(each), 1):.1f}"
+        largest = f"{known.max():.2f}" if len(known) else "-"
+        rows.append([each.name, str(len(each)), answered, largest])
+    return ["recording", "images", "answered/%", "largest force/N"], rows
+
+
+def _describe(series: ForceSeries) -> dict[str, Any]:
+    """Return what the page's script reads of a series."""
+    words, status = np.unique(series.column("status"), return_inverse=True)
+    columns = {
+        "time": series.seconds if len(series) else np.zeros(0),
+        "found": series.magnitude,
+        "stddev": np.where(series.solved, series.column("magnitude_stddev"), np.nan),
+        **dict(zip("xyz", series.force.T, strict=True)),
+    }
+    if series.has("true_force"):
+        columns["truth"] = series.true_magnitude
+    return {
+        "name": series.name,
+        "images": len(series),
+        "lost": int((~series.solved).sum()),
+        "words": words[:_MOST_WORDS].tolist(),
+        "status": _encode(np.minimum(status, _MOST_WORDS - 1), np.uint8),
+        "phase": _encode(_phase(series), np.uint8),
+        **{name: _encode(values, np.float32) for name, values in columns.items()},
+    }
+
+
+def _phase(series: ForceSeries) -> NDArray[np.uint8]:
+    """Return 0, in a record phase of loading (or without direction) 1, of unloading 2, of each image (n,)."""
+    if not series.has("direction"):
+        return np.zeros(len(series), np.uint8)
+    load, unload = (series.column("direction") == direction for direction in DIRECTIONS)
+    return np.where(series.scored, np.where(unload, 2, np.where(load, 1, 0)), 0).astype(np.uint8)
+
+
+def _encode(values: ArrayLike, kind: type) -> str:
+    """Return numbers as the page has them: little-endian bytes in base 64."""
+    return b64encode(np.ascontiguousarray(values, np.dtype(kind).newbyteorder("<")).tobytes()).decode()

@@ -8,8 +8,7 @@ from pathlib import Path
 
 from finforce_eval.cli.parser import SOURCES, add_engine_options, read_engine
 from finforce_eval.errors import OptionError
-from lab.experiments.experiment import PAGE, Experiment, run_experiment
-from lab.experiments.runs import RunOptions
+from lab.experiments.experiment import PAGE, Experiment, RunOptions, run_experiment
 from lab.harness import format_figures
 
 TWIN = "twin"

@@ -1,4 +1,4 @@
-"""The subcommand `stress`: families in, table, JSON, page and exit status out."""
+"""The subcommand `stress`: families in, table, JSON and exit status out."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import argparse
 import secrets
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
@@ -51,7 +50,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--mesh", default="default", choices=MESHES, help="mesh density")
     parser.add_argument("--jaw", default="bench", metavar="FILE", help="jaw file, or name of an included jaw (bench)")
     parser.add_argument("--json", metavar="OUT", help="write the figures as JSON")
-    parser.add_argument("--report", metavar="DIR", help="write a page with all families by level")
 
 
 def choose_families(names: str | None) -> list[Family]:
@@ -97,20 +95,6 @@ def list_broken(summary: Mapping[str, Any], trials: Sequence[Trial]) -> list[str
     return lines
 
 
-def write_page(
-    folder: Path, summaries: Sequence[Mapping[str, Any]], trials: Mapping[str, Sequence[Trial]], what: Mapping[str, str]
-) -> None:
-    """Write `stress.md`: the table, then each family by level with what is broken."""
-    folder.mkdir(parents=True, exist_ok=True)
-    lines = ["# Numerical stress", "", format_summaries(summaries), ""]
-    for summary in summaries:
-        name = summary["name"]
-        lines += [f"## {name}", "", f"{what[name]}.", ""]
-        lines += [format_summaries(summarise_levels(trials[name]), "level"), ""]
-        lines += [f"- {line.strip()}" for line in list_broken(summary, trials[name])] + [""]
-    (folder / "stress.md").write_text("\n".join(lines), encoding="utf-8")
-
-
 def describe_trial(trial: Trial) -> str:
     """Return a trial in one line."""
     errors = zip(AXES, trial.errors, trial.stated, strict=False)
@@ -136,8 +120,6 @@ def run(options: argparse.Namespace) -> int:
     print("\n".join(line for lines in broken.values() for line in lines))
     if options.json:
         write_figures(options.json, {"plan": asdict(plan), "families": collect_figures(summaries, trials)})
-    if options.report:
-        write_page(Path(options.report), summaries, trials, {family.name: family.what for family in families})
     return int(any(broken[family.name] for family in families if family.ruled))
 
 

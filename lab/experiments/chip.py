@@ -15,9 +15,8 @@ from finforce_eval.evaluation.scoring import measure_sharpness
 from finforce_eval.figures.figures import BLACK, BLUE, GREEN, ORANGE
 from finforce_sim.gripper import PressedGrasp
 from finforce_sim.scenarios import build_scenario
-from lab.experiments.experiment import Experiment, draw_panels, tabulate
+from lab.experiments.experiment import Case, Experiment, RunOptions, draw_panels, tabulate
 from lab.experiments.grasp_world import EstimatorSensor, GraspCase, ImageSensor, NoisySensor, World, build_plant
-from lab.experiments.runs import Case, RunOptions
 from lab.harness import Figures
 
 BEARS, BREAKS = 5.0, 5.43  # [N]

@@ -15,8 +15,18 @@ from numpy.typing import NDArray
 from finforce_eval.evaluate import evaluate_all
 from finforce_eval.evaluation.scoring import ONSET_FORCE, Evaluation, force_delays, measure_sharpness, rms
 from finforce_eval.figures.figures import BLACK, BLUE, GREEN, ORANGE
-from lab.experiments.experiment import Experiment, average, draw_panels, tabulate
-from lab.experiments.runs import SHARP, Case, RunOptions, axis_sharpness, build_setup, keep_poses
+from lab.experiments.experiment import (
+    SHARP,
+    Case,
+    Experiment,
+    RunOptions,
+    average,
+    axis_sharpness,
+    build_setup,
+    draw_panels,
+    keep_poses,
+    tabulate,
+)
 from lab.harness import Figures
 
 SCENES = {"cylinder": "grasp_cylinder", "cube": "grasp_cube", "asymmetric": "grasp_asymmetric"}

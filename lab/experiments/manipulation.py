@@ -20,8 +20,7 @@ from finforce_eval.table import AXES, ForceSeries
 from finforce_ifea.grasp_force import R_GRIPPER_JAW
 from finforce_sim.footage import START
 from finforce_sim.scenarios import build_scenario, write_script
-from lab.experiments.experiment import Experiment, average, tabulate
-from lab.experiments.runs import SHARP, Case, RunOptions, build_setup
+from lab.experiments.experiment import SHARP, Case, Experiment, RunOptions, average, build_setup, tabulate
 from lab.harness import Figures
 
 MASS, SPEED = 0.1, 1.2  # [kg], [rad/s]

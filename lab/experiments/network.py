@@ -21,9 +21,18 @@ from finforce_eval.figures.figures import BLACK, BLUE, ORANGE
 from finforce_eval.recordings.images import StampedImage
 from finforce_keypoints.networks.runtime import open_session
 from finforce_keypoints.networks.side_network import METADATA
-from lab.experiments.experiment import Experiment, average, draw_panels, tabulate
+from lab.experiments.experiment import (
+    SHARP,
+    Case,
+    Experiment,
+    RunOptions,
+    average,
+    axis_sharpness,
+    build_setup,
+    draw_panels,
+    tabulate,
+)
 from lab.experiments.grasp import find_phases, join_jaws
-from lab.experiments.runs import SHARP, Case, RunOptions, axis_sharpness, build_setup
 from lab.harness import Figures
 
 SHOWN = 10  # images that the network is given at a time

@@ -17,8 +17,7 @@ from finforce_eval.evaluation.scoring import ONSET_FORCE, Evaluation
 from finforce_eval.evaluation.setup import EvaluationSetup
 from finforce_eval.recordings.tracks import Recording
 from finforce_eval.table import AXES
-from lab.experiments.experiment import Experiment
-from lab.experiments.runs import SHARP, Case, RunOptions, axis_sharpness, build_setup
+from lab.experiments.experiment import SHARP, Case, Experiment, RunOptions, axis_sharpness, build_setup
 from lab.harness import Figures
 
 # Ø [mm] and height of the axis [mm] of the twin's cylinders, whose finger the paper's heights do not fit

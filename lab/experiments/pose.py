@@ -28,9 +28,8 @@ from finforce_keypoints.images import RgbdImage
 from finforce_sim.footage import CAMERAS, FINGER, START
 from finforce_sim.gripper import TwinGripper
 from finforce_sim.scenarios import build_scenario
-from lab.experiments.experiment import Experiment
+from lab.experiments.experiment import SHARP, Case, Experiment, RunOptions, axis_sharpness, build_setup, keep_poses
 from lab.experiments.grasp import join_jaws, score_grasp
-from lab.experiments.runs import SHARP, Case, RunOptions, axis_sharpness, build_setup, keep_poses
 from lab.harness import Figures
 
 SCENES = {

@@ -14,8 +14,7 @@ from finforce_eval.cli.main import main
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluate import read_evaluations
 from finforce_eval.evaluation.scoring import score_results, true_range
-from finforce_eval.figures.html_report import write_html
-from finforce_eval.figures.report import write_page
+from finforce_eval.figures.report import write_html, write_page
 from finforce_eval.recordings.writer import write_recording
 from finforce_eval.table import ForceSeries, read_table, write_table
 

@@ -4,7 +4,6 @@ import json
 
 import pytest
 from builtin_interfaces.msg import Time
-from eval_fakes import drawn_hues
 from geometry_msgs.msg import PoseStamped
 from std_msgs.msg import Header
 
@@ -13,9 +12,7 @@ from finforce_eval.cli.trace import (
     WAY,
     Trace,
     TraceError,
-    draw_way,
     format_trace,
-    median_image,
     read_spans,
     stage_figures,
 )
@@ -65,14 +62,6 @@ def test_figures_come_in_the_order_of_the_way_with_the_whole_of_it_last(ways):
     text = format_trace(make_trace(ways))
     assert "3 of 4 images answered" in text and "left jaw: 1 late" in text
     assert "| solver: left/keypoints | 1 | 3.00 | 3.00 |" in text
-
-
-def test_the_image_in_the_middle_is_one_that_was_noted(ways, tmp_path):
-    assert median_image(make_trace(ways)) == 10
-    draw_way(make_trace(ways), tmp_path / "way.png")
-    assert drawn_hues(tmp_path / "way.png") >= 2
-    with pytest.raises(TraceError, match="no image was answered"):
-        median_image(Trace(spans=ways, late={}, images=[10], lost={}))
 
 
 def test_a_folder_without_anything_of_an_image_is_said(tmp_path):

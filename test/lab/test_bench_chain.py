@@ -11,6 +11,7 @@ from finforce_eval.replay.live import ReplayLog
 from finforce_eval.replay.node_run import NodeRun
 from lab.bench.chain import (
     IMAGES,
+    START,
     TOGETHER,
     TrueGrasp,
     describe_run,
@@ -19,7 +20,6 @@ from lab.bench.chain import (
     find_delays,
     measure,
 )
-from lab.bench.streams import START
 
 FIRST = 10**12
 PERIOD = NANOSECONDS // 10

@@ -15,7 +15,7 @@ from finforce_eval.recordings.images import IMAGE
 from finforce_eval.replay.playback import RawMessage
 from finforce_sim.footage import Footage
 from finforce_sim.photographer import SceneSetting
-from lab.bench.streams import (
+from lab.bench.chain import (
     FINE_RATE,
     OBJECT_TOPIC,
     START,

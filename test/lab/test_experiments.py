@@ -25,13 +25,22 @@ from finforce_eval.tasks import Manifest
 from finforce_ifea.grasp_force import R_GRIPPER_JAW
 from lab.experiments import grasp_world
 from lab.experiments.chip import CHIP
-from lab.experiments.experiment import Experiment, average, run_experiment, tabulate
+from lab.experiments.experiment import (
+    Case,
+    Experiment,
+    RunOptions,
+    average,
+    build_scene,
+    keep_poses,
+    list_missing,
+    run_experiment,
+    tabulate,
+)
 from lab.experiments.grasp import GRASP, find_phases, score_grasp
 from lab.experiments.manipulation import MANIPULATION, score_weight, tell_gravity, true_gravity
 from lab.experiments.network import HEIGHT, NETWORK, SHOWN, WIDTH, ForceNetwork, reduce_image
 from lab.experiments.paper_tables import BENCH
 from lab.experiments.pose import POSE, drop_poses, flip_poses, score_poses, track_object, true_poses
-from lab.experiments.runs import Case, RunOptions, build_scene, keep_poses, list_missing
 from lab.harness import Figures, format_figures
 from lab.scenes import find_scene
 

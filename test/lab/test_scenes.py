@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from finforce_sim.footage import START
 from lab import scenes
-from lab.bench import streams
-from lab.bench.streams import FINE_RATE, slot_of
+from lab.bench import chain
+from lab.bench.chain import FINE_RATE, slot_of
 from lab.scenes import EVERY_RATE, GRASP, SmoothGripper, find_scene
 
 
@@ -54,7 +54,7 @@ def test_states_of_the_script_are_not_changed():
 
 
 def test_slots_are_those_of_the_stamps_that_a_scene_is_recorded_with():
-    assert streams.START == START
+    assert chain.START == START
     assert slot_of(START + round(1e9 * 7 / FINE_RATE)) == 7
 
 
