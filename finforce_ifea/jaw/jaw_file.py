@@ -184,7 +184,8 @@ class DrawingEntry(FileModel):
 class SectionClamp(FileModel):
     """What the holder keeps from moving: all below a height, circles about bolts, or both."""
 
-    z_below: Length | None = Field(None, description="All up to this height [m]")
+    z_below: Length | None = Field(None, description="All up to this height at x = 0 [m]")
+    slope: Number = Field(0.0, gt=-2.0, lt=2.0, description="Rise of that height with x [-], of a tilted base")
     circles: tuple[Point, ...] = Field((), description="Circles [x, z, radius] [m]")
 
     @model_validator(mode="after")
@@ -226,6 +227,7 @@ class SectionEntry(FileModel):
             width=width,
             taper=np.array(self.taper),
             clamped_z=self.clamped.z_below,
+            clamp_slope=self.clamped.slope,
             clamped_circles=np.array(self.clamped.circles).reshape(-1, 3),
             size=self.size,
         )

@@ -25,7 +25,8 @@ class Section:
         rings: (n, 2) each, x and z [m, jaw frame]: the outline counterclockwise, then the holes clockwise.
         width: [m], along y, at x = z = 0; the finger is symmetric about y = 0.
         taper: (2,) [-], change of the width along x and z; its sides are planes.
-        clamped_z: [m], everything up to this height is clamped; None where circles alone do.
+        clamped_z: [m], everything up to this height at x = 0 is clamped; None where circles alone do.
+        clamp_slope: [-], rise of that height with x.
         clamped_circles: (c, 3), x, z and radius [m] about bolts: everything within is clamped.
         size: [m], of the elements in the section; None for what the thinnest parts ask for.
     """
@@ -34,6 +35,7 @@ class Section:
     width: float
     clamped_z: float | None = 0.0
     clamped_circles: NDArray
+    clamp_slope: float = 0.0
     size: float | None = None
     taper: NDArray = field(default_factory=lambda: np.zeros(2))
 
@@ -56,16 +58,15 @@ class Section:
         """All that makes the finger's shape and clamp, to a micrometre."""
         numbers = [self.width, np.nan if self.clamped_z is None else self.clamped_z, *self.clamped_circles.ravel()]
         numbers += self.taper.tolist() if self.taper.any() else []
+        numbers += [self.clamp_slope] if self.clamp_slope else []
         rings = [np.round(1e6 * ring).astype(np.int64).tobytes() for ring in self.rings]
         return b"|".join([np.round(1e6 * np.array(numbers)).tobytes(), *rings])
 
     @cached_property
     def free_area(self) -> float:
         """The area [m^2] above the clamp."""
-        if self.clamped_z is None:
-            return float(self.polygon.area)
-        low_x, _, high_x, high_z = self.polygon.bounds
-        return float(self.polygon.intersection(shapely.box(low_x, self.clamped_z, high_x, high_z)).area)
+        held = 0.0 if self.clamped_z is None else cut_below(self.polygon, self.clamped_z, self.clamp_slope).area
+        return float(self.polygon.area - held)
 
     @property
     def inner_face_x(self) -> float:
@@ -77,11 +78,13 @@ class Section:
         """The largest z [m]."""
         return float(self.rings[0][:, 1].max())
 
+    def clamp_height(self, x: float | NDArray) -> float | NDArray:
+        """Return up to which height [m] everything is clamped at x [m], -inf where circles alone are."""
+        return -np.inf + 0.0 * x if self.clamped_z is None else self.clamped_z + self.clamp_slope * x
+
     def find_clamped(self, points: NDArray) -> NDArray:
         """Return which of points (n, 2) [m] are clamped, (n,) bool."""
-        held = np.zeros(len(points), bool)
-        if self.clamped_z is not None:
-            held |= points[:, 1] <= self.clamped_z + 1e-9
+        held = points[:, 1] <= self.clamp_height(points[:, 0]) + 1e-9
         for x, z, radius in self.clamped_circles:
             held |= np.hypot(points[:, 0] - x, points[:, 1] - z) <= radius + 1e-9
         return held
@@ -91,6 +94,14 @@ class Section:
         lateral = np.maximum(np.abs(points[:, 1]) - 0.5 * self.read_width(points[:, [0, 2]]), 0.0)
         in_plane = shapely.distance(self.polygon, shapely.points(points[:, [0, 2]]))
         return np.hypot(lateral, in_plane)
+
+
+def cut_below(polygon: shapely.Polygon, height: float, slope: float = 0.0) -> shapely.Geometry:
+    """Return the part of a section below a line: a height [m] at x = 0, and its rise with x [-]."""
+    low_x, low_z, high_x, high_z = polygon.bounds
+    deep = low_z - np.ptp(polygon.bounds)
+    corners = [(x, z) for x in (low_x, high_x) for z in (deep, max(height + slope * x, deep))]
+    return polygon.intersection(shapely.MultiPoint(corners).convex_hull)
 
 
 def find_reach(polygon: shapely.Polygon, z: NDArray) -> NDArray:
@@ -217,7 +228,7 @@ def find_face(section: Section, face_x: float) -> FaceLine:
 
     It begins at the clamp and ends where it falls away towards the tip.
     """
-    low = section.rings[0][:, 1].min() if section.clamped_z is None else section.clamped_z
+    low = max(section.rings[0][:, 1].min(), float(section.clamp_height(face_x)))
     z = np.arange(low, section.length - 0.5 * _FACE_SPACING, _FACE_SPACING)
     x = find_reach(section.polygon, z)
     near = np.abs(x - face_x) < _ON_FACE

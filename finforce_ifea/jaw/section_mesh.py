@@ -80,7 +80,7 @@ class _SizeField:
 
     def __init__(self, section: Section, size: float) -> None:
         self.size = size
-        self._still = -np.inf if section.clamped_z is None else section.clamped_z - _EDGE * size
+        self._section = section
         places, sizes = [], []
         for ring in section.rings:
             length = np.linalg.norm(np.roll(ring, -1, axis=0) - ring, axis=1)
@@ -97,7 +97,8 @@ class _SizeField:
         """Return the size (n,) [m] at points (n, 2) [m]."""
         distance, index = self._tree.query(points, k=self._count)
         wanted = (self._sizes[index] + _GROWTH * distance).reshape(len(points), -1)
-        largest = np.where(points[:, 1] < self._still, _COARSER * self.size, self.size)
+        still = self._section.clamp_height(points[:, 0]) - _EDGE * self.size
+        largest = np.where(points[:, 1] < still, _COARSER * self.size, self.size)
         return np.minimum(wanted.min(axis=1), largest)
 
 

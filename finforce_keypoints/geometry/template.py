@@ -113,7 +113,7 @@ def find_shape(jaw: Jaw) -> SideShape:
     if jaw.section is not None:
         rings: Sequence[NDArray] = jaw.section.rings
         lowest = min(float(ring[:, 1].min()) for ring in rings)
-        clamped_z = lowest if jaw.section.clamped_z is None else jaw.section.clamped_z
+        clamped_z = max(lowest, float(jaw.section.clamp_height(0.0)))
         bolts = jaw.section.clamped_circles
     elif jaw.drawing is not None:
         rings, clamped_z = _rings_of(_draw_bars(jaw)), jaw.drawing.clamped_z

@@ -86,15 +86,92 @@ def test_what_else_programs_export_is_the_same_finger(tmp_path, surface, name):
     check_found(recognize((raw := read_mesh(tmp_path, surface, name)).polygon, raw.width, Overrides()))
 
 
-def test_a_floor_a_slot_and_a_wider_base_are_named_with_their_place(tmp_path, surface):
+def test_a_floor_and_a_slot_are_named_with_their_place(tmp_path, surface):
     low, high = surface.bounds
     size, middle, side = high - low, 0.5 * (low + high), np.array([0.0, 0.5 * WIDTH, 0.0])
     floor = boxes_joined(surface, ((0.6 * size[0], 1.0, 0.6 * size[2]), middle - side + [0.0, 0.5, 0.0]))
-    base = boxes_joined(surface, ((size[0], 1.6 * WIDTH, 8.0), [middle[0], middle[1], low[2] + 4.0]))
     slot = boxes_joined(surface, ((3.0, 0.4 * WIDTH, 0.5 * size[2]), [high[0], middle[1], middle[2]]), cut=True)
-    for mesh, word in ((floor, "a floor"), (base, "wider than the blade"), (slot, "a slot")):
+    for mesh, word in ((floor, "a floor"), (slot, "a slot")):
         with pytest.raises(JawFileError, match=f"have another section.*{word}"):
             read_mesh(tmp_path, mesh)
+
+
+@pytest.mark.parametrize(("height", "clamp"), [(8.0, 10.5), (15.0, 15.0), (40.0, None)])
+def test_a_blade_on_a_wider_base_has_its_own_width_where_the_clamp_holds_the_base(tmp_path, surface, height, clamp):
+    low, high = surface.bounds
+    size, middle = high - low, 0.5 * (low + high)
+    base = boxes_joined(surface, ((size[0], 1.6 * WIDTH, height), [middle[0], middle[1], low[2] + 0.5 * height]))
+    raw = read_mesh(tmp_path, base)
+    assert raw.width == pytest.approx(WIDTH * MILLIMETRE)
+    if clamp is None:
+        with pytest.raises(JawFileError, match="wider than its blade up to z = 40 of 70 mm"):
+            recognize(raw.polygon, raw.width, Overrides(), wider=raw.base)
+        return
+    finger = recognize(raw.polygon, raw.width, Overrides(), wider=raw.base)
+    assert finger.clamped_z == pytest.approx(clamp * MILLIMETRE, abs=3e-4)
+    assert finger.width == pytest.approx(WIDTH * MILLIMETRE)
+
+
+@pytest.mark.parametrize("kind", ["nut", "slot"])
+def test_seats_of_nuts_and_slots_are_bolts_and_no_cells(kind):
+    polygon = draw_polygon(bolts=())
+    for x in (-8.0, 8.0):
+        nut = shapely.Polygon([(x + 1.7 * np.cos(a), 5.0 + 1.7 * np.sin(a)) for a in np.pi / 3.0 * np.arange(6)])
+        slot = shapely.LineString([(x - 1.3, 5.0), (x + 1.3, 5.0)]).buffer(1.5)
+        polygon = polygon.difference(slot if kind == "slot" else nut)
+    check_found(recognize(shapely.affinity.scale(polygon, 1e-3, 1e-3, origin=(0, 0)), 0.02, Overrides()))
+
+
+def draw_triangle(tilt, ribs, plate=1.6, band=1.6):
+    """A triangle with an upright inner face on a base that rises towards it, and ribs given by their ends."""
+    corners = [(14.0, 0.0), (14.0, 80.0), (-14.0, -28.0 * tilt)]
+    whole = shapely.Polygon([(14.0, -plate), *corners, (-14.0, -28.0 * tilt - plate)])
+    room = shapely.Polygon(corners).buffer(-band, join_style="mitre")
+    for start, end in ribs:
+        room = room.difference(shapely.LineString([start, end]).buffer(0.5, cap_style="flat"))
+    return shapely.affinity.scale(whole.difference(room), 1e-3, 1e-3, origin=(0, 0))
+
+
+LEVEL = [((-20.0, z + 4.0), (20.0, z)) for z in (12.0, 26.0, 40.0, 54.0)]
+
+
+@pytest.mark.parametrize("tilt", [-0.1, 0.1, 0.4])
+def test_a_tilted_base_is_held_from_band_to_band(tmp_path, tilt):
+    finger = recognize(draw_triangle(tilt, LEVEL), 0.02, Overrides())
+    assert finger.clamp_slope == pytest.approx(tilt, abs=1e-3) and len(finger.ribs) == len(LEVEL)
+    floor = finger.rings[0][finger.find_clamped(finger.rings[0])]
+    assert np.ptp(floor[:, 0]) == pytest.approx(28e-3, abs=1e-3)  # all of the edge, and nothing above the plate
+    assert (finger.clamp_height(floor[:, 0]) - floor[:, 1]).max() < 3.5e-3
+    level = recognize(draw_triangle(0.0, LEVEL), 0.02, Overrides())
+    assert level.clamp_slope == 0.0
+
+
+def test_a_rib_that_ends_on_the_base_is_a_rib_without_a_key_point_there():
+    ribs = [((-20.0, 30.0), (4.0, -2.0)), ((-20.0, 48.0), (20.0, 10.0)), ((-20.0, 64.0), (20.0, 26.0))]
+    finger = recognize(draw_triangle(0.0, ribs), 0.02, Overrides())
+    assert len(finger.ribs) == 3
+    points = choose_keypoints(finger)
+    assert {name for name in points if "_" in name and name.count("_") == 1} >= {"outer_1", "outer_2", "inner_2"}
+    assert "inner_1" not in points
+    places = np.array(list(points.values()))[:, [0, 2]]
+    apart = np.linalg.norm(places[:, None] - places, axis=2) + np.eye(len(places))
+    assert apart.min() > 2e-3
+
+
+def test_sides_that_are_alike_are_told_and_a_step_of_the_base_bends_no_face():
+    step = draw_triangle(0.0, LEVEL).union(shapely.box(4e-3, -10e-3, 14e-3, -1e-3))
+    finger = recognize(step, 0.02, Overrides())
+    assert finger.face_deviation < 2e-5 and finger.clamp_slope == 0.0
+    assert 8.4e-3 < finger.clamped_z < 10.1e-3  # the step and a part of the plate
+    alike = shapely.Polygon([(-12.0, 0.0), (12.0, 0.0), (0.0, 80.0)])
+    room = alike.buffer(-1.6, join_style="mitre")
+    for z in (14.0, 28.0, 42.0):
+        room = room.difference(shapely.LineString([(-30.0, z + 15.0), (30.0, z - 15.0)]).buffer(0.5, cap_style="flat"))
+    alike = shapely.affinity.scale(alike.difference(room), 1e-3, 1e-3, origin=(0, 0))
+    for polygon in (alike, shapely.affinity.rotate(alike, 130.0), shapely.affinity.scale(alike, -1.0, 1.0)):
+        finger = recognize(polygon, 0.02, Overrides())
+        assert any("alike" in note for note in finger.notes)
+        assert all(rib.inner[1] > rib.outer[1] for rib in finger.ribs)
 
 
 def test_a_small_hole_across_is_left_out_with_a_word(tmp_path, surface):

@@ -29,6 +29,8 @@ _ASIDE, _SIDE, _RULINGS = 0.5, 1e-4, 4
 # Cuts across it, evenly over the width: they may differ from the usual one by so much of its area on average, and few
 # of them by what is seen; what differs by more is another section.
 _CUTS, _ALIKE, _SEEN, _RARE, _OTHER = 25, 0.02, 0.01, 0.2, 0.1
+# A base is shorter than this share of the blade on it.
+_SHORT = 0.6
 # Ends of cut triangles are joined on a grid of this size [m].
 _GRID = 2e-7
 _CHORD = 2e-5
@@ -43,6 +45,7 @@ class RawSection:
         polygon: in metres, in a plane of the file's.
         width: along the extrusion [m], of a tapered finger at the section's origin; None where the file is flat.
         taper: (2,) [-], change of the width along the section's axes.
+        base: where the body is wider than that, which the clamp has to hold; None for nowhere.
         notes: what was found and guessed, a line each.
     """
 
@@ -50,6 +53,7 @@ class RawSection:
     width: float | None
     notes: list[str] = field(default_factory=list)
     taper: NDArray = field(default_factory=lambda: np.zeros(2))
+    base: shapely.Geometry | None = None
 
 
 def read_section(path: Path, *, unit: str | None = None, body: int | None = None) -> RawSection:
@@ -146,14 +150,25 @@ def _cut_surface(mesh: trimesh.Trimesh, unit: str | None, body: int | None) -> R
     if share < _PRISMATIC and not cuts.is_one:
         return _cut_tapered(mesh, axis, notes)
     letters = np.round(axis, 3).tolist()
+    base, width = None, cuts.width
     if not cuts.is_one:
-        raise JawFileError(f"is not prismatic along {letters}: {cuts.describe()}")
-    notes.append(f"prismatic along {letters} of the file, {1e3 * cuts.width:.4g} mm wide")
+        base = cuts.find_base()
+        if base is None:
+            raise JawFileError(f"is not prismatic along {letters}: {cuts.describe()}")
+        width = _measure_blade(mesh, axis, base)
+        notes.append(f"a blade {1e3 * width:.4g} mm wide on a base of {1e3 * cuts.width:.4g} mm")
+    notes.append(f"prismatic along {letters} of the file, {1e3 * width:.4g} mm wide")
     if share < _PRISMATIC:
         notes.append(f"edges that are chamfered or rounded are left out: {1.0 - share:.0%} of its surface")
     if pieces := int((cuts.pieces > 1).sum()):
         notes.append(f"a hole across it is left out: it parts {pieces} of {_CUTS} cuts")
-    return RawSection(polygon=cuts.section, width=cuts.width, notes=notes)
+    return RawSection(polygon=cuts.section, width=width, notes=notes, base=base)
+
+
+def _measure_blade(mesh: trimesh.Trimesh, axis: NDArray, base: shapely.Geometry) -> float:
+    """Return the width [m] along an axis of what stands out of a wider base."""
+    flat = mesh.vertices @ np.stack(_span(axis)).T
+    return float(np.ptp((mesh.vertices @ axis)[~shapely.contains_xy(base.buffer(_CHORD), *flat.T)]))
 
 
 def _drop_doubles(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
@@ -182,6 +197,7 @@ class _Cuts:
         areas: (n,) [m^2].
         pieces: (n,) into which each falls.
         width: of the body.
+        others: those that are another section.
     """
 
     section: shapely.Polygon
@@ -189,6 +205,13 @@ class _Cuts:
     areas: NDArray
     pieces: NDArray
     width: float
+    others: tuple[shapely.Geometry, ...]
+
+    def find_base(self) -> shapely.Geometry | None:
+        """Return what a base on both sides of a blade has for a section; None where the others are no such base."""
+        base = shapely.union_all(self.others)
+        extent, whole = (np.ptp(np.reshape(area.bounds, (2, 2)), axis=0).max() for area in (base, self.section))
+        return base if extent < _SHORT * whole else None
 
     @property
     def is_one(self) -> bool:
@@ -222,9 +245,11 @@ def _cut_often(mesh: trimesh.Trimesh, axis: NDArray) -> _Cuts:
         raise JawFileError(f"its section has {len(found[_CUTS // 2].geoms)} separate areas, expected one finger")
     typical = float(np.median([cut.area for cut in found]))
     section = min(whole, key=lambda cut: abs(cut.area - typical))
+    difference = np.array([cut.symmetric_difference(section).area for cut in found]) / section.area
     return _Cuts(
         section=section,
-        difference=np.array([cut.symmetric_difference(section).area for cut in found]) / section.area,
+        difference=difference,
+        others=tuple(cut for cut, much in zip(found, difference, strict=True) if much > _OTHER),
         areas=np.array([cut.area for cut in found]),
         pieces=np.array([len(getattr(cut, "geoms", [cut])) for cut in found]),
         width=float(high - low),

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from finforce_ifea.errors import JawFileError
 from finforce_ifea.jaw.cad.cad_file import read_section
-from finforce_ifea.jaw.cad.picture import draw_finger
+from finforce_ifea.jaw.cad.picture import draw_finger, draw_refused
 from finforce_ifea.jaw.cad.recognition import Overrides, RecognizedFinger, recognize
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.jaw.jaw_file import MATERIALS
+from finforce_ifea.jaw.section import cut_below
 
 # Key points [m] above the clamp at least; candidates so far from either end of the inner face, and from each other.
 _ABOVE, _AWAY, _STEP = 1e-3, 4e-3, 4e-3
@@ -60,20 +61,21 @@ def make_jaw(
     width = width or raw.width
     if width is None:
         raise JawFileError(f"{file.name}: a drawing has no width; give it in metres: --width 0.025")
+    picture = picture or output.with_suffix(".png")
+    output.parent.mkdir(parents=True, exist_ok=True)
     try:
-        finger = recognize(raw.polygon, width, overrides, raw.taper)
+        finger = recognize(raw.polygon, width, overrides, raw.taper, raw.base)
     except JawFileError as error:
-        raise JawFileError(f"{file.name}: {error}") from error
+        draw_refused(raw.polygon, str(error), picture)
+        raise JawFileError(f"{file.name}: {error} (its section is drawn in {picture})") from error
     reference, place = _choose_reference(finger)
     section = output.with_suffix(".section.json")
-    output.parent.mkdir(parents=True, exist_ok=True)
     section.write_text(_describe_section(finger, file.name), encoding="utf-8")
     heading = f"# {name}, from {file.name}. Lengths in metres, jaw frame (x closing, y width, z base to tip)."
     lines = [heading, f"name: {name}", *_describe_finger(finger, section.name, material)]
     lines.append(f"reference_point: {_list(_put_on_side(finger, *reference))}  # {place}")
     output.write_text("\n".join(lines) + "\n", encoding="utf-8")
     jaw = load_jaw(output)
-    picture = picture or output.with_suffix(".png")
     draw_finger(finger, jaw, picture)
     spread = f"{1e-6 * jaw.material.young_modulus:.3g} MPa +- {jaw.material.spread:.0%}"
     notes = [
@@ -90,14 +92,16 @@ def choose_keypoints(finger: RecognizedFinger) -> dict[str, NDArray]:
     """Return what a camera can see by name: (3,) [m], jaw frame.
 
     Key points are where the ribs meet the bands, on the side face towards the camera, inner band first, base to tip,
-    and the tip; what the clamp holds is left out, since it does not move. Where these are few, points of the bands half
-    way between them come behind.
+    and the tip; what the clamp holds is left out, since it does not move, and ends of ribs on no band. Where these are
+    few, points of the bands half way between them come behind.
     """
     places = {}
     for band in BANDS:
+        wall = getattr(finger, band)
         for number, rib in enumerate(finger.ribs, start=1):
             x, z = getattr(rib, band)
-            if z > finger.clamped_z + _ABOVE and not finger.find_clamped(np.array([[x, z]])).any():
+            is_there = np.hypot(*(wall.line - (x, z)).T).min() < wall.usual  # else it ends elsewhere, as on the base
+            if is_there and z > finger.clamp_height(x) + _ABOVE and not finger.find_clamped(np.array([[x, z]])).any():
                 places[f"{band}_{number}"] = (x, z)
     top = finger.polygon.intersection(shapely.box(-1.0, finger.length - _TIP, 1.0, 1.0)).centroid
     places["tip"] = (top.x, top.y)
@@ -114,7 +118,7 @@ def _find_middles(
     for band in BANDS:
         line = getattr(finger, band).line
         ends = {name: z for name, (_, z) in places.items() if name.startswith(band)}
-        ends = {"clamp": finger.clamped_z, **ends, "tip": places["tip"][1]}
+        ends = {"clamp": float(finger.clamp_height(line[0, 0])), **ends, "tip": places["tip"][1]}
         for (below, low), (above, high) in pairwise(ends.items()):
             z = 0.5 * (low + high)
             x = float(np.interp(z, line[:, 1], line[:, 0]))
@@ -136,7 +140,7 @@ def _find_face_end(finger: RecognizedFinger) -> float:
 
 def _choose_reference(finger: RecognizedFinger) -> tuple[NDArray, str]:
     """Return a point (2,) [m] that never bends: in the middle of the largest flat patch of what is clamped."""
-    held = finger.polygon.intersection(shapely.box(-1.0, -1.0, 1.0, finger.clamped_z))
+    held = cut_below(finger.polygon, finger.clamped_z, finger.clamp_slope)
     held = max(getattr(held, "geoms", [held]), key=lambda part: part.area, default=held)
     circle = shapely.maximum_inscribed_circle(held) if held.area > 0.0 else None
     if circle is None or circle.length < 1.5e-3:
@@ -161,10 +165,11 @@ def _describe_finger(finger: RecognizedFinger, section: str, name: str) -> list[
         name: of its material.
     """
     material, tapers = MATERIALS[name], bool(finger.taper.any())
-    low, high = finger.clamped_z + _AWAY, _find_face_end(finger) - _AWAY
+    low, high = float(finger.clamp_height(finger.face_x)) + _AWAY, _find_face_end(finger) - _AWAY
     count = int(np.clip(round((high - low) / _STEP) + 1, _FEWEST, _MOST))
     circles = ", ".join(f"[{x:.5f}, {z:.5f}, {radius:.5f}]" for x, z, radius in finger.clamped_circles)
-    clamped = f"z_below: {finger.clamped_z:.5g}" + (f", circles: [{circles}]" if circles else "")
+    tilt = f", slope: {finger.clamp_slope:.5f}" if finger.clamp_slope else ""
+    clamped = f"z_below: {finger.clamped_z:.5g}{tilt}" + (f", circles: [{circles}]" if circles else "")
     return [
         "section:",
         f"  file: {section}  # polygons in the x-z plane",

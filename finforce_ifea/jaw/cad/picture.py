@@ -1,12 +1,18 @@
 """The picture of a recognized finger: its section with all that was found, and the finger in three dimensions."""
 
+from collections.abc import Sequence
 from pathlib import Path
+from textwrap import wrap
+from typing import Any
 
 import numpy as np
+import shapely
+from numpy.typing import NDArray
 
 from finforce_ifea.jaw.cad.recognition import RecognizedFinger
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_ifea.jaw.mesh import VolumeMesh
+from finforce_ifea.jaw.section import order_rings
 
 _VIEW = {"elev": 16.0, "azim": 53.0}  # [deg], from the side that the camera sees
 _MATERIAL, _HELD, _INNER, _OUTER, _RIB = "#d9dee6", "#8a93a3", "#c0392b", "#2d6cb5", "#3a8f4d"
@@ -37,20 +43,45 @@ def draw_finger(finger: RecognizedFinger, jaw: Jaw, path: Path) -> None:
     figure.savefig(path, dpi=110)
 
 
-def _draw_section(axes, finger: RecognizedFinger) -> None:
-    """Draw the material, and what is clamped in a darker tone."""
-    from matplotlib.patches import Circle, PathPatch
+def draw_refused(polygon: shapely.Polygon, reason: str, path: Path) -> None:
+    """Draw a section [m] that shows no finger into a PNG file: its holes with numbers, and why it was refused."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.0, 9.0), layout="constrained")
+    axes = figure.add_subplot()
+    _draw_material(axes, order_rings(polygon))
+    for number, hole in enumerate(polygon.interiors, start=1):
+        place = shapely.Polygon(hole).representative_point()
+        axes.annotate(str(number), (1e3 * place.x, 1e3 * place.y), ha="center", va="center", fontsize=8)
+    axes.set(xlabel="mm, as in the file", ylabel="mm", aspect="equal")
+    axes.autoscale_view()
+    axes.set_title("\n".join(wrap(reason, 90)), fontsize=9)
+    figure.savefig(path, dpi=110)
+
+
+def _draw_material(axes, rings: Sequence[NDArray]) -> Any:
+    """Draw the material within rings (n, 2) [m] and return its patch."""
+    from matplotlib.patches import PathPatch
     from matplotlib.path import Path as Curve
 
     vertices, codes = [], []
-    for ring in finger.rings:
+    for ring in rings:
         vertices.append(1e3 * np.vstack([ring, ring[:1]]))
         codes.append(np.r_[Curve.MOVETO, np.full(len(ring) - 1, Curve.LINETO), Curve.CLOSEPOLY])
     curve = Curve(np.concatenate(vertices), np.concatenate(codes))
-    patch = PathPatch(curve, facecolor=_MATERIAL, edgecolor="black", linewidth=0.7)
-    axes.add_patch(patch)
+    return axes.add_patch(PathPatch(curve, facecolor=_MATERIAL, edgecolor="black", linewidth=0.7))
+
+
+def _draw_section(axes, finger: RecognizedFinger) -> None:
+    """Draw the material, and what is clamped in a darker tone."""
+    from matplotlib.patches import Circle
+
+    patch = _draw_material(axes, finger.rings)
     bounds = 1e3 * np.array(finger.polygon.bounds)
-    held = axes.axhspan(bounds[1] - 1.0, 1e3 * finger.clamped_z, facecolor=_HELD, label="clamped")
+    x = np.array([bounds[0], bounds[2]])
+    held = axes.fill_between(
+        x, bounds[1] - 1.0, 1e3 * finger.clamp_height(1e-3 * x), facecolor=_HELD, edgecolor="none", label="clamped"
+    )
     held.set_clip_path(patch)
     for x, z, radius in 1e3 * finger.clamped_circles:
         around = axes.add_patch(Circle((x, z), radius, facecolor=_HELD))
@@ -63,7 +94,7 @@ def _draw_section(axes, finger: RecognizedFinger) -> None:
 def _draw_walls(axes, finger: RecognizedFinger) -> None:
     """Draw the centre lines with their thickness."""
     for wall, colour, name in ((finger.inner, _INNER, "inner band"), (finger.outer, _OUTER, "outer band")):
-        free = wall.line[:, 1] > finger.clamped_z
+        free = wall.line[:, 1] > finger.clamp_height(wall.line[:, 0])
         label = f"{name}, {_say(wall.thickness[free])} mm"
         axes.plot(*(1e3 * wall.line[free].T), color=colour, linewidth=1.2, label=label)
     for number, rib in enumerate(finger.ribs):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import combinations
 
 import numpy as np
 import shapely
@@ -12,10 +13,12 @@ from scipy.spatial import cKDTree
 from shapely import affinity
 
 from finforce_ifea.errors import JawFileError
-from finforce_ifea.jaw.section import Section, find_reach, order_rings
+from finforce_ifea.jaw.section import Section, cut_below, find_reach, order_rings
 
-# A hole is round, thus a bolt's, when its area is this share of the circle's with its outline.
+# A hole is a bolt's when its area is this share of the circle's with its outline: a round one, or one that is the same
+# after half a turn, as the seat of a nut or a slot; cells narrow towards the tip, and square ones are at 0.79.
 _ROUND, _ROUND_POINTS = 0.955, 8
+_COMPACT, _SYMMETRIC = 0.8, 0.98
 # Points closer to the line between their neighbours than this [m] say nothing.
 _CHORD = 4e-6
 # Spacing of the places [m] where walls are measured.
@@ -30,8 +33,15 @@ _GRIP, _WASHER = 3.0, 2.0
 _FACES = 0.7
 _NEIGHBOURS, _LONGER = 3e-3, 1.4
 _FEWEST, _FLAT = 5, 1e-4
-# The clamp spans so much of the distance between the bands at least.
-_HELD = 0.5
+# Lines are tried through pairs of so many points, which are on them within so much [m].
+_CHORDS, _SIDE = 24, 5e-5
+# Cosines to the base that differ by less are alike.
+_EQUAL = 0.02
+# The clamp spans so much of the distance between the bands at least; the edge of a tilted base, which rises so much,
+# this.
+_HELD, _SPANNED, _TILTED = 0.5, 0.7, 0.02
+# Share of the length up to which there may be a base.
+_LOW = 0.35
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -116,7 +126,11 @@ class Overrides:
 
 
 def recognize(
-    polygon: shapely.Polygon, width: float, overrides: Overrides, taper: NDArray | None = None
+    polygon: shapely.Polygon,
+    width: float,
+    overrides: Overrides,
+    taper: NDArray | None = None,
+    wider: shapely.Geometry | None = None,
 ) -> RecognizedFinger:
     """Find the parts of a fin-ray finger in its section.
 
@@ -125,6 +139,7 @@ def recognize(
         width: of the finger [m], where its sides are no parallel planes that at the origin of the section.
         overrides: what is given.
         taper: (2,) [-], change of the width along the section's axes; None for none.
+        wider: where the body is wider than that, as its base; None for nowhere.
 
     Raises:
         JawFileError: The section shows no fin-ray finger; the message says what it shows and what to do.
@@ -142,16 +157,22 @@ def recognize(
     bolts, cells = _split_holes(turned)
     bolts, cells = _fit_bolts(bolts), _order_cells(cells)
     inner, outer, ribs = _measure_walls(turned, cells)
-    clamped_z, circles = _propose_clamp(cells, bolts, inner, overrides, notes)
-    _check_legs(turned, (inner, outer), clamped_z, circles)
-    face_x, deviation = _measure_face(turned, cells, clamped_z)
+    slope, floor = _find_floor(turned, (inner, outer))
+    clamped_z, circles = _propose_clamp(cells, bolts, inner, (slope, floor), overrides, notes)
+    top = 0.0 if wider is None else _find_top(wider, frame, slope, turned)
+    if top > clamped_z:
+        clamped_z = top
+        notes.append(f"clamped up to z = {1e3 * top:.4g} mm, as far as it is wider than the blade")
+    held = _find_held(turned, clamped_z, slope, circles)
+    _check_legs(held, (inner, outer), clamped_z)
+    face_x, deviation = _measure_face(turned, cells, clamped_z, slope)
     if deviation > _FLAT:
         notes.append(f"inner face curved: it leaves its plane by {1e3 * deviation:.2g} mm")
-    shift = _choose_origin(turned, clamped_z, overrides, face_x)
+    shift = _choose_origin(turned, held, overrides, face_x)
     move = np.array([shift, 0.0])
     taper = np.zeros(2) if taper is None else frame[:, :2] @ taper
     width -= float(taper @ (frame[:, 2] + move))
-    free = [band.thickness[band.line[:, 1] > clamped_z] for band in (inner, outer)]
+    free = [band.thickness[band.line[:, 1] > clamped_z + slope * band.line[:, 0]] for band in (inner, outer)]
     notes.append(
         f"{len(cells)} cells, {len(ribs)} ribs of {_say_range([rib.wall.usual for rib in ribs])} mm, inner band "
         f"{_say_range(free[0])} mm, outer band {_say_range(free[1])} mm; {len(bolts)} bolt holes"
@@ -165,7 +186,8 @@ def recognize(
         inner=inner.moved(move),
         outer=outer.moved(move),
         ribs=[rib.moved(move) for rib in ribs],
-        clamped_z=clamped_z,
+        clamped_z=clamped_z - slope * shift,
+        clamp_slope=slope,
         clamped_circles=circles + [shift, 0.0, 0.0],
         face_x=face_x + shift,
         face_deviation=deviation,
@@ -173,24 +195,61 @@ def recognize(
     )
 
 
-def _check_legs(polygon: shapely.Polygon, bands: tuple[Wall, Wall], clamped_z: float, circles: NDArray) -> None:
+def _find_held(polygon: shapely.Polygon, clamped_z: float, slope: float, circles: NDArray) -> shapely.Geometry:
+    """Return the part of a section that a clamp holds."""
+    around = [shapely.Point(x, z).buffer(radius) for x, z, radius in circles]
+    return polygon.intersection(shapely.union_all([cut_below(polygon, clamped_z, slope), *around]))
+
+
+def _check_legs(held: shapely.Geometry, bands: tuple[Wall, Wall], clamped_z: float) -> None:
     """Refuse a clamp that does not reach from one band to the other: a finger on one leg is many times too soft.
 
     Raises:
         JawFileError: It does not.
     """
-    low_x, low_z, high_x, _ = polygon.bounds
-    below = shapely.box(low_x, low_z - 1.0, high_x, clamped_z)
-    held = polygon.intersection(shapely.union_all([below, *(shapely.Point(x, z).buffer(r) for x, z, r in circles)]))
-    feet = [float(band.line[band.line[:, 1].argmin(), 0]) for band in bands]
-    apart = abs(feet[0] - feet[1])
+    apart = _measure_stance(bands)
     reach = 0.0 if held.is_empty else held.bounds[2] - held.bounds[0]
     if reach < _HELD * apart:
         raise JawFileError(
             f"what lies below z = {1e3 * clamped_z:.3g} mm is {1e3 * reach:.3g} mm wide, and its bands start "
-            f"{1e3 * apart:.3g} mm apart: one of them would not be held, as on a tilted base; state the clamp's height "
-            "(--clamp), or export the finger with its base across the inner face"
+            f"{1e3 * apart:.3g} mm apart: one of them would not be held; state the clamp's height (--clamp), or export "
+            "the finger with its base across the inner face"
         )
+
+
+def _find_top(wider: shapely.Geometry, frame: NDArray, slope: float, polygon: shapely.Polygon) -> float:
+    """Return up to which height at x = 0 [m] a body is wider than its blade, whose frame is given (2, 3).
+
+    Raises:
+        JawFileError: That is far up: no clamp holds it.
+    """
+    places = shapely.get_coordinates(wider) @ frame[:, :2].T + frame[:, 2]
+    top = float((places @ [-slope, 1.0]).max())
+    if top > _LOW * polygon.bounds[3]:
+        raise JawFileError(
+            f"it is wider than its blade up to z = {1e3 * top:.3g} of {1e3 * polygon.bounds[3]:.3g} mm: more than a "
+            "base; export the blade alone, or use a volume mesh (`mesh:` in the jaw file)"
+        )
+    return top
+
+
+def _measure_stance(bands: tuple[Wall, Wall]) -> float:
+    """Return how far apart bands start, along x [m]."""
+    feet = [float(band.line[band.line[:, 1].argmin(), 0]) for band in bands]
+    return abs(feet[0] - feet[1])
+
+
+def _find_floor(polygon: shapely.Polygon, bands: tuple[Wall, Wall]) -> tuple[float, float]:
+    """Return the edge that is the base of a finger: its rise with x [-], and its height at x = 0 [m].
+
+    That is (0, 0), the lowest point, where no edge reaches from one band to the other.
+    """
+    start, along = _find_base(polygon, np.array([0.0, 1.0]))
+    if abs(along[0]) < _SPANNED * _measure_stance(bands):
+        return 0.0, 0.0
+    slope = float(along[1] / along[0])
+    slope = slope if abs(slope) > _TILTED else 0.0
+    return slope, float(start[1] - slope * start[0])
 
 
 def _say_range(values) -> str:
@@ -206,15 +265,22 @@ def _split_holes(polygon: shapely.Polygon) -> tuple[list[NDArray], list[NDArray]
 
 
 def _is_round(hole: NDArray) -> bool:
-    """Whether a hole is a circle of some corners."""
+    """Whether a hole is a bolt's: a circle of some corners, the seat of a nut, a slot."""
     shape = shapely.Polygon(hole)
-    return len(hole) >= _ROUND_POINTS and 4.0 * np.pi * shape.area > _ROUND * shape.length**2
+    roundness = 4.0 * np.pi * shape.area / shape.length**2
+    if roundness > _ROUND:
+        return len(hole) >= _ROUND_POINTS
+    turned = affinity.rotate(shape, 180.0, origin=shape.centroid)
+    return roundness > _COMPACT and shape.intersection(turned).area > _SYMMETRIC * shape.area
 
 
 def _fit_bolts(holes: list[NDArray]) -> NDArray:
-    """Return the middles and radii (b, 3) [m] of round holes, lowest first."""
-    shapes = [shapely.Polygon(hole) for hole in holes]
-    rows = [(shape.centroid.x, shape.centroid.y, float(np.sqrt(shape.area / np.pi))) for shape in shapes]
+    """Return the middles and radii (b, 3) [m] of bolt holes, of a slot across it, lowest first."""
+    rows = []
+    for hole in holes:
+        shape = shapely.Polygon(hole)
+        across = shape.exterior.distance(shape.centroid) / np.cos(np.pi / len(hole))
+        rows.append((*shape.centroid.coords[0], min(float(np.sqrt(shape.area / np.pi)), across)))
     return np.array(sorted(rows, key=lambda row: row[1])).reshape(-1, 3)
 
 
@@ -258,8 +324,13 @@ def _turn_upright(
     chosen = min(faces, key=lambda face: face[2])
     if all(face[2] < _STRAIGHT * (high - low) for face in faces):
         # both are straight: the inner face stands at right angles on the base
-        base = _find_base(polygon, direction)
-        chosen = min(faces, key=lambda face: abs(face[1] @ base))
+        _, base = _find_base(polygon, direction)
+        lean = [abs(face[1] @ base) / np.linalg.norm(base) for face in faces]
+        chosen = faces[int(np.argmin(lean))]
+        if abs(lean[0] - lean[1]) < _EQUAL:
+            # the face from which ribs fall is many times stiffer next to the base, where the other could not hold much
+            chosen = faces[0] if _measure_rise(cells, direction, side) > 0.0 else faces[1]
+            notes.append("both sides meet the base alike: that from which ribs fall is taken as inner (--other-face)")
     if overrides.other_face:
         chosen = faces[1] if chosen is faces[0] else faces[0]
     sign, up, deviation = chosen
@@ -271,6 +342,16 @@ def _turn_upright(
     turned = affinity.affine_transform(polygon, [outward[0], outward[1], up[0], up[1], 0.0, 0.0])
     shift = np.array([-turned.bounds[2], -turned.bounds[1]])
     return affinity.translate(turned, *shift), np.column_stack([np.stack([outward, up]), shift])
+
+
+def _measure_rise(cells: list[NDArray], direction: NDArray, side: NDArray) -> float:
+    """Return by how much [m] cells lie higher along a direction on one side of their middles than on the other."""
+    rises = []
+    for cell in cells:
+        ring = _sample_ring(cell)
+        is_there = (ring - ring.mean(axis=0)) @ side > 0.0
+        rises.append(np.mean(ring[is_there] @ direction) - np.mean(ring[~is_there] @ direction))
+    return float(np.median(rises))
 
 
 def _measure_widths(polygon: shapely.Polygon, direction: NDArray) -> tuple[float, float]:
@@ -294,11 +375,13 @@ def _sample_ring(ring: NDArray, spacing: float = _SPACING) -> NDArray:
 def _fit_line(points: NDArray, direction: NDArray) -> tuple[NDArray, float]:
     """Return the unit vector of the line through points (n, 2), towards a direction, and how far they leave it [m].
 
-    The line is that of the middle four fifths, without the largest deviations: knobs and lugs are no bend.
+    Of a straight side what lies off the line is left out, as a step of the base; of a curved one the largest deviations
+    are: knobs and lugs are no bend.
     """
     if len(points) < _FEWEST:
         return direction, np.inf
-    kept = points
+    straight = _find_straight(points)
+    kept = points[straight]
     for _ in range(4):
         middle = kept.mean(axis=0)
         up = np.linalg.svd(kept - middle, full_matrices=False)[2][0]
@@ -308,59 +391,85 @@ def _fit_line(points: NDArray, direction: NDArray) -> tuple[NDArray, float]:
         if len(kept) < _FEWEST:
             return direction, np.inf
     up = up if up @ direction > 0.0 else -up
-    return up, float(np.sqrt(np.mean(off**2)))
+    bent = off if straight.all() else off[off <= limit]
+    return up, float(np.sqrt(np.mean(bent**2)))
 
 
-def _find_base(polygon: shapely.Polygon, direction: NDArray) -> NDArray:
-    """Return the unit vector of the longest straight edge at the base."""
+def _find_straight(points: NDArray) -> NDArray:
+    """Return which of points (n, 2) are on the line that most of them are on, all where that is less than half."""
+    ends = points[np.linspace(0, len(points) - 1, min(_CHORDS, len(points))).astype(int)]
+    best = np.ones(len(points), bool)
+    most = 0.5 * len(points)
+    for start, end in combinations(ends, 2):
+        way = end - start
+        near = np.abs((points - start) @ [-way[1], way[0]]) < _SIDE * np.linalg.norm(way)
+        if near.sum() > most and np.linalg.norm(way) > 0.0:
+            best, most = near, near.sum()
+    return best
+
+
+def _find_base(polygon: shapely.Polygon, direction: NDArray) -> tuple[NDArray, NDArray]:
+    """Return the start of the longest straight edge at the base (2,) [m], and the way to its end."""
     ring = np.array(polygon.exterior.simplify(2e-5).coords)
     begin, end = ring[:-1], ring[1:]
     height = 0.5 * (begin + end) @ direction
     low = height < height.min() + 0.25 * np.ptp(height)
     along = end - begin
     across = np.abs(along @ [-direction[1], direction[0]])
-    longest = along[np.where(low, across, -1.0).argmax()]
-    return longest / np.linalg.norm(longest)
+    longest = np.where(low, across, -1.0).argmax()
+    return begin[longest], along[longest]
 
 
-def _choose_origin(polygon: shapely.Polygon, clamped_z: float, overrides: Overrides, face_x: float) -> float:
+def _choose_origin(polygon: shapely.Polygon, held: shapely.Geometry, overrides: Overrides, face_x: float) -> float:
     """Return by how much [m] the section is moved along x: what the clamp holds is half on either side of x = 0."""
     if overrides.face_x is not None:
         return overrides.face_x - face_x
-    low_x, _, high_x, high_z = polygon.bounds
-    held = polygon.intersection(shapely.box(low_x, -1.0, high_x, max(clamped_z, 0.02 * high_z)))
-    return -0.5 * (held.bounds[0] + held.bounds[2])
+    base = held.union(cut_below(polygon, 0.02 * polygon.bounds[3]))
+    return -0.5 * (base.bounds[0] + base.bounds[2])
 
 
 def _propose_clamp(
-    cells: list[NDArray], bolts: NDArray, inner: Wall, overrides: Overrides, notes: list[str]
+    cells: list[NDArray],
+    bolts: NDArray,
+    inner: Wall,
+    base: tuple[float, float],
+    overrides: Overrides,
+    notes: list[str],
 ) -> tuple[float, NDArray]:
-    """Return the height below which everything is clamped, and circles about bolts farther up (c, 3) [m].
+    """Return the height at x = 0 below which everything is clamped, and circles about bolts farther up (c, 3) [m].
 
-    A bolt belongs to the base unless a whole cell lies below it.
+    Heights are counted along z from a line that is as tilted as the base (rise with x, height at x = 0). A bolt belongs
+    to the base unless a whole cell lies below it.
     """
-    lowest_top = min(float(cell[:, 1].max()) for cell in cells)
-    base = bolts[bolts[:, 1] <= lowest_top]
-    farther = bolts[bolts[:, 1] > lowest_top]
-    circles = farther * [1.0, 1.0, _WASHER]
+    slope, floor = base
+    lows, tops = (np.array([pick(cell[:, 1] - slope * cell[:, 0]) for cell in cells]) for pick in (np.min, np.max))
+    height_of = bolts[:, 1] - slope * bolts[:, 0]
+    is_base = height_of <= tops.min()
+    circles = bolts[~is_base] * [1.0, 1.0, _WASHER]
     if overrides.clamp_z is not None:
         notes.append(f"clamped below z = {1e3 * overrides.clamp_z:.4g} mm, as given")
         return overrides.clamp_z, circles[circles[:, 1] > overrides.clamp_z]
-    if len(base):
-        height = float((base[:, 1] + _GRIP * base[:, 2]).max())
-        reason = f"a radius of its {len(base)} base bolts above their heads"
+    if is_base.any():
+        height = float((height_of + _GRIP * bolts[:, 2])[is_base].max())
+        reason = f"a radius of its {is_base.sum()} base bolts above their heads"
     else:
-        height = max(min(float(cell[:, 1].min()) for cell in cells) - inner.usual, 0.0)
+        least = 0.5 * (floor + float(lows.min())) if slope or floor > _FLAT else 0.0
+        height = max(float(lows.min()) - inner.usual * np.hypot(1.0, slope), least)
         reason = "the solid base below its first cell"
-    height = round(2e3 * height) / 2e3
+    height = height if slope or floor > _FLAT else round(2e3 * height) / 2e3
     around = "".join(f", and around the bolt at z = {1e3 * z:.4g} mm" for _, z, _ in circles)
-    notes.append(f"clamped below z = {1e3 * height:.4g} mm, {reason}{around} (--clamp)")
+    tilt = (
+        f" at x = 0, along its base, {np.degrees(np.arctan(slope)):.0f} degrees off the face's normal" if slope else ""
+    )
+    notes.append(f"clamped below z = {1e3 * height:.4g} mm{tilt}, {reason}{around} (--clamp)")
     return height, circles
 
 
-def _measure_face(polygon: shapely.Polygon, cells: list[NDArray], clamped_z: float) -> tuple[float, float]:
+def _measure_face(
+    polygon: shapely.Polygon, cells: list[NDArray], clamped_z: float, slope: float
+) -> tuple[float, float]:
     """Return the plane x [m] of the inner face and how far it leaves that, between the clamp and the last cell [m]."""
-    low = max(clamped_z, min(float(cell[:, 1].min()) for cell in cells))
+    low = max(clamped_z + slope * polygon.bounds[2], min(float(cell[:, 1].min()) for cell in cells))
     high = max(float(cell[:, 1].max()) for cell in cells)
     reach = find_reach(polygon, np.linspace(low, high, 80)[1:-1])
     face = float(np.median(reach))
@@ -486,7 +595,10 @@ def _string_rib(found: NDArray, inner: Wall, outer: Wall) -> RecognizedRib:
 
 
 def _meet(end: NDArray, middle: NDArray, band: Wall) -> NDArray:
-    """Return where a rib, running on straight from its middle through its end, meets a band's centre line (2,) [m]."""
+    """Return where a rib, running on straight from its middle through its end, meets a band's centre line (2,) [m].
+
+    A rib that ends elsewhere, as on the base, ends where it does.
+    """
     tip = end.mean(axis=0)
     direction = (tip - middle) / max(np.linalg.norm(tip - middle), 1e-9)
     line = band.line
@@ -494,11 +606,11 @@ def _meet(end: NDArray, middle: NDArray, band: Wall) -> NDArray:
     crossing = shapely.LineString([tip - 2e-3 * direction, tip + 15e-3 * direction]).intersection(
         shapely.LineString(longer)
     )
-    if crossing.is_empty:
-        return line[cKDTree(line).query(tip + 0.5 * band.usual * direction)[1]]
     places = np.array(
         [(point.x, point.y) for point in getattr(crossing, "geoms", [crossing]) if point.geom_type == "Point"]
-    )
-    if not len(places):
-        return line[cKDTree(line).query(tip)[1]]
-    return places[np.linalg.norm(places - tip, axis=1).argmin()]
+    ).reshape(-1, 2)
+    if len(places):
+        return places[np.linalg.norm(places - tip, axis=1).argmin()]
+    beyond = tip + 0.5 * band.usual * direction
+    far, nearest = cKDTree(line).query(beyond)
+    return line[nearest] if far < _NEIGHBOURS else beyond
