@@ -1,15 +1,26 @@
-"""The subcommand `report`: forces over time as one HTML page."""
+"""The subcommand `report`: forces over time, evaluated or recorded, as one HTML page."""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
-from finforce_eval.errors import OptionError
+import numpy as np
+
+from finforce.messages import NANOSECONDS, stamp_of
+from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluate import read_evaluations
-from finforce_eval.figures.recorded_forces import read_forces
+from finforce_eval.evaluation.scoring import match_truth
 from finforce_eval.figures.report import write_html, write_page
 from finforce_eval.machine import version
+from finforce_eval.recordings.bags import bag_source, check_types, open_bag
+from finforce_eval.recordings.dataset import Dataset, is_dataset, open_dataset, read_parquet, rows_of
+from finforce_eval.recordings.recording import WRENCH
+from finforce_eval.recordings.tracks import JAWS, WrenchTrack
+from finforce_eval.recordings.writer import STATUS
+from finforce_eval.table import AXES, ForceSeries, stddev_along
 from finforce_eval.tasks import is_manifest
 
 
@@ -47,3 +58,77 @@ def run(options: argparse.Namespace) -> None:
     else:
         write_html(recorded, page, title=options.title, about={"version": version()})
     print(f"Page: {page}: {len(recorded) or len(evaluation.results)} plots")
+
+
+_FORCE, _STDDEV, _STATUS, _TRUTH = KINDS = ("wrench", "wrench_stddev", "wrench_status", "ground_truth_wrench")
+
+
+def read_forces(path: Path) -> list[ForceSeries]:
+    """Return the forces on the jaws of a recording, or of the episodes of a dataset.
+
+    Args:
+        path: rosbag2 folder, .mcap or .db3 file, or folder of a LeRobot dataset.
+
+    Raises:
+        RecordingError: it cannot be read, or holds no forces.
+    """
+    if is_dataset(path):
+        return _read_episodes(open_dataset(path, None))
+    source = bag_source(path)
+    types = {f"/{side}/{kind}": (STATUS if kind == _STATUS else WRENCH,) for side in JAWS for kind in KINDS}
+    samples: dict[str, list[Any]] = {}
+    with open_bag(source, path.stem) as bag:
+        check_types(bag.connections, types, path.stem)
+        for sample in bag.raw(types):
+            samples.setdefault(sample.topic, []).append(bag.decode(sample))
+    sides = [side for side in JAWS if f"/{side}/{_FORCE}" in samples]
+    if not sides:
+        raise RecordingError(f"{path.stem}: no forces: /left/wrench and /right/wrench have no messages; see annotate")
+    return [_make_series(f"{path.stem}/{side}" if len(sides) > 1 else path.stem, side, samples) for side in sides]
+
+
+def _read_episodes(dataset: Dataset) -> list[ForceSeries]:
+    """Return the forces of all episodes of a dataset, as `annotate` writes them."""
+    names = [name for name in dataset.info["features"] if name.endswith(tuple(f".force.{side}" for side in JAWS))]
+    if not names:
+        raise RecordingError(f"{dataset.folder.name}: no forces: no feature ends in .force.left or .force.right")
+    found = []
+    for episode in dataset.episodes:
+        rows = rows_of(read_parquet(episode.data), episode, dataset.folder.name)
+        stamps = np.rint(np.arange(len(rows)) * (NANOSECONDS / float(dataset.info["fps"]))).astype(np.int64)
+        for name in names:
+            side, values = name.rpartition(".")[2], {}
+            for column, end in (("force", ""), ("force_stddev", ".stddev")):
+                values[column] = np.array(rows[name + end].to_pylist(), dtype=np.float64).reshape(-1, 3)
+            stddev = stddev_along(values["force"], values["force_stddev"])
+            case = f"{dataset.folder.name}/episode_{episode.index:06d}/{side}"
+            found.append(ForceSeries.build(case, side, stamps, **values, magnitude_stddev=stddev, status=""))
+    return found
+
+
+def _make_series(name: str, side: str, samples: Mapping[str, list[Any]]) -> ForceSeries:
+    """Return the series of one jaw."""
+    found, stated, true = (_stack(samples.get(f"/{side}/{kind}", [])) for kind in (_FORCE, _STDDEV, _TRUTH))
+    stddev = match_truth(stated, found.stamps) if len(stated.stamps) else np.full_like(found.force, np.nan)
+    words = {stamp_of(each): each.status[0].values[0].value for each in samples.get(f"/{side}/{_STATUS}", [])}
+    status = [words.get(stamp, "") for stamp in found.stamps.tolist()]
+    return ForceSeries.build(
+        name,
+        side,
+        found.stamps,
+        force=found.force,
+        torque=found.torque,
+        magnitude_stddev=stddev_along(found.force, stddev),
+        true_force=match_truth(true, found.stamps) if len(true.stamps) else None,
+        status=np.array(status, dtype="U32"),
+    )
+
+
+def _stack(messages: list[Any]) -> WrenchTrack:
+    """Return wrenches as arrays, in the order of their stamps."""
+    messages = sorted(messages, key=stamp_of)
+    force, torque = (
+        np.array([[getattr(part, axis) for axis in AXES] for part in parts], dtype=np.float64).reshape(-1, 3)
+        for parts in ([each.wrench.force for each in messages], [each.wrench.torque for each in messages])
+    )
+    return WrenchTrack(stamps=np.array([stamp_of(each) for each in messages], np.int64), force=force, torque=torque)

@@ -1,4 +1,4 @@
-"""`finforce trace`: the way of a recording's images through the stages, in a table."""
+"""`finforce trace`: the way of a recording's images through the stages, in a table, from what every process noted."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from finforce.errors import FinforceError
 from finforce_eval.cli.parser import BAG_HELP, add_run_options
+from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.keypoint_source import parse_source
 from finforce_eval.evaluation.setup import make_setup, sides_of
 from finforce_eval.machine import write_figures
@@ -64,10 +64,6 @@ PERCENTS = (50, 95, 99)
 OTHER_WORK = ("/diagnostics", "/clock", "/camera/camera/color/camera_info")
 
 
-class TraceError(FinforceError, ValueError):
-    """Nothing was noted, or nothing that belongs to an image."""
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Trace:
     """The ways of the images of a recording.
@@ -98,7 +94,7 @@ def read_spans(folder: Path, offset: int, sent: Mapping[int, float]) -> pd.DataF
         left [ms]; `own` time in which the callback did not wait for another stage that it had called [ms].
 
     Raises:
-        TraceError: there is nothing.
+        RecordingError: there is nothing.
     """
     rows = []
     for path in sorted(folder.glob("*.json")):
@@ -110,7 +106,7 @@ def read_spans(folder: Path, offset: int, sent: Mapping[int, float]) -> pd.DataF
                 stage = f"{node}: {topic.lstrip('/').removeprefix('camera/camera/')}"
                 rows.append((stamp - offset, stage, 1e-6 * begin - 1e3 * left, 1e-6 * end - 1e3 * left, 1e-6 * own))
     if not rows:
-        raise TraceError("no stage has noted anything of an image; expected at least one image to be answered")
+        raise RecordingError("no stage has noted anything of an image; expected at least one image to be answered")
     return pd.DataFrame(rows, columns=["image", "stage", "begin", "end", "own"]).sort_values(["image", "begin"])
 
 

@@ -1,4 +1,4 @@
-"""The subcommand `view`: a recording with its forces in Rerun."""
+"""The subcommand `view`: a recording in Rerun: key points, bending jaws, contact, forces over time."""
 
 from __future__ import annotations
 

@@ -9,6 +9,8 @@ crosses 0.02 N, and shows when a grasp force above 0.1 N has arrived.
 
 For some minutes, the same grasp is played again and again from images to all stages in one process: growth of memory,
 lost images, and drift of the force.
+
+Messages are decoded before they are played, so that the player takes no time from the nodes.
 """
 
 from __future__ import annotations

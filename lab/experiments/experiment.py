@@ -1,4 +1,7 @@
-"""A set of cases that are run one after the other, kept one by one, and put on a page together."""
+"""A set of cases that are run one after the other, kept one by one, and put on a page together.
+
+Those of grasps are scenes of the twin or recordings of one's own, read with key points and scored.
+"""
 
 from __future__ import annotations
 

@@ -212,7 +212,7 @@ def test_report_takes_annotated_recordings_and_kept_evaluations(tmp_path, capsys
 
 
 def test_forces_of_an_annotated_recording_are_read_as_they_were_written(tmp_path):
-    from finforce_eval.figures.recorded_forces import read_forces
+    from finforce_eval.cli.report import read_forces
     from finforce_eval.recordings.recording import DEMO, read_recording
 
     whole = read_recording(DEMO)

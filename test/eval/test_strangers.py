@@ -308,7 +308,7 @@ def test_a_small_table_that_unpacks_to_far_more_than_its_size_is_refused(dataset
 
 
 def test_forces_of_a_dataset_are_shown_as_those_of_a_bag(dataset):
-    from finforce_eval.figures.recorded_forces import read_forces
+    from finforce_eval.cli.report import read_forces
 
     with pytest.raises(RecordingError, match="no forces: no feature ends in .force.left"):
         read_forces(dataset)

@@ -11,11 +11,11 @@ from finforce.ros import tracing
 from finforce_eval.cli.trace import (
     WAY,
     Trace,
-    TraceError,
     format_trace,
     read_spans,
     stage_figures,
 )
+from finforce_eval.errors import RecordingError
 
 OFFSET = 5_000
 MS = 1_000_000
@@ -65,7 +65,7 @@ def test_figures_come_in_the_order_of_the_way_with_the_whole_of_it_last(ways):
 
 
 def test_a_folder_without_anything_of_an_image_is_said(tmp_path):
-    with pytest.raises(TraceError, match="nothing was noted|noted anything"):
+    with pytest.raises(RecordingError, match="nothing was noted|noted anything"):
         read_spans(tmp_path, 0, {10: 0.0})
 
 

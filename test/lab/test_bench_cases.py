@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lab.bench.cases import HEIGHTS, LEVELS, NoisyCamera, bench_finger, load_cases, record_press
+from lab.bench.solvers import HEIGHTS, LEVELS, NoisyCamera, bench_finger, load_cases, record_press
 
 JAW = bench_finger()
 CASES = {case.name: case for case in load_cases()}

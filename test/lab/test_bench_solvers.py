@@ -8,8 +8,17 @@ import pytest
 
 from finforce_ifea.settings import SOLVERS
 from lab.bench import solvers as bench
-from lab.bench.cases import bench_finger, load_cases, record_press
-from lab.bench.solvers import Run, Tier, list_tiers, run_tier, score_shapes, tier_row
+from lab.bench.solvers import (
+    Run,
+    Tier,
+    bench_finger,
+    list_tiers,
+    load_cases,
+    record_press,
+    run_tier,
+    score_shapes,
+    tier_row,
+)
 
 JAW = bench_finger()
 CASES = {case.name: case for case in load_cases()}
