@@ -15,6 +15,7 @@ from finforce_eval.cli.parser import BAG_HELP, add_rest_options
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.at_rest import ROUNDS
 from finforce_eval.evaluation.check import FAULT, check_recording
+from finforce_eval.machine import write_json
 from finforce_eval.recordings.images import CAMERA_INFO, COMPRESSED, IMAGE
 from finforce_eval.recordings.writer import Entry, typestore, write_entries
 from finforce_eval.tasks import progress_bar
@@ -110,6 +111,8 @@ def _check(options: argparse.Namespace) -> int:
     folder.mkdir(parents=True, exist_ok=True)
     import_cv2().imwrite(str(folder / PICTURE), check.picture[..., ::-1])
     faults = sum(line.severity == FAULT for line in check.findings)
+    if options.json:
+        write_json(options.json, {"faults": faults, "findings": [line._asdict() for line in check.findings]})
     outcome = f"{faults} to be changed" if faults else "everything fits"
     print(f"{outcome}; {folder / PICTURE}: grey as given, orange as fitted, green key points")
     return 1 if faults else 0

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from finforce_eval.cli.parser import add_json_option
 from finforce_eval.evaluate import read_evaluations
 from finforce_eval.evaluation.comparison import (
     BETTER,
@@ -32,7 +33,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
     parser.add_argument("before", metavar="A", help="output of finforce evaluate --json, or its --out folder")
     parser.add_argument("after", metavar="B", help="the same with other settings, fingers or versions")
-    parser.add_argument("--json", metavar="OUT", help="write the changes as JSON")
+    add_json_option(parser)
     parser.add_argument("--strict", action="store_true", help="exit with 1 if a recording got worse or is missing")
 
 

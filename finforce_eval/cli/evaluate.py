@@ -8,24 +8,31 @@ from contextlib import ExitStack
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from finforce_eval.cli.parser import BAG_HELP, add_engine_options, add_run_options, read_engine
+from finforce_eval.cli.parser import BAG_HELP, add_engine_options, add_json_option, add_run_options, read_engine
 from finforce_eval.evaluate import evaluate_many
 from finforce_eval.evaluation.setup import make_setup
 from finforce_eval.evaluation.tables import evaluation_json, format_tables
 from finforce_eval.machine import write_json
+
+EXAMPLES = """examples:
+  finforce evaluate BAG --calibration twin                             # as recorded, scored
+  finforce evaluate BAG --from images --jaw my_finger.yaml --contact fixed:40
+  finforce evaluate BAG... --contact estimate --object can.stl --json scores.json --report scores
+  finforce evaluate BAG... --out kept --engine processes               # resumes when run again"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
     parser.add_argument("bags", nargs="+", metavar="BAG", help=BAG_HELP)
     add_run_options(parser)
+    results = parser.add_argument_group("results")
     text = "skip the images that the nodes skip: nothing moved, or the object is out of reach"
-    parser.add_argument("--as-live", action="store_true", help=text)
-    parser.add_argument("--json", metavar="OUT", help="write the scores as JSON")
-    parser.add_argument("--report", metavar="DIR", help="write a page with figures to this folder")
+    results.add_argument("--as-live", action="store_true", help=text)
+    add_json_option(results)
+    results.add_argument("--report", metavar="DIR", help="write a page with figures to this folder")
     text = "write a Parquet table of every recording (one row per image and jaw) and manifest.jsonl, with which "
     text += "a killed run resumes; finforce report shows the tables, finforce compare compares two folders"
-    parser.add_argument("--out", metavar="DIR", help=text)
+    results.add_argument("--out", metavar="DIR", help=text)
     add_engine_options(parser)
 
 

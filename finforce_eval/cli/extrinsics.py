@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from finforce.camera import ImageError, decode_picture
 from finforce.transforms import pose_numbers, rotation_between
-from finforce_eval.cli.parser import BAG_HELP, add_rest_options
+from finforce_eval.cli.parser import BAG_HELP, add_rest_options, length_mm
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.at_rest import ROUNDS, approach, first_images
 from finforce_eval.evaluation.keypoint_source import KeypointSource, build_records, choose_images, parse_source
 from finforce_eval.evaluation.setup import read_recordings, sides_of
+from finforce_eval.machine import write_json
 from finforce_eval.recordings.tracks import Recording
 from finforce_eval.tasks import progress_bar
 from finforce_ifea.jaw.jaw import load_jaw
@@ -26,8 +27,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
     text = f"{BAG_HELP}, with images; with --grid, an image"
     parser.add_argument("bags", nargs=1, metavar="BAG", help=text)
-    text = "find intrinsics and pose of the camera from an image of a table with holes of this pitch [m]"
-    parser.add_argument("--grid", type=float, metavar="PITCH", help=text)
+    text = "find intrinsics and pose of the camera from an image of a table with holes of this pitch [mm]"
+    parser.add_argument("--grid", type=length_mm, metavar="MM", help=text)
     add_rest_options(parser, images=45)
 
 
@@ -43,6 +44,12 @@ def run(options: argparse.Namespace) -> None:
     with progress_bar(ROUNDS * len(recording.images), "image") as bar:
         found, _ = approach(recording, source, jaws, start.camera_pose, bar.update)
     print(format_extrinsics(found, start.camera_pose))
+    if options.json:
+        pose, stddev = pose_numbers(found.T_gripper_camera), found.stddev.tolist()
+        write_json(
+            options.json,
+            {"T_gripper_camera": pose, "stddev": stddev, "residual_px": found.residual, "origins": found.origins},
+        )
 
 
 def read_at_rest(options: argparse.Namespace) -> tuple[KeypointSource, Recording]:

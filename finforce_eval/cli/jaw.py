@@ -9,7 +9,7 @@ from pathlib import Path
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
-    from finforce_eval.cli.parser import picture_file
+    from finforce_eval.cli.parser import add_json_option, length_mm, picture_file
     from finforce_ifea.jaw.jaw_file import MATERIALS
     from finforce_ifea.jaw.section import UNITS
 
@@ -18,26 +18,23 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--name", help="name of the finger (that of the file)")
     parser.add_argument("--unit", choices=tuple(UNITS), help="unit of the file (from the size of the finger)")
     parser.add_argument("--body", type=int, metavar="N", help="number of the body, from 1")
-    parser.add_argument("--width", type=float, metavar="M", help="width along y [m], for drawings")
+    parser.add_argument("--width", type=length_mm, metavar="MM", help="width along y [mm], for drawings")
     parser.add_argument("--material", default="tpu95a", choices=tuple(MATERIALS), help="material (tpu95a)")
-    parser.add_argument("--clamp", type=float, metavar="Z", help="height below which the finger is clamped [m]")
-    parser.add_argument("--face-x", type=float, metavar="X", help="x of the inner face in the jaw frame [m]")
+    parser.add_argument("--clamp", type=length_mm, metavar="MM", help="height below which the finger is clamped [mm]")
+    parser.add_argument("--face-x", type=length_mm, metavar="MM", help="x of the inner face in the jaw frame [mm]")
     parser.add_argument("--flip", action="store_true", help="swap base and tip")
     parser.add_argument("--other-face", action="store_true", help="take the other side as the inner face")
     text = "picture to draw (next to the jaw file, .png)"
+    add_json_option(parser)
     parser.add_argument("--picture", type=lambda name: Path(picture_file(name)), help=text)
 
 
 def run(options: argparse.Namespace) -> None:
     """Read a finger, say what was found, and write jaw file, section and picture."""
-    from finforce_eval.errors import OptionError
+    from finforce_eval.machine import write_json
     from finforce_ifea.jaw.cad.make_jaw import make_jaw
     from finforce_ifea.jaw.cad.recognition import Overrides
 
-    for name in ("width", "clamp", "face_x"):
-        value = getattr(options, name)
-        if value is not None and not -0.5 < value < 0.5:
-            raise OptionError(f"--{name.replace('_', '-')} {value:g}: expected metres, such as {value / 1e3:g}")
     started = time.monotonic()
     output = options.output or Path(f"{options.file.stem}.yaml")
     files, notes = make_jaw(
@@ -53,6 +50,8 @@ def run(options: argparse.Namespace) -> None:
         ),
         picture=options.picture,
     )
+    if options.json:
+        write_json(options.json, {"files": [str(path) for path in files], "notes": notes})
     for note in notes:
         print(f"  {note}")
     print(f"{', '.join(str(path) for path in files)}, {time.monotonic() - started:.1f} s")

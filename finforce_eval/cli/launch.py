@@ -30,6 +30,10 @@ SYSTEMS = {
     "bench": (BenchOptions, bench_processes),
     "replay": (ReplayOptions, replay_processes),
 }
+EXAMPLES = """examples:
+  finforce launch robot sim:=true                            # no hardware
+  finforce launch robot camera:=false gripper_port:=/dev/ttyACM0 object_mesh:=can.stl
+  finforce launch replay bag:=BAG images:=true contact_height:=0.040"""
 _POLL = 0.2  # [s] between two looks at the processes
 
 
@@ -39,7 +43,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     text = "argument of the launch file, such as sim:=true or object_mesh:=can.stl; lengths in metres"
     parser.add_argument("words", nargs="*", metavar="NAME:=VALUE", help=text)
     parser.add_argument("-s", "--show-args", action="store_true", help="list the arguments and their defaults")
-    parser.epilog = "example: finforce launch robot sim:=true"
 
 
 def run(options: argparse.Namespace) -> int:

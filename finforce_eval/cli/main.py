@@ -6,11 +6,13 @@ import argparse
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import redirect_stdout
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
 from finforce.errors import one_line
+from finforce.optional import import_library
 from finforce_eval.cli.parser import Parser
 from finforce_eval.errors import OptionError
 
@@ -58,14 +60,19 @@ def load_command(name: str) -> ModuleType:
     return import_module(f"lab.cli.{name}")
 
 
-def read_command(words: Sequence[str]) -> str:
-    """Return the subcommand that the words of a command line begin with; without one, print what there is and exit."""
+def build_commands() -> Parser:
+    """Return the parser of the subcommand's name."""
     parser = Parser(prog="finforce", description="Estimate the grasp force of fin-ray fingers from camera images.")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=Parser)
     for name, text in COMMANDS.items():
         commands.add_parser(name, help=text, add_help=False)
     parser.add_argument("--version", dest="command", action="store_const", const="version", help=COMMANDS["version"])
-    return "version" if list(words[:1]) == ["--version"] else parser.parse_args(words[:1]).command
+    return parser
+
+
+def read_command(words: Sequence[str]) -> str:
+    """Return the subcommand that the words of a command line begin with; without one, print what there is and exit."""
+    return "version" if list(words[:1]) == ["--version"] else build_commands().parse_args(words[:1]).command
 
 
 def build_parser(command: str) -> Parser:
@@ -73,6 +80,8 @@ def build_parser(command: str) -> Parser:
     module = load_command(command)
     parser = Parser(prog=f"finforce {command}", description=COMMANDS[command], epilog=getattr(module, "EXAMPLES", None))
     parser.set_defaults(run=getattr(module, "run", None))
+    text = "print nothing but notes and errors"
+    parser.add_argument("-q", "--quiet", action="store_true", help=text)  # which `main` takes, wherever it stands
     module.add_options(parser)
     return parser
 
@@ -80,6 +89,20 @@ def build_parser(command: str) -> Parser:
 def parse(words: Sequence[str]) -> argparse.Namespace:
     """Return the options of a command line, with `run`, the function that carries it out."""
     return build_parser(read_command(words)).parse_args(words[1:])
+
+
+def complete(words: Sequence[str]) -> None:
+    """Print what may come next on a command line that a shell is about to complete, and exit.
+
+    Raises:
+        MissingDependencyError: argcomplete is not installed.
+    """
+    argcomplete = import_library("argcomplete", "shell completion", "'finforce[completion]'")
+    typed = os.environ["COMP_LINE"][: int(os.environ.get("COMP_POINT", "999"))].split(" ")
+    if len(typed) > 2 and typed[1] in COMMANDS:
+        os.environ["_ARGCOMPLETE"] = str(int(os.environ["_ARGCOMPLETE"]) + 1)  # words before those to be completed
+        argcomplete.autocomplete(build_parser(typed[1]))
+    argcomplete.autocomplete(build_commands())
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -94,8 +117,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     from finforce.errors import FinforceError
 
     try:
-        options = parse(sys.argv[1:] if argv is None else argv)
-        return options.run(options) or 0
+        words = list(sys.argv[1:] if argv is None else argv)
+        if "_ARGCOMPLETE" in os.environ:
+            complete(words)
+        if quiet := not {"-q", "--quiet"}.isdisjoint(words):
+            os.environ["TQDM_DISABLE"] = "1"
+        options = parse([word for word in words if word not in ("-q", "--quiet")])
+        with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere if quiet else sys.stdout):
+            return options.run(options) or 0
     except (FinforceError, OSError) as error:
         print(f"finforce: {one_line(error)}".encode("utf-8", "backslashreplace").decode(), file=sys.stderr)
         return 2

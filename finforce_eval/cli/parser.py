@@ -5,7 +5,10 @@ from __future__ import annotations
 import argparse
 import re
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NoReturn
+from difflib import get_close_matches
+from typing import TYPE_CHECKING, Any, NoReturn
+
+from finforce.errors import suggest
 
 if TYPE_CHECKING:
     from finforce_eval.tasks import EngineOptions
@@ -33,39 +36,56 @@ def picture_file(text: str) -> str:
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose complaints are one line."""
+    """A parser whose complaints are one line, with the word that was likely meant."""
+
+    def __init__(self, **given: Any) -> None:
+        super().__init__(formatter_class=argparse.RawDescriptionHelpFormatter, **given)
+        self._negative_number_matcher = re.compile(r"-\.?\d")  # a pose that begins with a minus is no option
 
     def error(self, message: str) -> NoReturn:
         """Print one line and exit with 2."""
+        choice = re.search(r"invalid choice: '?(.*?)'? \(choose from (.*)\)", message)
+        unknown = re.match(r"unrecognized arguments: (-[\w-]+)", message)
+        if choice:
+            known = re.findall(r"[^\s',]+", choice[2])
+            message = f"{message[: choice.start()]}got {choice[1]!r}, {suggest(choice[1], known)}"
+        elif unknown and get_close_matches(unknown[1], self._option_string_actions):
+            message = f"no option {unknown[1]}, {suggest(unknown[1], self._option_string_actions)}"
         self.exit(2, f"{self.prog}: {message} (see {self.prog} --help)\n")
 
 
 def add_run_options(parser: argparse.ArgumentParser, *, calibration: bool = True, settings: bool = True) -> None:
     """Add what names jaw, solver, contact and key points and, where they count, calibration and single settings."""
-    parser.add_argument("--jaw", default="bench", metavar="FILE", help="jaw file, or name of an included jaw (bench)")
-    parser.add_argument("--solver", default="default", choices=SOLVERS, help="mechanics of the solver")
-    parser.add_argument("--mesh", default="default", choices=MESHES, help="mesh density")
-    parser.add_argument("--contact", action="append", default=[], metavar="CONTACT", help=CONTACT_HELP)
-    mesh = "mesh file of the object (that of the case.json)"
-    parser.add_argument("--object", metavar="MESH", help=mesh)
-    parser.add_argument("--object-unit", default="m", choices=UNITS, help="unit of the mesh (m)")
-    text = "key points: from images, keypoints as recorded, or truth of a simulated recording "
-    text += "(keypoints if recorded, else images)"
-    parser.add_argument("--from", dest="source", choices=SOURCES, help=text)
-    text = "jaws in the images, if no topic tells (both)"
-    parser.add_argument("--jaws", choices=JAWS_CHOICES, help=text)
-    add_detector_options(parser)
-    text = "reject truncated or damaged recordings instead of reading them up to the damage"
-    parser.add_argument("--strict", action="store_true", help=text)
+    finger = parser.add_argument_group("finger and mechanics")
+    finger.add_argument("--jaw", default="bench", metavar="FILE", help="jaw file, or name of an included jaw (bench)")
     if calibration:
         text = "calibration file, or name of an included one (material of the jaw file)"
-        parser.add_argument("--calibration", metavar="FILE", help=text)
+        finger.add_argument("--calibration", metavar="FILE", help=text)
+    finger.add_argument("--solver", default="default", choices=SOLVERS, help="mechanics of the solver")
+    finger.add_argument("--mesh", default="default", choices=MESHES, help="mesh density")
     if settings:
-        text = "set an estimator setting, repeatable; an unknown NAME lists all"
-        parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help=text)
+        text = "set an estimator setting, lengths in metres, repeatable; an unknown NAME lists all"
+        finger.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help=text)
+    contact = parser.add_argument_group("object and contact")
+    contact.add_argument("--contact", action="append", default=[], metavar="CONTACT", help=CONTACT_HELP)
+    contact.add_argument("--object", metavar="MESH", help="mesh file of the object (that of the case.json)")
+    contact.add_argument("--object-unit", default="m", choices=UNITS, help="unit of the mesh (m)")
+    images = parser.add_argument_group("key points and camera")
+    text = "key points: from images, keypoints as recorded, or truth of a simulated recording "
+    text += "(keypoints if recorded, else images)"
+    images.add_argument("--from", dest="source", choices=SOURCES, help=text)
+    images.add_argument("--jaws", choices=JAWS_CHOICES, help="jaws in the images, if no topic tells (both)")
+    add_detector_options(images)
+    text = "reject truncated or damaged recordings instead of reading them up to the damage"
+    images.add_argument("--strict", action="store_true", help=text)
 
 
-def add_detector_options(parser: argparse.ArgumentParser) -> None:
+def add_json_option(parser: argparse._ActionsContainer) -> None:
+    """Add the file for what the command finds."""
+    parser.add_argument("--json", metavar="OUT", help="write the results as JSON")
+
+
+def add_detector_options(parser: argparse._ActionsContainer) -> None:
     """Add what changes the key point detector."""
     text = "set a detector parameter such as model=FOLDER or detector.readout=0.02, repeatable"
     parser.add_argument("--detector", action="append", default=[], metavar="NAME=VALUE", help=text)
@@ -91,6 +111,7 @@ def add_rest_options(parser: argparse.ArgumentParser, images: int) -> None:
     add_detector_options(parser)
     text = f"number of initial images with open, still, unloaded jaws ({images})"
     parser.add_argument("--images", type=whole_number(1, 100_000), default=images, metavar="N", help=text)
+    add_json_option(parser)
 
 
 def whole_number(least: int, most: int) -> Callable[[str], int]:
@@ -105,10 +126,20 @@ def whole_number(least: int, most: int) -> Callable[[str], int]:
     return read
 
 
-def add_engine_options(parser: argparse.ArgumentParser) -> None:
+def length_mm(text: str) -> float:
+    """Return an option that is given in millimetres in metres; what looks like metres is refused."""
+    value = float(text)
+    if value and not 0.1 <= abs(value) <= 500.0:
+        likely = f", such as {1e3 * value:g}" if abs(value) < 0.1 else ""
+        raise argparse.ArgumentTypeError(f"{text}: expected millimetres{likely}")
+    return 1e-3 * value
+
+
+def add_engine_options(command: argparse.ArgumentParser) -> None:
     """Add what says how many recordings are worked at, and where."""
     from finforce_eval.tasks import ENGINES
 
+    parser = command.add_argument_group("many recordings")
     parser.add_argument("--engine", default=ENGINES[0], choices=ENGINES, help="how recordings are processed")
     text = "recordings processed in parallel (one per core)"
     parser.add_argument("--workers", type=int, default=0, metavar="N", help=text)

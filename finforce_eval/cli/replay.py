@@ -6,7 +6,7 @@ import argparse
 import math
 from dataclasses import asdict
 
-from finforce_eval.cli.parser import BAG_HELP, add_run_options
+from finforce_eval.cli.parser import BAG_HELP, add_json_option, add_run_options
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.keypoint_source import parse_source
 from finforce_eval.evaluation.setup import make_setup, sides_of
@@ -54,7 +54,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--sim-time", action="store_true", help="keep the stamps and publish /clock")
     parser.add_argument("--domain", type=int, metavar="ID", help="ROS_DOMAIN_ID, for example to watch in RViz (random)")
     parser.add_argument("--params", default="", metavar="FILE", help="YAML file with ROS parameters of the solvers")
-    parser.add_argument("--json", metavar="OUT", help="write the scores as JSON")
+    add_json_option(parser)
     parser.add_argument("--report", metavar="DIR", help="write a page with figures to this folder")
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from finforce_eval.cli.parser import BAG_HELP, add_run_options
+from finforce_eval.cli.parser import BAG_HELP, add_json_option, add_run_options
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.keypoint_source import parse_source
 from finforce_eval.evaluation.setup import make_setup, sides_of
@@ -27,7 +27,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("bag", metavar="BAG", help=BAG_HELP)
     add_run_options(parser, settings=False)
     parser.add_argument("--apart", action="store_true", help="run every stage in its own process")
-    parser.add_argument("--json", metavar="OUT", help="write the figures as JSON")
+    add_json_option(parser)
 
 
 def run(options: argparse.Namespace) -> None:

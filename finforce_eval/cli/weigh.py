@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from finforce_eval.calibration.weighing import find_holds, format_weighing, scale_calibration, weigh
-from finforce_eval.cli.parser import BAG_HELP, FORCE_HELP, add_run_options
+from finforce_eval.cli.parser import BAG_HELP, FORCE_HELP, add_json_option, add_run_options
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.forces import estimate_forces
 from finforce_eval.evaluation.setup import make_setup, read_keypoints
+from finforce_eval.machine import write_json
 from finforce_eval.tasks import progress_bar
 from finforce_ifea.jaw.calibration import save_calibration
 
@@ -24,6 +25,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     text = "reading of the scale [g] at the end of each hold, in order; without readings, the holds are listed"
     parser.add_argument("--grams", nargs="+", type=float, metavar="G", help=text)
     parser.add_argument("-o", "--output", metavar="FILE", help="calibration file to write; needs --grams")
+    add_json_option(parser)
     parser.add_argument("--force", action="store_true", help=FORCE_HELP)
 
 
@@ -47,6 +49,10 @@ def run(options: argparse.Namespace) -> None:
     scaled = scale_calibration(
         weighing, setup.jaw, setup.calibration, solver=setup.settings.solver, force=options.force
     )
+    if options.json:
+        holds = [{**vars(hold), "scale": weight} for hold, weight in zip(holds, weighing.weights.tolist(), strict=True)]
+        found = {"factor": weighing.factor, "factor_stddev": weighing.stddev, "misfit": weighing.misfit, "holds": holds}
+        write_json(options.json, {**found, "calibration": scaled.model_dump(mode="json")})
     if options.output:
         Path(options.output).parent.mkdir(parents=True, exist_ok=True)
         save_calibration(scaled, options.output)

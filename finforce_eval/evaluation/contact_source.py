@@ -179,6 +179,7 @@ def _before_load(track: ObjectTrack, recording: Recording, side: str) -> ObjectT
 ESTIMATED = ("estimate", "closest", "paper")
 AUTOMATIC, FIXED = "automatic", "fixed"
 FROM_CASE = "case"
+METRES = 0.5  # below it a height in millimetres was meant in metres: no jaw is touched so near to its clamp
 EXPECTED = f"expected {', '.join(ESTIMATED)}, fixed:Z_MM (millimetres), fixed:case or NAME=Z_MM"
 
 
@@ -280,4 +281,6 @@ def _height(value: str, text: str) -> float:
         height = math.nan
     if not math.isfinite(height):
         raise OptionError(f"--contact {text}: '{value}' is no height in millimetres")
+    if 0.0 < height < METRES:
+        raise OptionError(f"--contact {text}: expected millimetres, such as {text.replace(value, f'{1e3 * height:g}')}")
     return height

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from eval_fakes import FakeEstimator, make_recording
 
-from finforce_eval.cli.main import main
+from finforce_eval.cli.main import COMMANDS, build_parser, main, parse
 from finforce_eval.recordings.writer import write_entries, write_recording
 
 BENCH_KEYPOINTS = 15
@@ -275,3 +275,61 @@ def test_help_needs_no_heavy_import():
 def test_version_is_printed(capsys):
     assert main(["version"]) == 0
     assert capsys.readouterr().out.startswith("finforce ")
+
+
+@pytest.mark.parametrize(
+    ("words", "meant"),
+    [
+        (["evalute"], "got 'evalute', did you mean evaluate?"),
+        (["evaluate", "BAG", "--calibraton", "bench"], "no option --calibraton, did you mean --calibration?"),
+        (["evaluate", "BAG", "--solver", "solidd"], "got 'solidd', did you mean solid?"),
+        (["evaluate", "BAG", "--jaw", "bnch"], "did you mean bench?"),
+        (["evaluate", "BAG", "--calibration", "twinn"], "did you mean twin?"),
+        (["evaluate", "BAG", "--set", "iteration=3"], "did you mean iterations?"),
+        (
+            ["evaluate", "BAG", "--contact", "fixed:0.040"],
+            "--contact fixed:0.040: expected millimetres, such as fixed:40",
+        ),
+        (["evaluate", "BAG", "--from", "images", "--extrinsics", "-0.01,0,0"], "expected robot, bench, "),
+        (["jaw", "finger.stl", "--width", "0.022"], "--width: 0.022: expected millimetres, such as 22"),
+    ],
+)
+def test_the_likely_mistake_is_named_in_one_line(capsys, words, meant):
+    assert_refused(capsys, words, meant)
+
+
+def test_a_pose_may_begin_with_a_minus():
+    assert parse(["extrinsics", "BAG", "--extrinsics", "-0.01,0,0,0,0,0,1"]).extrinsics == "-0.01,0,0,0,0,0,1"
+
+
+def test_quiet_prints_nothing_wherever_it_stands(capsys):
+    for words in (["--quiet", "version"], ["version", "--quiet"], ["version", "-q"], ["twin", "list", "-q"]):
+        assert main(words) == 0
+        assert capsys.readouterr() == ("", "")
+    assert main(["evaluate", "nowhere", "-q"]) == 2
+    assert "no such recording" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_the_help_of_every_command_says_what_it_does(command):
+    text = build_parser(command).format_help()
+    assert COMMANDS[command][:20] in text and "--quiet" in text
+
+
+def test_the_options_of_evaluate_stand_in_groups_with_examples():
+    text = build_parser("evaluate").format_help()
+    for group in ("finger and mechanics:", "object and contact:", "key points and camera:", "results:", "examples:"):
+        assert f"\n{group}" in text
+
+
+def test_a_shell_completes_commands_and_options(tmp_path):
+    pytest.importorskip("argcomplete")
+    for line, expected in (("finforce eva", "evaluate"), ("finforce evaluate --calib", "--calibration")):
+        told = {"_ARGCOMPLETE": "1", "COMP_LINE": line, "COMP_POINT": str(len(line)), "_ARGCOMPLETE_IFS": "|"}
+        told |= {
+            "_ARGCOMPLETE_STDOUT_FILENAME": str(tmp_path / "out"),
+            "PYTHONPATH": f"{ROOT}:{os.environ.get('PYTHONPATH', '')}",
+        }
+        command = [sys.executable, "-m", "finforce_eval.cli.main"]
+        subprocess.run(command, env=os.environ | told, check=True)
+        assert expected in (tmp_path / "out").read_text()

@@ -329,7 +329,7 @@ def test_a_drawing_is_read_and_needs_a_width(tmp_path, capsys, suffix, write):
     assert raw.width is None
     check_found(recognize(raw.polygon, WIDTH * MILLIMETRE, Overrides()))
     assert main(["jaw", str(path), "-o", str(tmp_path / "out.yaml")]) == 2
-    assert "a drawing has no width; give it in metres: --width" in capsys.readouterr().err
+    assert "a drawing has no width; give it in millimetres: --width" in capsys.readouterr().err
 
 
 def test_the_command_writes_a_jaw_that_loads(tmp_path, capsys, surface):
@@ -381,7 +381,7 @@ def test_another_origin_is_another_number_alone(tmp_path, surface):
     """Key points keep their places on the finger wherever x = 0 is."""
     surface.export(tmp_path / "finger.stl")
     jaws = []
-    for options in ([], ["--face-x", "0.02"]):
+    for options in ([], ["--face-x", "20"]):
         assert main(["jaw", str(tmp_path / "finger.stl"), "-o", str(tmp_path / "finger.yaml"), *options]) == 0
         jaws.append(load_jaw(tmp_path / "finger.yaml"))
     shift = np.array([jaws[1].inner_face_x - jaws[0].inner_face_x, 0.0, 0.0])
@@ -458,11 +458,13 @@ def test_bad_files_are_refused_in_one_line(tmp_path, capsys, surface):
 
 
 @pytest.mark.parametrize(
-    ("option", "message"), [("--width=25", "--width 25: expected metres"), ("--clamp=20", "metres")]
+    ("option", "message"),
+    [("--width=0.025", "--width: 0.025: expected millimetres, such as 25"), ("--clamp=2000", "millimetres")],
 )
-def test_millimetres_in_options_are_refused(tmp_path, capsys, surface, option, message):
+def test_metres_in_options_are_refused(tmp_path, capsys, surface, option, message):
     surface.export(tmp_path / "finger.stl")
-    assert main(["jaw", str(tmp_path / "finger.stl"), "-o", str(tmp_path / "out.yaml"), option]) == 2
+    with pytest.raises(SystemExit, match="2"):
+        main(["jaw", str(tmp_path / "finger.stl"), "-o", str(tmp_path / "out.yaml"), option])
     assert message in capsys.readouterr().err
 
 

@@ -83,10 +83,11 @@ def test_the_command_prints_the_camera_of_a_picture(tmp_path, capsys):
     camera, T = make_camera(), make_pose()
     path = tmp_path / "table.png"
     cv2.imwrite(str(path), draw_table(camera, T)[..., ::-1])
-    assert main(["extrinsics", "--grid", "0.025", str(path)]) == 0
+    assert main(["extrinsics", "--grid", "25", str(path)]) == 0
     said = yaml.safe_load(capsys.readouterr().out)
     assert (said["width"], said["height"], len(said["T_camera_table"])) == (960, 540, 7)
-    assert main(["extrinsics", "--grid", "25", str(path)]) == 2
-    assert "pitch: got 25 m" in capsys.readouterr().err
-    assert main(["extrinsics", "--grid", "0.025", str(tmp_path)]) == 2
+    with pytest.raises(SystemExit, match="2"):
+        main(["extrinsics", "--grid", "0.025", str(path)])
+    assert "--grid: 0.025: expected millimetres, such as 25" in capsys.readouterr().err
+    assert main(["extrinsics", "--grid", "25", str(tmp_path)]) == 2
     assert "expected a picture" in capsys.readouterr().err

@@ -60,7 +60,7 @@ def make_jaw(
     raw = read_section(file, unit=unit, body=body)
     width = width or raw.width
     if width is None:
-        raise JawFileError(f"{file.name}: a drawing has no width; give it in metres: --width 0.025")
+        raise JawFileError(f"{file.name}: a drawing has no width; give it in millimetres: --width 25")
     picture = picture or output.with_suffix(".png")
     output.parent.mkdir(parents=True, exist_ok=True)
     try:
