@@ -22,7 +22,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--material", default="tpu95a", choices=tuple(MATERIALS), help="material (tpu95a)")
     parser.add_argument("--clamp", type=length_mm, metavar="MM", help="height below which the finger is clamped [mm]")
     parser.add_argument("--face-x", type=length_mm, metavar="MM", help="x of the inner face in the jaw frame [mm]")
-    parser.add_argument("--flip", action="store_true", help="swap base and tip")
+    parser.add_argument(
+        "--flip", action=argparse.BooleanOptionalAction, help="the wider end is, or is not, the tip; if about as wide"
+    )
     parser.add_argument("--other-face", action="store_true", help="take the other side as the inner face")
     text = "picture to draw (next to the jaw file, .png)"
     add_json_option(parser)

@@ -294,6 +294,19 @@ def test_wishes_go_before_guesses():
     assert np.linalg.norm(other.inner.line[-1] - finger.inner.line[-1]) > 1e-3
 
 
+def test_a_finger_is_not_held_by_its_tip_and_ends_that_are_alike_are_asked_for():
+    polygon = shapely.affinity.scale(draw_polygon(), 1e-3, 1e-3, origin=(0, 0))
+    with pytest.raises(JawFileError, match="would hold it by its tip"):
+        recognize(polygon, 0.02, Overrides(flip=True))
+    box = shapely.box(-14.0, 0.0, 14.0, 70.0)
+    rooms = [shapely.box(-12.0, z, 12.0, z + 12.0) for z in (10.0, 24.0, 38.0, 52.0)]
+    box = shapely.affinity.scale(box.difference(shapely.union_all(rooms)), 1e-3, 1e-3, origin=(0, 0))
+    with pytest.raises(JawFileError, match="--flip or --no-flip"):
+        recognize(box, 0.02, Overrides())
+    ends = [recognize(box, 0.02, Overrides(flip=flip)).ribs[0].inner[1] for flip in (False, True)]
+    assert abs(ends[0] - ends[1]) > 1e-3
+
+
 def test_a_bolt_above_a_whole_cell_is_held_by_itself():
     drawn = draw_polygon(ribs=5)
     inside = shapely.union_all([shapely.Polygon(ring) for ring in drawn.interiors])

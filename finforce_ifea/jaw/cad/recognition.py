@@ -113,13 +113,13 @@ class Overrides:
     """What a user states in place of the guesses.
 
     Attributes:
-        flip: base and tip are the other way round.
+        flip: whether the wider end is the tip, where both ends are about as wide; None: not stated.
         other_face: the other side is the inner face.
         clamp_z: height of the clamp [m].
         face_x: x of the inner face [m].
     """
 
-    flip: bool = False
+    flip: bool | None = None
     other_face: bool = False
     clamp_z: float | None = None
     face_x: float | None = None
@@ -302,13 +302,17 @@ def _turn_upright(
     narrow = _measure_widths(polygon, direction)
     if narrow[0] < narrow[1]:
         direction, narrow = -direction, narrow[::-1]
+    sizes = f"its section is {1e3 * narrow[0]:.3g} mm wide at one end and {1e3 * narrow[1]:.3g} mm at the other"
+    is_sure = narrow[1] <= _NARROWER * narrow[0]
+    if not is_sure and overrides.flip is None:
+        raise JawFileError(
+            f"{sizes}, expected a tip that is narrower than the base: no fin-ray finger, or --flip or --no-flip says "
+            f"whether the wider end is the tip"
+        )
+    if is_sure and overrides.flip:
+        raise JawFileError(f"{sizes}: --flip would hold it by its tip, expected the wider end to be the base")
     if overrides.flip:
         direction = -direction
-    elif narrow[1] > _NARROWER * narrow[0]:
-        raise JawFileError(
-            f"its section is {1e3 * narrow[0]:.3g} mm wide at one end and {1e3 * narrow[1]:.3g} mm at the other, "
-            "expected a tip that is narrower than the base: no fin-ray finger, or --flip says which end is the tip"
-        )
     side = np.array([-direction[1], direction[0]])
     ring = _sample_ring(np.array(polygon.exterior.coords)[:-1])
     low, high = np.sort(np.concatenate([cell @ direction for cell in cells]))[[0, -1]]
