@@ -315,8 +315,9 @@ def _cut_tapered(mesh: trimesh.Trimesh, axis: NDArray, notes: list[str]) -> RawS
     letters = np.round(axis, 3).tolist()
     if share < _PRISMATIC or not all(map(len, sides)):
         raise JawFileError(
-            f"is not prismatic: {np.floor(1e3 * share) / 10.0:.1f} % of its surface are sides, or walls along {letters}, "
-            f"expected {_PRISMATIC:.1%}: a finger whose walls all run in one direction, from one plane side to another"
+            f"is not prismatic: {np.floor(1e3 * share) / 10.0:.1f} % of its surface are sides, or walls along "
+            f"{letters}, expected {_PRISMATIC:.1%}: a finger whose walls all run in one direction, from one plane side "
+            "to another"
         )
     across = np.stack(_span(axis))
     low, high = (_fit_side(mesh, side, axis, across) for side in sides)
