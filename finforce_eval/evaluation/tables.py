@@ -12,24 +12,23 @@ from finforce_eval.evaluation.scoring import PHASES, CaseScore, Evaluation, Stat
 from finforce_eval.table import AXES, ForceSeries
 
 _CONTACT = (
-    "Contact: distance along the undeformed surface between the true pressure centre and the contact that the "
-    "solver was given (given) and that it found (solved), above 0.2 N; onset: frames from 0.02 N of true force to "
-    "the `touching` that stays, one per loading cycle, negative is early; false: share of the frames without true "
-    "force that were reported as touching; ms: a step of the contact estimator alone."
+    "Contact: distance from the true pressure centre along the undeformed surface above 0.2 N, of the contact given to "
+    "the solver (given) and found by it (solved); onset: frames from 0.02 N of true force until `touching` lasts, one "
+    "per loading cycle, negative is early; false: share of frames without true force reported as touching; ms: time "
+    "of a step of the contact estimator."
 )
 _VECTOR = (
-    "Force as a vector, over the record phases (record) and over all other images with a truth (moving): RMSE as a "
+    "Force as a vector, in the record phases (record) and in all other images with a true force (moving): RMSE of the "
     "vector and along x, y, z of the jaw; images within three stated standard deviations; sharpness: RMS of the stated "
-    "standard deviation over RMS of the error, 1 to 2 is good, below 1 too small, above 4 says nothing; off: images "
-    "with an error above 0.3 N along an axis."
+    "standard deviation over RMS of the error, 1 to 2 is good, below 1 too small, above 4 of no use; off: images with "
+    "an error above 0.3 N along an axis."
 )
 _MAGNITUDE = ("rmse_N", "nrmsd_pct", "max_error_N", "bias_N")  # not scored of a net force
 _DISTANCES = ("median_mm", "p95_mm", "max_mm")
 _SIGHT = (
-    "Key points: distance in the image, over the points that were visible, and in the jaw frame, over those that were "
-    "accepted; hidden+: hidden points that were accepted; visible-: visible points that were lost; detector: from "
-    "image to key points of all jaws. Force: from 0.02 N of true force to an estimate above 0.1 N, computed; "
-    "rise: what the true force takes from the one to the other."
+    "Key points: pixel error of visible points and error of accepted points in the jaw frame; hidden+: occluded points "
+    "accepted; visible-: visible points lost; detector: time from image to key points of all jaws. Force: time from "
+    "0.02 N of true force to an estimate above 0.1 N, with computation; rise: rise time of the true force."
 )
 
 

@@ -70,13 +70,12 @@ def find(options: RunOptions, figures: Mapping[str, Mapping[str, Any]], folder: 
     draw_weights(figures).savefig(folder / "weights.png")
     turns = tabulate(figures).reindex(columns=list(COLUMNS))
     turns[["axis", "light"]] = turns[["axis", "light"]].fillna("")
-    errors = {"along_rmse_N": "along gravity/N", "told_along_rmse_N": "direction told/N"}
+    errors = {"along_rmse_N": "along gravity/N", "told_along_rmse_N": "with gravity/N"}
     lights = average(turns, ("axis", "light"), errors)
     lights["paper/N"] = [PAPER.get(key, "") for key in zip(lights.axis, lights.light, strict=True)]
     note = (
         "RMSE of the net force of both jaws (Eq. 3) along the true one, while that is above 0.5 N: mean and "
-        "standard deviation over the turns; direction told: the solvers know which way gravity points in "
-        "the gripper, as an arm does."
+        "standard deviation over the turns; with gravity: the solvers know its direction in the gripper."
     )
     each = turns[["case", *KEYS]].rename(columns=COLUMNS)
     return Figures(
@@ -97,7 +96,7 @@ KEYS = {
     **SHARP,
     "answered_pct": "answered/%",
 }
-COLUMNS = {"case": "turn", "axis": "axis", "light": "light", "told_along_rmse_N": "direction told/N", **KEYS}
+COLUMNS = {"case": "turn", "axis": "axis", "light": "light", "told_along_rmse_N": "with gravity/N", **KEYS}
 
 
 def score_turn(recording: Recording, setup: EvaluationSetup) -> dict[str, Any]:

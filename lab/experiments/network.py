@@ -189,8 +189,8 @@ NETWORK = Experiment(
     name="network",
     title="Against an end-to-end network",
     about=(
-        "The paper trains a network on images and forces alone (ResNet-50 features of ten images, a transformer), and "
-        "finds that it fails on what it has not seen. The network here is of the same kind, with a smaller encoder, "
+        "The paper trains a network only on images and forces (ResNet-50 features of ten images, a transformer), and "
+        "finds that it fails on unfamiliar grasps. The network here is of the same kind, with a smaller encoder, "
         "trained on rendered grasps of a cylinder and a cube in bright light; both methods see the same images. "
         "finforce also has the object's mesh and poses, and the finger's model; the network has neither."
     ),

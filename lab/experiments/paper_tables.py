@@ -217,9 +217,9 @@ BENCH = Experiment(
     name="bench",
     title="Table I: cylinders pressed on one jaw",
     about=(
-        "The paper presses cylinders of 15, 25 and 35 mm on one jaw at three places, in three levels up and down, "
-        "three times, and gives the place to its solver. Here the same is done with the place given and with it "
-        "estimated from the object's mesh and pose. On `twin` everything is rendered, and seen by the detector."
+        "The paper presses cylinders of 15, 25 and 35 mm on one jaw at three locations, in three levels up and down, "
+        "three times, and gives the location to its solver. Here it is either given or estimated from the object's "
+        "mesh and pose. On `twin` everything is rendered and the key points are detected."
     ),
     list_cases=list_bench,
     run=run_bench,
@@ -229,7 +229,7 @@ PLACES = Experiment(
     name="places",
     title="Table II: value of knowing the contact location",
     about=(
-        "The paper presses a cylinder of 15 mm at three places and solves each with the place fixed at all three, and "
+        "The paper presses a cylinder of 15 mm at three locations and solves each with all three fixed locations and "
         "with its contact estimator. A location that the key points do not fit is rejected here instead of answered; "
         "such a cell shows what was answered."
     ),
