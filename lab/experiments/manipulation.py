@@ -161,7 +161,7 @@ def draw_weights(figures: Mapping[str, Mapping[str, Any]]) -> Any:
         drawn = row["drawn"]
         axes.plot(drawn["angle"], drawn["found"], color=BLUE, linewidth=0.9)
         axes.plot(drawn["angle"], drawn["truth"], color=BLACK, linewidth=1.0, dashes=(4, 2))
-        axes.set_title(name, fontsize=10)
+        axes.set_title(f"{name.replace('_', ', ')} [N]", fontsize=10)
         axes.set_rlim(0.0, 1.3 * max([*drawn["truth"], 0.1]))
         axes.tick_params(labelsize=7)
     return figure
