@@ -172,13 +172,7 @@ def recognize(
     move = np.array([shift, 0.0])
     taper = np.zeros(2) if taper is None else frame[:, :2] @ taper
     width -= float(taper @ (frame[:, 2] + move))
-    free = [band.thickness[band.line[:, 1] > clamped_z + slope * band.line[:, 0]] for band in (inner, outer)]
-    notes.append(
-        f"{len(cells)} cells, {len(ribs)} ribs of {_say_range([rib.wall.usual for rib in ribs])} mm, inner band "
-        f"{_say_range(free[0])} mm, outer band {_say_range(free[1])} mm; {len(bolts)} bolt holes"
-        + (f" of {_say_range(2.0 * bolts[:, 2])} mm" if len(bolts) else "")
-    )
-    return RecognizedFinger(
+    finger = RecognizedFinger(
         rings=order_rings(affinity.translate(turned, shift, 0.0)),
         width=width,
         taper=taper,
@@ -192,6 +186,19 @@ def recognize(
         face_x=face_x + shift,
         face_deviation=deviation,
         notes=notes,
+    )
+    notes.append(f"{len(cells)} cells, {_describe_walls(finger)}")
+    return finger
+
+
+def _describe_walls(finger: RecognizedFinger) -> str:
+    """Say how thick ribs and the free parts of bands are, and how wide bolt holes."""
+    bands = (finger.inner, finger.outer)
+    free = [band.thickness[band.line[:, 1] > finger.clamp_height(band.line[:, 0])] for band in bands]
+    return (
+        f"{len(finger.ribs)} ribs of {_say_range([rib.wall.usual for rib in finger.ribs])} mm, inner band "
+        f"{_say_range(free[0])} mm, outer band {_say_range(free[1])} mm; {len(finger.bolts)} bolt holes"
+        + (f" of {_say_range(2.0 * finger.bolts[:, 2])} mm" if len(finger.bolts) else "")
     )
 
 
@@ -297,36 +304,11 @@ def _turn_upright(
     And how it got there: a rotation, perhaps mirrored, and a shift (2, 3).
     """
     middles = np.array([shapely.Polygon(cell).centroid.coords[0] for cell in cells])
-    around = middles.mean(axis=0)
-    direction = np.linalg.svd(middles - around)[2][0]
-    narrow = _measure_widths(polygon, direction)
-    if narrow[0] < narrow[1]:
-        direction, narrow = -direction, narrow[::-1]
-    sizes = f"its section is {1e3 * narrow[0]:.3g} mm wide at one end and {1e3 * narrow[1]:.3g} mm at the other"
-    is_sure = narrow[1] <= _NARROWER * narrow[0]
-    if not is_sure and overrides.flip is None:
-        raise JawFileError(
-            f"{sizes}, expected a tip that is narrower than the base: no fin-ray finger, or --flip or --no-flip says "
-            f"whether the wider end is the tip"
-        )
-    if is_sure and overrides.flip:
-        raise JawFileError(f"{sizes}: --flip would hold it by its tip, expected the wider end to be the base")
-    if overrides.flip:
-        direction = -direction
+    direction = _find_direction(polygon, middles, overrides)
     side = np.array([-direction[1], direction[0]])
-    ring = _sample_ring(np.array(polygon.exterior.coords)[:-1])
-    low, high = np.sort(np.concatenate([cell @ direction for cell in cells]))[[0, -1]]
-    along = ring @ direction
-    height = middles @ direction
-    order = np.argsort(height)
-    chain = np.interp(along, height[order], (middles @ side)[order])
-    within = (along > low + 0.05 * (high - low)) & (along < high - 0.05 * (high - low))
-    faces = []
-    for sign in (1.0, -1.0):
-        points = ring[within & (sign * (ring @ side - chain) > 0.0)]
-        faces.append((sign, *_fit_line(points, direction)))
+    faces = _fit_sides(polygon, np.concatenate(cells), middles, direction)
     chosen = min(faces, key=lambda face: face[2])
-    if all(face[2] < _STRAIGHT * (high - low) for face in faces):
+    if all(face[2] < _STRAIGHT * np.ptp(np.concatenate(cells) @ direction) for face in faces):
         # both are straight: the inner face stands at right angles on the base
         _, base = _find_base(polygon, direction)
         lean = [abs(face[1] @ base) / np.linalg.norm(base) for face in faces]
@@ -346,6 +328,42 @@ def _turn_upright(
     turned = affinity.affine_transform(polygon, [outward[0], outward[1], up[0], up[1], 0.0, 0.0])
     shift = np.array([-turned.bounds[2], -turned.bounds[1]])
     return affinity.translate(turned, *shift), np.column_stack([np.stack([outward, up]), shift])
+
+
+def _find_direction(polygon: shapely.Polygon, middles: NDArray, overrides: Overrides) -> NDArray:
+    """Return the unit vector (2,) from base to tip along the middles (n, 2) of the cells.
+
+    Raises:
+        JawFileError: Which end is the tip is not sure, or stated wrongly.
+    """
+    direction = np.linalg.svd(middles - middles.mean(axis=0))[2][0]
+    narrow = _measure_widths(polygon, direction)
+    if narrow[0] < narrow[1]:
+        direction, narrow = -direction, narrow[::-1]
+    sizes = f"its section is {1e3 * narrow[0]:.3g} mm wide at one end and {1e3 * narrow[1]:.3g} mm at the other"
+    is_sure = narrow[1] <= _NARROWER * narrow[0]
+    if not is_sure and overrides.flip is None:
+        raise JawFileError(
+            f"{sizes}, expected a tip that is narrower than the base: no fin-ray finger, or --flip or --no-flip says "
+            f"whether the wider end is the tip"
+        )
+    if is_sure and overrides.flip:
+        raise JawFileError(f"{sizes}: --flip would hold it by its tip, expected the wider end to be the base")
+    return -direction if overrides.flip else direction
+
+
+def _fit_sides(
+    polygon: shapely.Polygon, corners: NDArray, middles: NDArray, direction: NDArray
+) -> list[tuple[float, NDArray, float]]:
+    """Return for both sides of a chain of cells their sign, the line upwards (2,), and how far they leave it [m]."""
+    side = np.array([-direction[1], direction[0]])
+    ring = _sample_ring(np.array(polygon.exterior.coords)[:-1])
+    low, high = np.sort(corners @ direction)[[0, -1]]
+    along, height = ring @ direction, middles @ direction
+    order = np.argsort(height)
+    chain = np.interp(along, height[order], (middles @ side)[order])
+    within = (along > low + 0.05 * (high - low)) & (along < high - 0.05 * (high - low))
+    return [(sign, *_fit_line(ring[within & (sign * (ring @ side - chain) > 0.0)], direction)) for sign in (1.0, -1.0)]
 
 
 def _measure_rise(cells: list[NDArray], direction: NDArray, side: NDArray) -> float:
