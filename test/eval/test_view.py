@@ -1,18 +1,19 @@
 """Claims about `finforce view`: the file holds pictures, jaws and forces as they were found, at their times."""
 
+from importlib.util import find_spec
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-pytest.importorskip("rerun")
-chunk = pytest.importorskip("rerun.chunk")
+if find_spec("rerun") is None:
+    pytest.skip("the viewer needs rerun-sdk", allow_module_level=True)
 
-from finforce_eval.cli import view  # noqa: E402
-from finforce_eval.cli.main import main  # noqa: E402
-from finforce_eval.evaluation.forces import estimate_forces  # noqa: E402
-from finforce_eval.recordings.recording import DEMO, read_recording  # noqa: E402
-from lab.scenes import GRASP, find_scene  # noqa: E402
+from finforce_eval.cli import view
+from finforce_eval.cli.main import main
+from finforce_eval.evaluation.forces import estimate_forces
+from finforce_eval.recordings.recording import DEMO, read_recording
+from lab.scenes import GRASP, find_scene
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +34,7 @@ def scene(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(view, "estimate_forces", estimate)
         assert main(["view", str(source), "--save", str(file), "--from", "images", "--calibration", "twin"]) == 0
-    rows = {}
+    chunk, rows = pytest.importorskip("rerun.chunk"), {}
     for piece in chunk.RrdReader(str(file)).stream().to_chunks():
         rows.setdefault(piece.entity_path, []).append(piece.to_record_batch())
     return SimpleNamespace(source=source, rows=rows, forces=found, shapes=shapes)

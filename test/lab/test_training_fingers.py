@@ -1,12 +1,14 @@
 """Claims about random fingers: what is drawn is a finger, it bends as its beams do, and the truth is in the picture."""
 
 import argparse
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
 import shapely
 
-pytest.importorskip("open3d", reason="scenes are rendered with Open3D: pip install open3d")
+if find_spec("open3d") is None:
+    pytest.skip("scenes are rendered with Open3D: pip install open3d", allow_module_level=True)
 pytest.importorskip("cv2", reason="pictures need OpenCV: pip install opencv-contrib-python-headless")
 
 from lab.training.commands import read_share
