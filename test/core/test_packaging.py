@@ -90,12 +90,12 @@ def test_name_version_and_licence_agree_everywhere():
     assert f"version: {version}" in (ROOT / "CITATION.cff").read_text()
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / ".github").glob("*/*.yml")), ids=lambda path: path.name)
+@pytest.mark.parametrize("path", [*sorted((ROOT / ".github").glob("*/*.yml")), ROOT / ".readthedocs.yaml"], ids=lambda path: path.name)
 def test_workflows_call_what_there_is(path):
     text = path.read_text()
     assert yaml.safe_load(text)
     targets = set(re.findall(r"^(\w+):", (ROOT / "Makefile").read_text(), re.M))
-    assert set(re.findall(r"run: make (\w+)", text)) <= targets
+    assert set(re.findall(r"(?:run:|-) make (\w+)", text)) <= targets
     for tool in re.findall(r"(tools/\w+\.\w+)", text):
         assert (ROOT / tool).is_file()
 
