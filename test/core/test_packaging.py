@@ -90,7 +90,9 @@ def test_name_version_and_licence_agree_everywhere():
     assert f"version: {version}" in (ROOT / "CITATION.cff").read_text()
 
 
-@pytest.mark.parametrize("path", [*sorted((ROOT / ".github").glob("*/*.yml")), ROOT / ".readthedocs.yaml"], ids=lambda path: path.name)
+@pytest.mark.parametrize(
+    "path", [*sorted((ROOT / ".github").glob("*/*.yml")), ROOT / ".readthedocs.yaml"], ids=lambda path: path.name
+)
 def test_workflows_call_what_there_is(path):
     text = path.read_text()
     assert yaml.safe_load(text)
