@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -48,10 +48,10 @@ class GripperForces:
     stamp: float
     jaws: Mapping[str, Solution]
     status: str
-    grasp: float
-    grasp_stddev: float
-    manipulation: NDArray
-    manipulation_stddev: NDArray
+    grasp: float = np.nan
+    grasp_stddev: float = np.nan
+    manipulation: NDArray = field(default_factory=lambda: np.full(3, np.nan))
+    manipulation_stddev: NDArray = field(default_factory=lambda: np.full(3, np.nan))
 
 
 class ForceSensor:
@@ -83,9 +83,7 @@ class ForceSensor:
         sides: Sequence[str] = SIDES,
     ) -> None:
         if (contact_height is None) == (object_mesh is None):
-            raise OptionError(
-                "expected contact_height [m] or object_mesh, one of the two, to know where the jaw is touched"
-            )
+            raise OptionError("expected contact_height [m] or object_mesh, one of the two")
         self._camera = camera
         jaws = {side: load_jaw(jaw, side) for side in sides}
         pose = pose_numbers(read_extrinsics(extrinsics))
@@ -95,12 +93,8 @@ class ForceSensor:
         self._loops: dict[str, ForceLoop] = {}
         for side, own in jaws.items():
             force = ForceEstimator(own, settings=settings, calibration=calibration)
-            contact = (
-                GivenContact(Contact.fixed(force.jaw, contact_height))
-                if mesh is None
-                else ContactEstimator(force.jaw, mesh=mesh)
-            )
-            self._loops[side] = ForceLoop(contact, force)
+            fixed = mesh is None and GivenContact(Contact.fixed(force.jaw, contact_height))
+            self._loops[side] = ForceLoop(fixed or ContactEstimator(force.jaw, mesh=mesh), force)
 
     def update(
         self, rgb: NDArray, depth: NDArray | None, stamp: float, T_camera_object: ArrayLike | None = None
@@ -111,7 +105,7 @@ class ForceSensor:
 
         Args:
             rgb: (h, w, 3) uint8.
-            depth: (h, w) aligned to the colours, in metres, or uint16 in millimetres; None without.
+            depth: (h, w) aligned to the colours, in metres, or whole numbers in millimetres; None without.
             stamp: image capture time [s], rising.
             T_camera_object: (4, 4) pose of the object's mesh in this image, where it is known.
 
@@ -122,7 +116,7 @@ class ForceSensor:
         if not isinstance(self._camera, CameraIntrinsics):
             self._camera = _intrinsics(self._camera, rgb.shape[:2])
         if depth is not None:
-            depth = decode_depth(depth, "16UC1" if np.asarray(depth).dtype == np.uint16 else "32FC1")
+            depth = decode_depth(depth, "16UC1" if np.asarray(depth).dtype.kind in "iu" else "32FC1")
         seen = self._detector.detect(RgbdImage(stamp=stamp, color=rgb, depth=depth, camera=self._camera))
         T = None if T_camera_object is None else check_pose(T_camera_object, "T_camera_object")
         found = {side: self._solve(self._loops[side], points, T) for side, points in seen.items()}
@@ -141,23 +135,13 @@ class ForceSensor:
 def combine_solutions(stamp: float, found: Mapping[str, Solution | None]) -> GripperForces:
     """Return what the solutions of one jaw or two in one image, None where a jaw was not seen, say of the gripper."""
     jaws = {side: solution for side, solution in found.items() if solution is not None}
-    wrong = {
-        side: "not seen" if each is None else f"{each.status}: {each.message}"
+    wrong = [
+        f"{side} jaw {f'{each.status}: {each.message}' if each else 'not seen'}"
         for side, each in found.items()
         if each is None or not each.trusted
-    }
+    ]
     if wrong:
-        unknown = np.full(3, np.nan)
-        status = "; ".join(f"{side} jaw {text}".strip(": ") for side, text in wrong.items())
-        return GripperForces(
-            stamp=stamp,
-            jaws=jaws,
-            status=status,
-            grasp=np.nan,
-            grasp_stddev=np.nan,
-            manipulation=unknown,
-            manipulation_stddev=unknown,
-        )
+        return GripperForces(stamp=stamp, jaws=jaws, status="; ".join(wrong))
     wrenches = {side: Wrench(each.force, each.torque) for side, each in jaws.items()}
     side, weakest = min(jaws.items(), key=lambda jaw: float(np.linalg.norm(jaw[1].force)))
     both = len(jaws) == len(SIDES)

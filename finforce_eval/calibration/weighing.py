@@ -149,12 +149,12 @@ def scale_calibration(
 
 def _suspect_newtons(scaled: Calibration, weighing: Weighing, jaw: Jaw) -> str:
     """Return a hint where the readings make sense as newtons."""
+    newton = 1e3 / GRAVITY  # in grams
     try:
-        scaled.changed(young_modulus=scaled.young_modulus / (1e-3 * GRAVITY)).check_modulus(jaw)
+        scaled.changed(young_modulus=scaled.young_modulus * newton).check_modulus(jaw)
     except CalibrationError:
         return ""
-    newtons = weighing.weights / (1e-3 * GRAVITY)
-    grams = " ".join(f"{reading / (1e-3 * GRAVITY):.0f}" for reading in newtons)
+    grams = " ".join(f"{newton * newton * weight:.0f}" for weight in weighing.weights)
     return f"; the readings look like newtons, in grams they are {grams}"
 
 
