@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -83,6 +84,16 @@ def build_camera(named: Mapping[str, Any], shape: tuple[int, int] | None) -> Cam
         )
     model = str(named.get("model") or (RATIONAL if distortion.size > 5 else PLUMB_BOB))
     return CameraIntrinsics(**size, **values, distortion=distortion, model=_MODELS.get(model.lower(), model))
+
+
+def cut_camera(camera: CameraIntrinsics, shape: tuple[int, int]) -> CameraIntrinsics:
+    """Return the camera of the middle of its images, scaled until they are h x w pixels (`shape`)."""
+    height, width = shape
+    scale = max(height / camera.height, width / camera.width)
+    middle = 0.5 * np.array([width / scale - camera.width, height / scale - camera.height])
+    cx, cy = (np.array([camera.cx, camera.cy]) + middle + 0.5) * scale - 0.5
+    lens = {"fx": camera.fx * scale, "fy": camera.fy * scale, "cx": float(cx), "cy": float(cy)}
+    return replace(camera, width=width, height=height, **lens)
 
 
 def _parse(text: str) -> Any:

@@ -9,16 +9,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from finforce.errors import PoseError
-from finforce.transforms import check_pose, invert_pose, pose_from_quaternion
+from finforce.transforms import check_pose, invert_pose, move_pose, pose_from_quaternion
 
 SIDES = ("left", "right")
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # about z: left and right change places
 
 
-def jaw_in_gripper(side: str, origin_x: float) -> NDArray:
+def jaw_in_gripper(side: str, origin_x: float, turn: ArrayLike | None = None) -> NDArray:
     """Return T_gripper_jaw (4, 4) of a jaw whose origin is at `origin_x` [m] on the closing axis.
 
-    The left jaw has the orientation of the gripper base, the right jaw is that turned by 180 degrees about z.
+    The left jaw has the orientation of the gripper base, the right jaw is that turned by 180 degrees about z. A jaw
+    that is mounted askew is turned by the rotation vector `turn` (3,) [rad] in its own frame.
 
     Raises:
         PoseError: the side is neither "left" nor "right".
@@ -27,12 +28,12 @@ def jaw_in_gripper(side: str, origin_x: float) -> NDArray:
         raise PoseError(f"side: got {side!r}, expected 'left' or 'right'")
     T = np.eye(4) if side == "left" else HALF_TURN.copy()
     T[0, 3] = origin_x
-    return T
+    return T if turn is None else T @ move_pose(np.eye(4), np.r_[np.zeros(3), turn])
 
 
-def jaw_in_camera(T_gripper_camera: NDArray, side: str, origin_x: float) -> NDArray:
-    """Return T_camera_jaw (4, 4) = T_gripper_camera^-1 T_gripper_jaw(origin_x [m])."""
-    return invert_pose(T_gripper_camera) @ jaw_in_gripper(side, origin_x)
+def jaw_in_camera(T_gripper_camera: NDArray, side: str, origin_x: float, turn: ArrayLike | None = None) -> NDArray:
+    """Return T_camera_jaw (4, 4) = T_gripper_camera^-1 T_gripper_jaw(origin_x [m], turn [rad])."""
+    return invert_pose(T_gripper_camera) @ jaw_in_gripper(side, origin_x, turn)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,12 +43,14 @@ class OpeningRange:
     nearest: float = 0.010
     farthest: float = 0.070
 
-    def place_jaw(self, T_gripper_camera: NDArray, side: str, step: float) -> list[NDArray]:
+    def place_jaw(
+        self, T_gripper_camera: NDArray, side: str, step: float, turn: ArrayLike | None = None
+    ) -> list[NDArray]:
         """Return T_camera_jaw (4, 4) at places from one end of the range to the other, at most `step` [m] apart."""
         count = max(2, int(np.ceil((self.farthest - self.nearest) / step)) + 1)
         sign = -1.0 if side == "left" else 1.0
         places = np.linspace(self.nearest, self.farthest, count)
-        return [jaw_in_camera(T_gripper_camera, side, sign * place) for place in places]
+        return [jaw_in_camera(T_gripper_camera, side, sign * place, turn) for place in places]
 
 
 def look_at(position: ArrayLike, target: ArrayLike, right: ArrayLike) -> NDArray:

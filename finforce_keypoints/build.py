@@ -17,7 +17,7 @@ from finforce_keypoints.images import ImageWatch, PixelDetector
 from finforce_keypoints.networks.metadata import build_name_map, parse_mapping
 from finforce_keypoints.networks.model import KeypointModel
 from finforce_keypoints.networks.side_network import COARSE, SideNetwork
-from finforce_keypoints.parameters import ALIGNED, DetectorParameters, DetectorSettings
+from finforce_keypoints.parameters import ALIGNED, DetectorParameters, DetectorSettings, find_mounts
 
 MODELS = Path(__file__).parent / "models"
 ANY_FINGER, BENCH = MODELS / "side_plane", MODELS / "plane"
@@ -51,7 +51,13 @@ def build_detector(
         settings = replace(settings, plane_depth=True)
     pixel_detector = build_pixel_detector(jaws, parameters, settings, dots)
     return KeypointDetector(
-        pixel_detector, jaws, parameters.camera_pose, settings, ImageWatch() if watched else None, rests
+        pixel_detector,
+        jaws,
+        parameters.camera_pose,
+        settings,
+        ImageWatch() if watched else None,
+        rests,
+        find_mounts(parameters, jaws),
     )
 
 
@@ -70,7 +76,7 @@ def build_pixel_detector(
         locator: AnyFinger | OneFinger = AnyFinger(SideNetwork(folder, threads=parameters.threads), jaws)
     else:
         locator = OneFinger(KeypointModel(folder, threads=parameters.threads), jaws)
-    return SidePlaneDetector(locator, jaws, parameters.camera_pose, opening)
+    return SidePlaneDetector(locator, jaws, parameters.camera_pose, opening, find_mounts(parameters, jaws))
 
 
 def choose_network(jaws: Mapping[str, Jaw]) -> Path:

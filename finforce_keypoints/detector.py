@@ -19,7 +19,7 @@ from finforce_keypoints.geometry.jaw_localizer import JawKeypoints, JawLocalizer
 from finforce_keypoints.geometry.side_picture import find_side
 from finforce_keypoints.geometry.stillness import StillWatch
 from finforce_keypoints.images import ImageWatch, PixelDetection, PixelDetector, RgbdImage, check_image
-from finforce_keypoints.parameters import DetectorSettings
+from finforce_keypoints.parameters import DetectorSettings, JawMount
 
 __all__ = ["JawKeypoints", "KeypointDetector"]
 
@@ -67,6 +67,7 @@ class KeypointDetector:
         settings: DetectorSettings | None = None,
         watch: ImageWatch | None = None,
         rests: bool = False,
+        mounts: Mapping[str, JawMount] | None = None,
     ) -> None:
         """Prepare to look at jaws.
 
@@ -77,6 +78,7 @@ class KeypointDetector:
             settings: of the geometry.
             watch: notices a camera that fails; None: nobody does.
             rests: whether pixels and depth are left out where nothing has moved.
+            mounts: by side; without, jaws stand straight and nothing covers them.
         """
         self.settings = settings or DetectorSettings()
         wrong = [side for side, jaw in jaws.items() if jaw.side != side]
@@ -88,7 +90,11 @@ class KeypointDetector:
         self._pixel_detector, self._image_watch = pixel_detector, watch
         self._still_watch = StillWatch() if rests else None
         self._counts_of = {side: len(jaw.keypoints) + 1 for side, jaw in jaws.items()}
-        self._jaws = {side: JawLocalizer(jaw, T_gripper_camera, self.settings) for side, jaw in jaws.items()}
+        mounts = mounts or {side: JawMount() for side in jaws}
+        self._jaws = {
+            side: JawLocalizer(jaw, T_gripper_camera, self.settings, mounts[side]) for side, jaw in jaws.items()
+        }
+        self._visible = {side: mounts[side].seen_points(jaw)[:-1] for side, jaw in jaws.items()}
         self.reset()
 
     def reset(self) -> None:
@@ -227,7 +233,7 @@ class KeypointDetector:
             found = {}
         for side in self._jaws:
             self._looks[side] += 1
-            seen = float(found[side].valid.mean()) if side in found else 0.0
+            seen = float(found[side].valid[self._visible[side]].mean()) if side in found else 0.0
             self._shares[side] += (seen - self._shares[side]) / min(self._looks[side], _MEMORY)
         return found
 

@@ -25,7 +25,6 @@ from finforce.messages import (
 from finforce_keypoints.errors import BlackImageError, EmptyDepthError, FrozenImageError, SyncError
 from finforce_keypoints.parameters import ALIGNED, AUTO, NO_DEPTH, DetectorParameters
 
-REFERENCE = "reference"  # the name of the reference point, the last row of every detection
 FROZEN_AFTER = 2  # repetitions of a picture, to the bit, after which a camera counts as frozen
 _WATCHED_STEP = 8  # every so many rows and columns are looked at
 _DARKEST = 10  # of 255: a picture whose brightest hundredth is below this shows nothing

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+import numpy as np
 from numpy.typing import NDArray
 
 from finforce.camera_topics import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC, OLD_COLOR_TOPIC, TRANSPORTS
@@ -17,6 +19,8 @@ from finforce_keypoints.errors import DetectorSettingsError
 if TYPE_CHECKING:
     from finforce_ifea.jaw.jaw import Jaw
 
+REFERENCE = "reference"  # the name of the reference point, the last row of every detection
+LARGEST_TURN = 0.3  # [rad]
 DEPTHS = ALIGNED, AUTO, NO_DEPTH = ("aligned", "auto", "none")
 
 
@@ -30,6 +34,13 @@ class DetectorParameters(GripperParameters):
     T_gripper_camera: tuple[float, ...] = setting(
         pose_numbers(ROBOT_CAMERA),
         "Pose of the colour camera in the gripper frame: x, y, z [m], qx, qy, qz, qw; if not set, from /tf if possible",
+    )
+    left_turn: tuple[float, ...] = setting(
+        (0.0, 0.0, 0.0), "Rotation vector of the left jaw against the gripper axes, in the jaw frame [rad]"
+    )
+    right_turn: tuple[float, ...] = setting((0.0, 0.0, 0.0), "Rotation vector of the right jaw, likewise [rad]")
+    covered: tuple[str, ...] = setting(
+        ("",), "Key points hidden by the holder, each as SIDE/NAME, such as left/outer_1 or left/reference"
     )
     publish_tf: bool = setting(True, "Whether jaw poses are published on /tf, if tf2_ros is installed")
     image_transport: str = setting(
@@ -93,6 +104,48 @@ class DetectorParameters(GripperParameters):
     def camera_pose(self) -> NDArray:
         """T_gripper_camera (4, 4); raises PoseError unless it is seven finite numbers with a unit quaternion."""
         return pose_from_quaternion(self.T_gripper_camera[:3], self.T_gripper_camera[3:])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class JawMount:
+    """How one jaw stands in the gripper, and what its holder covers.
+
+    Attributes:
+        turn: rotation vector (3,) against the gripper's axes, jaw frame [rad].
+        covered: names of the key points that are never seen, "reference" for the reference point.
+    """
+
+    turn: NDArray = field(default_factory=lambda: np.zeros(3))
+    covered: frozenset[str] = frozenset()
+
+    def seen_points(self, jaw: Jaw) -> NDArray[np.bool_]:
+        """Return which of a jaw's key points, the reference point last, are not covered (K + 1,)."""
+        return np.array([name not in self.covered for name in (*jaw.keypoint_names, REFERENCE)])
+
+
+def find_mounts(parameters: DetectorParameters, jaws: Mapping[str, Jaw]) -> dict[str, JawMount]:
+    """Return how the jaws, by side, are mounted.
+
+    Raises:
+        DetectorSettingsError: a turn is no three numbers, or `covered` names a point that the jaw does not have.
+    """
+    mounts = {}
+    for side, jaw in jaws.items():
+        turn = np.array(getattr(parameters, f"{side}_turn"), dtype=float)
+        if turn.shape != (3,) or not np.linalg.norm(turn) <= LARGEST_TURN:
+            raise DetectorSettingsError(
+                f"{side}_turn: got {turn.tolist()}, expected a rotation vector of three numbers, at most "
+                f"{LARGEST_TURN:g} rad long"
+            )
+        covered = frozenset(name.partition("/")[2] for name in parameters.covered if name.startswith(f"{side}/"))
+        unknown = sorted(covered - {*jaw.keypoint_names, REFERENCE})
+        if unknown:
+            raise DetectorSettingsError(
+                f"covered: got {', '.join(unknown)} of the {side} jaw, expected names of key points of the jaw "
+                f"'{jaw.name}' or {REFERENCE}"
+            )
+        mounts[side] = JawMount(turn=turn, covered=covered)
+    return mounts
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -25,7 +25,7 @@ from finforce_eval.evaluation.gripper import combine_jaws
 from finforce_eval.evaluation.keypoint_source import parse_source
 from finforce_eval.evaluation.setup import share_setup, sides_of
 from finforce_eval.machine import version, without_nan
-from finforce_eval.recordings.bags import NO_DIGEST, BagReader, bag_source, list_files, open_bag
+from finforce_eval.recordings.bags import NO_DIGEST, BagReader, bag_source, is_frames, list_files, open_bag
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.tracks import Recording
 from finforce_eval.recordings.writer import (
@@ -36,11 +36,11 @@ from finforce_eval.recordings.writer import (
     typestore,
     wrench_message,
 )
-from finforce_eval.table import AXES, ForceSeries
+from finforce_eval.table import AXES, ForceSeries, write_table
 from finforce_eval.tasks import Task, hash_settings
 
 GRIPPER_FRAME = "gripper_base"
-NOTE = "annotation.json"
+NOTE, TABLE, MOVIE = "annotation.json", "forces.parquet", "forces.webp"
 _OK, _WARN = 0, 1
 
 
@@ -58,7 +58,7 @@ def annotate_bag(source: Path, target: Path, options: argparse.Namespace, settin
     """Write a recording with forces and return figures of it; where it is there already, a run was killed after that.
 
     Args:
-        source: rosbag2 folder, .mcap or .db3 file.
+        source: rosbag2 folder, .mcap or .db3 file, video, or folder of pictures.
         target: the new folder.
         options: of the command `annotate`.
         settings: hash of them and of the files that they name.
@@ -80,13 +80,32 @@ def annotate_bag(source: Path, target: Path, options: argparse.Namespace, settin
     why = why_unanswered(jaws.values())
     if why:
         raise RecordingError(f"{source.stem}: {why}")
-    messages = ForceMessages(jaws, combine_jaws(jaws))
     figures = without_nan(_describe(jaws) | {"notes": list(recording.notes)})
     about = {"key": key, "figures": figures, "settings": dict(setup.about), "version": version()}
     with new_folder(target) as folder:
-        write_annotated(recording, bag_source(recording.source), messages, folder, side_file=options.side_file)
+        if is_frames(source):
+            write_frames(recording, jaws, folder, about, draw=options.draw)
+        else:
+            messages = ForceMessages(jaws, combine_jaws(jaws))
+            write_annotated(recording, bag_source(recording.source), messages, folder, side_file=options.side_file)
         (folder / NOTE).write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
     return figures
+
+
+def write_frames(
+    recording: Recording, jaws: Mapping[str, ForceSeries], folder: Path, about: Mapping[str, Any], *, draw: bool
+) -> None:
+    """Write the forces in a video or in pictures as a table, a row for each image and jaw, and if asked a movie.
+
+    Raises:
+        OSError: they cannot be written.
+    """
+    folder.mkdir()
+    write_table(folder / TABLE, list(jaws.values()), about)
+    if draw:
+        from finforce_eval.figures.movie import write_movie
+
+        write_movie(recording, list(jaws.values()), folder / MOVIE)
 
 
 def _describe(jaws: Mapping[str, ForceSeries]) -> dict[str, Any]:

@@ -30,11 +30,11 @@ from finforce_eval.recordings.dataset import (
     Dataset,
     Episode,
     open_dataset,
-    read_lens,
     read_parquet,
     recording_of,
     rows_of,
 )
+from finforce_eval.recordings.frames import choose_camera
 from finforce_eval.recordings.tracks import Recording
 from finforce_eval.table import ForceSeries, read_table, write_table
 from finforce_eval.tasks import Task, hash_settings
@@ -51,7 +51,7 @@ def episode_tasks(folder: Path, parts: Path, options: argparse.Namespace) -> lis
         FinforceError: the dataset cannot be read, or its camera is not known.
     """
     dataset = open_dataset(folder, options.color or "")
-    camera = read_lens(dataset, options.intrinsics)
+    camera = choose_camera(parse_source(options).choice, dataset.image_size, folder.name)
     _check_files(dataset)
     own = (f"{options.prefix}.force.", f"{options.prefix}.grasp_force")
     same = sorted(name for name in dataset.info["features"] if name.startswith(own))

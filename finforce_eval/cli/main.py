@@ -31,6 +31,7 @@ COMMANDS = {
     "calibrate": "calibrate a finger from recordings with measured forces",
     "weigh": "calibrate the modulus of a finger with readings of a kitchen scale",
     "check": "check that camera, jaw file, extrinsics and images match",
+    "camera": "make the rig file of a camera from a video or pictures of open, unloaded jaws",
     "extrinsics": "calibrate the camera pose from images of open, still, unloaded jaws",
     "twin": "make RGB-D recordings of a simulated gripper with ground truth",
     "demo": "run a simulated grasp through the nodes and write a report",

@@ -18,7 +18,7 @@ MESHES = ("default", "coarse", "fine")
 UNITS = ("m", "cm", "mm", "inch")
 SOURCES = ("images", "keypoints", "truth")
 JAWS_CHOICES = ("left", "right", "both")
-BAG_HELP = "rosbag2 folder, .mcap or .db3 file, or the folder of a LeRobot dataset"
+BAG_HELP = "rosbag2 folder, .mcap or .db3 file, the folder of a LeRobot dataset, a video, or a folder of pictures"
 CONTACT_HELP = (
     "contact: estimate, closest or paper, from the object's mesh and pose; fixed:Z_MM, the height of first touch above "
     "the clamped base [mm]; fixed:case, from the case.json next to each recording; NAME=Z_MM, for one "
@@ -74,6 +74,8 @@ def add_run_options(parser: argparse.ArgumentParser, *, calibration: bool = True
     text = "key points: from images, keypoints as recorded, or truth of a simulated recording "
     text += "(keypoints if recorded, else images)"
     images.add_argument("--from", dest="source", choices=SOURCES, help=text)
+    text = "treat every image as a separate photograph: no tare, no memory"
+    images.add_argument("--stills", action="store_true", help=text)
     images.add_argument("--jaws", choices=JAWS_CHOICES, help="jaws in the images, if no topic tells (both)")
     add_detector_options(images)
     text = "reject truncated or damaged recordings instead of reading them up to the damage"
@@ -91,6 +93,8 @@ def add_detector_options(parser: argparse._ActionsContainer) -> None:
     parser.add_argument("--detector", action="append", default=[], metavar="NAME=VALUE", help=text)
     text = "camera pose in the gripper frame: robot, bench, or x,y,z,qx,qy,qz,qw in metres (case.json, else robot)"
     parser.add_argument("--extrinsics", metavar="POSE", help=text)
+    text = "rig file of finforce camera, instead of --jaw, --extrinsics and --intrinsics; a --jaw after it has priority"
+    parser.add_argument("--rig", action=_UseRig, metavar="FILE", help=text)
     text = "topic of the colour images, or feature of a LeRobot dataset (the only one)"
     parser.add_argument("--color", metavar="TOPIC", help=text)
     text = "topic of the depth images (the only one in the frame of the colour images)"
@@ -102,6 +106,15 @@ def add_detector_options(parser: argparse._ActionsContainer) -> None:
     parser.add_argument("--intrinsics", nargs="+", metavar="NUMBER", help=text)
     episode = whole_number(0, 10**9)
     parser.add_argument("--episode", type=episode, default=0, metavar="N", help="episode of a LeRobot dataset (0)")
+
+
+class _UseRig(argparse.Action):
+    """Take the jaw of a rig file."""
+
+    def __call__(self, parser: Any, namespace: argparse.Namespace, value: Any, option: str | None = None) -> None:
+        from finforce_keypoints.rig import read_rig
+
+        namespace.rig, namespace.jaw = value, read_rig(value).jaw
 
 
 def add_rest_options(parser: argparse.ArgumentParser, images: int) -> None:

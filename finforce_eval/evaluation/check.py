@@ -287,7 +287,7 @@ def _draw(
     mean: RgbdImage, jaws: Mapping[str, Jaw], given: NDArray, found: Extrinsics | None, look: JawsAtRest | None
 ) -> NDArray:
     """Return the mean image with the jaws as given in grey, as fitted in orange, and the key points seen in green."""
-    cv2, picture, camera = import_cv2(), mean.color.copy(), mean.camera
+    picture, camera = mean.color.copy(), mean.camera
     middle = 0.5 * (OpeningRange().nearest + OpeningRange().farthest)
     for side, jaw in jaws.items():
         sign = -1.0 if side == "left" else 1.0
@@ -295,15 +295,25 @@ def _draw(
         if found is not None:
             poses.append((found.T_gripper_camera, found.origins[side], FITTED))
         for T, origin, color in poses:
-            pose, plane = jaw_in_camera(T, side, origin), find_side(jaw)
-            for ring in find_shape(jaw).rings:
-                line = project_plane(np.vstack((ring, ring[:1])), plane, pose, camera)
-                for part in np.split(line, np.flatnonzero(~np.isfinite(line).all(axis=1))):
-                    part = part[np.isfinite(part).all(axis=1)]
-                    if len(part) > 1:
-                        shifted = np.round(8.0 * np.clip(part, -4e3, 4e3)).astype(np.int32)
-                        cv2.polylines(picture, [shifted], False, color, 1, cv2.LINE_AA, 3)
+            draw_jaw(picture, jaw, jaw_in_camera(T, side, origin), camera, color)
     for jaw in look.jaws.values() if look else ():
-        for x, y in jaw.pixels[np.isfinite(jaw.pixels).all(axis=1)]:
-            cv2.circle(picture, (round(8 * x), round(8 * y)), 24, SEEN, 1, cv2.LINE_AA, 3)
+        draw_points(picture, jaw.pixels, SEEN)
     return picture
+
+
+def draw_jaw(picture: NDArray, jaw: Jaw, T_camera_jaw: NDArray, camera: CameraIntrinsics, color: Sequence[int]) -> None:
+    """Draw the lines of a jaw's side into a picture (h, w, 3)."""
+    cv2, plane = import_cv2(), find_side(jaw)
+    for ring in find_shape(jaw).rings:
+        line = project_plane(np.vstack((ring, ring[:1])), plane, T_camera_jaw, camera)
+        for part in np.split(line, np.flatnonzero(~np.isfinite(line).all(axis=1))):
+            part = part[np.isfinite(part).all(axis=1)]
+            if len(part) > 1:
+                shifted = np.round(8.0 * np.clip(part, -4e3, 4e3)).astype(np.int32)
+                cv2.polylines(picture, [shifted], False, color, 1, cv2.LINE_AA, 3)
+
+
+def draw_points(picture: NDArray, pixels: NDArray, color: Sequence[int]) -> None:
+    """Draw circles around pixels (n, 2), those that are finite, into a picture (h, w, 3)."""
+    for x, y in pixels[np.isfinite(pixels).all(axis=1)]:
+        import_cv2().circle(picture, (round(8 * x), round(8 * y)), 24, color, 1, import_cv2().LINE_AA, 3)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -30,6 +31,7 @@ _POINTS = ("points_x", "points_y", "points_z", "points_weight", "points_touching
 
 
 NOT_FOUND = "not found"  # status of a jaw that is in none of the images
+STILL_UPDATES, STILL_PERIOD = 30, 0.03  # as often, and so far apart [s], is a still seen, for its contact to settle
 LEAST_ANSWERED = 0.1  # share of the images with a force, below which there is no such finger in them
 
 
@@ -118,6 +120,7 @@ def estimate_forces(
             side,
             strict=strict,
             as_live=setup.as_live,
+            stills=setup.stills,
             progress=progress,
             watch=watch,
         )
@@ -188,6 +191,7 @@ def find_forces(
     *,
     strict: bool = True,
     as_live: bool = False,
+    stills: bool = False,
     progress: Callable[[int], Any] = lambda steps: None,
     watch: Callable[[str, int, Estimator], Any] | None = None,
 ) -> ForceSeries:
@@ -203,6 +207,7 @@ def find_forces(
         side: "left" or "right".
         strict: an image that is refused ends the run, else it has no force and says why.
         as_live: whether the images that the solver's node passes over are left out.
+        stills: whether nothing of one image is known in the next.
         progress: called with the number of images done since its last call.
         watch: called with side, stamp [ns] and estimator after every image.
 
@@ -212,7 +217,7 @@ def find_forces(
     """
     track = recording.jaw(side).keypoints
     stamps = track.stamps
-    run, rows = _JawRun(recording, side, jaw, ForceLoop(source, estimator)), []
+    run, rows = _JawRun(recording, side, jaw, ForceLoop(source, estimator), stills), []
     idling, answered = Idling(), np.ones(len(stamps), dtype=bool)
     unseen = _is_unseen(recording, side)
     for index, stamp in enumerate(stamps.tolist()):
@@ -259,12 +264,14 @@ class _JawRun:
         side: "left" or "right".
         jaw: the jaw of that side.
         loop: a fresh one.
+        stills: whether nothing of one image is known in the next.
 
     Attributes:
         snapshot: the jaw under the largest force so far of an image that is scored.
     """
 
-    def __init__(self, recording: Recording, side: str, jaw: Any, loop: ForceLoop) -> None:
+    def __init__(self, recording: Recording, side: str, jaw: Any, loop: ForceLoop, stills: bool = False) -> None:
+        self._updates = STILL_UPDATES if stills else 1
         self._jaw, self._loop, self._track = jaw, loop, recording.jaw(side).keypoints
         self._scored = recording.phases_at(self._track.stamps)["scored"]
         self._surface0 = np.array(loop.force.surface())
@@ -281,8 +288,11 @@ class _JawRun:
             ObservationError: the estimator refuses it.
             RecordingError: the contact estimator refuses a pose.
         """
-        loop = self._loop
-        solution = loop.update(self._track.observation(index))
+        loop, observation = self._loop, self._track.observation(index)
+        if self._updates > 1:
+            loop.force.forget()
+        for number in range(self._updates):
+            solution = loop.update(replace(observation, stamp=observation.stamp + number * STILL_PERIOD))
         row = self.row(solution.status, "" if solution.trusted else solution.message)
         row |= {"step_ms": loop.force_ms, "contact_ms": loop.contact_ms}
         row |= {"used": solution.keypoints_used, "residual": solution.residual}

@@ -24,6 +24,7 @@ from finforce_eval.recordings.images import DEPTH_ENDS, ImageChoice, ImageTrack
 from finforce_eval.recordings.tracks import DetectionTrack, JawTrack, KeypointTrack, PoseTrack, Recording
 from finforce_eval.tasks import progress_bar
 from finforce_keypoints.errors import KeypointError
+from finforce_keypoints.rig import read_rig
 
 if TYPE_CHECKING:
     from finforce_keypoints.detector import KeypointDetector
@@ -209,12 +210,15 @@ def parse_source(options: argparse.Namespace) -> KeypointSource:
     """
     parameters: dict[str, Any] = {}
     changes, extrinsics = getattr(options, "detector", []), getattr(options, "extrinsics", None)
+    rig = read_rig(options.rig) if getattr(options, "rig", None) else None
     source = getattr(options, "source", None) or ""
     for name, given in (("--detector", changes), ("--extrinsics", extrinsics)):
         if given and source in (KEYPOINTS, TRUTH):
             raise OptionError(f"{name}: --from {source} needs no detector; leave it out, or give --from {IMAGES}")
+    if rig is not None:
+        parameters |= rig.detector_parameters()
     if changes:
-        parameters = _parse_parameters(changes)
+        parameters |= _parse_parameters(changes)
     if extrinsics:
         parameters["T_gripper_camera"] = _parse_extrinsics(extrinsics)
     switches = {name: bool(getattr(options, name, False)) for name in ("strict", "as_live")}
@@ -223,6 +227,7 @@ def parse_source(options: argparse.Namespace) -> KeypointSource:
     choice = ImageChoice(
         **{name: value for name, value in given.items() if value},
         intrinsics=tuple(getattr(options, "intrinsics", None) or ()),
+        camera=rig.intrinsics if rig is not None else None,
         pairing=None if seconds is None or math.isnan(seconds) else round(seconds * NANOSECONDS),
     )
     return KeypointSource(source=source, jaw_file=options.jaw, parameters=parameters, choice=choice, **switches)

@@ -33,7 +33,8 @@ _OUTSIDE = ("bags", "out", "engine", "workers", "memory", "address", "shard", "r
 class EvaluationSetup:
     """The set-up of an offline run; its estimators are built and compiled once for all recordings.
 
-    With `as_live` the images are left out that the nodes of contact and force leave out.
+    With `as_live` the images are left out that the nodes of contact and force leave out; with `stills` every image is
+    one by itself.
     """
 
     jaw: Jaw
@@ -42,6 +43,7 @@ class EvaluationSetup:
     contacts: ContactChoice
     about: Mapping[str, str]
     as_live: bool = False
+    stills: bool = False
     _sides: dict[str, EvaluationSetup] = field(default_factory=dict, init=False, repr=False, compare=False)
     _estimators: dict[bool, ForceEstimator] = field(default_factory=dict, init=False, repr=False, compare=False)
 
@@ -84,7 +86,10 @@ def make_setup(options: argparse.Namespace) -> EvaluationSetup:
     contacts = read_contacts(options)
     jaw = load_jaw(options.jaw)
     changes = getattr(options, "set", [])
+    stills = getattr(options, "stills", False)
     settings = parse_settings(options.solver, options.mesh, changes)
+    if stills:  # no picture tells the offsets of another
+        settings = replace(settings, automatic_tare=False)
     calibration = load_calibration(options.calibration) if options.calibration else None
     as_live = getattr(options, "as_live", False)
     about = {
@@ -95,11 +100,17 @@ def make_setup(options: argparse.Namespace) -> EvaluationSetup:
         "contact": ", ".join(options.contact) or "estimate where mesh and poses are known, else fixed:case",
         "settings": ", ".join(changes) or "as they come",
         "calibration": options.calibration or "none",
-        "images": "those that the live chain answers" if as_live else "all",
+        "images": "each by itself" if stills else "those that the live chain answers" if as_live else "all",
         "version": version(),
     }
     return EvaluationSetup(
-        jaw=jaw, settings=settings, calibration=calibration, contacts=contacts, about=about, as_live=as_live
+        jaw=jaw,
+        settings=settings,
+        calibration=calibration,
+        contacts=contacts,
+        about=about,
+        as_live=as_live,
+        stills=stills,
     )
 
 

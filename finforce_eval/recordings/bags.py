@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -254,6 +255,9 @@ def check_types(connections: Iterable[Any], expected: Mapping[str, Collection[st
 
 
 # what people have recordings in, by the ending of their names, and what makes one of ours of it
+VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
+PICTURES = (".png", ".jpg", ".jpeg")
+BAGS = ("metadata.yaml", "*.mcap", "*.db3", "meta/info.json")  # what makes a folder something else than pictures
 _OTHERS = {
     ".bag": "a ROS 1 bag: rosbags-convert --src FILE --dst FOLDER makes a ROS 2 bag of it",
     ".hdf5": "HDF5, as ALOHA and robomimic write it: make a LeRobot dataset of it, with LeRobotDataset.create",
@@ -297,10 +301,23 @@ def _check_bag(path: Path) -> Path:
     return path
 
 
+def is_frames(path: Path) -> bool:
+    """Say whether a path is a video, or a folder of pictures and nothing else that is a recording."""
+    if not path.is_dir():
+        return path.suffix.lower() in VIDEOS
+    return not any(any(path.glob(pattern)) for pattern in BAGS) and bool(list_pictures(path))
+
+
+def list_pictures(folder: Path) -> list[Path]:
+    """Return the pictures of a folder in the order of the numbers in their names."""
+    found = [path for path in folder.iterdir() if path.suffix.lower() in PICTURES and path.is_file()]
+    return sorted(found, key=lambda path: [int(p) if p.isdigit() else p for p in re.split(r"(\d+)", path.name)])
+
+
 def list_files(path: Path) -> list[Path]:
     """Return the files of a recording; none where there is no such recording."""
     try:
-        source = bag_source(path)
+        source = path if is_frames(path) else bag_source(path)
         return [source] if source.is_file() else [each for each in source.iterdir() if each.is_file()]
     except (RecordingError, OSError):
         return []
@@ -334,7 +351,7 @@ def name_recordings(texts: Sequence[str | Path], between: str) -> list[tuple[str
 def _bag_stem(path: Path) -> Path:
     """Return the path of a recording without the ending of its file."""
     with suppress(RecordingError):
-        source = bag_source(path)
+        source = path if is_frames(path) else bag_source(path)
         return source.with_suffix("") if source.is_file() else source
     return path
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,18 +20,15 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from finforce.camera import MILLIMETRE, CameraIntrinsics, ImageError, decode_picture
+from finforce.camera import CameraIntrinsics, ImageError, decode_picture
 from finforce.errors import one_line
 from finforce.files import FileError, check_inside, check_plain, parse_json, raise_budget, read_json, read_text
-from finforce.messages import NANOSECONDS
-from finforce.optional import import_library
 from finforce.sandbox import MEMORY, limit_growth
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.recordings.bags import allowed_bytes
-from finforce_eval.recordings.image_files import read_intrinsics
-from finforce_eval.recordings.images import ImageChoice, StampedImage
+from finforce_eval.recordings.frames import FrameImages, choose_camera, decode_video
+from finforce_eval.recordings.images import ImageChoice
 from finforce_eval.recordings.tracks import JAWS, JawTrack, KeypointTrack, Recording
-from finforce_keypoints.images import RgbdImage, check_image
 
 pa.set_memory_pool(pa.system_memory_pool())  # the default one takes a gigabyte at once, which no limit tells from use
 INFO, STATS = Path("meta/info.json"), Path("meta/stats.json")
@@ -101,24 +98,19 @@ def read_episode(folder: Path, choice: ImageChoice, sides: Sequence[str] = ()) -
     if episode is None:
         numbers = [each.index for each in dataset.episodes]
         raise RecordingError(f"{folder.name}: no episode {choice.episode}; expected {min(numbers)} to {max(numbers)}")
-    return recording_of(dataset, episode, read_lens(dataset, choice.intrinsics), sides)
-
-
-def read_lens(dataset: Dataset, words: Sequence[str]) -> CameraIntrinsics:
-    """Return the camera of a dataset by the words of --intrinsics; raises OptionError without any."""
-    if not words:
-        raise OptionError(
-            f"{dataset.folder.name}: --intrinsics: a dataset does not describe its camera; expected fx fy cx cy, or a "
-            "file"
-        )
-    return read_intrinsics(words, dataset.image_size)
+    return recording_of(dataset, episode, choose_camera(choice, dataset.image_size, folder.name), sides)
 
 
 def recording_of(dataset: Dataset, episode: Episode, camera: CameraIntrinsics, sides: Sequence[str] = ()) -> Recording:
     """Return an episode as a recording whose jaws are still to be found."""
     name = f"{dataset.folder.name}/episode_{episode.index:06d}"
     images = EpisodeImages(
-        episode=episode, name=name, feature=dataset.camera, fps=float(dataset.info["fps"]), camera=camera
+        episode=episode,
+        name=name,
+        feature=dataset.camera,
+        fps=float(dataset.info["fps"]),
+        camera=camera,
+        count=episode.length,
     )
     jaws = {side: JawTrack(keypoints=KeypointTrack.empty()) for side in sides or JAWS}
     return Recording(name=name, path=episode.data, jaws=jaws, images=images)
@@ -273,97 +265,22 @@ def rows_of(table: pa.Table, episode: Episode, name: str) -> pa.Table:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class EpisodeImages:
-    """Pictures of an episode; iterating decodes them. See `ImageTrack`, whose part it takes.
-
-    Attributes:
-        episode: whose pictures they are.
-        name: of the episode, for messages.
-        feature: the column with the pictures, where there is no video.
-        fps: frames per second.
-        camera: intrinsics.
-        frames: (n,) numbers of those to be read, rising; None for all.
-        depth_scale: without meaning.
-    """
+class EpisodeImages(FrameImages):
+    """Pictures of an episode; those of its video, or else of the column `feature`."""
 
     episode: Episode
-    name: str
     feature: str
-    fps: float
-    camera: CameraIntrinsics
-    frames: NDArray[np.int64] | None = None
-    depth_scale: float = MILLIMETRE
-    frame_id: str = "camera_color_optical_frame"
-    topics: tuple[str, str] = ("", "")
-    info: str = ""
-    has_depth: bool = False
-
-    def __len__(self) -> int:
-        return self.episode.length if self.frames is None else len(self.frames)
 
     @property
     def is_video(self) -> bool:
         """Whether the pictures are those of a video."""
         return self.episode.video is not None
 
-    @property
-    def stamps(self) -> NDArray[np.int64]:
-        """Stamps of the frames (n,) [ns], from zero."""
-        frames = np.arange(self.episode.length) if self.frames is None else self.frames
-        return np.rint(frames * (NANOSECONDS / self.fps)).astype(np.int64)
-
-    def between(self, start: int, stop: int) -> EpisodeImages:
-        """Return the frames with start <= stamp < stop [ns]."""
-        return self.at(self.stamps[(self.stamps >= start) & (self.stamps < stop)])
-
-    def at(self, stamps: NDArray[np.int64]) -> EpisodeImages:
-        """Return the frames at some stamps [ns]."""
-        everything = np.arange(self.episode.length) if self.frames is None else self.frames
-        return replace(self, frames=everything[np.isin(self.stamps, stamps)])
-
-    def all_colors(self) -> EpisodeImages:
-        """Return them all."""
-        return self
-
-    colors_alone = all_colors
-
-    def __iter__(self) -> Iterator[StampedImage]:
-        """Decode the frames in their order.
-
-        Raises:
-            RecordingError: a frame is missing or damaged, or of another size than its camera.
-        """
-        frames = range(len(self)) if self.frames is None else self.frames.tolist()
-        wanted, count = dict(zip(frames, self.stamps.tolist(), strict=True)), 0
-        for frame, color in enumerate(self._read_video() if self.episode.video is not None else self._read_column()):
-            if frame in wanted:
-                stamp, count = wanted[frame], count + 1
-                image = RgbdImage(stamp=stamp / NANOSECONDS, color=color, depth=None, camera=self.camera)
-                try:
-                    check_image(image)
-                except ImageError as error:
-                    raise RecordingError(f"{self.name}: frame {frame}: {error}") from error
-                yield StampedImage(stamp, image)
-            if count == len(wanted):
-                return
-        raise RecordingError(f"{self.name}: {count} pictures; expected {len(wanted)}, the length of the episode")
-
-    def _read_video(self) -> Iterator[NDArray[np.uint8]]:
-        """Yield the frames of the video from the beginning of the episode."""
-        av = import_library("av", "reading videos", "'finforce[lerobot]'")
-        video = self.episode.video
-        try:
-            check_plain(video)
-            with av.open(str(video)) as container:
-                stream = container.streams.video[0]
-                early = self.episode.begin - 0.5 / self.fps
-                if early > 0.0:
-                    container.seek(int(early / stream.time_base), stream=stream)
-                for frame in container.decode(stream):
-                    if frame.time is None or frame.time >= early:
-                        yield frame.to_ndarray(format="rgb24")
-        except (FileError, av.FFmpegError, IndexError) as error:
-            raise RecordingError(f"{self.name}: {video.parent.name}/{video.name}: {error}") from error
+    def read_all(self) -> Iterator[NDArray[np.uint8]]:
+        """Yield the pictures of the episode, (h, w, 3) RGB."""
+        if self.episode.video is not None:
+            return decode_video(self.episode.video, self.name, self.episode.begin - 0.5 / self.fps)
+        return self._read_column()
 
     def _read_column(self) -> Iterator[NDArray[np.uint8]]:
         """Yield the pictures that stand in the episode's rows."""

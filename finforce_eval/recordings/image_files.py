@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.camera import MILLIMETRE, CameraIntrinsics, ImageError, IntrinsicsError, decode_depth, open_picture
-from finforce.camera_file import build_camera, camera_numbers, read_camera
+from finforce.camera_file import build_camera, camera_numbers, cut_camera, read_camera
 from finforce.errors import PoseError, one_line
 from finforce.files import FileError, read_bytes, read_json
 from finforce_contact.reconstruction.generated import affine_from_generator
@@ -114,12 +114,13 @@ def _read_array(path: Path) -> NDArray:
     return np.frombuffer(content, dtype, offset=begin).reshape(shape, order="F" if turned else "C")
 
 
-def read_intrinsics(words: Sequence[str], shape: tuple[int, int]) -> CameraIntrinsics:
+def read_intrinsics(words: Sequence[str], shape: tuple[int, int], *, is_cut: bool = False) -> CameraIntrinsics:
     """Return the camera of images (h, w) from numbers, or from a file and perhaps the name of one of its cameras.
 
     Args:
         words: fx fy cx cy [and k1 k2 p1 p2 k3], also with commas, or what `read_camera` takes.
         shape: height and width of the images.
+        is_cut: whether these may be the middle of the file's images, scaled.
 
     Raises:
         OptionError: they are neither, or of a camera with images of another size.
@@ -131,7 +132,9 @@ def read_intrinsics(words: Sequence[str], shape: tuple[int, int]) -> CameraIntri
     try:
         if numbers or len(words) > 2:
             return build_camera(camera_numbers(numbers), shape)
-        return read_camera(words[0], shape, *words[1:])
+        if not is_cut:
+            return read_camera(words[0], shape, *words[1:])
+        return cut_camera(read_camera(words[0], None, *words[1:]), shape)
     except IntrinsicsError as error:
         raise OptionError(f"--intrinsics {' '.join(words)[:80]}: {error}") from error
 

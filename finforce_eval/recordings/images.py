@@ -53,6 +53,8 @@ class ImageChoice:
         depth: topic; "" for the only one in the frame of the colour images.
         info: topic of camera_info; "" for that next to the colour images.
         intrinsics: words of --intrinsics, instead of camera_info.
+        camera: of a rig file, for images that do not describe theirs; others have to agree with it.
+        is_cut: whether images may be the middle of those that the intrinsics are of, scaled.
         episode: of a dataset.
         pairing: greatest distance between the stamps of a colour and a depth image that belong together [ns]; half a
             period of the colour images when absent.
@@ -62,6 +64,8 @@ class ImageChoice:
     depth: str = ""
     info: str = ""
     intrinsics: tuple[str, ...] = ()
+    camera: CameraIntrinsics | None = None
+    is_cut: bool = False
     episode: int = 0
     pairing: int | None = None
 
@@ -202,6 +206,11 @@ def find_images(bag: BagReader, source: Path, choice: ImageChoice | None = None)
         camera, frame_id = _read_camera(bag, info)
     else:
         camera, frame_id = read_intrinsics(choice.intrinsics, seen[color].shape), seen[color].frame
+    if choice.camera is not None and not choice.intrinsics and not same_camera(choice.camera, camera):
+        raise RecordingError(
+            f"{bag.name}: the rig is of another camera than {info}: {choice.camera.width} x {choice.camera.height}, "
+            f"focal length {choice.camera.fx:.1f}; found {camera.width} x {camera.height}, {camera.fx:.1f}"
+        )
     found: dict[str, list[int]] = {topic: [] for topic in topics}
     for raw in bag.raw(topics):
         found[raw.topic].append(read_stamp(raw.data))

@@ -12,8 +12,9 @@ from finforce.errors import ObservationError
 from finforce.files import FileError, read_json
 from finforce.messages import NANOSECONDS, Keypoints, decode_columns, decode_keypoints, stamp_of
 from finforce_eval.errors import DamagedError, RecordingError
-from finforce_eval.recordings.bags import bag_source, check_messages, check_types, open_bag
+from finforce_eval.recordings.bags import bag_source, check_messages, check_types, is_frames, open_bag
 from finforce_eval.recordings.dataset import is_dataset, read_episode
+from finforce_eval.recordings.frames import read_frames
 from finforce_eval.recordings.images import ImageChoice, ImageTrack, find_images
 from finforce_eval.recordings.salvage import SalvagedCopy
 from finforce_eval.recordings.tracks import (
@@ -62,7 +63,7 @@ class _Content(NamedTuple):
 def read_recording(
     path: str | Path, choice: ImageChoice | None = None, sides: Sequence[str] = (), *, strict: bool = False
 ) -> Recording:
-    """Read a rosbag2 folder or a single .mcap / .db3 file, with the `case.json` next to it, or an episode of a dataset.
+    """Read a bag (rosbag2 folder, .mcap or .db3) with its `case.json`, an episode of a dataset, a video, or pictures.
 
     Topics that are not ours are not decoded; those of unknown type are named in `notes`. Images are not read yet; a
     recording with images may do without key points, its tracks of them are empty then. One that is damaged is read as
@@ -82,6 +83,8 @@ def read_recording(
     choice = choice or ImageChoice()
     if is_dataset(Path(path)):
         return read_episode(Path(path), choice, sides)
+    if is_frames(Path(path)):
+        return read_frames(Path(path), choice, tuple(sides))
     source = bag_source(Path(path))
     folder = source if source.is_dir() else source.parent
     name = source.name if source.is_dir() else source.stem

@@ -15,8 +15,9 @@ from finforce.transforms import pose_numbers
 from finforce_keypoints.errors import GeometryError, ModelError
 from finforce_keypoints.geometry.side_picture import PlaneGrid, find_side, map_picture, project_plane, take_picture
 from finforce_keypoints.geometry.template import draw_template, find_motions, find_shape, fit_grid, span_shapes
-from finforce_keypoints.images import REFERENCE, PixelDetection
+from finforce_keypoints.images import PixelDetection
 from finforce_keypoints.networks.side_network import Places
+from finforce_keypoints.parameters import REFERENCE, JawMount
 
 if TYPE_CHECKING:
     from finforce_ifea.jaw.jaw import Jaw
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 
 SAME_PLACE = 1e-3  # [m] by which a jaw may move before its picture is mapped anew; places are exact all the same
 SEARCH_STEP = 24.0  # [px] between the places where a lost jaw is looked for; the network finds one half as far away
-LEAST_SCORE = 0.35  # mean likelihood of a jaw's points, below which it is not there
+LEAST_SCORE = 0.35  # mean likelihood of a jaw's points that are not covered, below which it is not there
 STRAIGHT = np.zeros((1, 2))  # pictures of a locator's own grid alone
 
 
@@ -54,6 +55,7 @@ class SidePlaneDetector:
         jaws: by side.
         T_gripper_camera: (4, 4).
         opening: where a jaw can be.
+        mounts: by side; without, jaws stand straight and nothing covers them.
 
     Raises:
         GeometryError: the camera is where it does not see the jaws' sides.
@@ -65,6 +67,7 @@ class SidePlaneDetector:
         jaws: Mapping[str, Jaw],
         T_gripper_camera: NDArray,
         opening: OpeningRange | None = None,
+        mounts: Mapping[str, JawMount] | None = None,
     ) -> None:
         self.name, self.sha256 = f"network {locator.name}", locator.sha256
         self._locator, self._T_gripper_camera, self._opening = locator, T_gripper_camera, opening or OpeningRange()
@@ -72,6 +75,8 @@ class SidePlaneDetector:
             check_camera_side(jaw, T_gripper_camera)
         self._planes = {side: find_side(jaw) for side, jaw in jaws.items()}
         self._rest = {side: find_rest(jaw) for side, jaw in jaws.items()}
+        self._mounts = mounts or {side: JawMount() for side in jaws}
+        self._seen = {side: self._mounts[side].seen_points(jaw) for side, jaw in jaws.items()}
         self._kept: dict[tuple[str, int], _View] = {}
         self._turn = 0
         self._camera: CameraIntrinsics | None = None
@@ -87,14 +92,15 @@ class SidePlaneDetector:
         if not views:
             return {}
         places = self._locate(image, views)
+        scores = [self._score(view, places, number) for number, view in enumerate(views)]
         found: dict[str, PixelDetection] = {}
         again: list[_View] = []
         for side, pose in expected.items():
             mine = [number for number, view in enumerate(views) if view.side == side]
-            best = max(mine, key=lambda number: places.likelihood[number].mean())
+            best = max(mine, key=scores.__getitem__)
             if pose is not None:
                 found[side] = self._describe(views[best], places, best)
-            elif places.likelihood[best].mean() >= LEAST_SCORE:
+            elif scores[best] >= LEAST_SCORE:
                 again.append(self._view(side, self._centre(views[best], places, best)))
         if again:
             # the jaw lay near the border of the picture it was found in
@@ -108,11 +114,17 @@ class SidePlaneDetector:
         starts = [None if move is None else move - view.shift for move, view in zip(moves, views, strict=True)]
         return self._locator.locate(pictures, [view.side for view in views], starts)
 
+    def _score(self, view: _View, places: Places, number: int) -> float:
+        """Return the mean likelihood of the points that can be seen of the jaw of one picture."""
+        return float(places.likelihood[number][self._seen[view.side]].mean())
+
     def _views_of(self, side: str, pose: NDArray | None) -> list[_View]:
         """Return where to look for one jaw: where it is expected, or all along the closing axis."""
         if pose is None:
             step = SEARCH_STEP * self._locator.grids[side].scale
-            return [self._view(side, place) for place in self._opening.place_jaw(self._T_gripper_camera, side, step)]
+            turn = self._mounts[side].turn
+            places = self._opening.place_jaw(self._T_gripper_camera, side, step, turn)
+            return [self._view(side, place) for place in places]
         kept = self._kept.get((side, self._turn))
         if kept is None or np.abs(kept.T_camera_jaw - pose).max() > SAME_PLACE:
             kept = self._kept[side, self._turn] = self._view(side, pose, self._locator.shifts[self._turn])
@@ -136,7 +148,7 @@ class SidePlaneDetector:
 
     def _describe(self, view: _View, places: Places, number: int) -> PixelDetection:
         """Return the detection of one picture, in pixels of the image; the next one begins where its points are."""
-        if places.moves is not None and places.likelihood[number].mean() >= LEAST_SCORE:
+        if places.moves is not None and self._score(view, places, number) >= LEAST_SCORE:
             self._moves[view.side] = places.moves[number] + view.shift
         plane, grid, camera = self._planes[view.side], view.grid, self._camera
         on_plane = grid.places(places.pixels[number])
@@ -148,7 +160,7 @@ class SidePlaneDetector:
         known = np.isfinite(pixels).all(axis=1)
         return PixelDetection(
             pixels=pixels,
-            likelihood=np.where(known, places.likelihood[number], 0.0),
+            likelihood=np.where(known & self._seen[view.side], places.likelihood[number], 0.0),
             stddev=np.where(known, stddev, np.inf),
         )
 

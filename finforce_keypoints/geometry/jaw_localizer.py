@@ -28,7 +28,7 @@ from finforce_keypoints.geometry.depth import (
 )
 from finforce_keypoints.geometry.jaw_pose import Origin, OriginEstimator, OriginTrack, ReferencePatch
 from finforce_keypoints.images import PixelDetection, RgbdImage, lie_inside
-from finforce_keypoints.parameters import DetectorSettings
+from finforce_keypoints.parameters import DetectorSettings, JawMount
 
 GATES = (5e-3, 2e-3)  # [m] off the known side plane, then off the one found, beyond which depth is not the finger's
 LEAST_DEPTHS, LEAST_SHARE = 6, 0.4  # samples of the finger with depth that a key point needs, and their share of all
@@ -36,7 +36,7 @@ DEPTH_NOISE = 0.06e-3  # [m] error of the depth that the samples of one point sh
 MISFIT = 5.0  # standard deviations of its depth off the fit, above which a key point is not there
 _LEAST_SEEN = 3  # points, or all there are: fewer likely ones are no jaw
 _LEAST_FOUND = 1 / 3  # share of the points that have to be likely where no jaw was known before
-REASONS = ("image", "likelihood", "depth", "workspace")
+REASONS = ("image", "likelihood", "depth", "workspace", "covered")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -80,10 +80,15 @@ class _Seen:
 class JawLocalizer:
     """Follows one jaw; raises MeshError when the jaw's mesh is bad."""
 
-    def __init__(self, jaw: Jaw, T_gripper_camera: NDArray, settings: DetectorSettings) -> None:
+    def __init__(
+        self, jaw: Jaw, T_gripper_camera: NDArray, settings: DetectorSettings, mount: JawMount | None = None
+    ) -> None:
         """Prepare where to sample depth on the jaw."""
         self._settings, self._sign = settings, 1.0 if jaw.side == "left" else -1.0
-        self._origin, self._track = OriginEstimator(jaw, T_gripper_camera, settings), OriginTrack(settings)
+        self._mount = mount or JawMount()
+        self._visible = self._mount.seen_points(jaw)
+        self._origin = OriginEstimator(jaw, T_gripper_camera, settings, self._mount)
+        self._track = OriginTrack(settings, self._origin.largest_stddev)
         self._patch, self._rest_check = ReferencePatch(jaw), RestCheck(jaw.keypoints)
         self._unconfirmed = 0
         self._samples = build_side_samples(jaw)
@@ -180,7 +185,7 @@ class JawLocalizer:
         return _Seen(
             image=image,
             detection=detection,
-            likely=likely & inside & np.isfinite(detection.stddev),
+            likely=likely & inside & np.isfinite(detection.stddev) & self._visible,
             rays=rays_from_pixels(np.where(inside[:, None], detection.pixels, np.nan), image.camera),
             ray_stddev=detection.stddev / np.sqrt(image.camera.fx * image.camera.fy),
         )
@@ -240,8 +245,9 @@ class JawLocalizer:
 
     def _is_there(self, likely: NDArray) -> bool:
         """Say whether enough of the points (K + 1,) bool are likely for a jaw, more of them for one that was lost."""
-        least = min(_LEAST_SEEN, len(likely))
-        return likely.sum() >= (max(least, _LEAST_FOUND * len(likely)) if self.is_lost else least)
+        count = self._visible.sum()
+        least = min(_LEAST_SEEN, count)
+        return likely.sum() >= (max(least, _LEAST_FOUND * count) if self.is_lost else least)
 
     def _fit_side(
         self, image: RgbdImage, sight: SideView, likely: NDArray, scale: DepthScale, T_camera_jaw: NDArray
@@ -288,7 +294,7 @@ class JawLocalizer:
             ~has_depth | ~np.isfinite(points).all(axis=1),
             outside,
         )
-        return np.select(against, REASONS, default="")[:-1]
+        return np.where(self._visible, np.select(against, REASONS[:-1], default=""), REASONS[-1])[:-1]
 
 
 IMAGES = 15  # over which displacements are averaged

@@ -19,7 +19,8 @@ from finforce.gripper_frames import jaw_in_camera
 from finforce.optional import import_cv2
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_keypoints.geometry.side_picture import PlaneGrid, SidePlane, map_picture, take_picture
-from finforce_keypoints.parameters import DetectorSettings
+from finforce_keypoints.geometry.template import BENDS, find_motions
+from finforce_keypoints.parameters import DetectorSettings, JawMount
 
 _BENT_AT = 0.010  # height for which the bending is given [m]
 _HIGHEST_RIGID = 3.5e-3  # key points that bend more than this say nothing about the jaw's place [m]
@@ -27,6 +28,9 @@ _LEAST_AGREEMENT = 0.6  # share of the points near the base that stand where the
 _SET_ASIDE = 3  # consecutive places off the course that are believed when they agree
 _RIGID_STDDEV = 0.3e-3  # [m] bending of the jaw at that height; more with the square of the height
 _ORIGIN_STDDEV = 0.6e-3  # [m] a jaw whose place is less well known is not found
+_COVERED_STDDEV = 3e-3  # [m] the same of a jaw whose rigid part is covered: how sure its place is goes into the force
+_ROUNDS = 6  # of reweighting
+_LEAST_BENT = 8  # points that tell the place of a jaw that may be bent
 _ORIGIN_GATE = 3.0  # standard deviations of an origin off the forecast, which mean that the speed has changed
 _ACCELERATION = 2e-3  # [m/s^1.5] random walk of the closing speed; what is more is noticed and followed
 _LONGEST_STEP = 0.5  # [s] without an image, after which the course starts anew
@@ -65,10 +69,13 @@ class OriginEstimator:
     ray r: the x for which r_xy q_z - q_xy, its distance from the ray [m], is least. All in the camera frame.
     """
 
-    def __init__(self, jaw: Jaw, T_gripper_camera: NDArray, settings: DetectorSettings) -> None:
+    def __init__(
+        self, jaw: Jaw, T_gripper_camera: NDArray, settings: DetectorSettings, mount: JawMount | None = None
+    ) -> None:
         """Keep the lines on which the jaw's points move, the reference point last."""
+        mount = mount or JawMount()
         self._tolerance = settings.reference_tolerance
-        self._T_camera_middle = jaw_in_camera(T_gripper_camera, jaw.side, 0.0)
+        self._T_camera_middle = jaw_in_camera(T_gripper_camera, jaw.side, 0.0, mount.turn)
         points = np.vstack((jaw.keypoints, jaw.reference_point))
         self._starts = points @ self._T_camera_middle[:3, :3].T + self._T_camera_middle[:3, 3]
         self._axis = T_gripper_camera[0, :3].copy()
@@ -76,6 +83,12 @@ class OriginEstimator:
         self._bent = np.append(np.where(bent < _HIGHEST_RIGID, bent, np.inf), 0.0)
         sign = -1.0 if jaw.side == "left" else 1.0
         self._low, self._high = sorted((sign * settings.opening_min, sign * settings.opening_max))
+        self._motions: NDArray | None = None
+        self.largest_stddev = _ORIGIN_STDDEV
+        if not mount.seen_points(jaw)[-1]:
+            bends = np.insert(find_motions(jaw)[:BENDS], 1, 0.0, axis=2) @ self._T_camera_middle[:3, :3].T
+            self._motions = np.append(bends, np.zeros((BENDS, 1, 3)), axis=1)
+            self.largest_stddev = _COVERED_STDDEV
 
     @property
     def middle(self) -> Origin:
@@ -92,12 +105,15 @@ class OriginEstimator:
         """Return the origin that rays show, None when they show none within the opening range.
 
         The reference point decides; without it, the key points near the clamped base do, less exactly as they bend.
-        What most of them contradict is no jaw.
+        What most of them contradict is no jaw. Where the holder covers the reference point, all points decide, bent in
+        whatever way the jaw's mechanics allow.
 
         Args:
             rays: (K + 1, 3) through the jaw's points, camera frame, z = 1; NaN: not seen.
             stddev: (K + 1,) of the rays' x and y [-]: that of the pixels by the focal length.
         """
+        if self._motions is not None:
+            return self._measure_bent(rays, stddev)
         x, error, off = self._solve(rays, stddev)
         with np.errstate(invalid="ignore"):
             fits = (off <= self._tolerance) & (x >= self._low) & (x <= self._high) & np.isfinite(self._bent)
@@ -111,6 +127,38 @@ class OriginEstimator:
         # bent points do not err independently: what they share is no smaller than the least bending
         spread = np.sqrt(1.0 / weights.sum() + bent.min() ** 2)
         return Origin(x=float(weights @ x / weights.sum()), stddev=float(spread), shared=float(bent.min()))
+
+    def _measure_bent(self, rays: NDArray, stddev: NDArray) -> Origin | None:
+        """Return the origin by all points that are seen; None where they are too few or no jaw within the range.
+
+        Least squares with less weight for what is far off, to first order around the median of the points' own places:
+
+            r_k - p_k / p_kz = D_k (a x + sum_i c_i m_ki) + e_k,   D_k = dr / dp,   c_i of the motions m_i ~ N(0, 1)
+        """
+        with np.errstate(invalid="ignore"):
+            x, _, off = self._solve(rays, stddev)
+            seen = off <= 2.0 * self._tolerance
+        if seen.sum() < _LEAST_BENT:
+            return None
+        middle = float(np.median(x[seen]))
+        points = self._starts[seen] + middle * self._axis
+        slopes = np.zeros((len(points), 2, 3))
+        slopes[:, 0, 0] = slopes[:, 1, 1] = 1.0
+        slopes[:, :, 2] = -points[:, :2] / points[:, 2:]
+        slopes /= points[:, 2, None, None]
+        along = np.broadcast_to(self._axis, (1, *points.shape))
+        columns = np.einsum("kab,ikb->kai", slopes, np.concatenate((along, self._motions[:, seen])))
+        away = rays[seen, :2] - points[:, :2] / points[:, 2:]
+        prior, doubt = np.diag([0.0, *np.ones(BENDS)]), np.ones(len(points))
+        for _ in range(_ROUNDS):
+            weighted = columns * (doubt / stddev[seen] ** 2)[:, None, None]
+            covariance = np.linalg.inv(np.einsum("kai,kaj->ij", weighted, columns) + prior)
+            found = covariance @ np.einsum("kai,ka->i", weighted, away)
+            left = np.linalg.norm(away - columns @ found, axis=1) / stddev[seen]
+            doubt = 1.0 / (1.0 + 0.5 * left**2)
+        place, spread = middle + float(found[0]), float(np.sqrt(covariance[0, 0]))
+        # what a finger differs from its shapes by is the same from image to image
+        return Origin(x=place, stddev=spread, shared=spread) if self._low <= place <= self._high else None
 
     def _agrees(self, origin: Origin, x: NDArray, off: NDArray) -> bool:
         """Say whether the points near the base, by origins (K + 1,) and distances (K + 1,), are of a jaw there."""
@@ -247,9 +295,9 @@ class OriginTrack:
     that the speed has changed: position and speed are opened to what was seen.
     """
 
-    def __init__(self, settings: DetectorSettings) -> None:
-        """Keep noise and gates."""
-        self._settings = settings
+    def __init__(self, settings: DetectorSettings, largest_stddev: float = _ORIGIN_STDDEV) -> None:
+        """Keep noise and gates; a jaw whose place is less well known than `largest_stddev` [m] is not found."""
+        self._settings, self._largest_stddev = settings, largest_stddev
         self.reset()
 
     def reset(self) -> None:
@@ -302,7 +350,7 @@ class OriginTrack:
         self._P = P - np.outer(gain, P[0])
         # a finger stays bent from image to image: no average of its points knows better where its base is
         self._P[0, 0] = max(self._P[0, 0], least)
-        return self._estimate() if np.sqrt(self._P[0, 0]) <= _ORIGIN_STDDEV else None
+        return self._estimate() if np.sqrt(self._P[0, 0]) <= self._largest_stddev else None
 
     def rest(self, stamp: float) -> None:
         """Take it that the jaw has not moved since the last image."""
@@ -314,7 +362,7 @@ class OriginTrack:
         self._stamp, self._state = stamp, np.array([origin.x, speed])
         self._P = np.diag([origin.stddev**2, 0.01**2])
         self._aside, self._missed = [], 0
-        return self._estimate() if origin.stddev <= _ORIGIN_STDDEV else None
+        return self._estimate() if origin.stddev <= self._largest_stddev else None
 
     def _miss(self, stamp: float, forecast: Origin | None) -> Origin | None:
         """Go on without an origin for a few images."""
@@ -324,7 +372,7 @@ class OriginTrack:
             return None
         self._state, self._P = self._predict(stamp)
         self._stamp = stamp
-        return forecast if forecast.stddev <= _ORIGIN_STDDEV else None
+        return forecast if forecast.stddev <= self._largest_stddev else None
 
     def _set_aside(self, stamp: float, origin: Origin, forecast: Origin) -> Origin | None:
         """Keep an origin that no jaw can reach; believe it once some in a row agree."""

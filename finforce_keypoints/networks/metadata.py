@@ -17,8 +17,8 @@ from finforce.files import FileError, read_yaml
 from finforce.typed_yaml import FileModel, Number, describe, parse_model
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_keypoints.errors import ModelError, NamingError
-from finforce_keypoints.images import REFERENCE
 from finforce_keypoints.networks.runtime import LARGEST_SIDE
+from finforce_keypoints.parameters import REFERENCE
 
 METADATA_FILE = "pytorch_config.yaml"
 LOCREF_STD = 7.2801  # DeepLabCut's default scale of its offset channels [px]

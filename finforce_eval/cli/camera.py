@@ -1,0 +1,123 @@
+"""The subcommand `camera`: pictures of open, unloaded jaws in, a rig file out."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce.gripper_frames import SIDES
+from finforce.transforms import pose_numbers
+from finforce_eval.cli.parser import BAG_HELP, add_rest_options
+from finforce_eval.errors import OptionError
+from finforce_eval.evaluation.check import FITTED, SEEN, draw_jaw, draw_points
+from finforce_eval.evaluation.keypoint_source import choose_images, parse_source
+from finforce_eval.evaluation.setup import read_recordings, sides_of
+from finforce_eval.recordings.tracks import Recording
+from finforce_eval.tasks import progress_bar
+from finforce_ifea.jaw.jaw import load_jaw
+from finforce_keypoints.build import ANY_FINGER
+from finforce_keypoints.detectors.side_plane import AnyFinger
+from finforce_keypoints.networks.side_network import SideNetwork
+from finforce_keypoints.parameters import NO_DEPTH
+from finforce_keypoints.placement import KEPT, ROUNDS, STARTS, STEPS, Placement, find_placement
+from finforce_keypoints.rig import Rig, RigCamera, describe_mount, write_rig
+
+PICTURES = 4  # of the images, which are compared
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the subcommand."""
+    parser.add_argument("bags", nargs=1, metavar="SOURCE", help=BAG_HELP)
+    text = "intrinsics of the camera, as --intrinsics; of larger images the middle, scaled, is taken"
+    parser.add_argument("--calibration", dest="intrinsics", nargs="+", metavar="FILE", help=text)
+    parser.add_argument("-o", "--output", default="rig.yaml", metavar="FILE", help="rig file (rig.yaml)")
+    text = "picture with the jaws drawn as found (the rig file's name with .png)"
+    parser.add_argument("--overlay", metavar="PNG", help=text)
+    add_rest_options(parser, images=45)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Find camera, jaws and covered points in the first images of a source, and write and draw them."""
+    from finforce.optional import import_cv2
+
+    options.source = "images"
+    source, sides = parse_source(options), sides_of(options)
+    source = replace(source, choice=replace(source.choice, is_cut=True))
+    (recording,) = read_recordings(options.bags, source.choice, sides, strict=source.strict)
+    colors = choose_pictures(recording, options.images)
+    jaws = {side: load_jaw(options.jaw, side) for side in SIDES if side in recording.jaws}
+    locator = AnyFinger(SideNetwork(source.parameters.get("model") or ANY_FINGER), jaws)
+    guess = source.node_parameters(recording).get("T_gripper_camera")
+    with progress_bar(STARTS + KEPT * STEPS + ROUNDS * len(colors), "step") as bar:
+        found = find_placement(colors, recording.images.camera, jaws, locator, as_pose(guess), progress=bar.update)
+    output = Path(options.output)
+    write_rig(build_rig(found, recording, options.jaw), output)
+    picture = Path(options.overlay or output.with_suffix(".png"))
+    import_cv2().imwrite(str(picture), draw_placement(found, colors[0], recording, jaws)[..., ::-1])
+    print(describe_placement(found, jaws))
+    print(f"Rig: {output}; {picture}: jaws as found in orange, key points seen in green")
+
+
+def as_pose(numbers) -> NDArray | None:
+    """Return a pose (4, 4) of its seven numbers; None of none."""
+    from finforce.transforms import pose_from_quaternion
+
+    return None if numbers is None else pose_from_quaternion(numbers[:3], numbers[3:])
+
+
+def choose_pictures(recording: Recording, count: int) -> list[NDArray]:
+    """Return some of the first images of a recording, (h, w, 3) each.
+
+    Raises:
+        RecordingError: they cannot be read.
+        OptionError: there are none.
+    """
+    images = choose_images(recording, NO_DEPTH) if recording.images is not None else []
+    if not len(images):
+        raise OptionError(f"{recording.name}: no images; expected pictures of jaws that are open and unloaded")
+    first = images.stamps[: min(count, len(images))]
+    chosen = np.unique(np.linspace(0, len(first) - 1, PICTURES).round().astype(int))
+    return [image.color for _, image in images.at(first[chosen])]
+
+
+def build_rig(found: Placement, recording: Recording, jaw: str) -> Rig:
+    """Return the rig of what was found."""
+    camera = recording.images.camera
+    names = load_jaw(jaw).keypoint_names
+    halves = [abs(origins).mean() for origins in found.origins.values()]
+    intrinsics = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy", "model")}
+    return Rig(
+        jaw=str(Path(jaw).resolve()) if Path(jaw).is_file() else jaw,
+        camera=RigCamera(**intrinsics, distortion=tuple(camera.distortion.tolist())),
+        T_gripper_camera=tuple(round(float(number), 7) for number in pose_numbers(found.T_gripper_camera)),
+        half_opening=round(float(np.mean(halves)), 5),
+        **{side: describe_mount(mount, names) for side, mount in found.mounts.items()},
+    )
+
+
+def describe_placement(found: Placement, jaws) -> str:
+    """Return what was found in words."""
+    x, y, z = 1e3 * found.T_gripper_camera[:3, 3]
+    lines = [
+        f"camera at {x:.1f}, {y:.1f}, {z:.1f} mm of the gripper; outlines {found.contrast:.2f}, "
+        f"{found.residual:.2f} px left over"
+    ]
+    for side, mount in found.mounts.items():
+        seen, count = int(mount.seen_points(jaws[side])[:-1].sum()), len(jaws[side].keypoints)
+        turned = ", ".join(f"{angle:.1f}" for angle in np.degrees(mount.turn))
+        places = ", ".join(f"{1e3 * origin:.1f}" for origin in found.origins[side])
+        lines.append(f"{side} jaw: {seen} of {count} key points to be seen, turned by {turned} degrees, at {places} mm")
+    return "\n".join(lines)
+
+
+def draw_placement(found: Placement, color: NDArray, recording: Recording, jaws) -> NDArray:
+    """Return the first picture with the jaws as found and the points seen."""
+    picture = color.copy()
+    for side, jaw in jaws.items():
+        draw_jaw(picture, jaw, found.pose(side, 0), recording.images.camera, FITTED)
+        draw_points(picture, found.seen[side][0], SEEN)
+    return picture

@@ -1,0 +1,213 @@
+"""Pictures without messages: frames of videos, folders of pictures, and the recordings that they are."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce.camera import MILLIMETRE, CameraIntrinsics, ImageError, decode_picture
+from finforce.files import FileError, check_plain, read_bytes
+from finforce.messages import NANOSECONDS
+from finforce.optional import import_library
+from finforce_eval.errors import OptionError, RecordingError
+from finforce_eval.recordings.bags import list_pictures
+from finforce_eval.recordings.image_files import read_intrinsics
+from finforce_eval.recordings.images import ImageChoice, StampedImage
+from finforce_eval.recordings.tracks import JAWS, JawTrack, KeypointTrack, Recording
+from finforce_keypoints.images import RgbdImage, check_image
+
+STILL_RATE = 1.0  # Hz of pictures that say nothing of their times
+LARGEST_PICTURE = 1 << 27  # bytes
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FrameImages:
+    """Pictures that are decoded one by one when they are iterated over. See `ImageTrack`, whose part it takes.
+
+    Attributes:
+        name: of the recording, for messages.
+        fps: frames per second.
+        camera: intrinsics.
+        count: of all frames.
+        frames: (n,) numbers of those to be read, rising; None for all.
+        depth_scale: without meaning.
+    """
+
+    name: str
+    fps: float
+    camera: CameraIntrinsics
+    count: int
+    frames: NDArray[np.int64] | None = None
+    depth_scale: float = MILLIMETRE
+    frame_id: str = "camera_color_optical_frame"
+    topics: tuple[str, str] = ("", "")
+    info: str = ""
+    has_depth: bool = False
+
+    def __len__(self) -> int:
+        return self.count if self.frames is None else len(self.frames)
+
+    @property
+    def is_video(self) -> bool:
+        """Whether the pictures are those of a video."""
+        return True
+
+    @property
+    def stamps(self) -> NDArray[np.int64]:
+        """Stamps of the frames (n,) [ns], from zero."""
+        frames = np.arange(self.count) if self.frames is None else self.frames
+        return np.rint(frames * (NANOSECONDS / self.fps)).astype(np.int64)
+
+    def between(self, start: int, stop: int) -> FrameImages:
+        """Return the frames with start <= stamp < stop [ns]."""
+        return self.at(self.stamps[(self.stamps >= start) & (self.stamps < stop)])
+
+    def at(self, stamps: NDArray[np.int64]) -> FrameImages:
+        """Return the frames at some stamps [ns]."""
+        everything = np.arange(self.count) if self.frames is None else self.frames
+        return replace(self, frames=everything[np.isin(self.stamps, stamps)])
+
+    def all_colors(self) -> FrameImages:
+        """Return them all."""
+        return self
+
+    colors_alone = all_colors
+
+    def read_all(self) -> Iterator[NDArray[np.uint8]]:
+        """Yield all frames, (h, w, 3) RGB."""
+        raise NotImplementedError
+
+    def __iter__(self) -> Iterator[StampedImage]:
+        """Decode the frames in their order.
+
+        Raises:
+            RecordingError: a frame is missing or damaged, or of another size than its camera.
+        """
+        frames = range(len(self)) if self.frames is None else self.frames.tolist()
+        wanted, count = dict(zip(frames, self.stamps.tolist(), strict=True)), 0
+        for frame, color in enumerate(self.read_all()):
+            if frame in wanted:
+                stamp, count = wanted[frame], count + 1
+                image = RgbdImage(stamp=stamp / NANOSECONDS, color=color, depth=None, camera=self.camera)
+                try:
+                    check_image(image)
+                except ImageError as error:
+                    raise RecordingError(f"{self.name}: frame {frame}: {error}") from error
+                yield StampedImage(stamp, image)
+            if count == len(wanted):
+                return
+        raise RecordingError(f"{self.name}: {count} pictures; expected {len(wanted)}")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class VideoImages(FrameImages):
+    """Frames of a video file, `path`."""
+
+    path: Path
+
+    def read_all(self) -> Iterator[NDArray[np.uint8]]:
+        """Yield all frames, (h, w, 3) RGB."""
+        return decode_video(self.path, self.name)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PictureImages(FrameImages):
+    """Pictures of a folder, `paths` in their order."""
+
+    paths: tuple[Path, ...]
+
+    def read_all(self) -> Iterator[NDArray[np.uint8]]:
+        """Yield all pictures, (h, w, 3) RGB."""
+        for path in self.paths:
+            yield read_picture(path)
+
+
+def decode_video(path: Path, name: str, begin: float = 0.0) -> Iterator[NDArray[np.uint8]]:
+    """Yield the frames (h, w, 3) RGB of a video from a time [s] on.
+
+    Raises:
+        RecordingError: it is no video, or damaged.
+        MissingDependencyError: PyAV is not installed.
+    """
+    av = import_library("av", "reading videos", "'finforce[lerobot]'")
+    try:
+        check_plain(path)
+        with av.open(str(path)) as container:
+            stream = container.streams.video[0]
+            if begin > 0.0:
+                container.seek(int(begin / stream.time_base), stream=stream)
+            for frame in container.decode(stream):
+                if frame.time is None or frame.time >= begin:
+                    yield frame.to_ndarray(format="rgb24")
+    except (FileError, av.FFmpegError, IndexError) as error:
+        raise RecordingError(f"{name}: {path.parent.name}/{path.name}: {error}") from error
+
+
+def read_picture(path: Path) -> NDArray[np.uint8]:
+    """Return a jpeg or png file as (h, w, 3) RGB; raises RecordingError where it is none."""
+    try:
+        return decode_picture(read_bytes(path, LARGEST_PICTURE), path.name)
+    except (FileError, ImageError) as error:
+        raise RecordingError(f"{path.name}: {error}") from error
+
+
+def read_frames(path: Path, choice: ImageChoice, sides: tuple[str, ...] = ()) -> Recording:
+    """Return a video or a folder of pictures as a recording whose jaws are still to be found.
+
+    Raises:
+        RecordingError: it cannot be read.
+        OptionError: nothing says what its camera is.
+        RigError: the rig is of another camera.
+    """
+    name = path.name if path.is_dir() else path.stem
+    if path.is_dir():
+        paths = tuple(list_pictures(path))
+        fps, count, shape = STILL_RATE, len(paths), read_picture(paths[0]).shape[:2]
+    else:
+        fps, count, shape = _look_at_video(path, name)
+    camera = choose_camera(choice, shape, name)
+    common = {"name": name, "fps": fps, "camera": camera, "count": count}
+    images = PictureImages(**common, paths=paths) if path.is_dir() else VideoImages(**common, path=path)
+    jaws = {side: JawTrack(keypoints=KeypointTrack.empty()) for side in sides or JAWS}
+    return Recording(name=name, path=path, jaws=jaws, images=images)
+
+
+def choose_camera(choice: ImageChoice, shape: tuple[int, int], name: str) -> CameraIntrinsics:
+    """Return the camera of images (h, w) that say nothing of it.
+
+    Raises:
+        OptionError: neither a rig nor intrinsics were given, or they are of other images.
+    """
+    if choice.camera is not None and not choice.intrinsics:
+        if (choice.camera.height, choice.camera.width) != shape:
+            raise OptionError(
+                f"{name}: pictures of {shape[1]} x {shape[0]}; expected {choice.camera.width} x {choice.camera.height} "
+                "as the rig has: another camera, or cut or scaled? make a rig of these by finforce camera"
+            )
+        return choice.camera
+    if not choice.intrinsics:
+        raise OptionError(
+            f"{name}: pictures do not describe their camera; expected --rig of finforce camera, or --intrinsics with "
+            "fx fy cx cy or a file"
+        )
+    return read_intrinsics(choice.intrinsics, shape, is_cut=choice.is_cut)
+
+
+def _look_at_video(path: Path, name: str) -> tuple[float, int, tuple[int, int]]:
+    """Return frames per second, number of frames, and height and width of a video."""
+    av = import_library("av", "reading videos", "'finforce[lerobot]'")
+    try:
+        check_plain(path)
+        with av.open(str(path)) as container:
+            stream = container.streams.video[0]
+            count = stream.frames or sum(bool(packet.size) for packet in container.demux(stream))
+            rate, shape = float(stream.average_rate or 0.0), (stream.height, stream.width)
+    except (FileError, av.FFmpegError, IndexError) as error:
+        raise RecordingError(f"{name}: {path.name}: {error}; expected a video") from error
+    if not (count and rate > 0.0):
+        raise RecordingError(f"{name}: {path.name}: {count} frames at {rate:g} Hz; expected a video")
+    return rate, count, shape

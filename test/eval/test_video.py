@@ -1,0 +1,100 @@
+"""Claims about pictures without messages: a video and a folder of them are recordings like others."""
+
+import numpy as np
+import pytest
+from eval_fakes import FakeEstimator, FakeJaw, make_recording
+from PIL import Image
+
+from finforce.gripper_frames import ROBOT_CAMERA
+from finforce.transforms import pose_numbers
+from finforce_contact.loop import GivenContact
+from finforce_eval.cli.main import main
+from finforce_eval.errors import OptionError, RecordingError
+from finforce_eval.evaluation.forces import STILL_UPDATES, find_forces
+from finforce_eval.recordings.images import ImageChoice
+from finforce_eval.recordings.recording import read_recording
+from finforce_keypoints.rig import Rig, RigCamera, write_rig
+
+CAMERA = RigCamera(width=64, height=48, fx=50.0, fy=50.0, cx=32.0, cy=24.0, model="plumb_bob")
+RIG = Rig(jaw="bench", camera=CAMERA, T_gripper_camera=tuple(pose_numbers(ROBOT_CAMERA)))
+CHOICE = ImageChoice(camera=RIG.intrinsics)
+LEVELS = (40, 80, 120, 160, 200)
+
+
+def write_pictures(folder, names=("b_10.png", "a_1.png", "b_9.png"), size=(48, 64)):
+    folder.mkdir()
+    for level, name in zip(LEVELS, names, strict=False):
+        Image.fromarray(np.full((*size, 3), level, np.uint8)).save(folder / name)
+    return folder
+
+
+def write_video(path, count=5):
+    av = pytest.importorskip("av")
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mpeg4", rate=20)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        for level in LEVELS[:count]:
+            frame = av.VideoFrame.from_ndarray(np.full((48, 64, 3), level, np.uint8), format="rgb24")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    return path
+
+
+def test_pictures_of_a_folder_come_in_the_order_of_their_numbers(tmp_path):
+    recording = read_recording(write_pictures(tmp_path / "stills"), CHOICE)
+    assert [int(image.color.mean()) for _, image in recording.images] == [80, 120, 40]
+    assert set(recording.jaws) == {"left", "right"} and recording.name == "stills"
+    assert (np.diff(recording.images.stamps) > 0).all()
+
+
+def test_frames_of_a_video_have_its_times(tmp_path):
+    recording = read_recording(write_video(tmp_path / "demo.mp4"), CHOICE, ("left",))
+    images = recording.images.between(50_000_000, 150_000_000)
+    np.testing.assert_array_equal(images.stamps, [50_000_000, 100_000_000])
+    np.testing.assert_allclose([image.color.mean() for _, image in images], LEVELS[1:3], atol=6)
+    assert set(recording.jaws) == {"left"} and len(recording.images) == 5
+
+
+def test_pictures_of_another_size_than_the_rigs_are_refused(tmp_path):
+    with pytest.raises(OptionError, match="96 x 72; expected 64 x 48"):
+        read_recording(write_pictures(tmp_path / "stills", size=(72, 96)), CHOICE)
+    with pytest.raises(OptionError, match="--rig"):
+        read_recording(write_pictures(tmp_path / "others"), ImageChoice())
+
+
+def test_a_damaged_picture_or_video_is_named(tmp_path):
+    folder = write_pictures(tmp_path / "stills")
+    (folder / "b_9.png").write_bytes(b"no picture")
+    with pytest.raises(RecordingError, match="b_9.png"):
+        list(read_recording(folder, CHOICE).images)
+    pytest.importorskip("av")
+    (tmp_path / "demo.mp4").write_bytes(b"no video")
+    with pytest.raises(RecordingError, match=r"demo\.mp4"):
+        read_recording(tmp_path / "demo.mp4", CHOICE)
+
+
+def test_pictures_without_a_jaw_have_no_force(tmp_path, capsys):
+    folder = write_pictures(tmp_path / "stills")
+    write_rig(RIG, tmp_path / "rig.yaml")
+    words = ["annotate", str(folder), "--rig", str(tmp_path / "rig.yaml"), "--contact", "fixed:40"]
+    assert main([*words, "--out", str(tmp_path / "out")]) == 2
+    assert "no key points in 3 images" in capsys.readouterr().err
+    assert not (tmp_path / "out" / "stills").exists()
+
+
+def test_nothing_of_one_still_is_known_in_the_next():
+    recording, seen = make_recording(frames=4, phases=False), []
+
+    class Watched(FakeEstimator):
+        def update(self, observation, contact):
+            seen.append((len(self.observations), observation.stamp))
+            return super().update(observation, contact)
+
+    forces = [(-float(n), 0.0, 0.0) for n in range(STILL_UPDATES)]
+    found = find_forces(
+        recording, FakeJaw(keypoints=np.zeros((4, 3))), GivenContact(None), Watched(forces), stills=True
+    )
+    assert [number for number, _ in seen] == 4 * list(range(STILL_UPDATES))  # each begins anew
+    np.testing.assert_allclose(found.magnitude, STILL_UPDATES - 1)  # and settles
+    times = np.array([stamp for _, stamp in seen]).reshape(4, -1)
+    assert (np.diff(times, axis=1) > 0.0).all()

@@ -1,0 +1,211 @@
+"""Claims about jaws whose holders hide them, and about a camera whose place nobody has measured."""
+
+import numpy as np
+import pytest
+
+from finforce.camera import EQUIDISTANT, CameraIntrinsics, project, rays_from_pixels
+from finforce.gripper_frames import ROBOT_CAMERA, jaw_in_camera
+from finforce.transforms import pose_numbers
+from finforce_ifea.jaw.jaw import load_jaw
+from finforce_keypoints import placement
+from finforce_keypoints.detectors.side_plane import AnyFinger, SidePlaneDetector
+from finforce_keypoints.errors import DetectorSettingsError, GeometryError, RigError
+from finforce_keypoints.geometry.jaw_pose import OriginEstimator
+from finforce_keypoints.geometry.side_picture import PlaneGrid, find_side, project_plane
+from finforce_keypoints.geometry.template import find_motions, find_shape
+from finforce_keypoints.images import RgbdImage
+from finforce_keypoints.networks.side_network import Places, Template
+from finforce_keypoints.parameters import DetectorParameters, DetectorSettings, JawMount, find_mounts
+from finforce_keypoints.placement import Outline, find_covered, find_placement
+from finforce_keypoints.rig import Rig, RigCamera, RigJaw, read_rig, write_rig
+from finforce_sim.sensor import build_d405_vga
+
+CAMERA = build_d405_vga()
+NAMES = load_jaw("bench").keypoint_names
+LOW = frozenset(
+    [*(name for name, z in zip(NAMES, load_jaw("bench").keypoints[:, 2], strict=True) if z < 0.02), "reference"]
+)
+RIG = Rig(
+    jaw="bench",
+    camera=RigCamera(
+        width=64, height=54, fx=21.0, fy=21.1, cx=32.0, cy=27.0, distortion=(-0.02,) * 4, model=EQUIDISTANT
+    ),
+    T_gripper_camera=tuple(pose_numbers(ROBOT_CAMERA)),
+    left=RigJaw(turn=(0.0, 0.05, 0.0), covered=("reference",)),
+)
+
+
+def points_of(jaw, T, moved=0.0):
+    points = np.vstack((jaw.keypoints, jaw.reference_point)) + moved
+    return project(points @ T[:3, :3].T + T[:3, 3], CAMERA)
+
+
+@pytest.mark.parametrize("bent", [0.0, 0.3, -0.3])
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_a_jaw_whose_base_is_covered_is_where_its_upper_points_say_however_it_bends(side, bent):
+    jaw, x, mount = (
+        load_jaw("bench", side),
+        -0.04 if side == "left" else 0.04,
+        JawMount(turn=np.array([0, 0.06, 0.02]), covered=LOW),
+    )
+    ways = find_motions(jaw)
+    moved = np.insert(np.append(bent * ways[0] - bent * ways[1], np.zeros((1, 2)), axis=0), 1, 0.0, axis=1)
+    pixels = points_of(jaw, jaw_in_camera(ROBOT_CAMERA, side, x, mount.turn), moved)
+    pixels[~mount.seen_points(jaw)] = np.nan
+    rays, stddev = rays_from_pixels(pixels, CAMERA), np.full(len(pixels), 0.3 / CAMERA.fx)
+    found = OriginEstimator(jaw, ROBOT_CAMERA, DetectorSettings(), mount).measure(rays, stddev)
+    assert abs(found.x - x) < min(0.3e-3, 3.0 * found.stddev)
+    assert found.shared == found.stddev < 3e-3  # what the bend hides is no better known in the next image
+    straight = OriginEstimator(jaw, ROBOT_CAMERA, DetectorSettings()).measure(rays, stddev)
+    assert straight is None or abs(straight.x - x) > 0.3e-3 or straight.stddev > found.stddev
+
+
+def test_points_that_cannot_be_seen_do_not_count_against_a_jaw():
+    jaws = {"left": load_jaw("bench")}
+    hidden = frozenset([*NAMES[3:12], "reference"])
+
+    class Half:
+        height, width, sha256 = 224, 176, ""
+        path = type("Path", (), {"name": "half"})
+
+        def prepare(self, template, points, shapes):
+            return Template(half=template, points=points, pieces=template[None])
+
+        def locate(self, pictures, templates, starts=()):
+            count, seen = len(templates[0].points), np.array([name not in hidden for name in (*NAMES, "reference")])
+            likelihood = np.tile(np.where(seen, 0.7, 0.05), (len(pictures), 1))
+            pixels = np.tile(np.asarray(templates[0].points, float), (len(pictures), 1, 1))
+            return Places(pixels=pixels, likelihood=likelihood, stddev=np.full((len(pictures), count), 0.5))
+
+    image = RgbdImage(stamp=1.0, color=np.zeros((480, 640, 3), np.uint8), depth=None, camera=CAMERA)
+    for mounts, is_there in ((None, False), ({"left": JawMount(covered=hidden)}, True)):
+        detector = SidePlaneDetector(AnyFinger(Half(), jaws), jaws, ROBOT_CAMERA, mounts=mounts)
+        found = detector.detect(image, {"left": None})
+        assert ("left" in found) == is_there
+    assert not found["left"].likelihood[[name in hidden for name in (*NAMES, "reference")]].any()
+
+
+def test_covered_points_lie_beyond_a_straight_edge():
+    places = np.array([[x, z] for z in range(10) for x in (0.0, 3.0)])
+    likelihood = np.where(places @ (0.3, 1.0) < 3.4, 0.1, 0.85)
+    likelihood[[2, 15]] = 0.6, 0.4  # one is taken for seen below it, and one is seldom seen above
+    covered = find_covered(likelihood, places)
+    assert (covered == (places @ (0.3, 1.0) < 3.4)).all()
+    assert not find_covered(np.full(20, 0.8), places).any()
+    likelihood[15] = 0.05
+    assert find_covered(likelihood, places)[15]
+
+
+def paint(poses, jaws, ground=(180, 170, 160)):
+    from finforce.optional import import_cv2
+
+    color = np.full((480, 640, 3), ground, np.uint8)
+    for side, T in poses.items():
+        for ring in find_shape(jaws[side]).rings:
+            line = project_plane(ring, find_side(jaws[side]), T, CAMERA)
+            import_cv2().fillPoly(color, [np.round(line).astype(np.int32)], (240, 120, 20))
+    return color
+
+
+def test_colours_tell_an_outline_where_it_is_and_nowhere_else():
+    jaws = {"left": load_jaw("bench")}
+    T, outline = jaw_in_camera(ROBOT_CAMERA, "left", -0.04), Outline(jaws["left"])
+    color = paint({"left": T}, jaws)
+    there = outline.contrast(color, T, CAMERA)
+    aside = jaw_in_camera(ROBOT_CAMERA, "left", -0.02)
+    assert there > 0.8 > 2.0 * outline.contrast(color, aside, CAMERA)
+    assert outline.contrast(np.full_like(color, 90), T, CAMERA) < 0.01
+    assert outline.contrast(color, jaw_in_camera(ROBOT_CAMERA, "left", -0.6), CAMERA) == 0.0  # out of the picture
+
+
+def test_a_picture_without_jaws_is_refused(monkeypatch):
+    monkeypatch.setattr(placement, "ROUNDS", 2)
+    monkeypatch.setattr(placement, "POLISH", 2)
+    jaws = {side: load_jaw("bench", side) for side in ("left", "right")}
+
+    class Dreamer:
+        """Sees every point wherever it is looked for, as networks do."""
+
+        grids = dict.fromkeys(jaws, PlaneGrid())
+
+        def locate(self, pictures, sides, starts=()):
+            points = np.array([jaws[side].keypoints[:, ::2] for side in sides])
+            points = np.concatenate((points, [[jaws[side].reference_point[::2]] for side in sides]), axis=1)
+            pixels = np.array([PlaneGrid().pixels(each) for each in points])
+            return Places(
+                pixels=pixels, likelihood=np.full(pixels.shape[:2], 0.9), stddev=np.full(pixels.shape[:2], 0.5)
+            )
+
+    poses = {side: jaw_in_camera(ROBOT_CAMERA, side, x) for side, x in (("left", -0.045), ("right", 0.045))}
+    found = find_placement([paint(poses, jaws)], CAMERA, jaws, Dreamer(), ROBOT_CAMERA)
+    assert found.contrast > 0.8 and not any(mount.covered for mount in found.mounts.values())
+    blank = np.random.default_rng(0).integers(0, 255, (480, 640, 3), dtype=np.uint8)
+    with pytest.raises(GeometryError, match="no such jaws"):
+        find_placement([blank], CAMERA, jaws, Dreamer(), ROBOT_CAMERA)
+
+
+def test_a_rig_file_says_what_was_written(tmp_path):
+    write_rig(RIG, tmp_path / "rig.yaml")
+    again = read_rig(tmp_path / "rig.yaml")
+    assert again == RIG and again.intrinsics.model == EQUIDISTANT
+    parameters = DetectorParameters(**{name: tuple(value) for name, value in again.detector_parameters().items()})
+    mount = find_mounts(parameters, {"left": load_jaw("bench")})["left"]
+    np.testing.assert_allclose(mount.turn, [0.0, 0.05, 0.0])
+    assert mount.covered == {"reference"} and not mount.seen_points(load_jaw("bench"))[-1]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ("qx", "qx", ""),
+        ("fx: 21.0", "fx: -1", "fx"),
+        ("jaw: bench", "jam: bench", "did you mean 'jaw'"),
+        ("turn:", "turns:", "turn"),
+    ],
+)
+def test_what_is_no_rig_is_refused_by_name(tmp_path, old, new, told):
+    write_rig(RIG, tmp_path / "rig.yaml")
+    text = (tmp_path / "rig.yaml").read_text()
+    (tmp_path / "rig.yaml").write_text(text.replace(old, new))
+    if told:
+        with pytest.raises(RigError, match=told):
+            read_rig(tmp_path / "rig.yaml")
+    else:
+        assert read_rig(tmp_path / "rig.yaml") == RIG
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"covered": ("left/rib_99",)}, {"left_turn": (0.0, 1.0, 0.0)}, {"right_turn": (0.0, float("nan"), 0.0)}]
+)
+def test_a_mount_that_cannot_be_is_refused(wrong):
+    jaws = {side: load_jaw("bench", side) for side in ("left", "right")}
+    with pytest.raises(DetectorSettingsError, match=next(iter(wrong))):
+        find_mounts(DetectorParameters(**wrong), jaws)
+
+
+def test_a_turned_jaw_is_turned_in_its_own_frame():
+    turn = [0.0, 0.1, 0.0]
+    for side in ("left", "right"):
+        straight, turned = (jaw_in_camera(ROBOT_CAMERA, side, 0.03, each) for each in (None, turn))
+        # both lean the tip the same way along their own closing direction
+        assert (straight[:3, :3].T @ turned[:3, 2])[0] == pytest.approx(np.sin(0.1))
+        np.testing.assert_allclose(straight[:3, 3], turned[:3, 3])
+
+
+def test_intrinsics_of_the_middle_of_an_image_show_the_same_rays():
+    from finforce.camera_file import cut_camera
+
+    camera = CameraIntrinsics(
+        width=2704,
+        height=2028,
+        fx=796.9,
+        fy=799.2,
+        cx=1354.4,
+        cy=1011.5,
+        distortion=np.array([-0.02, -0.01, 0.0, 0.0]),
+        model=EQUIDISTANT,
+    )
+    cut, points = cut_camera(camera, (540, 640)), np.array([[0.1, -0.2, 0.3], [0.0, 0.0, 1.0], [-0.2, 0.3, 0.4]])
+    scale = 540 / 2028
+    begin = np.array([(2704 - 640 / scale) / 2, 0.0])  # of the part that is left, in pixels' edges
+    np.testing.assert_allclose(project(points, cut), (project(points, camera) + 0.5 - begin) * scale - 0.5, atol=1e-9)
