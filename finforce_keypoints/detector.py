@@ -50,6 +50,7 @@ class KeypointDetector:
 
     Attributes:
         was_still: whether nothing had moved in the last image, so that its key points are the means of those before.
+        mounts: how the jaws, by side, stand in the gripper.
         counts: "images", "still", "<side>" found, "<side>/<reason>" refused key points, "off centre".
 
     Raises:
@@ -90,11 +91,11 @@ class KeypointDetector:
         self._pixel_detector, self._image_watch = pixel_detector, watch
         self._still_watch = StillWatch() if rests else None
         self._counts_of = {side: len(jaw.keypoints) + 1 for side, jaw in jaws.items()}
-        mounts = mounts or {side: JawMount() for side in jaws}
+        self.mounts = mounts or {side: JawMount() for side in jaws}
         self._jaws = {
-            side: JawLocalizer(jaw, T_gripper_camera, self.settings, mounts[side]) for side, jaw in jaws.items()
+            side: JawLocalizer(jaw, T_gripper_camera, self.settings, self.mounts[side]) for side, jaw in jaws.items()
         }
-        self._visible = {side: mounts[side].seen_points(jaw)[:-1] for side, jaw in jaws.items()}
+        self._visible = {side: self.mounts[side].seen_points(jaw)[:-1] for side, jaw in jaws.items()}
         self.reset()
 
     def reset(self) -> None:

@@ -64,10 +64,11 @@ def average_at_rest(
                 f"{recording.name}: the {side} jaw was found in {len(seen)} of {len(recording.images)} images: are the "
                 "jaws in view and is the guess, --extrinsics, within some 10 mm and 5 degrees?"
             )
-    averaged = {side: _average(np.array(seen)) for side, seen in pixels.items()}
-    return JawsAtRest(
-        jaws={side: SeenJaw(points=jaws[side].keypoints, pixels=averaged[side]) for side in jaws}, poses=poses
-    )
+    seen = {
+        side: SeenJaw(points=jaw.keypoints, pixels=_average(np.array(pixels[side])), turn=detector.mounts[side].turn)
+        for side, jaw in jaws.items()
+    }
+    return JawsAtRest(jaws=seen, poses=poses)
 
 
 def _average(pixels: NDArray) -> NDArray:

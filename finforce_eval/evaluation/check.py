@@ -27,6 +27,7 @@ from finforce_keypoints.geometry.side_picture import find_side, project_plane
 from finforce_keypoints.geometry.template import find_shape
 from finforce_keypoints.images import RgbdImage
 from finforce_keypoints.parameters import NO_DEPTH
+from finforce_keypoints.placement import LEAST_FOUND, measure_contrast
 
 OK, WARNING, FAULT = "ok", "warning", "fault"
 DARK, BRIGHT = 25.0, 235.0  # of 255: mean brightness beyond which a picture shows little
@@ -208,7 +209,7 @@ def _find_reasons(mean: RgbdImage, source: KeypointSource, recording: Recording,
     return [
         Finding(
             WARNING,
-            "no better upside down, mirrored, with other conventions of the extrinsics or another included finger: "
+            "none of the known fingers; no better upside down, mirrored, or with other conventions of the extrinsics: "
             "are the jaws in view, lit, and within some 15 mm of where the extrinsics say?",
         )
     ]
@@ -233,7 +234,15 @@ def _misfit(recording: Recording, source: KeypointSource, image: RgbdImage, pose
     except FinforceError:
         return np.inf
     seen = min(np.isfinite(jaw.pixels).all(axis=1).mean() for jaw in look.jaws.values())
-    return found.residual if seen >= ENOUGH else np.inf
+    contrast = measure_contrast(image.color, image.camera, jaws, _poses_at(found, look))
+    return found.residual if seen >= ENOUGH and contrast >= LEAST_FOUND else np.inf
+
+
+def _poses_at(found: Extrinsics, look: JawsAtRest) -> dict[str, NDArray]:
+    """Return T_camera_jaw (4, 4) by side of the jaws as fitted."""
+    return {
+        side: jaw_in_camera(found.T_gripper_camera, side, x, look.jaws[side].turn) for side, x in found.origins.items()
+    }
 
 
 def _readings(image: RgbdImage, source: KeypointSource, T: NDArray) -> Iterator[tuple[str, RgbdImage, NDArray, str]]:
@@ -290,12 +299,12 @@ def _draw(
     picture, camera = mean.color.copy(), mean.camera
     middle = 0.5 * (OpeningRange().nearest + OpeningRange().farthest)
     for side, jaw in jaws.items():
-        sign = -1.0 if side == "left" else 1.0
+        sign, turn = -1.0 if side == "left" else 1.0, look.jaws[side].turn if look else None
         poses = [(given, sign * abs(found.origins[side]) if found else sign * middle, GIVEN)]
         if found is not None:
             poses.append((found.T_gripper_camera, found.origins[side], FITTED))
         for T, origin, color in poses:
-            draw_jaw(picture, jaw, jaw_in_camera(T, side, origin), camera, color)
+            draw_jaw(picture, jaw, jaw_in_camera(T, side, origin, turn), camera, color)
     for jaw in look.jaws.values() if look else ():
         draw_points(picture, jaw.pixels, SEEN)
     return picture

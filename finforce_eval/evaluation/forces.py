@@ -32,6 +32,7 @@ _POINTS = ("points_x", "points_y", "points_z", "points_weight", "points_touching
 
 NOT_FOUND = "not found"  # status of a jaw that is in none of the images
 STILL_UPDATES, STILL_PERIOD = 30, 0.03  # as often, and so far apart [s], is a still seen, for its contact to settle
+PICKED_STDDEV = 1e-3  # [m] of key points that say nothing of it: picked by hand, they scatter by a millimetre or two
 LEAST_ANSWERED = 0.1  # share of the images with a force, below which there is no such finger in them
 
 
@@ -291,6 +292,8 @@ class _JawRun:
         loop, observation = self._loop, self._track.observation(index)
         if self._updates > 1:
             loop.force.forget()
+            if observation.stddev is None:
+                observation = replace(observation, stddev=np.full(observation.points.shape, PICKED_STDDEV))
         for number in range(self._updates):
             solution = loop.update(replace(observation, stamp=observation.stamp + number * STILL_PERIOD))
         row = self.row(solution.status, "" if solution.trusted else solution.message)

@@ -44,10 +44,12 @@ class SeenJaw:
     Attributes:
         points: key points of the jaw file (n, 3) [m], jaw frame.
         pixels: (n, 2) column and row in the raw image, mean of many images [px]; NaN where one was not seen.
+        turn: rotation vector (3,) of a jaw that is mounted askew, jaw frame [rad]; None for a straight one.
     """
 
     points: NDArray
     pixels: NDArray
+    turn: NDArray | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -118,7 +120,7 @@ def measure_misses(side: str, jaw: SeenJaw, camera: CameraIntrinsics, T: NDArray
     The camera is at T (4, 4) in the gripper base, the jaws' origins at -half and half on the closing axis [m].
     """
     seen = np.isfinite(jaw.pixels).all(axis=1)
-    T_camera_jaw = jaw_in_camera(T, side, -half if side == "left" else half)
+    T_camera_jaw = jaw_in_camera(T, side, -half if side == "left" else half, jaw.turn)
     places = project(jaw.points[seen] @ T_camera_jaw[:3, :3].T + T_camera_jaw[:3, 3], camera)
     return (places - jaw.pixels[seen]).ravel()
 

@@ -212,7 +212,9 @@ class JawLocalizer:
         late = self._find_delays(seen, T_camera_jaw)
         points[:, 0] -= self._sign * self._track.speed * (late - late[-1])
         stddev = compute_stddev(sight, depths, fit.stddev, seen.ray_stddev)
-        stddev[:, 0] = np.hypot(stddev[:, 0], origin.stddev)
+        # whoever takes the points' errors for independent averages away what they share, unless it is stated as larger
+        points_alike = 1.0 if self._visible[-1] else max(float(seen.likely.sum()), 1.0)
+        stddev[:, 0] = np.hypot(stddev[:, 0], origin.stddev * np.sqrt(points_alike))
         reasons = self._judge(seen.image, seen.detection, has_depth, points)
         valid = reasons == ""
         count = len(valid)

@@ -19,7 +19,7 @@ from finforce.gripper_frames import jaw_in_camera
 from finforce.optional import import_cv2
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_keypoints.geometry.side_picture import PlaneGrid, SidePlane, map_picture, take_picture
-from finforce_keypoints.geometry.template import BENDS, find_motions
+from finforce_keypoints.geometry.template import BENDS, SHARE, find_motions
 from finforce_keypoints.parameters import DetectorSettings, JawMount
 
 _BENT_AT = 0.010  # height for which the bending is given [m]
@@ -149,13 +149,14 @@ class OriginEstimator:
         along = np.broadcast_to(self._axis, (1, *points.shape))
         columns = np.einsum("kab,ikb->kai", slopes, np.concatenate((along, self._motions[:, seen])))
         away = rays[seen, :2] - points[:, :2] / points[:, 2:]
-        prior, doubt = np.diag([0.0, *np.ones(BENDS)]), np.ones(len(points))
+        prior, variance, doubt = np.diag([0.0, *np.ones(BENDS)]), stddev[seen] ** 2, np.ones(len(points))
         for _ in range(_ROUNDS):
-            weighted = columns * (doubt / stddev[seen] ** 2)[:, None, None]
+            weighted = columns * (doubt / variance)[:, None, None]
             covariance = np.linalg.inv(np.einsum("kai,kaj->ij", weighted, columns) + prior)
             found = covariance @ np.einsum("kai,ka->i", weighted, away)
-            left = np.linalg.norm(away - columns @ found, axis=1) / stddev[seen]
-            doubt = 1.0 / (1.0 + 0.5 * left**2)
+            # what moves far differs from its shapes more
+            variance = stddev[seen] ** 2 + (SHARE**2) * ((columns[:, :, 1:] @ found[1:]) ** 2).sum(axis=1)
+            doubt = 1.0 / (1.0 + 0.5 * ((away - columns @ found) ** 2).sum(axis=1) / variance)
         place, spread = middle + float(found[0]), float(np.sqrt(covariance[0, 0]))
         # what a finger differs from its shapes by is the same from image to image
         return Origin(x=place, stddev=spread, shared=spread) if self._low <= place <= self._high else None
