@@ -40,7 +40,7 @@ from finforce_eval.table import AXES, ForceSeries, write_table
 from finforce_eval.tasks import Task, hash_settings
 
 GRIPPER_FRAME = "gripper_base"
-NOTE, TABLE, MOVIE = "annotation.json", "forces.parquet", "forces.webp"
+NOTE, TABLE = "annotation.json", "forces.parquet"
 _OK, _WARN = 0, 1
 
 
@@ -84,28 +84,13 @@ def annotate_bag(source: Path, target: Path, options: argparse.Namespace, settin
     about = {"key": key, "figures": figures, "settings": dict(setup.about), "version": version()}
     with new_folder(target) as folder:
         if is_frames(source):
-            write_frames(recording, jaws, folder, about, draw=options.draw)
+            folder.mkdir()
+            write_table(folder / TABLE, list(jaws.values()), about)
         else:
             messages = ForceMessages(jaws, combine_jaws(jaws))
             write_annotated(recording, bag_source(recording.source), messages, folder, side_file=options.side_file)
         (folder / NOTE).write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
     return figures
-
-
-def write_frames(
-    recording: Recording, jaws: Mapping[str, ForceSeries], folder: Path, about: Mapping[str, Any], *, draw: bool
-) -> None:
-    """Write the forces in a video or in pictures as a table, a row for each image and jaw, and if asked a movie.
-
-    Raises:
-        OSError: they cannot be written.
-    """
-    folder.mkdir()
-    write_table(folder / TABLE, list(jaws.values()), about)
-    if draw:
-        from finforce_eval.figures.movie import write_movie
-
-        write_movie(recording, list(jaws.values()), folder / MOVIE)
 
 
 def _describe(jaws: Mapping[str, ForceSeries]) -> dict[str, Any]:
