@@ -123,13 +123,6 @@ class Outline:
         return float(along @ np.linalg.solve(covariance, along) / (self._inside @ self._inside))
 
 
-def measure_contrast(
-    color: NDArray, camera: CameraIntrinsics, jaws: Mapping[str, Jaw], poses: Mapping[str, NDArray]
-) -> float:
-    """Return the mean contrast of jaws at T_camera_jaw (4, 4) by side in an image (h, w, 3)."""
-    return float(np.mean([Outline(jaw, FINER).contrast(color, poses[side], camera) for side, jaw in jaws.items()]))
-
-
 def place_camera(x: NDArray, right: float) -> NDArray:
     """Return T_gripper_camera (4, 4) of a wrist camera.
 
