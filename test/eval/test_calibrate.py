@@ -1,5 +1,6 @@
 """Claims about what `finforce calibrate` hands to the fit and prints of it."""
 
+import json
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -125,8 +126,10 @@ def test_recordings_of_the_right_jaw_calibrate_its_mirror_image(tmp_path, monkey
         "finforce_eval.calibration.calibrate.fit_calibration", lambda jaw, *_: seen.append(jaw.side) or make_fit()
     )
     bag = write_recording(bench_recording(side="right"), tmp_path / "bag")
-    assert main(["calibrate", str(bag), "-o", str(tmp_path / "finger.yaml")]) == 0
+    found = tmp_path / "found.json"
+    assert main(["calibrate", str(bag), "-o", str(tmp_path / "finger.yaml"), "--json", str(found)]) == 0
     assert seen == ["right"]
+    assert json.loads(found.read_text())["calibration"]["young_modulus"] == 31.4e6
 
 
 def test_every_uncertainty_has_its_value():

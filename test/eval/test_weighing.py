@@ -1,5 +1,6 @@
 """Claims about the stiffness that a kitchen scale tells."""
 
+import json
 from importlib import resources
 
 import numpy as np
@@ -87,7 +88,10 @@ def test_a_wrong_modulus_is_mended_by_weights(tmp_path, capsys):
     ends = track.stamps[0] * 1e-9 + np.array([float(end) for _, end in spans])
     weights = [np.interp(end - 0.5, truth.stamps * 1e-9, np.abs(truth.force[:, 0])) for end in ends]
     grams = [f"{1e3 * weight / GRAVITY:.0f}" for weight in weights]
-    assert main([*options, "--grams", *grams, "-o", str(mended)]) == 0
+    assert main([*options, "--grams", *grams, "-o", str(mended), "--json", str(tmp_path / "found.json")]) == 0
+    found = json.loads((tmp_path / "found.json").read_text())
+    assert found["calibration"]["young_modulus"] == load_calibration(mended).young_modulus
+    assert len(found["holds"]) == len(grams) and 0.0 < found["factor"] < 1.0
     # the estimates of this recording are 2 % off
     assert load_calibration(mended).young_modulus == pytest.approx(base.young_modulus, rel=0.04)
 

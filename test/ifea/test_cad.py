@@ -348,7 +348,10 @@ def test_a_drawing_is_read_and_needs_a_width(tmp_path, capsys, suffix, write):
 def test_the_command_writes_a_jaw_that_loads(tmp_path, capsys, surface):
     surface.export(tmp_path / "my_finger.stl")
     output = tmp_path / "made" / "my_finger.yaml"
-    assert main(["jaw", str(tmp_path / "my_finger.stl"), "-o", str(output), "--material", "tpu85a"]) == 0
+    found = tmp_path / "found.json"
+    words = ["-o", str(output), "--material", "tpu85a", "--json", str(found)]
+    assert main(["jaw", str(tmp_path / "my_finger.stl"), *words]) == 0
+    assert str(output) in json.loads(found.read_text())["files"]
     said = capsys.readouterr().out
     for word in ("unit: mm", "prismatic", "inner face", "clamped below", "4 ribs", "19 key points", "tpu85a: 12 MPa"):
         assert word in said

@@ -1,5 +1,6 @@
 """Claims about the check before any force: what fits passes, and what does not is named as what it is."""
 
+import json
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -66,7 +67,9 @@ def still(record):
 
 
 def check(folder, capsys, tmp_path, *options):
-    status = main(["check", str(folder), "--images", str(IMAGES), "--report", str(tmp_path), *options])
+    words = ["--images", str(IMAGES), "--report", str(tmp_path), "--json", str(tmp_path / "check.json")]
+    status = main(["check", str(folder), *words, *options])
+    assert (json.loads((tmp_path / "check.json").read_text())["faults"] > 0) == bool(status)
     assert cv2.imread(str(tmp_path / "check.png")).shape == (480, 640, 3)
     return status, capsys.readouterr().out
 
