@@ -104,7 +104,9 @@ def check_texts(command, options):
     if command == "launch":
         list_parts(options.system, options.words)
     if command in ("evaluate", "annotate", "calibrate", "weigh", "replay", "view", "check", "extrinsics"):
-        options = Namespace(**{"contact": [], "set": [], "solver": "default", "mesh": "default", **vars(options)})
+        options = Namespace(
+            **{"contact": [], "set": [], "solver": "default", "mesh": "default", **vars(options), "rig": None}
+        )
         if not any("Z_MM" in contact for contact in options.contact):
             read_contacts(options)
         parse_settings(options.solver, options.mesh, options.set)
