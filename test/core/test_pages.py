@@ -88,6 +88,9 @@ def check_finforce(words):
         known = build_parser(words[1])._option_string_actions
         assert {option for word in words for option in re.findall(r"--?[a-z][a-z-]*", word)} <= set(known)
         return
+    if "--rig" in words:  # whose file is read at once
+        assert "--rig" in build_parser(words[1])._option_string_actions
+        words = words[: words.index("--rig")] + words[words.index("--rig") + 2 :]
     with redirect_stderr(io.StringIO()) as said:
         try:
             options = parse(words[1:])
@@ -104,9 +107,7 @@ def check_texts(command, options):
     if command == "launch":
         list_parts(options.system, options.words)
     if command in ("evaluate", "annotate", "calibrate", "weigh", "replay", "view", "check", "extrinsics"):
-        options = Namespace(
-            **{"contact": [], "set": [], "solver": "default", "mesh": "default", **vars(options), "rig": None}
-        )
+        options = Namespace(**{"contact": [], "set": [], "solver": "default", "mesh": "default", **vars(options)})
         if not any("Z_MM" in contact for contact in options.contact):
             read_contacts(options)
         parse_settings(options.solver, options.mesh, options.set)
