@@ -34,6 +34,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     text += "points of a bench recording (images)"
     parser.add_argument("--from", dest="source", default="images", choices=("images", "keypoints"), help=text)
     parser.add_argument("--contact", action="append", default=[], metavar="CONTACT", help=CONTACT_HELP)
+    parser.add_argument("--rate", default="1", help="playback speed (1)")
     parser.add_argument("--report", default="report", metavar="DIR", help="folder of the report (report)")
 
 
@@ -49,8 +50,9 @@ def run(options: argparse.Namespace) -> None:
         bag, calibration = prepare_recording(Path(options.report) / SCENE), SCENE_CALIBRATION
         contacts = contacts or ["estimate"]
     words = ["replay", str(bag), "--from", options.source, "--calibration", calibration, "--report", options.report]
+    words += ["--rate", options.rate]
     replay = parse([*words, *(word for contact in contacts for word in ("--contact", contact))])
-    print(f"Playing {bag.name} through the nodes in real time ...", flush=True)
+    print(f"Playing {bag.name} through the nodes at {options.rate} x real time ...", flush=True)
     replay.run(replay)
     print(f"Next, the simulated robot: {next_command()}")
 

@@ -29,6 +29,9 @@ def format_replay(result: Replay) -> str:
     return "\n".join([*lines, "", *format_summary(result)])
 
 
+_FEW = 0.7  # share of the images with a force, below which a busy machine may be the cause
+
+
 def format_summary(result: Replay) -> list[str]:
     """Return the few figures that matter, one a line: error of the grasp force, pixel error, delay."""
     score, sight = result.grasp_score, result.evaluation.total.sight
@@ -36,6 +39,8 @@ def format_summary(result: Replay) -> list[str]:
     if error.rmse_N is not None:
         where = f"of {score.largest:.2f} N at most; {error.n} of {score.frames} images in the record phases answered"
         lines.append(f"Grasp force: {error.rmse_N:.3f} N RMSE, {error.max_error_N:.3f} N largest error, {where}")
+    if error.n < _FEW * score.frames:
+        lines.append("Few images were answered: where the machine was too busy, --rate 0.5 plays at half the speed")
     if sight["pixel_median_px"] is not None:
         median, p95 = sight["pixel_median_px"], sight["pixel_p95_px"]
         lines.append(f"Key points: {median:.2f} px off in the median, {p95:.2f} px at the 95th percentile")

@@ -140,6 +140,7 @@ def test_a_force_that_never_shows_is_said(played):
     silent = replace(replay_of(played), grasp_score=score_grasp(played, {}, {}))
     text = " ".join(replay.format_summary(silent))
     assert "did not show" in text and "Grasp force" not in text
+    assert "--rate 0.5" in text and "--rate" not in " ".join(replay.format_summary(replay_of(played)))
 
 
 def test_the_demo_plays_its_recording_and_ends_with_figures_and_report(rendered, played, tmp_path, monkeypatch, capsys):
@@ -155,7 +156,7 @@ def test_the_demo_plays_its_recording_and_ends_with_figures_and_report(rendered,
 
     monkeypatch.setattr(replay, "replay", play)
     monkeypatch.setattr("finforce_eval.figures.report.write_report", report)
-    demo.run(Namespace(source="images", contact=[], report=str(tmp_path / "report")))
+    demo.run(Namespace(source="images", contact=[], rate="1", report=str(tmp_path / "report")))
     assert asked["recording"].path == tmp_path / "report" / demo.SCENE
     assert (asked["calibration"], asked["source"], asked["about"]["contact"]) == ("twin", "images", "estimate")
     assert asked["recordings"] == [played]
