@@ -29,7 +29,7 @@ from finforce_contact.session import ContactSession, detections_type
 from finforce_ifea.messages import columns_from_outline
 
 
-class ContactOutputs:
+class _ContactOutputs:
     """The publishers of a contact estimator node.
 
     Args:
@@ -113,7 +113,7 @@ class ContactEstimatorNode(ros.ImageNode):
         self.health = {side: Health(source=f"{side}/jaw_pose", stale_after=age) for side in self.sides}
         ros.follow_settings(self, parameters, self._limit_age)
         self.stage = ros.Stage(self, pipeline)
-        self.out = ContactOutputs(self.stage, parameters, self.session.stream, self.skips)
+        self.out = _ContactOutputs(self.stage, parameters, self.session.stream, self.skips)
         with self.rejections():
             self.get_logger().info(self.session.load_mesh(parameters))
         self._serve()

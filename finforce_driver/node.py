@@ -62,7 +62,7 @@ def build_gripper(parameters: DriverParameters, settings: GripperSettings) -> Gr
     return Gripper(build_bus(parameters.port, parameters.interface, baud_rate=parameters.baud_rate), settings)
 
 
-class JointLink:
+class _JointLink:
     """A `JointGripper` on a node: it listens to the joint's states and sends commands.
 
     Args:
@@ -160,7 +160,7 @@ class GripperDriverNode(Node):
         # another gripper's driver has joint states and actions of its own
         self.is_other = parameters.interface in LINKS
         if self.is_other:
-            self.gripper = JointLink(self, parameters.interface, parameters.port, settings, joint).gripper
+            self.gripper = _JointLink(self, parameters.interface, parameters.port, settings, joint).gripper
         else:
             self.gripper = build(parameters, settings)
         self.wake = self.create_guard_condition(self._on_states)

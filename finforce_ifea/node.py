@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 _SLOW = 4.0  # s of preparation, after which somebody may wonder
 
 
-class SolverOutputs:
+class _SolverOutputs:
     """The publishers of a solver node.
 
     Args:
@@ -224,7 +224,7 @@ class IfeaSolverNode(ros.ImageNode):
         self.waiting: tuple[PointCloud2, float] | None = None  # key points without their contact, and when they came
         self.last: Solution | None = None
         self.stage = ros.Stage(self, pipeline)
-        self.out = SolverOutputs(self.stage, parameters, self.skips)
+        self.out = _SolverOutputs(self.stage, parameters, self.skips)
         self._serve(parameters.jaw_name)
         self._subscribe(parameters.jaw_name)
         source = "fixed" if self.contacts.is_fixed else "by topic"

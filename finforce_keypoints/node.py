@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 TF_WAIT = 2.0  # [s] from the first image, for the camera's pose on /tf
 
 
-class DetectorOutputs:
+class _DetectorOutputs:
     """The publishers of a key point detector node.
 
     Args:
@@ -169,7 +169,7 @@ class KeypointDetectorNode(ros.ImageNode):
         self.found: Mapping[str, JawKeypoints] = {}
         self.rested, self.idling = float("-inf"), Idling()
         self.stage = ros.Stage(self, pipeline)
-        self.out = DetectorOutputs(self.stage, parameters, self.feed.stream, self.frames, names, self.detector)
+        self.out = _DetectorOutputs(self.stage, parameters, self.feed.stream, self.frames, names, self.detector)
         self.detector.warm_up()  # before images come: those that came meanwhile would be lost
         self._serve()
         self._subscribe()

@@ -196,7 +196,7 @@ class Posture:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ScriptStep:
+class _ScriptStep:
     """A straight way from the last posture to the next; its phase is that of `/bench/phase`."""
 
     phase: str
@@ -248,16 +248,16 @@ def write_script(scenario: Scenario) -> Script:
     )
 
 
-def _plan_steps(scenario: Scenario, start: Posture) -> Iterator[ScriptStep]:
+def _plan_steps(scenario: Scenario, start: Posture) -> Iterator[_ScriptStep]:
     """Yield still, close, load level by level, what is done while held, unload, open; the middle for each cycle."""
-    yield ScriptStep(phase="0:load:0:settle", duration=scenario.tare - _TARE_RECORD, end=start)
-    yield ScriptStep(phase="0:load:0:record", duration=_TARE_RECORD, end=start)
+    yield _ScriptStep(phase="0:load:0:settle", duration=scenario.tare - _TARE_RECORD, end=start)
+    yield _ScriptStep(phase="0:load:0:record", duration=_TARE_RECORD, end=start)
     levels = scenario.displacement * np.arange(scenario.levels + 1) / scenario.levels
     levels = levels if scenario.displacement > 0.0 else levels[:1]
     for cycle in range(scenario.cycles):
         closed = Posture(closing=0.0)
         approach = scenario.clearance / scenario.closing_speed
-        yield ScriptStep(phase=f"{cycle}:load:0:ramp", duration=approach, end=closed)
+        yield _ScriptStep(phase=f"{cycle}:load:0:ramp", duration=approach, end=closed)
         for level in levels[1:]:
             yield from _hold_level(scenario, f"{cycle}:load", level, closed)
             closed = replace(closed, closing=float(level))
@@ -268,42 +268,42 @@ def _plan_steps(scenario: Scenario, start: Posture) -> Iterator[ScriptStep]:
         yield from _release(scenario, f"{cycle}:unload:0", closed, start)
 
 
-def _release(scenario: Scenario, phase: str, held: Posture, start: Posture) -> Iterator[ScriptStep]:
+def _release(scenario: Scenario, phase: str, held: Posture, start: Posture) -> Iterator[_ScriptStep]:
     """Yield the way back to first touch, the opening beyond it, and the rest there."""
     speed = scenario.closing_speed
-    yield ScriptStep(phase=f"{phase}:ramp", duration=held.closing / speed, end=replace(held, closing=0.0))
-    yield ScriptStep(phase=f"{phase}:settle", duration=scenario.clearance / speed, end=start)
-    yield ScriptStep(phase=f"{phase}:settle", duration=scenario.settle, end=start)
-    yield ScriptStep(phase=f"{phase}:record", duration=scenario.record, end=start)
+    yield _ScriptStep(phase=f"{phase}:ramp", duration=held.closing / speed, end=replace(held, closing=0.0))
+    yield _ScriptStep(phase=f"{phase}:settle", duration=scenario.clearance / speed, end=start)
+    yield _ScriptStep(phase=f"{phase}:settle", duration=scenario.settle, end=start)
+    yield _ScriptStep(phase=f"{phase}:record", duration=scenario.record, end=start)
 
 
-def _hold_level(scenario: Scenario, prefix: str, level: float, before: Posture) -> Iterator[ScriptStep]:
+def _hold_level(scenario: Scenario, prefix: str, level: float, before: Posture) -> Iterator[_ScriptStep]:
     """Yield the way to a level [m] and the rest there."""
     phase, end = f"{prefix}:{_millimetres(level)}", replace(before, closing=float(level))
-    yield ScriptStep(phase=f"{phase}:ramp", duration=abs(level - before.closing) / scenario.closing_speed, end=end)
-    yield ScriptStep(phase=f"{phase}:settle", duration=scenario.settle, end=end)
-    yield ScriptStep(phase=f"{phase}:record", duration=scenario.record, end=end)
+    yield _ScriptStep(phase=f"{phase}:ramp", duration=abs(level - before.closing) / scenario.closing_speed, end=end)
+    yield _ScriptStep(phase=f"{phase}:settle", duration=scenario.settle, end=end)
+    yield _ScriptStep(phase=f"{phase}:record", duration=scenario.record, end=end)
 
 
-def _plan_manipulation(scenario: Scenario, phase: str, held: Posture) -> Iterator[ScriptStep]:
+def _plan_manipulation(scenario: Scenario, phase: str, held: Posture) -> Iterator[_ScriptStep]:
     """Yield lifting, turning there and back and setting down; or drawing the object aside and back."""
     record = f"{phase}:record"
     if scenario.mass > HELD:
         lifted = replace(held, lifted=1.0)
         turned = replace(lifted, turn=scenario.turn_angle)
-        yield ScriptStep(phase=record, duration=_LIFT_TIME, end=lifted)
+        yield _ScriptStep(phase=record, duration=_LIFT_TIME, end=lifted)
         if scenario.turn_angle:
             duration = abs(scenario.turn_angle) / scenario.turn_rate
-            yield ScriptStep(phase=record, duration=duration, end=turned)
-            yield ScriptStep(phase=record, duration=scenario.record, end=turned)
-            yield ScriptStep(phase=record, duration=duration, end=lifted)
-        yield ScriptStep(phase=record, duration=scenario.record, end=lifted)
-        yield ScriptStep(phase=record, duration=_LIFT_TIME, end=held)
+            yield _ScriptStep(phase=record, duration=duration, end=turned)
+            yield _ScriptStep(phase=record, duration=scenario.record, end=turned)
+            yield _ScriptStep(phase=record, duration=duration, end=lifted)
+        yield _ScriptStep(phase=record, duration=scenario.record, end=lifted)
+        yield _ScriptStep(phase=record, duration=_LIFT_TIME, end=held)
     if scenario.slide or scenario.rock:
         moved = replace(held, slide=scenario.slide, rock=scenario.rock)
-        yield ScriptStep(phase=record, duration=scenario.shift_time, end=moved)
-        yield ScriptStep(phase=record, duration=scenario.record, end=moved)
-        yield ScriptStep(phase=record, duration=scenario.shift_time, end=held)
+        yield _ScriptStep(phase=record, duration=scenario.shift_time, end=moved)
+        yield _ScriptStep(phase=record, duration=scenario.record, end=moved)
+        yield _ScriptStep(phase=record, duration=scenario.shift_time, end=held)
 
 
 def _millimetres(length: float) -> str:

@@ -181,7 +181,7 @@ class _Edges:
     second: NDArray
 
 
-class MeshOutline:
+class _MeshOutline:
     """The edges of a mesh, prepared for finding the outline from any side."""
 
     def __init__(self, mesh: ObjectMesh, samples: int = 60) -> None:
@@ -225,7 +225,7 @@ def compare_outline(outline: Outline, image: DepthImage, reach: float) -> Compar
     the object after it. Points beside which something else is in front, or whose split is not clear, are unknown.
 
     Args:
-        outline: in the camera frame, as of `MeshOutline.find`.
+        outline: in the camera frame, as of `_MeshOutline.find`.
         image: where to look.
         reach: how far to look to either side [m].
     """
@@ -459,7 +459,7 @@ class MeshAligner:
         self.camera, self.settings = camera, settings
         low, high = mesh.bounds
         self.middle, self.radius = mesh.middle, 0.5 * float(np.linalg.norm(high - low))
-        self._view, self._outline = MeshView(mesh), MeshOutline(mesh)
+        self._view, self._outline = MeshView(mesh), _MeshOutline(mesh)
 
     def middle_of(self, T_camera_object: NDArray) -> NDArray:
         """Return the middle of the object's bounding box (3,) [m] in the camera frame, for a pose (4, 4)."""

@@ -40,7 +40,7 @@ LEAST_THICKNESS = 0.02  # of the lateral extent
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class DepthGrid:
+class _DepthGrid:
     """The front on every `step`-th pixel: depths [m], which are the object, the cells between them, and their rays."""
 
     step: int
@@ -79,7 +79,7 @@ def complete_surface(evidence: ImageEvidence, shape: Reconstruction, report: Rep
     return Reconstruction(mesh=mesh, T_camera_object=T, scale=np.ones(3), score=score, method="completion")
 
 
-def _build_grid(evidence: ImageEvidence, shape: Reconstruction) -> DepthGrid:
+def _build_grid(evidence: ImageEvidence, shape: Reconstruction) -> _DepthGrid:
     """Return the smoothed front, continued to the outline of the object's largest part.
 
     Behind what hides the object, its front is that of the shape.
@@ -98,7 +98,7 @@ def _build_grid(evidence: ImageEvidence, shape: Reconstruction) -> DepthGrid:
     if not cells.any():
         raise ReconstructionError("mask: nowhere two pixels wide; move nearer to the object")
     rays = compute_rays(evidence.camera)[::step, ::step]
-    return DepthGrid(step=step, front=depth[::step, ::step], cells=_thicken_corners(cells), rays=rays, region=region)
+    return _DepthGrid(step=step, front=depth[::step, ::step], cells=_thicken_corners(cells), rays=rays, region=region)
 
 
 def _smooth_depth(evidence: ImageEvidence, mask: NDArray) -> NDArray:
@@ -130,7 +130,7 @@ def _thicken_corners(cells: NDArray) -> NDArray:
         cells[:-1, :-1] |= rising
 
 
-def _guess_back(grid: DepthGrid, evidence: ImageEvidence, shape: Reconstruction) -> NDArray:
+def _guess_back(grid: _DepthGrid, evidence: ImageEvidence, shape: Reconstruction) -> NDArray:
     """Return the depths (h, w) of the back on the grid of the front [m].
 
     Where the shape has none, the body is taken as thick as it is wide.
@@ -149,7 +149,7 @@ def _used_vertices(cells: NDArray) -> NDArray:
     return padded[:-1, :-1] | padded[1:, :-1] | padded[:-1, 1:] | padded[1:, 1:]
 
 
-def _join_sheets(grid: DepthGrid, back: NDArray) -> tuple[NDArray, NDArray]:
+def _join_sheets(grid: _DepthGrid, back: NDArray) -> tuple[NDArray, NDArray]:
     """Return vertices (n, 3) [m] and triangles (m, 3) of front, back and the walls between them."""
     used = _used_vertices(grid.cells)
     count = int(used.sum())

@@ -116,7 +116,7 @@ UNIFORM = ScaleFreedom()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Pull:
+class _Pull:
     """What draws points of the mesh: points (n, 3) [m], unit directions (n, 3), ways to go (n,) [m], weights (n,)."""
 
     points: NDArray
@@ -188,7 +188,7 @@ class _StageFit:
         H[np.diag_indices_from(H)] += DAMPING * np.diag(H) + 1e-12
         return _limit_step(np.linalg.solve(H, gradient))
 
-    def _pull_surface(self, affine: NDArray) -> Pull:
+    def _pull_surface(self, affine: NDArray) -> _Pull:
         """Return the pull of the measured points on the nearest points of the mesh, along the distance's gradient."""
         measured = self._evidence.points[:: self._stride]
         nearest = self._view.closest(measured, affine)
@@ -200,9 +200,9 @@ class _StageFit:
         residuals = np.einsum("ij,ij->i", offset, directions)
         facing = np.einsum("ij,ij->i", nearest.normals, self._evidence.normals[:: self._stride]) > FACING
         weights = facing * _weigh(residuals, self._stage.width) / len(measured)
-        return Pull(points=nearest.points, directions=directions, residuals=residuals, weights=weights)
+        return _Pull(points=nearest.points, directions=directions, residuals=residuals, weights=weights)
 
-    def _pull_outline(self, affine: NDArray) -> Pull:
+    def _pull_outline(self, affine: NDArray) -> _Pull:
         """Return the pull of the mask's outline on the rim of the mesh, across the outline."""
         step, evidence = self._stage.step, self._evidence
         view = self._view.render(affine, evidence.camera, step)
@@ -215,7 +215,7 @@ class _StageFit:
         slope = evidence.edge_slope[rows, columns]
         directions = np.column_stack((slope, -(slope * points[:, :2]).sum(axis=1) / z))
         weights = OUTLINE_WEIGHT * weights * _weigh(residuals, self._stage.width) / max(len(rim), 1)
-        return Pull(points=points, directions=directions, residuals=residuals, weights=weights)
+        return _Pull(points=points, directions=directions, residuals=residuals, weights=weights)
 
 
 def _find_rim(view: RenderedMesh) -> NDArray:

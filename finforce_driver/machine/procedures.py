@@ -148,7 +148,7 @@ JITTER = 60  # [ticks] by which a count may differ from the last one in addition
 SILENCES = 3  # questions without any answer after which there is none to be had
 
 
-class Travel:
+class _Travel:
     """The travel of the motor during a calibration, by the counts of its encoder.
 
     A count is believed when it continues the last one: a digit that was corrupted on the line is a count, too.
@@ -235,7 +235,7 @@ class CalibrationRun:
 
     def __init__(self, settings: GripperSettings, *, calibrated: bool, reset: bool) -> None:
         self._settings = settings
-        self.travel = Travel(settings)
+        self.travel = _Travel(settings)
         self.step = Step.RESET if reset else Step.START
         self.reason = ""
         self._was_calibrated = calibrated and not reset
@@ -260,7 +260,7 @@ class CalibrationRun:
         self._starts += 1
         self._begun, self.step = now, Step.WATCH
         self._first, self._runs, self._moved = None, False, False
-        self.travel = Travel(self._settings)
+        self.travel = _Travel(self._settings)
         return Command.CALIBRATE
 
     def take(self, reply: Reply) -> None:

@@ -15,7 +15,7 @@ from finforce_eval.errors import OptionError
 
 
 @dataclass(frozen=True, kw_only=True)
-class PipelineOptions(ReplayOptions, GripperOptions):
+class _PipelineOptions(ReplayOptions, GripperOptions):
     """What the command is asked for: what the launch files are, as far as it is about our nodes."""
 
     jaws: str = setting("both", "Jaws in the images", choices=("left", "right", "both"))
@@ -29,7 +29,7 @@ OTHER = ("bag", "rate", "rviz", "sim", "composed")  # of launch files, which sta
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
-    names = ", ".join(entry.name for entry in fields(PipelineOptions) if entry.name not in OTHER)
+    names = ", ".join(entry.name for entry in fields(_PipelineOptions) if entry.name not in OTHER)
     text = f"argument as of the launch files, such as object_mesh:=can.stl: {names}. gripper:=true includes the driver"
     parser.add_argument("words", nargs="*", metavar="NAME:=VALUE", help=text)
 
@@ -41,7 +41,7 @@ def pipeline_process(words: list[str]) -> Process:
         OptionError: a word names no option, or its value is none.
     """
     try:
-        options = options_from_words(PipelineOptions, words, without=OTHER)
+        options = options_from_words(_PipelineOptions, words, without=OTHER)
         processes = replay_processes(replace(options, composed=False), Path())
     except ValueError as error:
         raise OptionError(str(error)) from error

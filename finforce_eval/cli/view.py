@@ -37,7 +37,7 @@ def run(options: argparse.Namespace) -> None:
         raise OptionError(f"--save {options.save}: expected a name that ends in .rrd")
     setup = make_setup(options)
     (recording,) = read_keypoints(options)
-    view = RerunView(recording.name, Path(options.save) if options.save else None)
+    view = _RerunView(recording.name, Path(options.save) if options.save else None)
     frames = sum(len(track.keypoints.stamps) for track in recording.jaws.values())
     with progress_bar(frames, "image", recording.name) as bar:
         jaws = estimate_forces(recording, setup, progress=bar.update, watch=view.show_shape)
@@ -55,7 +55,7 @@ _USED, _REFUSED = (25, 204, 51), (230, 51, 25)
 _COLOURS = {"left": (0, 114, 178), "right": (213, 94, 0), "grasp": (0, 158, 115), "truth": (204, 204, 204)}
 
 
-class RerunView:
+class _RerunView:
     """Sends a recording to Rerun.
 
     Args:

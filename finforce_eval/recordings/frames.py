@@ -104,7 +104,7 @@ class FrameImages:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class VideoImages(FrameImages):
+class _VideoImages(FrameImages):
     """Frames of a video file, `path`."""
 
     path: Path
@@ -115,7 +115,7 @@ class VideoImages(FrameImages):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class PictureImages(FrameImages):
+class _PictureImages(FrameImages):
     """Pictures of a folder, `paths` in their order."""
 
     paths: tuple[Path, ...]
@@ -171,7 +171,7 @@ def read_frames(path: Path, choice: ImageChoice, sides: tuple[str, ...] = ()) ->
         fps, count, shape = _look_at_video(path, name)
     camera = choose_camera(choice, shape, name)
     common = {"name": name, "fps": fps, "camera": camera, "count": count}
-    images = PictureImages(**common, paths=paths) if path.is_dir() else VideoImages(**common, path=path)
+    images = _PictureImages(**common, paths=paths) if path.is_dir() else _VideoImages(**common, path=path)
     jaws = {side: JawTrack(keypoints=KeypointTrack.empty()) for side in sides or JAWS}
     return Recording(name=name, path=path, jaws=jaws, images=images)
 

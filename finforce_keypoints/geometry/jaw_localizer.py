@@ -89,7 +89,7 @@ class JawLocalizer:
         self._visible = self._mount.seen_points(jaw)
         self._origin = OriginEstimator(jaw, T_gripper_camera, settings, self._mount)
         self._track = OriginTrack(settings, self._origin.largest_stddev)
-        self._patch, self._rest_check = ReferencePatch(jaw), RestCheck(jaw.keypoints)
+        self._patch, self._rest_check = ReferencePatch(jaw), _RestCheck(jaw.keypoints)
         self._unconfirmed = 0
         self._samples = build_side_samples(jaw)
         self._rest = np.vstack((jaw.keypoints, jaw.reference_point))
@@ -305,7 +305,7 @@ _BENT = 0.3e-3  # [m] root mean square of what no affine map explains: more of i
 _BENT_SHARE = 0.15  # of the displacement across the closing axis, the same
 
 
-class RestCheck:
+class _RestCheck:
     """Finds how far the key points of one jaw at rest lie from its file, across the closing axis.
 
     Attributes:

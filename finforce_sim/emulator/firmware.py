@@ -66,7 +66,7 @@ class EmulatedGripper:
         self.node_id = node_id
         self.jaws = Jaws()
         self.jaws.object_opening, self.jaws.load = object_opening, load
-        self.protection = Protection()
+        self.protection = _Protection()
         self.violations: Counter[str] = Counter()
         self.configured = True
         self._firmware = VARIANTS[variant]
@@ -267,7 +267,7 @@ _FIRST_BYTE = {Fault.TEMPERATURE: 0x40, Fault.ENCODER: 0x20, Fault.SUPPLY: 0x10,
 
 
 @dataclass
-class Protection:
+class _Protection:
     """The environment that the firmware watches, and what it has latched.
 
     Attributes:

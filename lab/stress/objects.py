@@ -26,7 +26,7 @@ CLEAR = 0.02
 POSE_NOISE = 1e-4
 
 
-class PressedOutline:
+class _PressedOutline:
     """A rigid outline for the forward problem; depth counts from first touch with the undeformed jaw."""
 
     def __init__(self, polygons: tuple[NDArray, ...], length: float) -> None:
@@ -75,7 +75,7 @@ def press_scene(bench: Bench, scene: HardScene) -> list[PressedImage]:
     height = bench.find_height(scene.height)
     polygons = cut_outline(scene.mesh, R, float(surface.high[0]), scene.across)
     try:
-        rigid = PressedOutline(polygons, float(surface.high[1]))
+        rigid = _PressedOutline(polygons, float(surface.high[1]))
     except ContactError:
         rigid = None
     depths, presses = plan_depths(bench.find_depth(scene.depth)), {}
@@ -110,7 +110,7 @@ def rotation_of(tilt: float) -> NDArray:
     return np.array([[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]])
 
 
-class Chain:
+class _Chain:
     """Contact estimator and solver of one jaw in their loop, and the camera that sees the jaw with noise."""
 
     def __init__(self, bench: Bench, scene: HardScene, random: np.random.Generator) -> None:
@@ -154,7 +154,7 @@ def run_objects(plan: Plan) -> Iterator[Trial]:
 
 def play_scene(bench: Bench, scene: HardScene, frames: list[PressedImage], seed: int) -> Iterator[Trial]:
     """Yield the images of a scene after the tare, each a step of contact estimator and solver."""
-    chain = Chain(bench, scene, bench.plan.random("objects", scene.name, seed))
+    chain = _Chain(bench, scene, bench.plan.random("objects", scene.name, seed))
     tare = [frames[0]] * bench.estimator.settings.tare_frames
     for index, frame in enumerate([*tare, *frames]):
         step = chain.see(frame)

@@ -29,7 +29,7 @@ AXES = ("x", "y", "z", "magnitude", "torque")  # of an answer: force, its magnit
 NO_ERROR = 1e-9  # [N, N m], which needs no standard deviation
 
 
-class HangError(BaseException):
+class _HangError(BaseException):
     """A step took longer than the time limit; no handler of errors inside the step must catch it."""
 
 
@@ -159,7 +159,7 @@ def attempt(
             result = work()
     except FinforceError as error:
         return Trial(seed=seed, level=level, outcome="refused", step_time=thread_time() - begin, note=str(error))
-    except HangError:
+    except _HangError:
         return Trial(seed=seed, level=level, outcome="hung", note=f"no answer within {limit:g} s")
     except Exception as error:
         return Trial(seed=seed, level=level, outcome="crashed", note=f"{type(error).__name__}: {error}")
@@ -171,7 +171,7 @@ def attempt(
 
 @contextmanager
 def _limit_time(limit: float) -> Iterator[None]:
-    """Raise `HangError` inside the block after `limit` [s]."""
+    """Raise `_HangError` inside the block after `limit` [s]."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -185,7 +185,7 @@ def _limit_time(limit: float) -> Iterator[None]:
 
 
 def _raise_hang(_signal: int, _frame: Any) -> None:
-    raise HangError
+    raise _HangError
 
 
 def run_family(family: Family, plan: Plan) -> list[Trial]:

@@ -40,7 +40,7 @@ class NetworkShape:
     folded: bool = False
 
 
-class ResidualBlock(nn.Module):
+class _ResidualBlock(nn.Module):
     """Two dense 3 x 3 convolutions beside the identity, y = relu(x + B(relu(A x))); channels and size stay."""
 
     def __init__(self, channels: int, folded: bool = False) -> None:
@@ -53,7 +53,7 @@ class ResidualBlock(nn.Module):
         return torch.relu(features + self.second(self.first(features)))
 
 
-class CoarsePart(nn.Module):
+class _CoarsePart(nn.Module):
     """Picture and template at half size to displacements every eighth pixel of the template, and features there."""
 
     def __init__(self, shape: NetworkShape) -> None:
@@ -67,9 +67,9 @@ class CoarsePart(nn.Module):
         rows, columns = shape.height // 32, -(-shape.width // 32)
         self.places = nn.Parameter(torch.zeros(1, coarse, rows, columns))
         self.up16 = build_convolution(coarse, middle, kernel=1, folded=folded, activate=False)
-        self.merge16 = ResidualBlock(middle, folded)
+        self.merge16 = _ResidualBlock(middle, folded)
         self.up8 = build_convolution(middle, fine, kernel=1, folded=folded, activate=False)
-        self.merge8 = ResidualBlock(fine, folded)
+        self.merge8 = _ResidualBlock(fine, folded)
         self.moves = nn.Conv2d(fine, 2, 1)
 
     def forward(self, pictures: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -82,7 +82,7 @@ class CoarsePart(nn.Module):
         return self.moves(fine), fine
 
 
-class FinePart(nn.Module):
+class _FinePart(nn.Module):
     """Pieces of picture and template (N, 6, PIECE, PIECE) to the place of the template's middle in the picture."""
 
     def __init__(self, shape: NetworkShape) -> None:
@@ -90,7 +90,7 @@ class FinePart(nn.Module):
         finest, fine = shape.fine
         folded = shape.folded
         self.stem = build_convolution(6, finest, stride=2, folded=folded)
-        self.level2 = ResidualBlock(finest, folded)
+        self.level2 = _ResidualBlock(finest, folded)
         self.down4 = _build_stage(finest, fine, 2, folded)
         self.votes = nn.Conv2d(fine, 3, 1)
         self.judge = nn.Sequential(nn.Linear(2 * fine + shape.coarse[1], 32), nn.ReLU(), nn.Linear(32, 2))
@@ -114,7 +114,7 @@ class FingerNetwork(nn.Module):
     def __init__(self, shape: NetworkShape | None = None) -> None:
         super().__init__()
         self.shape = shape = shape or NetworkShape()
-        self.coarse, self.fine = CoarsePart(shape), FinePart(shape)
+        self.coarse, self.fine = _CoarsePart(shape), _FinePart(shape)
         rows, columns = torch.meshgrid(torch.arange(PIECE), torch.arange(PIECE), indexing="ij")
         window = torch.stack((columns, rows), dim=-1).float() - 0.5 * (PIECE - 1)
         self.register_buffer("window", window.reshape(1, 1, PIECE * PIECE, 2))
@@ -270,7 +270,7 @@ def _build_stage(inputs: int, outputs: int, blocks: int, folded: bool) -> nn.Seq
     """Return a halving of the resolution and the residual blocks after it."""
     return nn.Sequential(
         build_convolution(inputs, outputs, stride=2, folded=folded),
-        *(ResidualBlock(outputs, folded) for _ in range(blocks)),
+        *(_ResidualBlock(outputs, folded) for _ in range(blocks)),
     )
 
 

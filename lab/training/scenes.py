@@ -53,7 +53,7 @@ TEXTURES = Path(__file__).parent / "textures"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class PicturePaint:
+class _PicturePaint:
     """A surface that shows a photograph, laid on from its three sides.
 
     Attributes:
@@ -94,10 +94,10 @@ def _draw_texture(rng: np.random.Generator) -> NDArray:
     return np.clip(image[..., rng.permutation(3)] * np.exp(rng.normal(0.0, 0.5, 3)), 0.0, 1.0)
 
 
-def _draw_any_paint(rng: np.random.Generator) -> Paint | PicturePaint:
+def _draw_any_paint(rng: np.random.Generator) -> Paint | _PicturePaint:
     if rng.random() < 0.4:
         size = float(np.exp(rng.uniform(np.log(0.02), np.log(0.2))))
-        return PicturePaint(
+        return _PicturePaint(
             image=_draw_texture(rng), size=size, gloss=rng.uniform(0.0, 0.6), sharpness=rng.uniform(5, 80)
         )
     return draw_paint(rng)
@@ -165,7 +165,7 @@ def extrude(finger: Finger) -> _Solid:
     return _Solid(section=points, triangles=triangles, half=finger.half_width(points[:, 1]))
 
 
-def _box(low: ArrayLike, high: ArrayLike, paint: Paint | PicturePaint, decals: tuple[Decal, ...] = ()) -> Body:
+def _box(low: ArrayLike, high: ArrayLike, paint: Paint | _PicturePaint, decals: tuple[Decal, ...] = ()) -> Body:
     """Return a box of two corners (3,) [m], jaw frame."""
     return build_box(np.array([low, high], dtype=float), np.eye(4), paint, decals)
 
