@@ -129,9 +129,9 @@ def find_mounts(parameters: DetectorParameters, jaws: Mapping[str, Jaw]) -> dict
     Raises:
         DetectorSettingsError: a turn is no three numbers, or `covered` names a point that the jaw does not have.
     """
-    mounts = {}
+    mounts, turns = {}, {"left": parameters.left_turn, "right": parameters.right_turn}
     for side, jaw in jaws.items():
-        turn = np.array(getattr(parameters, f"{side}_turn"), dtype=float)
+        turn = np.array(turns[side], dtype=float)
         if turn.shape != (3,) or not np.linalg.norm(turn) <= LARGEST_TURN:
             raise DetectorSettingsError(
                 f"{side}_turn: got {turn.tolist()}, expected a rotation vector of three numbers, at most "

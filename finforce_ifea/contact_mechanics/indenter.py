@@ -262,7 +262,7 @@ class FaceProfile(NamedTuple):
     x: float
 
 
-class _IndenterPose(NamedTuple):
+class IndenterPose(NamedTuple):
     """Where an object in a contact state (depth, shape, height) is.
 
     Attributes:
@@ -282,11 +282,11 @@ class _IndenterPose(NamedTuple):
 
 @njit(**_OPTIONS)
 def pose_object(pressed, face_x, x):
-    """Return the `_IndenterPose` in a contact state (3,)."""
+    """Return the `IndenterPose` in a contact state (3,)."""
     if pressed.is_round:
         radius = np.exp(x[1])
-        return _IndenterPose(face_x + radius - x[0], x[2], radius, 1.0, 0.0)
-    return _IndenterPose(face_x + pressed.front - x[0], x[2], 0.0, np.cos(x[1]), np.sin(x[1]))
+        return IndenterPose(face_x + radius - x[0], x[2], radius, 1.0, 0.0)
+    return IndenterPose(face_x + pressed.front - x[0], x[2], 0.0, np.cos(x[1]), np.sin(x[1]))
 
 
 @njit(**_OPTIONS)

@@ -372,7 +372,7 @@ def test_poses_that_are_late_come_late():
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        (["nothing"], "invalid choice"),
+        (["nothing"], "got 'nothing', expected one of"),
         (["chip", "--on", "some_bag"], "expected twin"),
         (["grasp", "--on", "twin", "a_bag"], "not both"),
         (["grasp", "--seed", "-1"], "from 0"),
