@@ -57,7 +57,7 @@ LEAST_LIKELIHOOD = 0.5  # mean likelihood of points that are not covered
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Placement:
+class CameraPlacement:
     """Where a camera is and how jaws stand before it.
 
     Attributes:
@@ -81,7 +81,7 @@ class Placement:
         return jaw_in_camera(self.T_gripper_camera, side, self.origins[side][number], self.mounts[side].turn)
 
 
-class Outline:
+class OutlineContrast:
     """What tells the outline of a jaw from its surroundings.
 
     Args:
@@ -148,7 +148,7 @@ def search_camera(
         jaws: by side.
         progress: called with the number of places tried since its last call.
     """
-    outlines = {side: Outline(jaw) for side, jaw in jaws.items()}
+    outlines = {side: OutlineContrast(jaw) for side, jaw in jaws.items()}
 
     def compare(x: NDArray, right: float, colors: Sequence[NDArray]) -> float:
         T = place_camera(x, right)
@@ -190,7 +190,7 @@ def find_placement(
     guess: NDArray | None = None,
     half: float = 0.045,
     progress: Callable[[int], Any] = lambda steps: None,
-) -> Placement:
+) -> CameraPlacement:
     """Return where the camera is and how the jaws are mounted.
 
     Args:
@@ -253,7 +253,7 @@ class _Refinement:
         self._images, self._camera, self._jaws, self._locator = images, camera, jaws, locator
         self._points = {side: np.vstack((jaw.keypoints, jaw.reference_point)) for side, jaw in jaws.items()}
         self._planes = {side: find_side(jaw) for side, jaw in jaws.items()}
-        self._outlines = {side: Outline(jaw, FINER) for side, jaw in jaws.items()}
+        self._outlines = {side: OutlineContrast(jaw, FINER) for side, jaw in jaws.items()}
         self._start, count, sides = T, len(images), len(jaws)
         origins = [np.full(count, _origin(side, half)) for side in jaws]
         # step of the camera, turns of the jaws, origins by jaw and picture
@@ -348,7 +348,7 @@ class _Refinement:
         if score > self._best[0]:
             self._best = (score, self._x)
 
-    def describe(self) -> Placement:
+    def describe(self) -> CameraPlacement:
         """Return what was found, and which points are never seen.
 
         Raises:
@@ -377,7 +377,7 @@ class _Refinement:
             sure = (self._likelihood[side] >= 0.5) & visible
             kept[side] = np.where(sure[:, :, None], self._seen[side], np.nan)
             away.append(self._away(side, T, turns[side], origins[side])[sure])
-        return Placement(
+        return CameraPlacement(
             T_gripper_camera=T,
             mounts=mounts,
             origins=origins,

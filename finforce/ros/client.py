@@ -72,13 +72,13 @@ class GripperClient:
     @property
     def force(self) -> float | None:
         """The grasp force [N]; None while none comes that is trusted. A warning says if nobody publishes any."""
-        topic = self._node.resolve_topic_name("grasp_wrench")
-        if monotonic() - self._began > FOUND and not self._node.count_publishers(topic):
+        force, topic = _fresh(self._force), self._node.resolve_topic_name("grasp_wrench")
+        if force is None and monotonic() - self._began > FOUND and not self._node.count_publishers(topic):
             text = (
                 f"nobody publishes {topic}: no solver runs in this domain; start one with finforce launch or pipeline"
             )
             self._node.get_logger().warning(text, throttle_duration_sec=5.0)
-        return _fresh(self._force)
+        return force
 
     @property
     def opening(self) -> float | None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce.gripper_frames import SIDES
+from finforce.gripper_frames import SIDES, read_extrinsics
 from finforce.transforms import pose_numbers
 from finforce_eval.cli.parser import BAG_HELP, add_rest_options
 from finforce_eval.errors import OptionError
@@ -23,7 +23,7 @@ from finforce_keypoints.build import ANY_FINGER
 from finforce_keypoints.detectors.side_plane import AnyFinger
 from finforce_keypoints.networks.side_network import SideNetwork
 from finforce_keypoints.parameters import NO_DEPTH
-from finforce_keypoints.placement import KEPT, ROUNDS, STARTS, STEPS, Placement, find_placement
+from finforce_keypoints.placement import KEPT, ROUNDS, STARTS, STEPS, CameraPlacement, find_placement
 from finforce_keypoints.rig import Rig, RigCamera, describe_mount, write_rig
 
 PICTURES = 4  # of the images, which are compared
@@ -52,21 +52,15 @@ def run(options: argparse.Namespace) -> None:
     jaws = {side: load_jaw(options.jaw, side) for side in SIDES if side in recording.jaws}
     locator = AnyFinger(SideNetwork(source.parameters.get("model") or ANY_FINGER), jaws)
     guess = source.node_parameters(recording).get("T_gripper_camera")
+    guess = None if guess is None else read_extrinsics(guess)
     with progress_bar(STARTS + KEPT * STEPS + ROUNDS * len(colors), "step") as bar:
-        found = find_placement(colors, recording.images.camera, jaws, locator, as_pose(guess), progress=bar.update)
+        found = find_placement(colors, recording.images.camera, jaws, locator, guess, progress=bar.update)
     output = Path(options.output)
     write_rig(build_rig(found, recording, options.jaw), output)
     picture = Path(options.overlay or output.with_suffix(".png"))
     import_cv2().imwrite(str(picture), draw_placement(found, colors[0], recording, jaws)[..., ::-1])
     print(describe_placement(found, jaws))
     print(f"Rig: {output}; {picture}: jaws as found in orange, key points seen in green")
-
-
-def as_pose(numbers) -> NDArray | None:
-    """Return a pose (4, 4) of its seven numbers; None of none."""
-    from finforce.transforms import pose_from_quaternion
-
-    return None if numbers is None else pose_from_quaternion(numbers[:3], numbers[3:])
 
 
 def choose_pictures(recording: Recording, count: int) -> list[NDArray]:
@@ -84,7 +78,7 @@ def choose_pictures(recording: Recording, count: int) -> list[NDArray]:
     return [image.color for _, image in images.at(first[chosen])]
 
 
-def build_rig(found: Placement, recording: Recording, jaw: str) -> Rig:
+def build_rig(found: CameraPlacement, recording: Recording, jaw: str) -> Rig:
     """Return the rig of what was found."""
     camera = recording.images.camera
     names = load_jaw(jaw).keypoint_names
@@ -99,7 +93,7 @@ def build_rig(found: Placement, recording: Recording, jaw: str) -> Rig:
     )
 
 
-def describe_placement(found: Placement, jaws) -> str:
+def describe_placement(found: CameraPlacement, jaws) -> str:
     """Return what was found in words."""
     x, y, z = 1e3 * found.T_gripper_camera[:3, 3]
     lines = [
@@ -114,7 +108,7 @@ def describe_placement(found: Placement, jaws) -> str:
     return "\n".join(lines)
 
 
-def draw_placement(found: Placement, color: NDArray, recording: Recording, jaws) -> NDArray:
+def draw_placement(found: CameraPlacement, color: NDArray, recording: Recording, jaws) -> NDArray:
     """Return the first picture with the jaws as found and the points seen."""
     picture = color.copy()
     for side, jaw in jaws.items():

@@ -202,46 +202,50 @@ def find_images(bag: BagReader, source: Path, choice: ImageChoice | None = None)
     info = "" if choice.intrinsics else choice.info or _find_info(bag, color, seen[color].frame)
     topics = (color, depth) if depth else (color,)
     check_types(bag.connections, dict.fromkeys(topics, IMAGES) | {info: (CAMERA_INFO,)}, bag.name)
-    if info:
-        camera, frame_id = _read_camera(bag, info)
-    else:
-        camera, frame_id = read_intrinsics(choice.intrinsics, seen[color].shape), seen[color].frame
-    if choice.camera is not None and not choice.intrinsics and not same_camera(choice.camera, camera):
-        raise RecordingError(
-            f"{bag.name}: the rig is of another camera than {info}: {choice.camera.width} x {choice.camera.height}, "
-            f"focal length {choice.camera.fx:.1f}; found {camera.width} x {camera.height}, {camera.fx:.1f}"
-        )
+    camera, frame_id = _choose_camera(bag, info, choice, seen[color])
     found: dict[str, list[int]] = {topic: [] for topic in topics}
     for raw in bag.raw(topics):
         found[raw.topic].append(read_stamp(raw.data))
     stamps = {topic: _rising(times, topic, bag.name) for topic, times in found.items()}
-    if not depth:
-        return ImageTrack(
-            source=source,
-            name=bag.name,
-            topics=(color, ""),
-            stamps=stamps[color],
-            depth_stamps=np.full(len(stamps[color]), ALONE),
-            camera=camera,
-            frame_id=frame_id,
-            info=info,
-        )
-    pairing = pairing_tolerance(stamps[color]) if choice.pairing is None else choice.pairing
-    nearest = find_nearest(stamps[depth], stamps[color])
-    paired = np.abs(stamps[depth][nearest] - stamps[color]) <= pairing
-    if not paired.any():
-        raise RecordingError(f"{bag.name}: no depth image on {depth} within {pairing / 10**6:g} ms of one on {color}")
+    depth_stamps = np.full(len(stamps[color]), ALONE)
+    paired = np.ones(len(depth_stamps), dtype=bool)
+    if depth:
+        pairing = pairing_tolerance(stamps[color]) if choice.pairing is None else choice.pairing
+        depth_stamps = stamps[depth][find_nearest(stamps[depth], stamps[color])]
+        paired = np.abs(depth_stamps - stamps[color]) <= pairing
+        if not paired.any():
+            raise RecordingError(
+                f"{bag.name}: no depth image on {depth} within {pairing / 10**6:g} ms of one on {color}"
+            )
     return ImageTrack(
         source=source,
         name=bag.name,
         topics=(color, depth),
         stamps=stamps[color][paired],
-        depth_stamps=stamps[depth][nearest[paired]],
+        depth_stamps=depth_stamps[paired],
         camera=camera,
         frame_id=frame_id,
         unpaired=stamps[color][~paired],
         info=info,
     )
+
+
+def _choose_camera(bag: BagReader, info: str, choice: ImageChoice, first: _FirstImage) -> tuple[CameraIntrinsics, str]:
+    """Return the camera of the images, by a topic or as given, and its frame.
+
+    Raises:
+        RecordingError: it changes, or is not that of the rig.
+        OptionError: the intrinsics that were given cannot be used.
+    """
+    if not info:
+        return read_intrinsics(choice.intrinsics, first.shape), first.frame
+    camera, frame_id = _read_camera(bag, info)
+    if choice.camera is not None and not same_camera(choice.camera, camera):
+        raise RecordingError(
+            f"{bag.name}: the rig is of another camera than {info}: {choice.camera.width} x {choice.camera.height}, "
+            f"focal length {choice.camera.fx:.1f}; found {camera.width} x {camera.height}, {camera.fx:.1f}"
+        )
+    return camera, frame_id
 
 
 def _find_topic(bag: BagReader, ends: Sequence[str]) -> str:

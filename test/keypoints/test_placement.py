@@ -16,7 +16,7 @@ from finforce_keypoints.geometry.template import find_motions, find_shape
 from finforce_keypoints.images import RgbdImage
 from finforce_keypoints.networks.side_network import Places, Template
 from finforce_keypoints.parameters import DetectorParameters, DetectorSettings, JawMount, find_mounts
-from finforce_keypoints.placement import Outline, find_covered, find_placement
+from finforce_keypoints.placement import OutlineContrast, find_covered, find_placement
 from finforce_keypoints.rig import Rig, RigCamera, RigJaw, read_rig, write_rig
 from finforce_sim.sensor import build_d405_vga
 
@@ -109,7 +109,7 @@ def paint(poses, jaws, ground=(180, 170, 160)):
 
 def test_colours_tell_an_outline_where_it_is_and_nowhere_else():
     jaws = {"left": load_jaw("bench")}
-    T, outline = jaw_in_camera(ROBOT_CAMERA, "left", -0.04), Outline(jaws["left"])
+    T, outline = jaw_in_camera(ROBOT_CAMERA, "left", -0.04), OutlineContrast(jaws["left"])
     color = paint({"left": T}, jaws)
     there = outline.contrast(color, T, CAMERA)
     aside = jaw_in_camera(ROBOT_CAMERA, "left", -0.02)
