@@ -40,7 +40,9 @@ def version() -> str:
 
 def write_figures(path: Path | str, figures: Mapping[str, Any]) -> None:
     """Write figures as JSON with the machine, versions and commit that they are of; what is not finite becomes null."""
-    write_json(path, {"machine": describe_machine(), **without_nan(figures)})
+    text = json.dumps({"machine": describe_machine(), **without_nan(figures)}, indent=2, allow_nan=False)
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    Path(path).write_text(text + "\n", encoding="utf-8")
 
 
 def _processor() -> str:
@@ -75,7 +77,9 @@ def describe_sources(file: Path) -> str:
 
 
 def without_nan(content: Any) -> Any:
-    """Return nested mappings and sequences with None for numbers that are not finite."""
+    """Return nested mappings, sequences and arrays as plain values, with None for numbers that are not finite."""
+    if isinstance(content, np.ndarray | np.generic):
+        content = content.tolist()
     if isinstance(content, Mapping):
         return {name: without_nan(value) for name, value in content.items()}
     if isinstance(content, list | tuple):
@@ -91,9 +95,3 @@ def _find_versions() -> Iterator[tuple[str, str]]:
 
 
 LIBRARIES = ("numpy", "scipy", "numba", "open3d", "manifold3d", "trimesh")
-
-
-def write_json(path: str, content: Mapping[str, Any]) -> None:
-    """Write one JSON object."""
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    Path(path).write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")

@@ -5,10 +5,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from finforce_eval.cli.parser import BAG_HELP, FORCE_HELP, add_json_option, add_run_options
+from finforce_eval.cli.parser import BAG_HELP, FORCE_HELP, Outcome, add_run_options
 from finforce_eval.evaluation.forces import truth_sides
 from finforce_eval.evaluation.setup import make_setup, read_keypoints
-from finforce_eval.machine import write_json
 from finforce_ifea.jaw.calibration import name_mechanics, save_calibration
 
 
@@ -17,11 +16,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("bags", nargs="+", metavar="BAG", help=BAG_HELP)
     add_run_options(parser, calibration=False)
     parser.add_argument("-o", "--output", required=True, metavar="FILE", help="calibration file to write")
-    add_json_option(parser)
     parser.add_argument("--force", action="store_true", help=FORCE_HELP)
 
 
-def run(options: argparse.Namespace) -> None:
+def run(options: argparse.Namespace) -> Outcome:
     """Identify the material and write the calibration."""
     from finforce_eval.calibration.calibrate import calibrate, calibration_case, format_fit
 
@@ -39,8 +37,7 @@ def run(options: argparse.Namespace) -> None:
         fit.calibration.check_modulus(jaw)
     solver = name_mechanics(jaw, setup.settings.solver)
     found = fit.calibration.changed(solver=solver, uncertainty=fit.uncertainty)
-    if options.json:
-        left = {"force_rms_N": fit.force_rms, "shape_rms_mm": 1e3 * fit.shape_rms, "plateaus": fit.plateaus}
-        write_json(options.json, {**left, "calibration": found.model_dump(mode="json")})
     save_calibration(found, options.output)
     print(f"Calibration: {options.output}")
+    left = {"force_rms_N": fit.force_rms, "shape_rms_mm": 1e3 * fit.shape_rms, "plateaus": fit.plateaus}
+    return Outcome({**left, "calibration": found.model_dump(mode="json")})

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from finforce.gripper_frames import SIDES, read_extrinsics
 from finforce.transforms import pose_numbers
-from finforce_eval.cli.parser import BAG_HELP, add_rest_options
+from finforce_eval.cli.parser import BAG_HELP, Outcome, add_rest_options
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.check import FITTED, SEEN, draw_jaw, draw_points
 from finforce_eval.evaluation.keypoint_source import choose_images, parse_source
@@ -40,7 +40,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add_rest_options(parser, images=45)
 
 
-def run(options: argparse.Namespace) -> None:
+def run(options: argparse.Namespace) -> Outcome:
     """Find camera, jaws and covered points in the first images of a source, and write and draw them."""
     from finforce.optional import import_cv2
 
@@ -56,11 +56,13 @@ def run(options: argparse.Namespace) -> None:
     with progress_bar(STARTS + KEPT * STEPS + ROUNDS * len(colors), "step") as bar:
         found = find_placement(colors, recording.images.camera, jaws, locator, guess, progress=bar.update)
     output = Path(options.output)
-    write_rig(build_rig(found, recording, options.jaw), output)
+    rig = build_rig(found, recording, options.jaw)
+    write_rig(rig, output)
     picture = Path(options.overlay or output.with_suffix(".png"))
     import_cv2().imwrite(str(picture), draw_placement(found, colors[0], recording, jaws)[..., ::-1])
     print(describe_placement(found, jaws))
     print(f"Rig: {output}; {picture}: jaws as found in orange, key points seen in green")
+    return Outcome({"rig": rig.model_dump(mode="json"), "contrast": found.contrast, "residual_px": found.residual})
 
 
 def choose_pictures(recording: Recording, count: int) -> list[NDArray]:

@@ -11,11 +11,10 @@ from finforce.camera_topics import COLOR_TOPIC, COMPRESSED_COLOR, DEPTH_TOPIC, I
 from finforce.errors import MissingDependencyError
 from finforce.messages import read_stamp
 from finforce_eval.cli.extrinsics import read_at_rest
-from finforce_eval.cli.parser import BAG_HELP, add_rest_options
+from finforce_eval.cli.parser import BAG_HELP, Outcome, add_rest_options
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.at_rest import ROUNDS
 from finforce_eval.evaluation.check import FAULT, check_recording
-from finforce_eval.machine import write_json
 from finforce_eval.recordings.images import CAMERA_INFO, COMPRESSED, IMAGE
 from finforce_eval.recordings.writer import Entry, typestore, write_entries
 from finforce_eval.tasks import progress_bar
@@ -37,11 +36,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--report", default=".", metavar="DIR", help=f"folder for {PICTURE} (current folder)")
 
 
-def run(options: argparse.Namespace) -> int:
+def run(options: argparse.Namespace) -> Outcome:
     """Check the first images of a recording, print what fits and what does not, and draw it.
 
     Returns:
-        0 if everything fits, 1 if something has to be changed.
+        The findings; status 0 if everything fits, 1 if something has to be changed.
     """
     with TemporaryDirectory() as scratch:
         if options.topics is not None:
@@ -99,7 +98,7 @@ def record_camera(topics: Sequence[str], count: int, folder: Path, domain: int |
     return write_entries(sorted(entries, key=lambda entry: entry.stamp), folder)
 
 
-def _check(options: argparse.Namespace) -> int:
+def _check(options: argparse.Namespace) -> Outcome:
     from finforce.optional import import_cv2
 
     source, recording = read_at_rest(options)
@@ -111,8 +110,7 @@ def _check(options: argparse.Namespace) -> int:
     folder.mkdir(parents=True, exist_ok=True)
     import_cv2().imwrite(str(folder / PICTURE), check.picture[..., ::-1])
     faults = sum(line.severity == FAULT for line in check.findings)
-    if options.json:
-        write_json(options.json, {"faults": faults, "findings": [line._asdict() for line in check.findings]})
     outcome = f"{faults} to be changed" if faults else "everything fits"
     print(f"{outcome}; {folder / PICTURE}: grey as given, orange as fitted, green key points")
-    return 1 if faults else 0
+    findings = [line._asdict() for line in check.findings]
+    return Outcome({"faults": faults, "findings": findings}, status=int(faults > 0))

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from finforce_eval.cli.parser import add_json_option
+from finforce_eval.cli.parser import Outcome
 from finforce_eval.evaluate import read_evaluations
 from finforce_eval.evaluation.comparison import (
     BETTER,
@@ -24,7 +24,7 @@ from finforce_eval.evaluation.comparison import (
     total_change,
 )
 from finforce_eval.evaluation.tables import evaluation_json
-from finforce_eval.machine import without_nan, write_json
+from finforce_eval.machine import without_nan
 
 WORSE_FOUND = 1
 
@@ -33,21 +33,19 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
     parser.add_argument("before", metavar="A", help="output of finforce evaluate --json, or its --out folder")
     parser.add_argument("after", metavar="B", help="the same with other settings, fingers or versions")
-    add_json_option(parser)
     parser.add_argument("--strict", action="store_true", help="exit with 1 if a recording got worse or is missing")
 
 
-def run(options: argparse.Namespace) -> int:
-    """Compare two evaluations: print the table, write JSON."""
+def run(options: argparse.Namespace) -> Outcome:
+    """Compare two evaluations and print the table."""
     before, after = (_read(Path(path)) for path in (options.before, options.after))
     changes = compare_evaluations(before, after)
     for name, (old, new) in differing_settings(before, after).items():
         print(f"{name}: {old} -> {new}")
     print(format_changes(changes))
-    if options.json:
-        rows = [asdict(change) for change in changes]
-        write_json(options.json, without_nan({"changes": rows, "mean": asdict(total_change(changes))}))
-    return WORSE_FOUND if options.strict and any(change.verdict in (WORSE, LOST) for change in changes) else 0
+    found = {"changes": [asdict(change) for change in changes], "mean": asdict(total_change(changes))}
+    worse = options.strict and any(change.verdict in (WORSE, LOST) for change in changes)
+    return Outcome(found, status=WORSE_FOUND if worse else 0)
 
 
 def _read(path: Path) -> Mapping[str, Any]:

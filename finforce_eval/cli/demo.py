@@ -14,7 +14,7 @@ from typing import Any
 from finforce.systems.launch import find_share
 from finforce_eval.annotation.bag import new_folder
 from finforce_eval.cli.main import parse
-from finforce_eval.cli.parser import CONTACT_HELP
+from finforce_eval.cli.parser import CONTACT_HELP, Outcome
 from finforce_eval.cli.twin import RecordingForm, record_scene
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.keypoint_source import IMAGES
@@ -38,7 +38,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--report", default="report", metavar="DIR", help="folder of the report (report)")
 
 
-def run(options: argparse.Namespace) -> None:
+def run(options: argparse.Namespace) -> Outcome:
     """Replay a recording, print the error of the force, write the report.
 
     Raises:
@@ -53,8 +53,9 @@ def run(options: argparse.Namespace) -> None:
     words += ["--rate", options.rate]
     replay = parse([*words, *(word for contact in contacts for word in ("--contact", contact))])
     print(f"Playing {bag.name} through the nodes at {options.rate} x real time ...", flush=True)
-    replay.run(replay)
+    outcome = replay.run(replay)
     print(f"Next, the simulated robot: {next_command()}")
+    return outcome
 
 
 def next_command() -> str:

@@ -8,11 +8,10 @@ from contextlib import ExitStack
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from finforce_eval.cli.parser import BAG_HELP, add_engine_options, add_json_option, add_run_options, read_engine
+from finforce_eval.cli.parser import BAG_HELP, Outcome, add_engine_options, add_run_options, read_engine
 from finforce_eval.evaluate import evaluate_many
 from finforce_eval.evaluation.setup import make_setup
 from finforce_eval.evaluation.tables import evaluation_json, format_tables
-from finforce_eval.machine import write_json
 
 EXAMPLES = """examples:
   finforce evaluate BAG --calibration twin                             # as recorded, scored
@@ -28,7 +27,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     results = parser.add_argument_group("results")
     text = "skip the images that the nodes skip: nothing moved, or the object is out of reach"
     results.add_argument("--as-live", action="store_true", help=text)
-    add_json_option(results)
     results.add_argument("--report", metavar="DIR", help="write a page with figures to this folder")
     text = "write a Parquet table of every recording (one row per image and jaw) and manifest.jsonl, with which "
     text += "a killed run resumes; finforce report shows the tables, finforce compare compares two folders"
@@ -36,8 +34,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add_engine_options(parser)
 
 
-def run(options: argparse.Namespace) -> int:
-    """Evaluate recordings: print the table, write JSON and report; 2 where one of them failed."""
+def run(options: argparse.Namespace) -> Outcome:
+    """Evaluate recordings: print the table, write the report; status 2 where one of them failed."""
     setup, engine = make_setup(options), read_engine(options)
     with ExitStack() as stack:
         folder = Path(options.out or stack.enter_context(TemporaryDirectory(prefix="finforce_")))
@@ -45,11 +43,9 @@ def run(options: argparse.Namespace) -> int:
     for name, error in failed.items():
         print(f"failed: {error if name in error else f'{name}: {error}'}", file=sys.stderr)
     print(format_tables(evaluation))
-    if options.json:
-        more = {"failed": failed} if failed else {}
-        write_json(options.json, evaluation_json(evaluation, **more, **setup.about))
     if options.report:
         from finforce_eval.figures.report import write_overview
 
         print(f"Report: {write_overview(evaluation, options.report, about=setup.about)}")
-    return 2 if failed else 0
+    more = {"failed": failed} if failed else {}
+    return Outcome(evaluation_json(evaluation, **more, **setup.about), status=2 if failed else 0)

@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 
 from finforce.camera import ImageError, decode_picture
 from finforce.transforms import pose_numbers, rotation_between
-from finforce_eval.cli.parser import BAG_HELP, add_rest_options, length_mm
+from finforce_eval.cli.parser import BAG_HELP, Outcome, add_rest_options, length_mm
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.at_rest import ROUNDS, approach, first_images
 from finforce_eval.evaluation.keypoint_source import KeypointSource, build_records, choose_images, parse_source
 from finforce_eval.evaluation.setup import read_recordings, sides_of
-from finforce_eval.machine import write_json
 from finforce_eval.recordings.tracks import Recording
 from finforce_eval.tasks import progress_bar
 from finforce_ifea.jaw.jaw import load_jaw
@@ -32,11 +31,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add_rest_options(parser, images=45)
 
 
-def run(options: argparse.Namespace) -> None:
+def run(options: argparse.Namespace) -> Outcome:
     """Find the camera's pose from the first images of a recording, and print it as the nodes take it."""
     if options.grid is not None:
-        print(format_grid_camera(find_grid_camera(read_picture(Path(options.bags[0])), options.grid)))
-        return
+        above = find_grid_camera(read_picture(Path(options.bags[0])), options.grid)
+        print(format_grid_camera(above))
+        pose = pose_numbers(above.T_camera_table)
+        return Outcome({"camera": vars(above.camera), "T_camera_table": pose, "residual_px": above.residual})
     source, recording = read_at_rest(options)
     start = build_records(source.node_parameters(recording)).parameters
     recording = replace(recording, images=choose_images(recording, start.depth))
@@ -44,12 +45,10 @@ def run(options: argparse.Namespace) -> None:
     with progress_bar(ROUNDS * len(recording.images), "image") as bar:
         found, _ = approach(recording, source, jaws, start.camera_pose, bar.update)
     print(format_extrinsics(found, start.camera_pose))
-    if options.json:
-        pose, stddev = pose_numbers(found.T_gripper_camera), found.stddev.tolist()
-        write_json(
-            options.json,
-            {"T_gripper_camera": pose, "stddev": stddev, "residual_px": found.residual, "origins": found.origins},
-        )
+    pose, stddev = pose_numbers(found.T_gripper_camera), found.stddev.tolist()
+    return Outcome(
+        {"T_gripper_camera": pose, "stddev": stddev, "residual_px": found.residual, "origins": found.origins}
+    )
 
 
 def read_at_rest(options: argparse.Namespace) -> tuple[KeypointSource, Recording]:

@@ -6,10 +6,11 @@ import argparse
 import time
 from pathlib import Path
 
+from finforce_eval.cli.parser import Outcome, length_mm, picture_file
+
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
-    from finforce_eval.cli.parser import add_json_option, length_mm, picture_file
     from finforce_ifea.jaw.jaw_file import MATERIALS
     from finforce_ifea.jaw.section import UNITS
 
@@ -27,13 +28,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--other-face", action="store_true", help="take the other side as the inner face")
     text = "picture to draw (next to the jaw file, .png)"
-    add_json_option(parser)
     parser.add_argument("--picture", type=lambda name: Path(picture_file(name)), help=text)
 
 
-def run(options: argparse.Namespace) -> None:
+def run(options: argparse.Namespace) -> Outcome:
     """Read a finger, say what was found, and write jaw file, section and picture."""
-    from finforce_eval.machine import write_json
     from finforce_ifea.jaw.cad.make_jaw import make_jaw
     from finforce_ifea.jaw.cad.recognition import Overrides
 
@@ -52,8 +51,7 @@ def run(options: argparse.Namespace) -> None:
         ),
         picture=options.picture,
     )
-    if options.json:
-        write_json(options.json, {"files": [str(path) for path in files], "notes": notes})
     for note in notes:
         print(f"  {note}")
     print(f"{', '.join(str(path) for path in files)}, {time.monotonic() - started:.1f} s")
+    return Outcome({"files": [str(path) for path in files], "notes": notes})

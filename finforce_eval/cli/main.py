@@ -13,7 +13,7 @@ from types import ModuleType
 
 from finforce.errors import one_line
 from finforce.optional import import_library
-from finforce_eval.cli.parser import Parser
+from finforce_eval.cli.parser import Parser, add_output_options
 from finforce_eval.errors import OptionError
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
@@ -80,9 +80,8 @@ def build_parser(command: str) -> Parser:
     """Return the parser of a subcommand's options."""
     module = load_command(command)
     parser = Parser(prog=f"finforce {command}", description=COMMANDS[command], epilog=getattr(module, "EXAMPLES", None))
-    parser.set_defaults(run=getattr(module, "run", None))
-    text = "print nothing but notes and errors"
-    parser.add_argument("-q", "--quiet", action="store_true", help=text)  # which `main` takes, wherever it stands
+    parser.set_defaults(run=getattr(module, "run", None), json=None)
+    add_output_options(parser)
     module.add_options(parser)
     return parser
 
@@ -125,7 +124,12 @@ def main(argv: Sequence[str] | None = None) -> int:
             os.environ["TQDM_DISABLE"] = "1"
         options = parse([word for word in words if word not in ("-q", "--quiet")])
         with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere if quiet else sys.stdout):
-            return options.run(options) or 0
+            outcome = options.run(options)
+            if options.json:
+                from finforce_eval.machine import write_figures
+
+                write_figures(options.json, outcome.results)
+            return outcome.status
     except (FinforceError, OSError) as error:
         print(f"finforce: {one_line(error)}".encode("utf-8", "backslashreplace").decode(), file=sys.stderr)
         return 2

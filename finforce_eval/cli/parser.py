@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -26,6 +27,14 @@ CONTACT_HELP = (
 )
 FORCE_HELP = "accept a modulus more than a factor of 3 off the jaw file's, or outside 5 to 200 MPa for TPU"
 PICTURES = (".png", ".jpg", ".svg", ".pdf")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a command has found, as `--json` writes it, and its exit status."""
+
+    results: Mapping[str, Any] = field(default_factory=dict)
+    status: int = 0
 
 
 def picture_file(text: str) -> str:
@@ -82,9 +91,11 @@ def add_run_options(parser: argparse.ArgumentParser, *, calibration: bool = True
     images.add_argument("--strict", action="store_true", help=text)
 
 
-def add_json_option(parser: argparse._ActionsContainer) -> None:
-    """Add the file for what the command finds."""
-    parser.add_argument("--json", metavar="OUT", help="write the results as JSON")
+def add_output_options(parser: argparse.ArgumentParser) -> None:
+    """Add what every command has; `main` takes `--quiet`, wherever it stands, and writes the JSON."""
+    parser.add_argument("-q", "--quiet", action="store_true", help="print nothing but notes and errors")
+    text = "write the results as JSON"
+    parser.add_argument("--json", default=argparse.SUPPRESS, metavar="OUT", help=text)  # of an action, or before it
 
 
 def add_detector_options(parser: argparse._ActionsContainer) -> None:
@@ -124,7 +135,6 @@ def add_rest_options(parser: argparse.ArgumentParser, images: int) -> None:
     add_detector_options(parser)
     text = f"number of initial images with open, still, unloaded jaws ({images})"
     parser.add_argument("--images", type=whole_number(1, 100_000), default=images, metavar="N", help=text)
-    add_json_option(parser)
 
 
 def whole_number(least: int, most: int) -> Callable[[str], int]:

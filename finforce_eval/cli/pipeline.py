@@ -11,6 +11,7 @@ from finforce.settings import setting
 from finforce.systems.launch import options_from_words
 from finforce.systems.live import gripper_process
 from finforce.systems.processes import GripperOptions, Process, ReplayOptions, finish, merge, replay_processes
+from finforce_eval.cli.parser import Outcome
 from finforce_eval.errors import OptionError
 
 
@@ -49,11 +50,12 @@ def pipeline_process(words: list[str]) -> Process:
     return merge([*processes, *driver])
 
 
-def run(options: argparse.Namespace) -> int:
-    """Run the process until Ctrl-C; return its exit status."""
+def run(options: argparse.Namespace) -> Outcome:
+    """Run the process until Ctrl-C; its exit status is that of the command."""
     process = pipeline_process(options.words)
     try:
         from finforce.ros.composition import main
     except ImportError as error:
         raise MissingDependencyError(f"the pipeline needs ROS 2: pip install 'finforce[ros]' ({error})") from error
-    return main([*process.arguments, "--ros-args"])
+    status = main([*process.arguments, "--ros-args"])
+    return Outcome({"processes": [process.executable]}, status=status)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from finforce.errors import MissingDependencyError
 from finforce.processors import ALL
+from finforce_eval.cli.parser import Outcome
 from finforce_eval.tasks import progress_bar
 
 if TYPE_CHECKING:
@@ -27,13 +28,16 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--calibration", default="", metavar="FILE", help=text)
 
 
-def run(options: argparse.Namespace) -> None:
+def run(options: argparse.Namespace) -> Outcome:
     """Compile and build under a progress bar."""
     count = len(COMPILED) + len(options.jaws)
+    prepared = []
     with progress_bar(count, "part", "preparing") as bar:
         for done in prepare(options.jaws, options.calibration):
+            prepared.append(done)
             bar.update()
             bar.write(done)
+    return Outcome({"prepared": prepared})
 
 
 _MOST = 8  # processes, each of some 300 MB

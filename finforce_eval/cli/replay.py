@@ -6,12 +6,11 @@ import argparse
 import math
 from dataclasses import asdict
 
-from finforce_eval.cli.parser import BAG_HELP, add_json_option, add_run_options
+from finforce_eval.cli.parser import BAG_HELP, Outcome, add_run_options
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.keypoint_source import parse_source
 from finforce_eval.evaluation.setup import make_setup, sides_of
 from finforce_eval.evaluation.tables import evaluation_json, format_tables
-from finforce_eval.machine import write_json
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.replay.replay import Playing, Replay, replay
 
@@ -61,11 +60,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--sim-time", action="store_true", help="keep the stamps and publish /clock")
     parser.add_argument("--domain", type=int, metavar="ID", help="ROS_DOMAIN_ID, for example to watch in RViz (random)")
     parser.add_argument("--params", default="", metavar="FILE", help="YAML file with ROS parameters of the solvers")
-    add_json_option(parser)
     parser.add_argument("--report", metavar="DIR", help="write a page with figures to this folder")
 
 
-def run(options: argparse.Namespace) -> None:
+def run(options: argparse.Namespace) -> Outcome:
     """Play a recording and score it.
 
     Raises:
@@ -83,10 +81,6 @@ def run(options: argparse.Namespace) -> None:
     recording = read_recording(options.bag, keypoints.choice, sides_of(options), strict=keypoints.strict)
     result = replay(recording, setup, calibration_file=calibration, playing=playing, keypoints=keypoints)
     print(format_replay(result))
-    if options.json:
-        score = result.grasp_score
-        grasp = {"grasp": asdict(score.error), "grasp_delay": score.delay}
-        write_json(options.json, evaluation_json(result.evaluation, **grasp, **setup.about))
     if options.report:
         from finforce_eval.figures.report import write_report
 
@@ -98,3 +92,6 @@ def run(options: argparse.Namespace) -> None:
             recordings=[result.recording],
         )
         print(f"Report: {page}")
+    score = result.grasp_score
+    grasp = {"grasp": asdict(score.error), "grasp_delay": score.delay}
+    return Outcome(evaluation_json(result.evaluation, **grasp, **setup.about))

@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from finforce_eval.cli.parser import BAG_HELP, add_json_option, add_run_options
+from finforce_eval.cli.parser import BAG_HELP, Outcome, add_run_options
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.keypoint_source import parse_source
 from finforce_eval.evaluation.setup import make_setup, sides_of
-from finforce_eval.machine import write_figures
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.replay.replay import Playing, play_to_nodes
 
@@ -27,10 +26,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("bag", metavar="BAG", help=BAG_HELP)
     add_run_options(parser, settings=False)
     parser.add_argument("--apart", action="store_true", help="run every stage in its own process")
-    add_json_option(parser)
 
 
-def run(options: argparse.Namespace) -> None:
+def run(options: argparse.Namespace) -> Outcome:
     """Play a recording in real time and print where the time went.
 
     Raises:
@@ -55,8 +53,7 @@ def run(options: argparse.Namespace) -> None:
             lost={name: state["refused"] for name, state in log.health.items() if "refused" in state},
         )
     print(format_trace(trace))
-    if options.json:
-        write_figures(options.json, {"stages": stage_figures(trace), "images": len(trace.images), "lost": trace.lost})
+    return Outcome({"stages": stage_figures(trace), "images": len(trace.images), "lost": trace.lost})
 
 
 WAY = "image out to grasp force in"

@@ -2,6 +2,7 @@
 
 import argparse
 
+from finforce_eval.cli.parser import Outcome
 from finforce_eval.machine import version
 
 
@@ -9,6 +10,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add nothing."""
 
 
-def run(options: argparse.Namespace) -> None:
+def run(options: argparse.Namespace) -> Outcome:
     """Print the version."""
     print(f"finforce {version()}")
+    return Outcome({"version": version()})

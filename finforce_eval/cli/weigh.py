@@ -8,11 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from finforce_eval.calibration.weighing import find_holds, format_weighing, scale_calibration, weigh
-from finforce_eval.cli.parser import BAG_HELP, FORCE_HELP, add_json_option, add_run_options
+from finforce_eval.cli.parser import BAG_HELP, FORCE_HELP, Outcome, add_run_options
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.forces import estimate_forces
 from finforce_eval.evaluation.setup import make_setup, read_keypoints
-from finforce_eval.machine import write_json
 from finforce_eval.tasks import progress_bar
 from finforce_ifea.jaw.calibration import save_calibration
 
@@ -25,11 +24,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     text = "reading of the scale [g] at the end of each hold, in order; without readings, the holds are listed"
     parser.add_argument("--grams", nargs="+", type=float, metavar="G", help=text)
     parser.add_argument("-o", "--output", metavar="FILE", help="calibration file to write; needs --grams")
-    add_json_option(parser)
     parser.add_argument("--force", action="store_true", help=FORCE_HELP)
 
 
-def run(options: argparse.Namespace) -> None:
+def run(options: argparse.Namespace) -> Outcome:
     """Find the holds of a recording, and scale the stiffness by the readings of a scale."""
     if options.output and not options.grams:
         raise OptionError("-o needs --grams: the readings of the scale, one for each hold")
@@ -43,17 +41,16 @@ def run(options: argparse.Namespace) -> None:
         for number, hold in enumerate(holds, 1):
             print(f"hold {number}: {hold.start:.1f} to {hold.end:.1f} s, estimated {hold.force:.3f} N")
         print(f"{len(holds)} holds; give their readings with --grams")
-        return
+        return Outcome({"holds": [vars(hold) for hold in holds]})
     weighing = weigh(holds, options.grams, recording.name)
     print(format_weighing(weighing))
     scaled = scale_calibration(
         weighing, setup.jaw, setup.calibration, solver=setup.settings.solver, force=options.force
     )
-    if options.json:
-        holds = [{**vars(hold), "scale": weight} for hold, weight in zip(holds, weighing.weights.tolist(), strict=True)]
-        found = {"factor": weighing.factor, "factor_stddev": weighing.stddev, "misfit": weighing.misfit, "holds": holds}
-        write_json(options.json, {**found, "calibration": scaled.model_dump(mode="json")})
     if options.output:
         Path(options.output).parent.mkdir(parents=True, exist_ok=True)
         save_calibration(scaled, options.output)
         print(f"Calibration: {options.output}")
+    holds = [{**vars(hold), "scale": weight} for hold, weight in zip(holds, weighing.weights.tolist(), strict=True)]
+    found = {"factor": weighing.factor, "factor_stddev": weighing.stddev, "misfit": weighing.misfit, "holds": holds}
+    return Outcome({**found, "calibration": scaled.model_dump(mode="json")})

@@ -8,7 +8,7 @@ from time import perf_counter
 from typing import Any
 
 from finforce.errors import FinforceError
-from finforce_eval.cli.parser import picture_file
+from finforce_eval.cli.parser import Outcome, picture_file
 from finforce_eval.errors import OptionError
 from finforce_eval.machine import describe_machine, write_figures
 from lab.harness import PARTS, draw_tradeoff, figures_json, format_figures, measure_part, select_parts
@@ -26,14 +26,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--model", metavar="FOLDER", help="network for the part images (the included one)")
     text = f"parts to measure: {', '.join(PARTS)} (those of `make bench`)"
     parser.add_argument("--parts", metavar="A,B", help=text)
-    parser.add_argument("--json", metavar="OUT", help="write the figures as JSON")
     text = "picture of the first part; the name of the part is added for others"
     parser.add_argument("--figure", type=picture_file, metavar="PNG", help=text)
     parser.add_argument("--quick", action="store_true", help="measure fewer cases")
 
 
-def run(options: argparse.Namespace) -> None:
-    """Measure the parts, print each one's tables, write the JSON and the pictures."""
+def run(options: argparse.Namespace) -> Outcome:
+    """Measure the parts, print each one's tables, draw the pictures."""
     given = {name: getattr(options, name) for name in ("folder", "jaw", "minutes", "count", "model")}
     given = {name: value for name, value in given.items() if value is not None}
     machine, content = describe_machine(), {}
@@ -42,9 +41,10 @@ def run(options: argparse.Namespace) -> None:
         if picture and number:
             picture = picture.with_stem(f"{picture.stem}_{part}")
         content[part] = _run_part(part, options.quick, given, picture)
-        if options.json:
+        if options.json:  # what comes next may fail
             write_figures(options.json, content)
     print(f"\n{machine['processor']}, {machine['cores']} cores, Python {machine['python']}, {machine['commit']}")
+    return Outcome(content)
 
 
 def _run_part(part: str, quick: bool, given: dict[str, Any], picture: Path | None) -> dict[str, Any]:

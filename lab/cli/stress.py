@@ -10,9 +10,9 @@ from typing import Any
 
 from tqdm import tqdm
 
-from finforce_eval.cli.parser import MESHES, SOLVERS, whole_number
+from finforce_eval.cli.parser import MESHES, SOLVERS, Outcome, whole_number
 from finforce_eval.errors import OptionError
-from finforce_eval.machine import describe_machine, write_figures
+from finforce_eval.machine import describe_machine
 from lab.stress import inputs, objects
 from lab.stress.stress import (
     AXES,
@@ -49,7 +49,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--solver", default="default", choices=SOLVERS, help="mechanics of the solver")
     parser.add_argument("--mesh", default="default", choices=MESHES, help="mesh density")
     parser.add_argument("--jaw", default="bench", metavar="FILE", help="jaw file, or name of an included jaw (bench)")
-    parser.add_argument("--json", metavar="OUT", help="write the figures as JSON")
 
 
 def choose_families(names: str | None) -> list[Family]:
@@ -103,11 +102,11 @@ def describe_trial(trial: Trial) -> str:
     return f"seed {trial.seed}, {trial.level}: {trial.outcome}, {notes}"
 
 
-def run(options: argparse.Namespace) -> int:
-    """Run the families, print the table, write what was asked for.
+def run(options: argparse.Namespace) -> Outcome:
+    """Run the families, print the table.
 
     Returns:
-        0; 1 when a rule is broken by a family that it is asked of, or by one of its levels.
+        The figures, and status 0; 1 when a rule is broken by a family that it is asked of, or by one of its levels.
     """
     families = choose_families(options.families)
     plan = Plan(seed=options.seed, solver=options.solver, mesh=options.mesh, count=options.count, jaw=options.jaw)
@@ -118,9 +117,8 @@ def run(options: argparse.Namespace) -> int:
     print(format_summaries(summaries))
     broken = {summary["name"]: list_broken(summary, trials[summary["name"]]) for summary in summaries}
     print("\n".join(line for lines in broken.values() for line in lines))
-    if options.json:
-        write_figures(options.json, {"plan": asdict(plan), "families": collect_figures(summaries, trials)})
-    return int(any(broken[family.name] for family in families if family.ruled))
+    status = int(any(broken[family.name] for family in families if family.ruled))
+    return Outcome({"plan": asdict(plan), "families": collect_figures(summaries, trials)}, status=status)
 
 
 def collect_figures(summaries: Sequence[Mapping[str, Any]], trials: Mapping[str, Sequence[Trial]]) -> dict[str, Any]:

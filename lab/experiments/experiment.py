@@ -35,7 +35,7 @@ from finforce_eval.tasks import OK, EngineOptions, Manifest, Task, choose_shard,
 from finforce_ifea.jaw.calibration import load_calibration
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.settings import EstimatorSettings
-from lab.harness import Figures, format_figures
+from lab.harness import Figures, figures_json, format_figures
 from lab.scenes import TwinScene, find_scene
 
 RECORDINGS = "recordings"
@@ -258,10 +258,9 @@ def run_experiment(
         raise FinforceError(f"{experiment.name}: not one of {len(cases)} cases gave figures; the first: "
                             f"{next(iter(failed.values()), 'there are none')}")  # fmt: skip
     findings = experiment.find(options, figures, folder)
-    about = {"experiment": experiment.name, "version": version(), "cases": len(cases), "failed": failed}
-    about["tables"] = {title: rows.to_dict("records") for title, rows in findings.tables.items()}
+    about = {"version": version(), "cases": len(cases), "failed": failed, **figures_json(findings)}
     about["figures"] = {name: _without_drawn(row) for name, row in figures.items()}
-    write_figures(folder / f"{experiment.name}.json", about)
+    write_figures(folder / f"{experiment.name}.json", {experiment.name: about})
     (folder / PAGE).write_text(_write_page(experiment, findings, len(cases), failed), encoding="utf-8")
     return findings
 

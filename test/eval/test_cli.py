@@ -313,7 +313,17 @@ def test_quiet_prints_nothing_wherever_it_stands(capsys):
 @pytest.mark.parametrize("command", COMMANDS)
 def test_the_help_of_every_command_says_what_it_does(command):
     text = build_parser(command).format_help()
-    assert COMMANDS[command][:20] in text and "--quiet" in text
+    assert COMMANDS[command][:20] in text and "--quiet" in text and "--json" in text
+
+
+def test_every_command_writes_what_it_found_and_on_which_machine(tmp_path):
+    for words, name in (
+        (["version"], "version"),
+        (["twin", "list"], "scenes"),
+        (["launch", "robot", "-s"], "arguments"),
+    ):
+        assert main([*words, "--quiet", "--json", str(tmp_path / "found.json")]) == 0
+        assert {"machine", name} == set(json.loads((tmp_path / "found.json").read_text()))
 
 
 def test_the_options_of_evaluate_stand_in_groups_with_examples():

@@ -11,7 +11,7 @@ from finforce_eval.cli.main import main
 from finforce_eval.evaluation.comparison import compare_evaluations, total_change
 from finforce_eval.evaluation.scoring import score_results, true_range
 from finforce_eval.evaluation.tables import evaluation_json
-from finforce_eval.machine import write_json
+from finforce_eval.machine import write_figures
 from finforce_eval.table import write_table
 
 
@@ -124,7 +124,7 @@ def test_the_tables_of_an_evaluation_say_what_its_json_says(tmp_path, capsys):
     (tmp_path / "out").mkdir()
     about = {"about": {"jaw": "fake"}, "true_range_N": true_range(recording)}
     write_table(tmp_path / "out" / "pressed.parquet", [result], about)
-    write_json(tmp_path / "scores.json", evaluation_json(score_results([result], [recording]), jaw="fake"))
+    write_figures(tmp_path / "scores.json", evaluation_json(score_results([result], [recording]), jaw="fake"))
     assert main(["compare", str(tmp_path / "out"), str(tmp_path / "scores.json"), "--strict"]) == 0
     said = capsys.readouterr().out
     assert "1 the same, 0 unsure or in one file only" in said and "->" not in said

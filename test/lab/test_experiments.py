@@ -80,7 +80,7 @@ def test_a_run_that_was_killed_goes_on_where_it_was(tmp_path):
     again = Counting()
     again.carry_out(tmp_path)
     assert again.ran == ["three"]
-    rows = json.loads((tmp_path / "count" / "count.json").read_text())["tables"]["Letters"]
+    rows = json.loads((tmp_path / "count" / "count.json").read_text())["count"]["rows"]["Letters"]
     assert sum(row["letters"] for row in rows) == 11
     assert "It counts." in (tmp_path / "count" / "README.md").read_text()
     nothing = Counting()
@@ -160,7 +160,7 @@ def test_parts_are_put_on_a_page_by_a_run_of_all(tmp_path):
     second.carry_out(tmp_path, shard="2/2")
     whole.carry_out(tmp_path)
     assert (first.ran, second.ran, whole.ran) == (["one", "three"], ["two"], [])
-    rows = json.loads((tmp_path / "count" / "count.json").read_text())["tables"]["Letters"]
+    rows = json.loads((tmp_path / "count" / "count.json").read_text())["count"]["rows"]["Letters"]
     assert sum(row["letters"] for row in rows) == 11
 
 
