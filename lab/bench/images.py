@@ -101,7 +101,7 @@ def sight_columns(stats: Mapping[str, float | None]) -> dict[str, float]:
         "point error median/mm": found["point_median_mm"],
         "point error p95/mm": found["point_p95_mm"],
         "hidden accepted/%": found["hidden_accepted_pct"],
-        "visible accepted/%": 100.0 - found["visible_lost_pct"],
+        "visible lost/%": found["visible_lost_pct"],
     }
 
 

@@ -117,8 +117,10 @@ def run(options: argparse.Namespace) -> Outcome:
     print(format_summaries(summaries))
     broken = {summary["name"]: list_broken(summary, trials[summary["name"]]) for summary in summaries}
     print("\n".join(line for lines in broken.values() for line in lines))
+    content = {"plan": asdict(plan), "tables": {"families": format_summaries(summaries)}}
+    content["families"] = collect_figures(summaries, trials)
     status = int(any(broken[family.name] for family in families if family.ruled))
-    return Outcome({"plan": asdict(plan), "families": collect_figures(summaries, trials)}, status=status)
+    return Outcome(content, status=status)
 
 
 def collect_figures(summaries: Sequence[Mapping[str, Any]], trials: Mapping[str, Sequence[Trial]]) -> dict[str, Any]:

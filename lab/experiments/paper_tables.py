@@ -209,7 +209,7 @@ def _format(cell: Mapping[str, Any] | None) -> str:
     if cell is None:
         return "-"
     if cell["rmse_N"] is None or not np.isfinite(cell["rmse_N"]) or cell["solved_pct"] < LEAST_SOLVED:
-        return "refused"
+        return "rejected"
     return f"{cell['rmse_N']:.2f}" + ("" if cell["solved_pct"] > 99.9 else f", {cell['solved_pct']:.0f} %")
 
 

@@ -179,27 +179,48 @@ def fill_pages(monkeypatch):
     return __import__("fill_pages")
 
 
-def test_page_takes_its_tables_from_the_figures_and_keeps_what_they_do_not_hold(fill_pages, tmp_path):
-    machine = {"commit": "abc", "processor": "P", "cores": 2, "python": "3"}
-    content = {"machine": machine, "solvers": {"tables": {"tiers": "| t |"}}}
-    (tmp_path / "bench.json").write_text(json.dumps(content))
-    texts = fill_pages.read_texts(tmp_path / "bench.json")
-    assert texts["solvers.tables.tiers"] == "| t |" and "abc" in texts["machine.solvers"]
-    block = "x\n<!-- begin {0} -->\nold\n<!-- end {0} -->\n"
-    page = block.format("solvers.tables.tiers") + block.format("nodes")
-    filled = fill_pages.fill(page, texts)
-    assert filled == page.replace("old", "| t |", 1)
-    assert fill_pages.fill(filled, texts) == filled
+MACHINE = {"commit": "abc", "processor": "P", "cores": 2, "python": "3"}
+ROWS = [{"way": "on time", "Hz": 30, "error/N": 0.05}, {"way": "on time", "Hz": 60, "error/N": 0.07}]
+FOUND = {"machine": MACHINE, "chain": {"rows": {"chain": ROWS}, "tables": {"chain": "| t |"}, "axes": [1.0, 2.0]}}
+
+
+def test_a_template_is_filled_with_the_numbers_at_their_places(fill_pages):
+    template = (
+        "{chain.rows.chain.on time.60.error/N|1000*.0f}, {max(chain.rows.*.on time.30.error/N)|}, {chain.axes.1|.1f} N"
+    )
+    places = ["chain.tables.chain", *(match["place"] for match in fill_pages._FIELD.finditer(template))]
+    known = fill_pages.take_figures({"other": {"machine": "", "values": {}}}, FOUND, places)
+    texts = fill_pages.write_texts(known, {"t": template, "unknown": "{chain.axes.0|}"})
+    assert (
+        texts["t"] == "70, 0.05, 2.0 N" and texts["chain.tables.chain"] == "| t |" and "abc" in texts["machine.chain"]
+    )
+    assert "unknown" not in texts and "other" in known
+    page = "x\n<!-- begin {0} -->\nold\n<!-- end {0} -->\n"
+    assert fill_pages.fill(page.format("t") + page.format("nodes"), texts) == page.format("t").replace(
+        "old", texts["t"]
+    ) + page.format("nodes")
+
+
+@pytest.mark.parametrize(
+    "place", ["chain.rows.chain.late.error/N", "chain.row", "mean(chain.rows.chain.on time.90.Hz)"]
+)
+def test_a_file_without_a_number_that_a_page_needs_changes_nothing(fill_pages, place):
+    with pytest.raises(LookupError):
+        fill_pages.take_figures({}, FOUND, [place])
+
+
+def test_every_table_of_the_pages_is_what_the_kept_figures_say(fill_pages):
+    templates = fill_pages.yaml.safe_load(fill_pages.TEMPLATES.read_text(encoding="utf-8"))
+    known = json.loads(fill_pages.FIGURES.read_text(encoding="utf-8"))
+    texts, shown = fill_pages.list_parameters() | fill_pages.write_texts(known, templates), set()
+    for path in fill_pages.PAGES:
+        page = path.read_text(encoding="utf-8")
+        shown |= {match["name"] for match in fill_pages._BLOCK.finditer(page)}
+        assert fill_pages.fill(page, texts) == page, path.name
+    assert templates.keys() <= shown <= texts.keys()
 
 
 def test_page_chooses_the_columns_of_its_tables(fill_pages):
-    page = "<!-- begin t -->\n| tier | error |\n|---|---:|\n| a | 9 |\n<!-- end t -->\n"
-    texts = {"t": "| tier | time | error |\n|---|---:|---:|\n| a | 1 | 2 |\nA note."}
+    page = "<!-- begin a.tables.t -->\n| tier | error |\n|---|---:|\n| a | 9 |\n<!-- end a.tables.t -->\n"
+    texts = {"a.tables.t": "| tier | time | error |\n|---|---:|---:|\n| a | 1 | 2 |\nA note."}
     assert fill_pages.fill(page, texts) == page.replace("| a | 9 |", "| a | 2 |\nA note.")
-
-
-def test_the_parameters_on_the_page_are_those_that_the_nodes_declare(fill_pages):
-    page = (ROOT / "docs" / "interfaces.md").read_text(encoding="utf-8")
-    texts = fill_pages.list_parameters()
-    assert all(f"<!-- begin {name} -->" in page for name in texts)
-    assert fill_pages.fill(page, texts) == page
