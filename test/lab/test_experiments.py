@@ -144,7 +144,7 @@ def test_a_case_that_fails_costs_itself_only_and_is_named(tmp_path, capsys):
     experiment.carry_out(tmp_path)
     assert experiment.ran == ["one", "two"]
     assert "failed: bad: it is bad" in capsys.readouterr().err
-    assert json.loads((tmp_path / "count" / "count.json").read_text())["failed"] == {"bad": "it is bad"}
+    assert json.loads((tmp_path / "count" / "count.json").read_text())["count"]["failed"] == {"bad": "it is bad"}
     assert "2 of 3 cases" in (tmp_path / "count" / "README.md").read_text()
 
 
@@ -393,7 +393,7 @@ def test_the_bench_runs_on_the_recording_in_the_package(tmp_path, capsys):
     bag = str(DATA / "bench_cyl25_middle")
     command = ["experiment", "bench", "--on", bag, "--calibration", "bench", "--report", str(tmp_path)]
     assert main(command) == 0
-    figures = json.loads((tmp_path / "bench" / "bench.json").read_text())
+    figures = json.loads((tmp_path / "bench" / "bench.json").read_text())["bench"]
     assert figures["figures"]["bench_cyl25_middle"]["contacts"]["estimate"]["rmse_N"] < 0.2
     assert "(0.28)" in capsys.readouterr().out
     assert bag not in (tmp_path / "bench" / "README.md").read_text()
