@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from finforce_eval.evaluation.scoring import Evaluation
+from finforce_eval.evaluation.scoring import Evaluation, rms
 from finforce_eval.evaluation.tables import markdown_tables, score_table
 from finforce_eval.recordings.tracks import DIRECTIONS, Recording
 from finforce_eval.table import ForceSeries
@@ -95,7 +95,10 @@ def write_overview(evaluation: Evaluation, folder: str | Path, *, about: Mapping
         lines += _show_pictures(folder, name, _stem(name), PICTURES)
     # names of recordings may hold HTML; none of it is ours
     page.write_text("\n".join(lines).replace("<", "&lt;") + "\n", encoding="utf-8")
-    write_page(evaluation, folder / "report.html", about=about, title=title)
+    names = [f"{_stem(each.name)}_jaw.png" for each in results]
+    names += [f"{_stem(_recording_of(each))}_images.png" for each in results]
+    pictures = [folder / name for name in (*reversed(names), "unity.png") if (folder / name).exists()]
+    write_page(evaluation, folder / "report.html", about=about, title=title, picture=pictures[0])
     return page
 
 
@@ -120,7 +123,9 @@ def _recording_of(result: ForceSeries) -> str:
     return result.name.removesuffix(f"/{result.side}")
 
 
-def write_page(evaluation: Evaluation, path: Path, *, about: Mapping[str, str], title: str) -> Path:
+def write_page(
+    evaluation: Evaluation, path: Path, *, about: Mapping[str, str], title: str, picture: Path | None = None
+) -> Path:
     """Write one HTML page with the scores and plots that zoom; it needs no other file.
 
     Args:
@@ -128,12 +133,13 @@ def write_page(evaluation: Evaluation, path: Path, *, about: Mapping[str, str], 
         path: of the page.
         about: what was run: solver, jaw, contact, ...
         title: heading of the page.
+        picture: PNG file that is shown on top.
 
     Raises:
         OSError: it cannot be written.
     """
     table, results = score_table(evaluation), list(evaluation.results.values())
-    return write_html(results, path, title=title, about=about, columns=table.names, rows=table.rows)
+    return write_html(results, path, title=title, about=about, columns=table.names, rows=table.rows, picture=picture)
 
 
 def _overview(evaluation: Evaluation) -> list[str]:
@@ -191,6 +197,7 @@ def _forget_pictures(folder: Path, name: str, pictures: Mapping[str, str]) -> st
 TEMPLATE = Path(__file__).parents[1] / "data" / "page" / "report.html"
 _PLACE = "@DATA@"
 _MOST_WORDS = 255
+WAITING = "waiting"  # status of an image that the tare still needs
 
 
 def write_html(
@@ -201,6 +208,7 @@ def write_html(
     about: Mapping[str, str],
     columns: Sequence[str] = (),
     rows: Sequence[Sequence[str]] = (),
+    picture: Path | None = None,
 ) -> Path:
     """Write the page.
 
@@ -211,6 +219,7 @@ def write_html(
         about: what was run, name by name.
         columns: of a table above the plots; the first holds names.
         rows: of the table: one for each series, in their order, and any after them; without one, images and answers.
+        picture: PNG file that is shown on top.
 
     Returns:
         The page.
@@ -222,6 +231,8 @@ def write_html(
         columns, rows = _count_answers(series)
     content = {
         "title": title,
+        "headline": describe_series(series),
+        "picture": picture and "data:image/png;base64," + b64encode(picture.read_bytes()).decode(),
         "about": dict(about),
         "columns": list(columns),
         "rows": [list(row) for row in rows],
@@ -232,6 +243,18 @@ def write_html(
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(TEMPLATE.read_text(encoding="utf-8").replace(_PLACE, data), encoding="utf-8")
     return path
+
+
+def describe_series(series: Sequence[ForceSeries]) -> str:
+    """Return in one sentence how far forces are off, or how large they are, and how many images have one."""
+    waited = sum(int((each.column("status") == WAITING).sum()) for each in series)
+    solved = np.concatenate([np.zeros(0), *(each.magnitude[each.solved] for each in series)])
+    errors = np.concatenate([np.zeros(0), *(each.error[each.counted] for each in series if each.has("true_force"))])
+    count = sum(map(len, series))
+    head = f"{solved.max(initial=0.0):.2f} N at most"
+    if errors.size:
+        head = f"{rms(errors):.3f} N RMSE of the force over {errors.size} images, {head}"
+    return f"{head}; {count - waited - solved.size} of {count - waited} images after the tare without an answer"
 
 
 def _count_answers(series: Sequence[ForceSeries]) -> tuple[list[str], list[list[str]]]:
@@ -260,6 +283,7 @@ def _describe(series: ForceSeries) -> dict[str, Any]:
         "name": series.name,
         "images": len(series),
         "lost": int((~series.solved).sum()),
+        "tare": int((series.column("status") == WAITING).sum()),
         "words": words[:_MOST_WORDS].tolist(),
         "status": _encode(np.minimum(status, _MOST_WORDS - 1), np.uint8),
         "phase": _encode(_phase(series), np.uint8),

@@ -14,7 +14,7 @@ from finforce_eval.cli.main import main
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluate import read_evaluations
 from finforce_eval.evaluation.scoring import score_results, true_range
-from finforce_eval.figures.report import write_html, write_page
+from finforce_eval.figures.report import describe_series, write_html, write_page
 from finforce_eval.recordings.writer import write_recording
 from finforce_eval.table import ForceSeries, read_table, write_table
 
@@ -60,7 +60,7 @@ def make_course(name="pressed", count=600, truth=True):
         stamps,
         force=force,
         magnitude_stddev=np.full(count, 0.1),
-        status=np.where(np.isnan(force[:, 0]), "taring", "ok"),
+        status=np.where(np.isnan(force[:, 0]), "waiting", "ok"),
         scored=np.arange(count) % 200 > 150,
         direction=np.where(np.arange(count) > 300, "unload", "load"),
         true_force=np.nan_to_num(force) * 1.1 if truth else None,
@@ -160,6 +160,17 @@ def test_the_page_of_an_evaluation_has_its_scores(browser, tmp_path):
     assert f"{evaluation.total.all.bias_N:.2f}" in page.locator("#table tbody").inner_text()
     assert said == [] and len(asked) == 1
     page.close()
+
+
+def test_the_headline_says_how_far_off_and_leaves_the_tare_out():
+    course = make_course()
+    words, error = describe_series([course]), np.sqrt(np.mean(course.error[course.counted] ** 2))
+    assert words.startswith(f"{error:.3f} N RMSE") and words.endswith(
+        "; 0 of 580 images after the tare without an answer"
+    )
+    course.table.loc[:2, "status"] = "diverged"
+    assert "; 3 of 583 images" in describe_series([course])
+    assert "RMSE" not in describe_series([make_course(truth=False)])
 
 
 def keep(path, recording, result):
