@@ -69,7 +69,7 @@ def _read_start(path: str | Path, most: int) -> bytes:
         with os.fdopen(handle, "rb") as file:
             state = os.fstat(handle)
             if not stat.S_ISREG(state.st_mode):
-                raise FileError("is no plain file")
+                raise FileError("is not a plain file")
             return file.read(min(most, state.st_size + 1))
     except (OSError, ValueError) as error:  # a name with a null byte is a ValueError
         if isinstance(error, FileError):
@@ -100,7 +100,7 @@ def read_text(path: str | Path, largest: int = LARGEST) -> str:
     try:
         return read_bytes(path, largest).decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise FileError(f"is no text in UTF-8: {error.reason} at byte {error.start}") from error
+        raise FileError(f"is not UTF-8 text: {error.reason} at byte {error.start}") from error
 
 
 def read_yaml(path: str | Path, *, text_keys: bool = True) -> Any:
@@ -125,7 +125,7 @@ def parse_yaml(text: str, *, text_keys: bool = True) -> Any:
     except FileError:
         raise
     except (yaml.YAMLError, TypeError, ValueError, OverflowError, RecursionError, AttributeError) as error:
-        raise FileError(f"is no valid YAML: {one_line(error)}") from error
+        raise FileError(f"is not valid YAML: {one_line(error)}") from error
 
 
 def read_json(path: str | Path) -> Any:
@@ -138,7 +138,7 @@ def parse_json(text: str) -> Any:
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise FileError(f"is no valid JSON: {one_line(error)}") from error
+        raise FileError(f"is not valid JSON: {one_line(error)}") from error
 
 
 class _BoundedLoader(yaml.SafeLoader):
@@ -190,7 +190,7 @@ class _BoundedLoader(yaml.SafeLoader):
                 continue
             key = self.construct_object(key_node, deep=True)
             if self.text_keys and not isinstance(key, str):
-                raise FileError(f"the key {str(key)[:40]!r} in the mapping from line {line} on is no text")
+                raise FileError(f"the key {str(key)[:40]!r} in the mapping from line {line} on is not text")
             if isinstance(key, Hashable) and key in keys:
                 raise FileError(f"the key {key!r} stands twice in the mapping from line {line} on")
             if isinstance(key, Hashable):

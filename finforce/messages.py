@@ -150,7 +150,7 @@ def _plan(columns: tuple[tuple[str, np.dtype, tuple[int, ...]], ...]) -> tuple[t
     for name, kind, shape in columns:
         code = _CODES.get(kind.newbyteorder("="))
         if code is None or len(shape) > 1:
-            raise ObservationError(f"column '{name}' of type {kind}, shape (n, *{shape}) is no field")
+            raise ObservationError(f"column '{name}' of type {kind}, shape (n, *{shape}) is not a field")
         count = shape[0] if shape else 1
         fields.append(PointField(name, point_step, code, count))
         point_step += kind.itemsize * count

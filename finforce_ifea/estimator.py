@@ -404,7 +404,7 @@ class KeypointGate:
         self._allowed = np.ones(len(jaw.keypoints), bool)
         for name in filter(None, (part.strip() for part in settings.ignored_keypoints.split(","))):
             if name not in jaw.keypoint_names:
-                raise ObservationError(f"ignored_keypoints: {name!r} is no key point of the jaw {jaw.name!r}")
+                raise ObservationError(f"ignored_keypoints: {name!r} is not a key point of the jaw {jaw.name!r}")
             self._allowed[jaw.keypoint_names.index(name)] = False
         self.reset()
 

@@ -44,7 +44,9 @@ def build_mechanics(jaw: Jaw, settings: EstimatorSettings) -> Mechanics:
         model: JawModel = build_plane_model(jaw, mesh, density)
     elif name == "frame":
         if jaw.drawing is None:
-            raise JawFileError(f"the jaw {jaw.name!r} is no drawing, which a frame needs; expected solver {jaw.model}")
+            raise JawFileError(
+                f"the jaw {jaw.name!r} is not a drawing, which a frame needs; expected solver {jaw.model}"
+            )
         from finforce_ifea.fem.frame import FrameModel
 
         model = FrameModel(jaw.drawing, jaw.material, mesh=mesh)
@@ -71,7 +73,9 @@ def build_plane_model(jaw: Jaw, mesh: VolumeMesh, density: str | None = None) ->
     from finforce_ifea.fem.plane import PlaneModel
 
     if jaw.section is None:
-        raise JawFileError(f"the jaw {jaw.name!r} is no section, which solver plane needs; expected solver {jaw.model}")
+        raise JawFileError(
+            f"the jaw {jaw.name!r} is not a section, which solver plane needs; expected solver {jaw.model}"
+        )
     key = (jaw.digest, jaw.material.poisson_ratio, jaw.section.size)
     if key not in _WIDTH_SHARES:
         coarse = jaw.build_mesh("coarse")

@@ -5,7 +5,7 @@ import sys
 import pytest
 from hypothesis import settings
 
-settings.register_profile("finforce", deadline=None)  # a machine under load is no counterexample
+settings.register_profile("finforce", deadline=None)  # a machine under load is not a counterexample
 settings.load_profile("finforce")
 
 

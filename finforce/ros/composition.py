@@ -46,7 +46,7 @@ def read_part(text: str) -> Part:
     except (ValueError, TypeError):
         pass
     raise ros.ParameterError(
-        f"{text!r} is no part of a pipeline; expected a JSON list: one of {', '.join(CLASSES)}, and its ROS arguments"
+        f"{text!r} is not part of a pipeline; expected a JSON list: one of {', '.join(CLASSES)}, and its ROS arguments"
     )
 
 

@@ -83,7 +83,7 @@ def options_from_words(record: type[OptionsT], words: Sequence[str], without: Se
         name, given, text = word.partition(":=")
         name = former.get(name, name)
         if name not in known:
-            raise ValueError(f"{name!r} is no option: {suggest(name, known)}")
+            raise ValueError(f"{name!r} is not an option: {suggest(name, known)}")
         if not given:
             raise ValueError(f"{word!r}: expected {name}:=VALUE")
         texts[name] = text

@@ -264,7 +264,7 @@ def explain_refusal(path: str, baud_rate: int, error: Exception) -> str:
         return f"{path} is in use by another program: end that first (`fuser -v {path}` names it)"
     if number in (errno.EACCES, errno.EPERM):
         return f"no permission to open {path}: `sudo usermod -aG dialout $USER`, then log in again"
-    return f"{path} is no serial port, or knows no {baud_rate} baud ({error}): ports here: {_name_ports()}"
+    return f"{path} is not a serial port, or knows no {baud_rate} baud ({error}): ports here: {_name_ports()}"
 
 
 def _name_ports() -> str:

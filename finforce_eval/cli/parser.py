@@ -49,7 +49,7 @@ class Parser(argparse.ArgumentParser):
 
     def __init__(self, **given: Any) -> None:
         super().__init__(formatter_class=argparse.RawDescriptionHelpFormatter, **given)
-        self._negative_number_matcher = re.compile(r"-\.?\d")  # a pose that begins with a minus is no option
+        self._negative_number_matcher = re.compile(r"-\.?\d")  # a pose that begins with a minus is not an option
 
     def error(self, message: str) -> NoReturn:
         """Print one line and exit with 2."""

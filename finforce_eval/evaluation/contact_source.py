@@ -280,7 +280,7 @@ def _height(value: str, text: str) -> float:
     except ValueError:
         height = math.nan
     if not math.isfinite(height):
-        raise OptionError(f"--contact {text}: '{value}' is no height in millimetres")
+        raise OptionError(f"--contact {text}: '{value}' is not a height in millimetres")
     if 0.0 < height < METRES:
         raise OptionError(f"--contact {text}: expected millimetres, such as {text.replace(value, f'{1e3 * height:g}')}")
     return height

@@ -288,7 +288,7 @@ def _parse_value(given: str, text: str, default: Any) -> Any:
     try:
         return _SWITCHES[text.lower()] if isinstance(default, bool) else type(default)(text)
     except (KeyError, ValueError):
-        raise OptionError(f"{given}: '{text}' is no {type(default).__name__}") from None
+        raise OptionError(f"{given}: '{text}' is not of type {type(default).__name__}") from None
 
 
 def detect_keypoints(

@@ -288,7 +288,7 @@ def bag_source(path: Path) -> Path:
     if len(files) != 1:
         found = f"no metadata.yaml and {len(files)} bag files: run `ros2 bag reindex` on it; expected one or metadata"
         found = found if files else "no metadata.yaml, .mcap or .db3"
-        raise RecordingError(f"{path.name}: the folder is no recording: {found} in it")
+        raise RecordingError(f"{path.name}: the folder is not a recording: {found} in it")
     return _check_bag(files[0])
 
 

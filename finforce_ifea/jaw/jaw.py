@@ -95,7 +95,7 @@ class Jaw:
             JawFileError: The jaw is no section.
         """
         if self.section is None:
-            raise JawFileError(f"the jaw {self.name!r} is no section; only one has a plane mesh")
+            raise JawFileError(f"the jaw {self.name!r} is not a section; only one has a plane mesh")
         return mesh_section(self.section, _find_share(density))
 
     @cached_property

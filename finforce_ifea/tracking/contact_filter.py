@@ -292,7 +292,7 @@ def update_state(points, average, extended, forecast, expectation, state):
 def _weigh_depth(points, average):
     """Return information on the depth, its weighted innovation, and the pull (3,) of shape and height on it.
 
-    The averaged residuals are taken off as each point's bias; what they have in common along the depth is no bias.
+    The averaged residuals are taken off as each point's bias; what they have in common along the depth is not a bias.
     """
     count = len(points)
     p00, p11, p01 = np.empty(count), np.empty(count), np.empty(count)

@@ -29,18 +29,18 @@ def laughs(levels, width=10):
         ("a: &a [*a]", "refers to what it is itself part of"),
         ("a: &a {b: *a}", "refers to what it is itself part of"),
         ("[" * 1000 + "]" * 1000, "nested more than 50 deep"),
-        ("a: " * 2, "no valid YAML"),
+        ("a: " * 2, "not valid YAML"),
         ("{" * 60, "deep"),
         ("young_modulus: " + "9" * 5000, "5000 digits"),
         ("a: 0x" + "f" * 3000, "digits"),
-        ("date: 2020-13-45", "no valid YAML"),
-        ("1: 2\na: 3", "key '1' in the mapping from line 1 on is no text"),
+        ("date: 2020-13-45", "not valid YAML"),
+        ("1: 2\na: 3", "key '1' in the mapping from line 1 on is not text"),
         ("a: 1\na: 2", "'a' stands twice"),
-        ("? [a, b]\n: 1", "no text"),
-        ("a: !!python/object/apply:os.system [ls]", "no valid YAML"),
-        ("a: [1, 2", "no valid YAML"),
-        ("a: \x00", "no valid YAML"),
-        ("<<: 3\na: 1", "no valid YAML"),
+        ("? [a, b]\n: 1", "not text"),
+        ("a: !!python/object/apply:os.system [ls]", "not valid YAML"),
+        ("a: [1, 2", "not valid YAML"),
+        ("a: \x00", "not valid YAML"),
+        ("<<: 3\na: 1", "not valid YAML"),
     ],
 )
 def test_yaml_that_would_do_harm_is_refused(text, words, tmp_path):
@@ -64,7 +64,12 @@ def test_yaml_that_is_sound_is_read(tmp_path):
 
 @pytest.mark.parametrize(
     ("text", "words"),
-    [("[" * 100_000, "no valid JSON"), ("{", "no valid JSON"), ("1" * 10_000, "no valid JSON"), ("", "no valid JSON")],
+    [
+        ("[" * 100_000, "not valid JSON"),
+        ("{", "not valid JSON"),
+        ("1" * 10_000, "not valid JSON"),
+        ("", "not valid JSON"),
+    ],
 )
 def test_json_that_would_do_harm_is_refused(text, words, tmp_path):
     path = tmp_path / "file.json"
@@ -76,9 +81,9 @@ def test_json_that_would_do_harm_is_refused(text, words, tmp_path):
 def test_what_is_no_plain_file_is_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     for path, words in (
-        (tmp_path / "pipe", "no plain file"),
+        (tmp_path / "pipe", "not a plain file"),
         (tmp_path, "plain file|directory"),
-        ("/dev/zero", "no plain file"),
+        ("/dev/zero", "not a plain file"),
         (tmp_path / "nothing", "No such file"),
         (str(tmp_path / "null\0byte"), "cannot be read"),
     ):
@@ -92,7 +97,7 @@ def test_large_files_and_other_texts_are_refused(tmp_path):
     with pytest.raises(FileError, match="more than 16384 KiB"):
         read_bytes(tmp_path / "large")
     (tmp_path / "binary").write_bytes(b"a: \xff\xfe")
-    with pytest.raises(FileError, match="no text in UTF-8: invalid start byte at byte 3"):
+    with pytest.raises(FileError, match="not UTF-8 text: invalid start byte at byte 3"):
         read_yaml(tmp_path / "binary")
 
 

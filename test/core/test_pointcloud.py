@@ -102,7 +102,7 @@ def test_malformed_cloud_is_refused_with_the_reason(change, message):
 def test_columns_of_different_length_or_unknown_type_are_refused():
     with pytest.raises(ObservationError, match="differ in length"):
         encode_cloud({"x": np.zeros(2), "y": np.zeros(3)})
-    with pytest.raises(ObservationError, match="is no field"):
+    with pytest.raises(ObservationError, match="is not a field"):
         encode_cloud({"x": np.zeros(2, dtype=np.int64)})
 
 

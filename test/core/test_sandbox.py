@@ -36,7 +36,7 @@ def test_whatever_ends_it_costs_one_sentence(function, arguments, words):
 
 
 def test_an_error_of_ours_is_raised_as_it_is():
-    with pytest.raises(FileError, match="is no valid JSON"):
+    with pytest.raises(FileError, match="is not valid JSON"):
         run_limited(parse_json, "{")
 
 

@@ -85,7 +85,7 @@ def test_absent_recording_is_refused(capsys, tmp_path):
 
 
 def test_empty_folder_is_refused(capsys, tmp_path):
-    assert_refused(capsys, ["evaluate", tmp_path], "the folder is no recording")
+    assert_refused(capsys, ["evaluate", tmp_path], "the folder is not a recording")
 
 
 def test_a_recording_of_which_nothing_is_left_is_refused(capsys, bag):

@@ -264,7 +264,7 @@ def test_what_needs_a_clock_is_refused_offline_and_reaches_the_node_of_a_replay(
         ("threads=0", "threads: got 0, expected 1 to 64"),
         ("detector.readout=9", "readout: got 9.0, expected"),
         ("dots.kind=green", "kind: got 'green', expected"),
-        ("threads=many", "'many' is no int"),
+        ("threads=many", "'many' is not of type int"),
         ("treads=2", "unknown parameter; did you mean threads?"),
     ],
 )

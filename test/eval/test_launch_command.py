@@ -43,7 +43,7 @@ def test_with_ros_from_apt_nodes_of_other_packages_are_started_too(monkeypatch):
 @pytest.mark.parametrize(
     ("word", "reason"),
     [
-        ("simm:=true", "'simm' is no option: did you mean sim?"),
+        ("simm:=true", "'simm' is not an option: did you mean sim?"),
         ("sim", "'sim': expected sim:=VALUE"),
         ("contact_height:=40", "contact_height: got 40.0, expected 0 to 0.5 m; 40 mm are 0.04 m"),
         ("dof:=5", "expected one of 6, 7"),

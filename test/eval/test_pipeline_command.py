@@ -30,8 +30,8 @@ def test_one_jaw_at_a_known_height_needs_no_contact_estimator_and_the_driver_com
 @pytest.mark.parametrize(
     ("word", "reason"),
     [
-        ("sim:=true", "'sim' is no option"),
-        ("nothing", "'nothing' is no option"),
+        ("sim:=true", "'sim' is not an option"),
+        ("nothing", "'nothing' is not an option"),
         ("jaws:=three", "jaws: got 'three', expected one of left, right, both"),
         ("images:=perhaps", "expected true or false"),
         ("contact_height:=low", "expected a float"),

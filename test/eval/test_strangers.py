@@ -301,7 +301,7 @@ def test_a_small_table_that_unpacks_to_far_more_than_its_size_is_refused(dataset
         read_parquet(path)
     path.unlink()
     os.mkfifo(path)
-    with pytest.raises(RecordingError, match="is no plain file"):
+    with pytest.raises(RecordingError, match="is not a plain file"):
         read_parquet(path)
 
 

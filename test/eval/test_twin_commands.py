@@ -72,7 +72,7 @@ def test_a_scene_is_recorded_with_its_changes(asked, tmp_path, capsys):
     [
         (["nothing"], "expected one of"),
         (["grasp_cylinder", "--size", "640"], "WIDTHxHEIGHT"),
-        (["grasp_cylinder", "--set", "mass"], "is no float"),
+        (["grasp_cylinder", "--set", "mass"], "is not of type float"),
         (["grasp_cylinder", "--set", "colour=red"], "unknown number"),
         (["grasp_cylinder", "--set", "closing_speed=9"], "closing_speed"),
         (["grasp_cylinder", "--camera", "moon"], "moon"),

@@ -119,13 +119,13 @@ def test_a_misspelt_key_gets_a_suggestion_before_the_right_one_is_missed(tmp_pat
         ("# nothing\n", "is empty"),
         ("- 1\n- 2\n", "got a list .*, expected a mapping of name"),
         ("finger", "got the text 'finger', expected a mapping of name"),
-        ("a: [1, 2\nb: 3", "is no valid YAML"),
+        ("a: [1, 2\nb: 3", "is not valid YAML"),
         ("a: 1\na: 2\n", "'a' stands twice"),
         ("m: {b: 1, b: 2}\n", "'b' stands twice"),
-        ("when: 2024-99-99\n", "is no valid YAML"),
+        ("when: 2024-99-99\n", "is not valid YAML"),
         ("[" * 5000, "is nested more than 50 deep"),
-        ("? [1, 2]\n: 3\n", "is no valid YAML"),
-        ("a: !!python/object/apply:os.system ['true']\n", "is no valid YAML"),
+        ("? [1, 2]\n: 3\n", "is not valid YAML"),
+        ("a: !!python/object/apply:os.system ['true']\n", "is not valid YAML"),
     ],
 )
 def test_what_is_no_mapping_is_refused(tmp_path, text, words):
@@ -136,7 +136,7 @@ def test_what_is_no_mapping_is_refused(tmp_path, text, words):
 def test_a_binary_file_is_refused(tmp_path):
     path = tmp_path / "finger.yaml"
     path.write_bytes(b"\x89PNG\xff\xfe\x00")
-    with pytest.raises(JawFileError, match="is no text in UTF-8"):
+    with pytest.raises(JawFileError, match="is not UTF-8 text"):
         load_jaw(path)
 
 

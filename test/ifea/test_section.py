@@ -188,7 +188,9 @@ def test_tapered_finger_has_its_volume_and_its_plane_model_the_solid_s_force(tmp
 
 
 def test_plane_model_of_a_drawing_is_refused():
-    with pytest.raises(JawFileError, match="the jaw 'bench' is no section, which solver plane needs; expected solver"):
+    with pytest.raises(
+        JawFileError, match="the jaw 'bench' is not a section, which solver plane needs; expected solver"
+    ):
         build_mechanics(load_jaw("bench"), EstimatorSettings(solver="plane"))
 
 
