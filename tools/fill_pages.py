@@ -38,7 +38,7 @@ _REDUCE = {"mean": mean, "median": median, "min": min, "max": max, "sum": sum}
 
 
 def find_values(node: Any, place: Sequence[str]) -> Iterator[Any]:
-    """Yield what nested figures hold at a place: keys, which may have `*`, numbers in lists, or texts of records.
+    """Yield what nested figures hold at a place: keys, which may have `*`, entries of lists, or texts of records.
 
     Raises:
         LookupError: a key is not there, or no record has the text.
@@ -48,6 +48,9 @@ def find_values(node: Any, place: Sequence[str]) -> Iterator[Any]:
     elif isinstance(node, Mapping):
         for name in matching(node, place[0]) if "*" in place[0] else [place[0]]:
             yield from find_values(node[name], place[1:])
+    elif place[0] == "*":
+        for entry in node:
+            yield from find_values(entry, place[1:])
     elif place[0].isdigit() and not isinstance(node[0], Mapping):
         yield from find_values(node[int(place[0])], place[1:])
     elif chosen := [record for record in node if place[0] in map(str, record.values())]:

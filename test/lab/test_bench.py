@@ -186,13 +186,13 @@ FOUND = {"machine": MACHINE, "chain": {"rows": {"chain": ROWS}, "tables": {"chai
 
 def test_a_template_is_filled_with_the_numbers_at_their_places(fill_pages):
     template = (
-        "{chain.rows.chain.on time.60.error/N|1000*.0f}, {max(chain.rows.*.on time.30.error/N)|}, {chain.axes.1|.1f} N"
+        "{chain.rows.chain.on time.60.error/N|1000*.0f}, {max(chain.rows.*.on time.*.error/N)|}, {chain.axes.1|.1f} N"
     )
     places = ["chain.tables.chain", *(match["place"] for match in fill_pages._FIELD.finditer(template))]
     known = fill_pages.take_figures({"other": {"machine": "", "values": {}}}, FOUND, places)
     texts = fill_pages.write_texts(known, {"t": template, "unknown": "{chain.axes.0|}"})
     assert (
-        texts["t"] == "70, 0.05, 2.0 N" and texts["chain.tables.chain"] == "| t |" and "abc" in texts["machine.chain"]
+        texts["t"] == "70, 0.07, 2.0 N" and texts["chain.tables.chain"] == "| t |" and "abc" in texts["machine.chain"]
     )
     assert "unknown" not in texts and "other" in known
     page = "x\n<!-- begin {0} -->\nold\n<!-- end {0} -->\n"
