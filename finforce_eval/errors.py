@@ -14,6 +14,10 @@ class DamagedError(RecordingError):
     """A recording breaks off, or part of it is no longer what was written."""
 
 
+class SilentReplayError(RecordingError):
+    """The nodes gave no force for a recording that was played to them."""
+
+
 class OutOfBoundsError(RecordingError):
     """A recording would take more memory or time than one of its size does."""
 

@@ -13,7 +13,7 @@ from finforce.camera_topics import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 from finforce.health import IDLE
 from finforce.ros.tracing import FOLDER
 from finforce.systems.processes import Process, ReplayOptions, compose, replay_processes
-from finforce_eval.errors import RecordingError
+from finforce_eval.errors import RecordingError, SilentReplayError
 from finforce_eval.evaluation.contact_source import FIXED, ContactChoice
 from finforce_eval.evaluation.forces import check_keypoint_count, truth_sides
 from finforce_eval.evaluation.gripper import with_distances
@@ -256,13 +256,13 @@ def _score(recording: Recording, setup: EvaluationSetup, log: ReplayLog) -> Eval
     """Score the wrenches of every jaw with ground truth.
 
     Raises:
-        RecordingError: there are none.
+        SilentReplayError: there are none.
     """
     results = []
     sides = truth_sides(recording)
     for side in sides:
         if not any("force" in row for row in log.rows[side].values()):
-            raise RecordingError(f"{recording.name}: no wrench came on {side}/wrench: {_words(log, side)}")
+            raise SilentReplayError(f"{recording.name}: no wrench came on {side}/wrench: {_words(log, side)}")
         estimator = setup.side(side).estimator()
         threshold = setup.settings.likelihood_threshold
         result = live_result(recording, side, log, likelihood_threshold=threshold, estimator=estimator)

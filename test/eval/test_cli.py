@@ -11,7 +11,10 @@ import numpy as np
 import pytest
 from eval_fakes import FakeEstimator, make_recording
 
+from finforce_eval.cli import replay
 from finforce_eval.cli.main import COMMANDS, build_parser, main, parse
+from finforce_eval.cli.parser import Outcome
+from finforce_eval.errors import SilentReplayError
 from finforce_eval.recordings.writer import write_entries, write_recording
 
 BENCH_KEYPOINTS = 15
@@ -324,6 +327,20 @@ def test_every_command_writes_what_it_found_and_on_which_machine(tmp_path):
     ):
         assert main([*words, "--quiet", "--json", str(tmp_path / "found.json")]) == 0
         assert {"machine", name} == set(json.loads((tmp_path / "found.json").read_text()))
+
+
+def test_the_demo_of_a_busy_machine_is_played_once_more_and_slower(monkeypatch, capsys):
+    rates = []
+
+    def play(options):
+        rates.append(options.rate)
+        if len(rates) < 2:
+            raise SilentReplayError("no wrench came")
+        return Outcome({"rate": options.rate})
+
+    monkeypatch.setattr(replay, "run", play)
+    assert main(["demo", "--from", "keypoints", "--rate", "2"]) == 0
+    assert rates == [2.0, 0.5] and "Once more at 0.5 x real time" in capsys.readouterr().out
 
 
 def test_the_options_of_evaluate_stand_in_groups_with_examples():
