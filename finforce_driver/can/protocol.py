@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import IntEnum, IntFlag
+from enum import IntEnum
 from threading import Lock
 from time import monotonic
 from typing import Any
@@ -166,7 +166,7 @@ class Command(IntEnum):
     CALIBRATE = 62
 
 
-class Flag(IntFlag):
+class Flag(IntEnum):
     """Bits of the last byte of a move."""
 
     ACTIVATE = 0x80

@@ -4,6 +4,7 @@ import ast
 import math
 import re
 from dataclasses import fields
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -266,6 +267,14 @@ def test_every_value_of_a_configuration_has_its_unit_or_reason_beside_it(path):
     assert all(lines[n].split("#")[0].strip() in known or "#" in lines[n - 1] for n in values)
 
 
+@cache
+def attributes(place):
+    """The names of all attributes in a file, or in the files of a folder."""
+    paths = [place] if place.is_file() else place.rglob("*.py")
+    trees = [ast.parse(path.read_text(encoding="utf-8")) for path in paths]
+    return {node.attr for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
+
+
 @pytest.mark.parametrize(
     ("record", "folder"),
     [
@@ -282,10 +291,7 @@ def test_every_value_of_a_configuration_has_its_unit_or_reason_beside_it(path):
     ],
 )
 def test_every_field_is_read(record, folder):
-    read = set()
-    for path in (*(ROOT / folder).rglob("*.py"), ROOT / "finforce" / "settings.py"):
-        tree = ast.parse(path.read_text(encoding="utf-8"))
-        read |= {node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
+    read = attributes(ROOT / folder) | attributes(ROOT / "finforce" / "settings.py")
     assert {entry.name for entry in fields(record)} <= read
 
 

@@ -5,6 +5,7 @@ import configparser
 import re
 import sys
 import xml.etree.ElementTree as ElementTree
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 
@@ -37,6 +38,7 @@ def manifest():
     return ElementTree.parse(ROOT / "package.xml").getroot()
 
 
+@cache
 def imported(path):
     """The top names of what a file imports; optional libraries by their adapters' calls."""
     names = set()

@@ -51,4 +51,4 @@ def test_a_driver_that_believes_every_reply_is_found_out(monkeypatch):
 
 def test_a_driver_that_does_not_get_back_into_step_is_found_out(monkeypatch):
     monkeypatch.setattr(Exchange, "in_step", True)
-    assert any(FaultRun(seed, 60, (FaultKind.LATE,)).run().wrong for seed in range(3))
+    assert FaultRun(7, 40, (FaultKind.LATE,)).run().wrong

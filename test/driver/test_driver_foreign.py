@@ -10,7 +10,7 @@ from finforce_sim.emulator.firmware import Fault
 
 
 def test_what_the_driver_did_not_order_never_becomes_a_wrong_state_or_a_crushed_object():
-    found, by_event, wrong, _, peak = run_many(20)
+    found, by_event, wrong, _, peak = run_many(12)
     assert (dict(found), dict(by_event), wrong) == ({}, {}, [])
     assert peak < 8.0
 

@@ -11,7 +11,11 @@ from finforce_eval.recordings.tracks import JawTrack, KeypointTrack, PoseTrack, 
 from finforce_ifea.errors import ContactError
 from finforce_ifea.jaw.section import FaceLine
 from finforce_ifea.observation import Contact
+from lab.scenes import GRASP
 from lab.stress.stress import Family, Trial, attempt
+
+# a grasp of three seconds, of which both jaws touch the rod in one
+QUICK_GRASP = replace(GRASP, changes={"settle": 0.1, "record": 0.4, "closing_speed": 0.04, "clearance": 0.004})
 
 PERIOD = 33_333_333
 START = 1_000_000_000_000

@@ -9,12 +9,13 @@ import pytest
 pytest.importorskip("av")
 parquet = pytest.importorskip("pyarrow.parquet")
 
+from eval_fakes import QUICK_GRASP  # noqa: E402
 from lerobot_fakes import CAMERA, write_dataset  # noqa: E402
 
 from finforce_eval.cli.main import main  # noqa: E402
 from finforce_eval.recordings.recording import read_recording  # noqa: E402
 from lab.bench.chain import true_grasp  # noqa: E402
-from lab.scenes import GRASP, find_scene  # noqa: E402
+from lab.scenes import find_scene  # noqa: E402
 
 VERSIONS = ("v2.1", "v3.0")
 HEIGHT = 41.7  # mm, of the rod
@@ -23,7 +24,7 @@ HEIGHT = 41.7  # mm, of the rod
 @pytest.fixture(scope="module")
 def scene():
     """A rendered grasp of a rod: the recording and its pictures."""
-    recording = read_recording(find_scene(GRASP))
+    recording = read_recording(find_scene(QUICK_GRASP))
     return recording, [item.image.color for item in recording.images.colors_alone()]
 
 
@@ -145,21 +146,34 @@ def test_statistics_are_of_the_frames_that_have_a_force(version, annotated):
             assert found[kind] == pytest.approx([getattr(grasp, kind)()], rel=1e-4)
 
 
-def test_a_dataset_that_has_forces_is_refused_but_for_other_names(annotated, scene, tmp_path, capsys):
-    assert annotate(tmp_path, annotated / "v2.1", scene) == 2
+FROM_THE_FIRST = ("--set", "automatic_tare=no")  # a force in every image
+
+
+@pytest.fixture(scope="module")
+def small(scene, tmp_path_factory):
+    """Two episodes of a few images."""
+    folder = tmp_path_factory.mktemp("small") / "small"
+    write_dataset(folder, [scene[1][:3], scene[1][:5]], "v2.1")
+    return folder
+
+
+def test_a_dataset_that_has_forces_is_refused_but_for_other_names(small, scene, tmp_path, capsys):
+    assert annotate(tmp_path / "once", small, scene, *FROM_THE_FIRST) == 0
+    assert annotate(tmp_path / "again", tmp_path / "once" / "small", scene, *FROM_THE_FIRST) == 2
     assert "already; expected another --prefix" in capsys.readouterr().err
-    assert not (tmp_path / "v2.1").exists()
-    assert annotate(tmp_path, annotated / "v2.1", scene, "--prefix", "observation.finforce") == 0
-    row = rows_of(tmp_path / "v2.1")[-1]
+    assert not (tmp_path / "again" / "small").exists()
+    words = (*FROM_THE_FIRST, "--prefix", "observation.finforce")
+    assert annotate(tmp_path / "again", tmp_path / "once" / "small", scene, *words) == 0
+    row = rows_of(tmp_path / "again" / "small")[-1]
     assert row["observation.finforce.grasp_force"] == row["observation.grasp_force"]
 
 
 @pytest.fixture
-def broken(datasets, tmp_path):
-    return shutil.copytree(datasets / "v2.1", tmp_path / "broken")
+def broken(small, tmp_path):
+    return shutil.copytree(small, tmp_path / "broken")
 
 
-def test_a_missing_video_is_named_and_nothing_is_written_until_it_is_there(broken, datasets, scene, tmp_path, capsys):
+def test_a_missing_video_is_named_and_nothing_is_written_until_it_is_there(broken, scene, tmp_path, capsys):
     video = next((broken / "videos").rglob("episode_000001.mp4"))
     content = video.read_bytes()
     video.unlink()
@@ -168,13 +182,13 @@ def test_a_missing_video_is_named_and_nothing_is_written_until_it_is_there(broke
     assert "1 of 4 files cannot be read; videos/" in said and "episode_000001.mp4" in said
     assert not (tmp_path / "out" / "broken").exists()
     video.write_bytes(content)
-    assert annotate(tmp_path / "out", broken, scene) == 0
+    assert annotate(tmp_path / "out", broken, scene, *FROM_THE_FIRST) == 0
     assert rows_of(tmp_path / "out" / "broken")
 
 
 def lengthen(folder):
     path = folder / "meta/episodes.jsonl"
-    path.write_text(path.read_text().replace('"length": 30', '"length": 31'))
+    path.write_text(path.read_text().replace('"length": 3', '"length": 4'))
     info = json.loads((folder / "meta/info.json").read_text())
     (folder / "meta/info.json").write_text(json.dumps(info | {"total_frames": info["total_frames"] + 1}))
 
@@ -195,7 +209,7 @@ def cut_video(folder):
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
-        (lengthen, "30 pictures; expected 31"),
+        (lengthen, "3 pictures; expected 4"),
         (change_info(total_frames=7), "expected the 7 of"),
         (change_info(codebase_version="v1.6"), "layout v1.6; expected v2.0, v2.1, v3.0"),
         (change_info(fps=0), "expected features, fps"),
@@ -213,10 +227,10 @@ def test_a_dataset_that_does_not_fit_itself_is_refused(damage, words, broken, sc
     assert not (tmp_path / "out" / "broken").exists()
 
 
-def test_a_camera_has_to_be_described_and_chosen(datasets, scene, tmp_path, capsys):
-    assert main(["annotate", str(datasets / "v2.1"), "--out", str(tmp_path)]) == 2
+def test_a_camera_has_to_be_described_and_chosen(small, scene, tmp_path, capsys):
+    assert main(["annotate", str(small), "--out", str(tmp_path)]) == 2
     assert "--intrinsics" in capsys.readouterr().err
-    assert annotate(tmp_path, datasets / "v2.1", scene, "--images", "observation.images.front") == 2
+    assert annotate(tmp_path, small, scene, "--images", "observation.images.front") == 2
     assert CAMERA in capsys.readouterr().err
 
 

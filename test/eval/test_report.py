@@ -36,11 +36,12 @@ def test_report_shows_every_picture_it_names_and_names_every_picture(tmp_path):
     assert "- solver: fake" in page.read_text()
 
 
-def test_exact_estimate_still_draws(tmp_path):
-    result, recording = evaluate("exact", gain=1.0)
+def test_exact_estimate_still_draws_and_html_in_the_name_of_a_recording_stays_text(tmp_path):
+    result, recording = evaluate("<img src=x onerror=alert(1)>", gain=1.0)
     page = write_report(score_results([result], [recording]), tmp_path, keypoint_names="abcd", about={})
     assert "0.000" in page.read_text() or "0.00 " in page.read_text()
     assert drawn_hues(next(tmp_path.glob("*force*.png")))
+    assert "&lt;img" in page.read_text() and "<" not in page.read_text()
 
 
 def test_outline_of_a_box_from_the_side_is_its_rectangle():
@@ -58,9 +59,3 @@ def test_matplotlib_is_loaded_only_for_a_report():
         "assert report and forces and 'matplotlib' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
-
-
-def test_html_in_the_name_of_a_recording_stays_text(tmp_path):
-    result, recording = evaluate("<img src=x onerror=alert(1)>")
-    page = write_report(score_results([result], [recording]), tmp_path, keypoint_names="abcd", about={})
-    assert "&lt;img" in page.read_text() and "<" not in page.read_text()

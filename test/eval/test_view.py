@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from eval_fakes import QUICK_GRASP
 
 if find_spec("rerun") is None:
     pytest.skip("the viewer needs rerun-sdk", allow_module_level=True)
@@ -13,13 +14,13 @@ from finforce_eval.cli import view
 from finforce_eval.cli.main import main
 from finforce_eval.evaluation.forces import estimate_forces
 from finforce_eval.recordings.recording import DEMO, read_recording
-from lab.scenes import GRASP, find_scene
+from lab.scenes import find_scene
 
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     """A rendered grasp in Rerun: recording, and the rows of each entity."""
-    source = find_scene(GRASP)
+    source = find_scene(QUICK_GRASP)
     file = tmp_path_factory.mktemp("view") / "grasp.rrd"
     shapes, found = {"left": [], "right": []}, {}
 
@@ -72,8 +73,9 @@ def test_jaws_bend_and_forces_are_those_that_were_found(scene):
         assert np.isnan(expected[:40]).all() and np.nanmax(expected) > 2.0
         _, meshes = column(rows[f"/jaws/{side}/surface"], "vertex_positions")
         assert len(meshes) == len(shapes[side])
-        np.testing.assert_allclose(meshes[-40], shapes[side][-40], atol=1e-7)
-        moved = np.abs(np.asarray(meshes[100]) - np.asarray(meshes[10])).max()
+        pressed = int(np.nanargmax(expected))
+        np.testing.assert_allclose(meshes[pressed], shapes[side][pressed], atol=1e-7)
+        moved = np.abs(np.asarray(meshes[pressed]) - np.asarray(meshes[10])).max()
         assert moved > 1e-3
 
 
@@ -82,7 +84,7 @@ def test_an_arrow_stands_where_something_presses_and_only_there(scene):
     _, values = column(rows["/forces/left"], "scalars")
     pressed = np.nan_to_num([value[0] for value in values]) > 0.0
     times, _ = column(rows["/jaws/left/force/arrow"], "vectors")
-    assert len(times) == pressed.sum() > 20
+    assert len(times) == pressed.sum() > 10
 
 
 def test_another_ending_or_a_folder_that_is_none_is_refused(tmp_path, capsys):

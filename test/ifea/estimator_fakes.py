@@ -47,6 +47,10 @@ class Recording:
             observations[i] = replace(observations[i], points=points, likelihood=likelihood)
         return replace(self, observations=observations)
 
+    def first(self, count):
+        """The first frames alone."""
+        return replace(self, observations=self.observations[:count], forces=self.forces[:count])
+
 
 def true_course(depths, diameter, height):
     """Key points (n, K, 3) [m] and forces (n, 3) [N] at depths (n,) [m] of a cylinder [mm] at a height [mm]."""

@@ -34,8 +34,9 @@ from finforce_ifea.relaxation import RelaxationTerm, apply_relaxation
 # --- accuracy
 
 
-@pytest.mark.parametrize("solver", MODELS)
-@pytest.mark.parametrize(("height", "bound"), [(20, 0.15), (40, 0.05), (60, 0.05)])
+@pytest.mark.parametrize(
+    ("solver", "height", "bound"), [("frame", 20, 0.15), ("frame", 40, 0.05), ("frame", 60, 0.05), ("solid", 20, 0.15)]
+)
 def test_force_is_that_of_the_independent_program(height, bound, solver):
     """Camera noise of the bench, 25 mm; bounds in N of up to 3.8, 1.7 and 1.9, measured 0.12, 0.03, 0.03."""
     recording = pressed(height)
@@ -46,11 +47,10 @@ def test_force_is_that_of_the_independent_program(height, bound, solver):
     assert np.isfinite(found[loaded]).all()
 
 
-@pytest.mark.parametrize("solver", MODELS)
 @pytest.mark.parametrize(("diameter", "bound"), [(15, 0.12), (35, 0.22)])
-def test_size_of_the_object_need_not_be_known(diameter, bound, solver):
+def test_size_of_the_object_need_not_be_known(diameter, bound):
     recording = pressed(20, diameter=diameter)
-    found = errors(recording, solved(20, solver, diameter=diameter))
+    found = errors(recording, solved(20, diameter=diameter))
     # measured 0.07 and 0.17 N of up to 3.5 and 4.1
     assert rms(found[loaded_frames(recording)]) < bound
 
@@ -95,7 +95,7 @@ def test_standard_deviation_is_honest():
     """Errors are about as large as announced: over heights and seeds, their ratio has a root mean square near one."""
     ratios = []
     for height in (20, 40, 60):
-        for seed in range(3):
+        for seed in range(2):
             recording, solutions = pressed(height, seed=seed), sliding(height, seed=seed)
             announced = np.array([solution.magnitude_stddev for solution in solutions])
             ratios.append((errors(recording, solutions) / announced)[loaded_frames(recording)])
@@ -116,10 +116,15 @@ def test_standard_deviation_grows_with_the_noise_and_with_hidden_points():
 # --- determinism and symmetry
 
 
+@cache
+def begun(solver):
+    """The solutions of the first 130 images of a press."""
+    return run(pressed().first(130), solver=solver)
+
+
 @pytest.mark.parametrize("solver", [*MODELS, "paper"])
 def test_two_runs_are_identical_to_the_bit(solver):
-    recording = replace(pressed(), observations=pressed().observations[:110])
-    assert_identical(run(recording, solver=solver), run(recording, solver=solver))
+    assert_identical(run(pressed().first(90), solver=solver), begun(solver)[:90])
 
 
 def test_reset_forgets_everything():
@@ -128,7 +133,7 @@ def test_reset_forgets_everything():
     expected = run(pressed(), make_estimator(solver="frame", calibration=relaxing))
     estimator = make_estimator(solver="frame", calibration=relaxing)
     before = pressed(20, seed=2).changed(range(170, 200), lambda _, likelihood: likelihood.put([3, 4], 0.1))
-    run(replace(before, observations=before.observations[:200]), estimator)
+    run(before.first(200), estimator)
     estimator.reset()
     assert not estimator.tared
     assert_identical(run(pressed(), estimator), expected)
@@ -143,9 +148,9 @@ def test_warm_up_leaves_no_trace():
 @pytest.mark.parametrize("solver", MODELS)
 def test_mirrored_jaw_gives_the_mirrored_force(solver):
     mirror, right = np.array([1.0, -1.0, 1.0]), BENCH.mirrored()
-    recording, estimator = pressed(20), make_estimator(right, solver=solver)
-    contact = Contact.fixed(right, 0.020)
-    for observation, left in zip(recording.observations, solved(20, solver), strict=True):
+    recording, estimator = pressed().first(130), make_estimator(right, solver=solver)
+    contact = Contact.fixed(right, 0.040)
+    for observation, left in zip(recording.observations, begun(solver), strict=True):
         found = estimator.update(replace(observation, points=observation.points * mirror), contact)
         np.testing.assert_allclose(found.force, left.force * mirror, atol=1e-8)
         np.testing.assert_allclose(found.torque, -left.torque * mirror, atol=1e-9)
@@ -172,9 +177,7 @@ def test_force_does_not_depend_on_where_the_jaw_lies_along_its_width():
 
 @pytest.mark.parametrize("solver", ["default", "solid", "frame", "paper"])
 def test_trusted_solutions_are_complete(solver):
-    recording = pressed()
-    recording = replace(recording, observations=recording.observations[:130])
-    solutions = run(recording, solver=solver)
+    recording, solutions = pressed().first(130), begun(solver)
     assert {"waiting", "ok"} <= statuses(solutions)
     for observation, solution in zip(recording.observations, solutions, strict=True):
         assert solution.stamp == observation.stamp
@@ -202,8 +205,7 @@ def check_loaded(solution):
 
 def test_paper_setting_shows_the_locking_of_its_elements():
     """Linear tetrahedra at the true modulus give several times the force: the reason for another element."""
-    recording = replace(pressed(), observations=pressed().observations[:110], forces=pressed().forces[:110])
-    found = magnitudes(run(recording, solver="paper"))[95:110] / np.linalg.norm(recording.forces[95:110], axis=1)
+    found = magnitudes(begun("paper"))[95:110] / np.linalg.norm(pressed().forces[95:110], axis=1)
     # its stiffness at the middle is 7.7 times that of hexahedra, less what its energy weight takes
     assert 4.0 < found.mean() < 9.0
 

@@ -18,7 +18,7 @@ from lab.stress.session import Bench, judge, open_session, update
 from lab.stress.stress import Plan, run_family, summarise_family
 
 # Families whose answers are right within what they state, with as many trials as there is time for; see docs/stress.md.
-SHORT = {"subsets": 8, "noise": 8, "gross": 4, "clusters": 4, "jumps": 4, "stamps": 6, "model": 3, "right": 4}
+SHORT = ("subsets", "noise", "gross", "clusters", "jumps", "stamps", "model", "right")
 
 
 @cache
@@ -43,13 +43,13 @@ def play(steps):
 @pytest.mark.parametrize("name", SHORT)
 def test_family_breaks_no_rule(name):
     family = replace(FAMILIES[name], timed=False)
-    summary = summarise_family(family, run_family(family, Plan(solver="frame", count=SHORT[name], seed=1)))
+    summary = summarise_family(family, run_family(family, Plan(solver="frame", count=3, seed=1)))
     assert summary["broken"] == [] and summary["n"] > 0
 
 
 def test_forces_of_a_long_run_do_not_drift():
     family = replace(FAMILIES["long"], timed=False)
-    trials = run_family(family, Plan(solver="frame", count=1500))
+    trials = run_family(family, Plan(solver="frame", count=600))
     assert summarise_family(family, trials)["broken"] == []
     assert "memory" in trials[-1].note
 
