@@ -17,7 +17,7 @@ from finforce_keypoints.images import ImageWatch, PixelDetector
 from finforce_keypoints.networks.metadata import build_name_map, parse_mapping
 from finforce_keypoints.networks.model import KeypointModel
 from finforce_keypoints.networks.side_network import COARSE, SideNetwork
-from finforce_keypoints.parameters import ALIGNED, DetectorParameters, DetectorSettings, find_mounts
+from finforce_keypoints.parameters import ALIGNED, DetectorParameters, DetectorSettings, JawMount, find_mounts
 
 MODELS = Path(__file__).parent / "models"
 ANY_FINGER, BENCH = MODELS / "side_plane", MODELS / "plane"
@@ -49,7 +49,8 @@ def build_detector(
     settings = settings or DetectorSettings()
     if parameters.depth != ALIGNED:
         settings = replace(settings, plane_depth=True)
-    pixel_detector = build_pixel_detector(jaws, parameters, settings, dots)
+    mounts = find_mounts(parameters, jaws)
+    pixel_detector = build_pixel_detector(jaws, parameters, settings, dots, mounts)
     return KeypointDetector(
         pixel_detector,
         jaws,
@@ -57,12 +58,16 @@ def build_detector(
         settings,
         ImageWatch() if watched else None,
         rests,
-        find_mounts(parameters, jaws),
+        mounts,
     )
 
 
 def build_pixel_detector(
-    jaws: Mapping[str, Jaw], parameters: DetectorParameters, settings: DetectorSettings, dots: DotSettings | None = None
+    jaws: Mapping[str, Jaw],
+    parameters: DetectorParameters,
+    settings: DetectorSettings,
+    dots: DotSettings | None = None,
+    mounts: Mapping[str, JawMount] | None = None,
 ) -> PixelDetector:
     """Return what finds the pixels of key points; see `build_detector`."""
     opening = OpeningRange(nearest=settings.opening_min, farthest=settings.opening_max)
@@ -76,7 +81,7 @@ def build_pixel_detector(
         locator: AnyFinger | OneFinger = AnyFinger(SideNetwork(folder, threads=parameters.threads), jaws)
     else:
         locator = OneFinger(KeypointModel(folder, threads=parameters.threads), jaws)
-    return SidePlaneDetector(locator, jaws, parameters.camera_pose, opening, find_mounts(parameters, jaws))
+    return SidePlaneDetector(locator, jaws, parameters.camera_pose, opening, mounts or find_mounts(parameters, jaws))
 
 
 def choose_network(jaws: Mapping[str, Jaw]) -> Path:

@@ -21,7 +21,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--body", type=int, metavar="N", help="number of the body, from 1")
     parser.add_argument("--width", type=length_mm, metavar="MM", help="width along y [mm], for drawings")
     parser.add_argument("--material", default="tpu95a", choices=tuple(MATERIALS), help="material (tpu95a)")
-    parser.add_argument("--clamp", type=length_mm, metavar="MM", help="height below which the finger is clamped [mm]")
+    parser.add_argument(
+        "--clamp",
+        type=length_mm,
+        metavar="MM",
+        help="height of the clamp at the inner face, parallel to a tilted base [mm]",
+    )
     parser.add_argument("--face-x", type=length_mm, metavar="MM", help="x of the inner face in the jaw frame [mm]")
     parser.add_argument(
         "--flip", action=argparse.BooleanOptionalAction, help="the wider end is, or is not, the tip; if about as wide"

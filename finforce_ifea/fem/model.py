@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.linalg.lapack import dpbtrf, dpbtrs
@@ -26,22 +27,130 @@ class BandedFactor:
         return dpbtrs(self._factor, b, lower=1)[0].reshape(b.shape)
 
 
-class SparseFactor:
-    """LU factor of any regular symmetric matrix, for wide bands and for states beyond a buckling point.
+class SparsePlan:
+    """Where the entries of L and D are in the factors L D L^T of all symmetric matrices with one pattern.
 
     Args:
-        matrix: (n, n).
-        ordered: whether its unknowns are numbered by `order_unknowns`.
+        pointer: where each column of the upper triangle begins (n + 1,).
+        index: the rows of its entries, rising, the diagonal's last (k,).
     """
 
-    def __init__(self, matrix: sparse.csc_matrix, *, ordered: bool = False) -> None:
-        self._matrix, self._ordered = matrix, ordered
-        self._lu = _factorise_sparse(matrix, 0.1, ordered)
+    def __init__(self, pointer: NDArray, index: NDArray) -> None:
+        self._pattern = pointer, index
+        first = np.concatenate([[0], np.cumsum(_find_rows(pointer, index, pointer, np.zeros(0, np.int64)))])
+        rows = np.zeros(first[-1], np.int64)
+        _find_rows(pointer, index, first, rows)
+        lower = sparse.csr_matrix((np.ones(len(rows)), rows, first), (len(first) - 1,) * 2)
+        lower.sort_indices()
+        columns = lower.tocsc()
+        self.rows, self.columns = (lower.indptr, lower.indices), (columns.indptr, columns.indices)
+
+    def factorise(self, upper: NDArray) -> "DiagonalFactor | None":
+        """Factorise a matrix by its upper entries (k,); return None where that loses digits without exchanging rows.
+
+        Positive definite ones never do.
+        """
+        pointer, index = self._pattern
+        values, pivots = np.empty(len(self.rows[1])), np.empty(len(pointer) - 1)
+        _eliminate(pointer, index, upper, *self.rows, *self.columns, values, pivots)
+        factor = DiagonalFactor(self, values, pivots)
+        is_exact = factor.positive or np.abs(values).max(initial=0.0) < _LARGEST_GROWTH
+        return factor if is_exact else None
+
+
+class DiagonalFactor:
+    """Factors L D L^T of a sparse symmetric matrix."""
+
+    def __init__(self, plan: SparsePlan, values: NDArray, pivots: NDArray) -> None:
+        self._parts = (*plan.columns, values, pivots)
+        self.positive = bool((pivots > 0.0).all())
+
+    def solve(self, b: NDArray) -> NDArray:
+        """Return K^-1 b for b of shape (n,) or (n, k)."""
+        x = np.array(b, float, order="C").reshape(len(b), -1)
+        _substitute(*self._parts, x)
+        return x.reshape(b.shape)
+
+
+# Entries of L up to which an indefinite matrix keeps half of its digits.
+_LARGEST_GROWTH = 1e8
+_OPTIONS = {"cache": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}}
+
+
+@njit(**_OPTIONS)
+def _find_rows(pointer, index, first, rows):
+    """Write the columns of the entries of L, row by row from `first` (n + 1,) on; return how many each row has (n,).
+
+    Source: Davis, Direct Methods for Sparse Linear Systems (2006), chapter 4.1. Nothing is written to `rows` of no
+    length.
+    """
+    n = len(pointer) - 1
+    parent, mark, count = np.full(n, -1), np.full(n, -1), np.zeros(n, np.int64)
+    for k in range(n):
+        mark[k] = k
+        for p in range(pointer[k], pointer[k + 1]):
+            i = index[p]
+            while mark[i] != k:
+                if parent[i] < 0:
+                    parent[i] = k
+                if len(rows):
+                    rows[first[k] + count[k]] = i
+                count[k] += 1
+                mark[i] = k
+                i = parent[i]
+    return count
+
+
+@njit(**_OPTIONS)
+def _eliminate(pointer, index, data, row_pointer, row_index, first, rows, values, pivots):
+    """Write L's values (k,) by columns, and 1 / D (n,), row by row."""
+    n = len(pivots)
+    row, end = np.zeros(n), first[:n].copy()
+    for k in range(n):
+        for p in range(pointer[k], pointer[k + 1]):
+            row[index[p]] = data[p]
+        pivot, row[k] = row[k], 0.0
+        for q in range(row_pointer[k], row_pointer[k + 1]):
+            i = row_index[q]
+            value, row[i] = row[i], 0.0
+            for p in range(first[i], end[i]):
+                row[rows[p]] -= values[p] * value
+            values[end[i]] = value * pivots[i]
+            pivot -= values[end[i]] * value
+            end[i] += 1
+        pivots[k] = 1.0 / pivot
+
+
+@njit(**_OPTIONS)
+def _substitute(first, rows, values, pivots, x):
+    """Replace x (n, k) by (L D L^T)^-1 x."""
+    n, columns = x.shape
+    for i in range(n):
+        here = x[i]
+        for p in range(first[i], first[i + 1]):
+            there, value = x[rows[p]], values[p]
+            for c in range(columns):
+                there[c] -= value * here[c]
+    for i in range(n - 1, -1, -1):
+        here = x[i]
+        for c in range(columns):
+            here[c] *= pivots[i]
+        for p in range(first[i], first[i + 1]):
+            there, value = x[rows[p]], values[p]
+            for c in range(columns):
+                here[c] -= value * there[c]
+
+
+class SparseFactor:
+    """LU factor of any regular symmetric matrix (n, n)."""
+
+    def __init__(self, matrix: sparse.csc_matrix) -> None:
+        self._matrix, self._lu = matrix, _factorise_sparse(matrix, 0.1)
 
     @property
     def positive(self) -> bool:
         """Whether the matrix is positive definite: elimination along the diagonal meets positive pivots alone."""
-        plain = _factorise_sparse(self._matrix, 0.0, self._ordered)
+        plain = _factorise_sparse(self._matrix, 0.0)
         return bool((plain.perm_r == plain.perm_c).all() and (plain.U.diagonal() > 0.0).all())
 
     def solve(self, b: NDArray) -> NDArray:
@@ -49,20 +158,17 @@ class SparseFactor:
         return self._lu.solve(np.asarray(b))
 
 
-Factor = BandedFactor | SparseFactor  # of a symmetric matrix; `positive` when the state that it belongs to is stable
+# of a symmetric matrix; `positive` when the state that it belongs to is stable
+Factor = BandedFactor | DiagonalFactor | SparseFactor
 
 
-def _factorise_sparse(matrix: sparse.csc_matrix, pivoting: float, ordered: bool) -> SuperLU:
+def _factorise_sparse(matrix: sparse.csc_matrix, pivoting: float) -> SuperLU:
     """Return the LU factors; above zero, `pivoting` is the share of a column's largest entry that a pivot needs."""
-    # the fill is small and so are supernodes: panels of more than one column only cost
-    order = {"permc_spec": "NATURAL", "panel_size": 1} if ordered else {"permc_spec": "MMD_AT_PLUS_A"}
-    return splu(matrix, diag_pivot_thresh=pivoting, options={"SymmetricMode": True}, **order)
+    return splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=pivoting, options={"SymmetricMode": True})
 
 
 def order_unknowns(row: NDArray, col: NDArray, size: int) -> NDArray:
     """Return the place of each unknown (size,) in the order of minimum degree, in which factors have little fill.
-
-    To find it takes as long as a factorisation, and depends on the matrix' pattern alone.
 
     Args:
         row: of entries of the symmetric matrix, either triangle or both (k,).
@@ -72,7 +178,7 @@ def order_unknowns(row: NDArray, col: NDArray, size: int) -> NDArray:
     pattern = sparse.coo_matrix((np.ones(len(row)), (row, col)), (size, size)).tocsc()
     pattern = pattern + pattern.T
     pattern += 2.0 * abs(pattern).sum() * sparse.eye(size)  # positive definite, so that nothing is pivoted
-    return _factorise_sparse(pattern.tocsc(), 0.0, ordered=False).perm_c
+    return _factorise_sparse(pattern.tocsc(), 0.0).perm_c
 
 
 def factorise_banded(storage: NDArray) -> BandedFactor | None:

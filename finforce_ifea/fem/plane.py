@@ -107,7 +107,11 @@ def _differentiate(corners: NDArray) -> tuple[NDArray, NDArray]:
 
 @njit(cache=True, error_model="numpy")
 def _add_triangles(u, elements, gradients, volumes, lame, shear, with_tangent, force, K):
-    """Add nodal forces (n, 3) and fill stiffnesses K (t, 18, 18); return energy [J] and the smallest det F."""
+    """Add nodal forces (n, 3) and fill lower blocks of stiffnesses K (t, 18, 18).
+
+    Returns:
+        Energy [J] and the smallest det F.
+    """
     energy, smallest = 0.0, 1e300
     a = np.empty((6, 2))
     for e in range(len(elements)):
@@ -138,7 +142,7 @@ def _add_triangles(u, elements, gradients, volumes, lame, shear, with_tangent, f
             f_xx, f_xz, f_zz = xx * xx + xz * xz, xx * zx + xz * zz, zx * zx + zz * zz
             for i in range(6):
                 sx, sz = s_xx * g[i, 0] + s_xz * g[i, 1], s_xz * g[i, 0] + s_zz * g[i, 1]
-                for j in range(6):
+                for j in range(i + 1):
                     along = weight * (sx * g[j, 0] + sz * g[j, 1])
                     turn = weight * shear * (g[i, 0] * g[j, 0] + g[i, 1] * g[j, 1])
                     K[e, 3 * i, 3 * j] += along + k * a[i, 0] * a[j, 0] + m * a[j, 0] * a[i, 0] + turn * f_xx

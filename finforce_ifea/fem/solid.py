@@ -24,6 +24,7 @@ from finforce_ifea.fem.model import (
     Factor,
     Linearization,
     SparseFactor,
+    SparsePlan,
     factorise_banded,
     order_unknowns,
     sparse_from_banded,
@@ -116,12 +117,12 @@ class SolidModel:
             return
         self.dof = np.append(order_unknowns(high, low, self.size), self.size)[self.dof]
         source, high, low = self._find_entries()
-        # both triangles, column by column: the pattern stays, only values change
-        keys = np.concatenate([low * self.size + high, (high * self.size + low)[high > low]])
-        self._keys, self._slot = np.unique(keys, return_inverse=True)
-        self._source = np.concatenate([source, source[high > low]])
-        self._pointer = np.searchsorted(self._keys // self.size, np.arange(self.size + 1))
-        self._index = self._keys % self.size
+        # the upper triangle, column by column: the pattern stays, only values change
+        keys, self._slot = np.unique(high * self.size + low, return_inverse=True)
+        self._source = source
+        self._pointer = np.searchsorted(keys // self.size, np.arange(self.size + 1))
+        self._index = keys % self.size
+        self._plan = SparsePlan(self._pointer, self._index)
 
     def _find_entries(self) -> tuple[NDArray, NDArray, NDArray]:
         """Return the lower entries of all element matrices: where they are stored there, and their two unknowns."""
@@ -151,23 +152,24 @@ class SolidModel:
         stored = self._assemble() if tangent else None
         return Linearization(force=force, energy=energy, smallest_det=smallest, tangent=stored)
 
-    def _assemble(self) -> NDArray | sparse.csc_matrix:
+    def _assemble(self) -> NDArray:
         if not self.banded:
-            values = np.bincount(self._slot, self._Ke.ravel()[self._source], len(self._keys))
-            return sparse.csc_matrix((values, self._index, self._pointer), (self.size, self.size), copy=False)
+            return np.bincount(self._slot, self._Ke.ravel()[self._source], len(self._index))
         storage = np.zeros((self.bandwidth + 1, self.size), order="F")
         _scatter_lower(self._Ke.ravel(), self._source, self._row, self._col, storage)
         return storage
 
-    def factorise(self, tangent: NDArray | sparse.csc_matrix) -> Factor:
-        """Factorise a stored tangent; Cholesky, or LU where the state is not stable or the band is wide."""
-        if not self.banded:
-            return SparseFactor(tangent, ordered=True)
-        return factorise_banded(tangent) or SparseFactor(sparse_from_banded(tangent))
+    def factorise(self, tangent: NDArray) -> Factor:
+        """Factorise a stored tangent; Cholesky or alike, or LU where the state is not stable."""
+        factor = factorise_banded(tangent) if self.banded else self._plan.factorise(tangent)
+        return factor or SparseFactor(self.sparse_tangent(tangent))
 
-    def sparse_tangent(self, tangent: NDArray | sparse.csc_matrix) -> sparse.csc_matrix:
+    def sparse_tangent(self, tangent: NDArray) -> sparse.csc_matrix:
         """Return a stored tangent as the full symmetric matrix (size, size) [N/m]."""
-        return sparse_from_banded(tangent) if self.banded else tangent
+        if self.banded:
+            return sparse_from_banded(tangent)
+        upper = sparse.csc_matrix((tangent, self._index, self._pointer), (self.size, self.size))
+        return (upper + sparse.triu(upper, 1).T).tocsc()
 
     def attach(self, points: NDArray, max_distance: float = 1e-3) -> _Probe:
         """Return a probe of material points (p, 3) [m, undeformed]; raises MeshError when one is off the jaw."""
@@ -191,16 +193,14 @@ class SolidModel:
         """Return the generalised load (size,) [N] of forces (p, 3) [N] at a probe's points."""
         return forces.ravel() @ probe.matrix
 
-    def stiffen(self, tangent: NDArray | sparse.csc_matrix, probe: _Probe, q: NDArray, blocks: NDArray) -> None:
+    def stiffen(self, tangent: NDArray, probe: _Probe, q: NDArray, blocks: NDArray) -> None:
         """Add springs blocks (p, 3, 3) [N/m] at a probe's points to a stored tangent, in place."""
         matrix = probe.matrix
         if self.banded:
             _add_banded_springs(matrix.indptr, matrix.indices, matrix.data, blocks, tangent)
             return
-        springs = sparse.bsr_matrix((blocks, np.arange(len(blocks)), np.arange(len(blocks) + 1)))
-        added = (matrix.T @ springs @ matrix).tocoo()
-        added.eliminate_zeros()
-        tangent.data[np.searchsorted(self._keys, added.col * self.size + added.row)] += added.data
+        where = self._pointer, self._index
+        _add_sparse_springs(matrix.indptr, matrix.indices, matrix.data, blocks, *where, tangent)
 
 
 def _order_nodes(elements: NDArray) -> NDArray:
@@ -457,3 +457,19 @@ def _add_banded_springs(start, column, weight, blocks, storage):
                     for j in range(start[3 * p + b], start[3 * p + b + 1]):
                         if column[j] <= column[i]:
                             storage[column[i] - column[j], column[j]] += weight[i] * blocks[p, a, b] * weight[j]
+
+
+@njit(cache=True, error_model="numpy")
+def _add_sparse_springs(start, column, weight, blocks, pointer, index, values):
+    """Add the springs of points, see `_add_banded_springs`, to the upper triangle's values (k,), by columns."""
+    for p in range(len(blocks)):
+        for a in range(3):
+            for b in range(3):
+                if blocks[p, a, b] == 0.0:
+                    continue
+                for i in range(start[3 * p + a], start[3 * p + a + 1]):
+                    first, last = pointer[column[i]], pointer[column[i] + 1]
+                    for j in range(start[3 * p + b], start[3 * p + b + 1]):
+                        if column[j] <= column[i]:
+                            place = first + np.searchsorted(index[first:last], column[j])
+                            values[place] += weight[i] * blocks[p, a, b] * weight[j]

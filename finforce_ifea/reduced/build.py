@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
+from scipy.interpolate import CubicHermiteSpline
 from scipy.linalg import eigh
 from scipy.sparse.linalg import splu
 
@@ -41,6 +42,7 @@ class Face:
         sides = np.stack([np.interp(heights, surface.heights, y) for y in columns], axis=1)
         points = np.array([[face.read(z), y, z] for z, row in zip(heights, sides, strict=True) for y in row])
         self._probe, self._across, self._count = self._model.attach(points, 1e-3), surface.across, len(heights)
+        self._loads: NDArray | None = None
         self._share = None if has_own_rows(mechanics) else self._share_nodes(mechanics, heights)
         self.basis = np.zeros((self._model.size, 0))
 
@@ -116,12 +118,16 @@ class Face:
 
     def _unit_loads(self, q: NDArray) -> NDArray:
         """Return the loads (size, 2 n) of unit forces along x and z at each row."""
+        if self._loads is not None:
+            return self._loads
         columns = np.zeros((len(q), 2 * self._count))
         for row in range(self._count):
             for number, axis in enumerate((0, 2)):
                 forces = np.zeros((self._count * self._across, 3))
                 forces[row * self._across : (row + 1) * self._across, axis] = 1.0 / self._across
                 columns[:, 2 * row + number] = self._model.load(self._probe, q, forces)
+        if isinstance(self._model, SolidModel):  # whose loads do not depend on its state
+            self._loads = columns
         return columns
 
 
@@ -143,9 +149,8 @@ _DENSER = 0.5
 _EARLY = 0.8
 # The rod stops where it needs this many times the force that it needs half way up at full depth.
 _HARDEST = 12.0
-_LONGEST, _SHORTEST = 0.5e-3, 0.02e-3
-# What is not stored need not be as exact.
-_ITERATIONS, _TOLERANCE, _PASSING = 30, 1e-9, 1e-6
+# Shortest step of a depth [m]; iterations to an equilibrium, and its tolerance [m].
+_SHORTEST, _ITERATIONS, _TOLERANCE = 0.02e-3, 30, 1e-9
 # Quarters of a path that are tried next where it cannot be divided.
 _KEPT = 3
 _FEWEST_ROWS, _MOST_ROWS = 12, 84
@@ -234,14 +239,14 @@ def _press_rod(contact: RigidContact, hardest: float, height: float) -> tuple[fl
     Raises:
         ContactError: the jaw cannot be pressed there.
     """
-    rod, divided = _Rod(contact, height), None
+    rod = _Rod(contact, height)
     path = rod.press(hardest)
-    while divided is None:
-        depth = _find_depth(path, hardest)
-        divided = rod.divide(path, depth, DEPTHS)
+    depth = _find_depth(path, hardest)
+    while (divided := rod.divide(path, depth)) is None:
         path = path[: _KEPT * len(path) // 4]
-        if divided is None and not path:
+        if not path:
             raise ContactError(f"the jaw cannot be pressed evenly at a height of {1e3 * height:.1f} mm")
+        depth = path[-1].depth
     return depth, divided
 
 
@@ -250,10 +255,14 @@ def _find_depth(path: list[_Equilibrium], hardest: float) -> float:
 
     Depths that change smoothly with height make equilibria that do.
     """
-    forces = [0.0, *(float(np.linalg.norm(item.state.force)) for item in path[-2:])]
-    if len(path) < 2 or not forces[-2] < hardest < forces[-1]:
+    if len(path) < 2:
         return path[-1].depth
-    return float(np.interp(hardest, forces[-2:], [item.depth for item in path[-2:]]))
+    forces = np.array([item.state.force for item in path[-2:]])
+    sizes, depths = np.linalg.norm(forces, axis=1), [item.depth for item in path[-2:]]
+    if not sizes[0] < hardest < sizes[1]:
+        return depths[1]
+    slopes = [item.state.force_modes[:, 0] for item in path[-2:]]
+    return float(CubicHermiteSpline(sizes, depths, sizes / np.einsum("ij,ij->i", forces, slopes))(hardest))
 
 
 def _choose_rows(mechanics: Mechanics) -> NDArray:
@@ -290,6 +299,12 @@ def has_own_rows(mechanics: Mechanics) -> bool:
     return bool(gaps.min() > _CLOSEST * gaps.mean() and len(own) <= _MOST_ROWS)
 
 
+def _divide(largest: float) -> NDArray:
+    """Return the depths (T - 1,) [m] up to the largest at which equilibria are stored, denser at the beginning."""
+    share = np.arange(1, DEPTHS + 1) / DEPTHS
+    return largest * ((1.0 - _EARLY) * share + _EARLY * share**2)
+
+
 class _Rod:
     """A rod at one height, pressed in deeper and deeper."""
 
@@ -302,46 +317,53 @@ class _Rod:
 
     def press(self, hardest: float) -> list[_Equilibrium]:
         """Return equilibria at rising depths below first touch, up to where the jaw gives way or resists."""
-        path, step = [], _LONGEST
-        while not path or path[-1].depth < self._deepest - 1e-9:
-            before = path[-1] if path else None
-            depth = min((before.depth if before else 0.0) + step, self._deepest)
-            found = self._settle(before, depth, _PASSING)
-            if found is None:
-                step *= 0.5
-                if step < _SHORTEST:
-                    break
-                continue
-            path.append(found)
-            if np.linalg.norm(found.state.force) > hardest:
+        path: list[_Equilibrium] = []
+        for depth in _divide(self._deepest):
+            path += self._advance(path[-1] if path else None, depth)
+            if not path or path[-1].depth < depth or np.linalg.norm(path[-1].state.force) > hardest:
                 break
         if not path:
             raise ContactError(f"the jaw cannot be pressed at a height of {1e3 * self._height:.1f} mm")
         return path
 
-    def divide(self, path: list[_Equilibrium], largest: float, count: int) -> list[NDArray] | None:
+    def _advance(self, start: _Equilibrium | None, depth: float) -> list[_Equilibrium]:
+        """Return the equilibria on the way to a depth [m], the last one there unless the jaw gives way."""
+        way: list[_Equilibrium] = []
+        done = start.depth if start else 0.0
+        step = depth - done
+        while done < depth and step > _SHORTEST:
+            found = self._settle(way[-1] if way else start, min(done + step, depth))
+            if found is None:
+                step *= 0.5
+            else:
+                way.append(found)
+                done = found.depth
+        return way
+
+    def divide(self, path: list[_Equilibrium], largest: float) -> list[NDArray] | None:
         """Return the unknowns of equilibria that divide a path up to a depth [m], denser at its beginning.
 
         The unloaded one comes first. None where one is not found: the jaw goes over to another shape there.
         """
         depths = np.array([item.depth for item in path])
         states = [np.zeros(self._contact.model.size)]
-        share = np.arange(1, count + 1) / count
-        for depth in largest * ((1.0 - _EARLY) * share + _EARLY * share**2):
+        for depth in _divide(largest):
             below = int(np.searchsorted(depths, depth + 1e-12)) - 1
-            found = self._settle(path[below] if below >= 0 else None, depth, _TOLERANCE)
+            start = path[below] if below >= 0 else None
+            found = start if start and start.depth > depth - 1e-12 else self._settle(start, depth)
             if found is None:
                 return None
             states.append(found.q)
         return states
 
-    def _settle(self, start: _Equilibrium | None, depth: float, tolerance: float) -> _Equilibrium | None:
-        """Return the equilibrium at a depth [m] of the rod, to a tolerance of the unknowns; or None."""
+    def _settle(self, start: _Equilibrium | None, depth: float) -> _Equilibrium | None:
+        """Return the equilibrium at a depth [m] of the rod, or None."""
         contact, model = self._contact, self._contact.model
         place = np.array([self._touch + depth, np.log(self._radius), self._height])
         q = np.zeros(model.size)
         if start is not None:
-            q = start.q + limit_step(model, start.state.modes[:, 0] * (depth - start.depth))
+            q = start.q + start.state.modes[:, 0] * (depth - start.depth)
+        before = _TOLERANCE
         for _ in range(_ITERATIONS):
             state = contact.linearize(q, place)
             if not state.touches:
@@ -351,8 +373,10 @@ class _Rod:
             q = q + step
             if not (np.isfinite(q).all() and state.smallest_det > 0):
                 return None
-            if np.abs(step).max() < tolerance:
+            size = float(np.abs(step).max())
+            if size * min(size / before, 1.0) < _TOLERANCE:  # the next step is smaller still
                 return _Equilibrium(depth=depth, q=q, state=state)
+            before = size
         return None
 
 

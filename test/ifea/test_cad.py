@@ -142,6 +142,8 @@ def test_a_tilted_base_is_held_from_band_to_band(tmp_path, tilt):
     floor = finger.rings[0][finger.find_clamped(finger.rings[0])]
     assert np.ptp(floor[:, 0]) == pytest.approx(28e-3, abs=1e-3)  # all of the edge, and nothing above the plate
     assert (finger.clamp_height(floor[:, 0]) - floor[:, 1]).max() < 3.5e-3
+    stated = recognize(draw_triangle(tilt, LEVEL), 0.02, Overrides(clamp_z=0.02))
+    assert stated.clamp_height(stated.face_x) == pytest.approx(0.02) and stated.clamp_slope == finger.clamp_slope
     level = recognize(draw_triangle(0.0, LEVEL), 0.02, Overrides())
     assert level.clamp_slope == 0.0
 

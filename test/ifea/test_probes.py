@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 from mechanics_fakes import BENCH, EDGE, TPU, bench_mechanics, block, unknowns_from_displacements, wobble
+from scipy import sparse
 
-from finforce_ifea.fem.model import SparseFactor, order_unknowns
+from finforce_ifea.fem.model import SparseFactor, SparsePlan, order_unknowns
 from finforce_ifea.fem.solid import SolidModel
 
 
@@ -24,8 +25,8 @@ def test_banded_and_sparse_factorisations_agree(pressed):
     tangent = model.linearize(q).tangent
     b = np.random.default_rng(0).normal(size=(model.size, 3))
     banded = model.factorise(tangent).solve(b)
-    sparse = SparseFactor(model.sparse_tangent(tangent)).solve(b)
-    np.testing.assert_allclose(banded, sparse, atol=1e-8 * np.abs(sparse).max())
+    other = SparseFactor(model.sparse_tangent(tangent)).solve(b)
+    np.testing.assert_allclose(banded, other, atol=1e-8 * np.abs(other).max())
     np.testing.assert_allclose(model.factorise(tangent).solve(b[:, 1]), banded[:, 1], atol=1e-12 * np.abs(banded).max())
 
 
@@ -37,18 +38,39 @@ def test_factor_solves_with_the_tangent(pressed, wide):
         assert np.abs(left).max() < 1e-7
 
 
+def count_fill(matrix):
+    """Entries of L below its diagonal when a matrix is factorised in the order of its unknowns."""
+    upper = sparse.triu(matrix).tocsc()
+    upper.sort_indices()
+    return len(SparsePlan(upper.indptr, upper.indices).rows[1])
+
+
 def test_unknowns_are_numbered_for_little_fill_once_and_for_all(wide):
-    tangent = wide.linearize(np.zeros(wide.size)).tangent
-    numbered = SparseFactor(tangent, ordered=True)
+    tangent = wide.sparse_tangent(wide.linearize(np.zeros(wide.size)).tangent)
+    fill = len(wide._plan.rows[1])
     # as little as an order found for this very matrix; by rows and columns of the block it is more
-    assert numbered._lu.L.nnz <= 1.02 * SparseFactor(tangent)._lu.L.nnz
+    assert fill <= 1.02 * SparseFactor(tangent)._lu.L.nnz
     points = np.lexsort(wide.mesh.nodes.T)
     dof = wide.dof[points].ravel()
     rows = np.unique(dof[dof < wide.size], return_index=True)[1]
     by_rows = dof[dof < wide.size][np.sort(rows)]
-    assert SparseFactor(tangent[by_rows][:, by_rows].tocsc(), ordered=True)._lu.L.nnz > 1.3 * numbered._lu.L.nnz
+    assert count_fill(tangent[by_rows][:, by_rows]) > 1.3 * fill
     place = order_unknowns(*tangent.nonzero(), wide.size)
     assert sorted(place) == list(range(wide.size))
+
+
+@pytest.mark.parametrize(("last", "positive"), [(2.0, True), (-1.0, False), (1e-12, None)])
+def test_sparse_elimination_tells_stable_states_and_leaves_those_without_pivots(last, positive):
+    """Of [[last, 1], [1, 0]] elimination along the diagonal divides by `last`; of positive definite ones it may."""
+    matrix = np.array([[last, 0.5], [0.5, 2.0 if positive else 0.0]])
+    pointer, index = np.array([0, 1, 3]), np.array([0, 0, 1])
+    factor = SparsePlan(pointer, index).factorise(matrix[[0, 0, 1], [0, 1, 1]])
+    if positive is None:
+        assert factor is None
+        return
+    assert factor.positive == positive == bool(np.linalg.eigvalsh(matrix)[0] > 0.0)
+    np.testing.assert_allclose(matrix @ factor.solve(np.eye(2)), np.eye(2), atol=1e-12)
+    np.testing.assert_allclose(factor.solve(np.array([1.0, 2.0])), np.linalg.solve(matrix, [1.0, 2.0]), atol=1e-12)
 
 
 def test_tangent_beyond_a_buckling_point_is_still_factorised(pressed):

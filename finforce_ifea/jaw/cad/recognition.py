@@ -468,8 +468,10 @@ def _propose_clamp(
     height_of = bolts[:, 1] - slope * bolts[:, 0]
     is_base = height_of <= tops.min()
     circles = bolts[~is_base] * [1.0, 1.0, _WASHER]
+    off = f", along its base, {np.degrees(np.arctan(slope)):.0f} degrees off the face's normal" if slope else ""
     if overrides.clamp_z is not None:
-        notes.append(f"clamped below z = {1e3 * overrides.clamp_z:.4g} mm, as given")
+        at = " at the inner face" if slope else ""
+        notes.append(f"clamped below z = {1e3 * overrides.clamp_z:.4g} mm{at}{off}, as given")
         return overrides.clamp_z, circles[circles[:, 1] > overrides.clamp_z]
     if is_base.any():
         height = float((height_of + _GRIP * bolts[:, 2])[is_base].max())
@@ -480,10 +482,8 @@ def _propose_clamp(
         reason = "the solid base below its first cell"
     height = height if slope or floor > _FLAT else round(2e3 * height) / 2e3
     around = "".join(f", and around the bolt at z = {1e3 * z:.4g} mm" for _, z, _ in circles)
-    tilt = (
-        f" at x = 0, along its base, {np.degrees(np.arctan(slope)):.0f} degrees off the face's normal" if slope else ""
-    )
-    notes.append(f"clamped below z = {1e3 * height:.4g} mm{tilt}, {reason}{around} (--clamp)")
+    at = " at x = 0" if slope else ""
+    notes.append(f"clamped below z = {1e3 * height:.4g} mm{at}{off}, {reason}{around} (--clamp)")
     return height, circles
 
 
