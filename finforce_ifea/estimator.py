@@ -29,7 +29,13 @@ from finforce_ifea.observation import (
 from finforce_ifea.relaxation import Relaxation
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tare import TareKeeper
-from finforce_ifea.tracking.contact_state import UNSEEN_ALONG, ContactState, compute_force, find_rejection_reason
+from finforce_ifea.tracking.contact_state import (
+    BUMPED,
+    UNSEEN_ALONG,
+    ContactState,
+    compute_force,
+    find_rejection_reason,
+)
 from finforce_ifea.tracking.contact_tracker import ContactTracker
 from finforce_ifea.tracking.friction import SMOOTH, Coefficient
 from finforce_ifea.tracking.given_contact import GivenContactTracker
@@ -38,6 +44,8 @@ from finforce_ifea.tracking.lateral_load import measure_torsion
 
 _LONGEST_GAP = 1.0
 _TOLERANCE = 1e-3
+# A detector may repeat the key points of a jaw that stands still, and looks again every 4 s; longer is stale [s].
+_STALE = 5.0
 _UNTARED = "no tare: the jaw was loaded from the start; key point offsets are unknown"
 # Relative standard deviation of forces without a calibration, at least: a material known by name has its own.
 _UNCALIBRATED = 0.1
@@ -103,6 +111,7 @@ class ForceEstimator:
     def reset(self) -> None:
         """Forget everything but the jaw: offsets, place, relaxation, stamps."""
         self._stamp: float | None = None
+        self._seen, self._changed = b"", 0.0
         self._followed: float | None = None  # stamp of the last image that a tracker took
         self._contact: Contact | None = None
         self._at_rest = self.is_idle = False
@@ -171,6 +180,9 @@ class ForceEstimator:
             self._follow(contact)
         self._contact = contact
         self._stamp = observation.stamp
+        seen = np.asarray(observation.points).tobytes()
+        if seen != self._seen:
+            self._seen, self._changed = seen, self._stamp
         points = self._gate.accept(observation)
         self._taring.add(points, observation.stddev, apart=contact is not None and contact.touching is False)
         used, self.is_idle = np.isfinite(points[:, 0]), False
@@ -178,6 +190,9 @@ class ForceEstimator:
         if count < self.settings.minimum_keypoints:
             seen = f"{count} of {len(used)} key points can be used"
             return self._fail("not_enough_points", seen, used)
+        if self._stamp - self._changed > _STALE and self._taring.is_noisy:
+            stale = f"the same key points to the bit for {self._stamp - self._changed:.0f} s"
+            return self._fail("unobservable", f"{stale}: the camera or the detector hangs", used)
         waiting = self._await_tare()
         if waiting:
             return self._fail("waiting", waiting, used)
@@ -295,6 +310,8 @@ class ForceEstimator:
             return self._fail("diverged", "the shape cannot be reached by the jaw", used, iterations)
         reason = find_rejection_reason(state, settles=self.settings.solver != "paper")
         if reason:
+            if state["bumped"] > BUMPED and self._contact.touching is False:
+                self._taring.note(quiet=True, loaded=False)
             return self._fail("unobservable", reason, used, iterations)
         self._taring.note(quiet=bool(state["quiet"]), loaded=bool(state["loaded"]))
         return self._solution(state, used)

@@ -276,6 +276,11 @@ class TareKeeper:
         return self.tare.is_taken
 
     @property
+    def is_noisy(self) -> bool:
+        """Whether the key points of the tare were those of a camera, whose noise no two images share."""
+        return self.tared and bool(np.trace(self.tare.noise) > 3.0 * (1.01 * _NOISE_FLOOR) ** 2)
+
+    @property
     def missing(self) -> int:
         """Frames still to come before the first tare by itself; 0 when none is due."""
         due = self._open and not self.tared

@@ -51,6 +51,8 @@ CONTACT_STATE = np.dtype(
         ("location_error", float),  # relative standard deviation of the force that the location leaves
         ("stiffening", float),  # force over depth relative to that of first touch
         ("extrapolation", float),  # distance of the shape from the stored ones, as a share of what these are good for
+        ("bumped", float),  # probability that all key points have moved together since the tare
+        ("motion", float),  # of the key points by that [m]
         ("ambiguity", float),  # change of the force by an iteration that did not converge [N]
         ("bearable", float),  # force beyond which no equilibrium is believed [N]
         ("y", float),  # of the pressure along the width [m]
@@ -122,6 +124,8 @@ _FARTHEST_SHAPE = 2.0
 _MAJORITY = 0.5
 # A location that is so surely wrong, and by at least so much [m].
 _MISTAKEN, _LEAST_OFFSET = 0.99, 4e-3
+# A camera that has more probably moved than not.
+BUMPED = 0.5
 
 
 def find_rejection_reason(state: ContactState, *, settles: bool) -> str:
@@ -149,6 +153,14 @@ def find_rejection_reason(state: ContactState, *, settles: bool) -> str:
     if magnitude > state["bearable"]:
         most = f"expected {state['bearable']:.0f} N at most"
         return f"the shape would take {magnitude:.0f} N, {most}; is the contact elsewhere?"
+    return _find_doubt(state, float(magnitude))
+
+
+def _find_doubt(state: ContactState, magnitude: float) -> str:
+    """Return why the force of a contact that fits the key points may still be another one."""
+    if state["bumped"] > BUMPED:
+        motion = f"all key points have moved together by {1e3 * state['motion']:.1f} mm since the tare"
+        return f"{motion}: the camera was bumped (open the jaw and tare), or the contact is elsewhere"
     vague = max(_VAGUE_FORCE, _VAGUE_SHARE * magnitude)
     if state["hidden"] > vague:
         return "the object may press next to the clamp, where no key point shows a force"

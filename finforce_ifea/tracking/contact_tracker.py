@@ -5,7 +5,7 @@ The shape of an unknown object is its radius, that of a known outline its tilt.
 
 from __future__ import annotations
 
-from math import hypot, nan, sqrt
+from math import hypot, log, nan, sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +18,7 @@ from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE
 from finforce_ifea.observation import Contact
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tare import PointNoise, Tare
+from finforce_ifea.tracking.common_motion import CommonMotion
 from finforce_ifea.tracking.contact_search import LOADED_DEPTH, TOUCH_DEPTH, ContactSearch, find_x_model
 from finforce_ifea.tracking.contact_state import (
     MIDDLE_STDDEV,
@@ -39,6 +40,9 @@ _FARTHEST_HEIGHT = 8.0
 _BEYOND_STORED, _BACK = 1.0, 0.8
 # An object is apart from the jaw where its pose says so by this many standard deviations.
 _APART_SIGMAS = 3.0
+# Heights next to the clamp, as shares of the lowest at which key points show a force; objects farther off than this,
+# or deeper in, are surely so [m].
+_NEXT_TO_CLAMP, _WELL_CLEAR = np.array([0.2, 0.4, 0.6, 0.8, 1.0]), 3e-3
 _LEAST_VARIANCE = 1e-12
 # What of the friction the mechanics does not follow, and a traction ratio that is never excluded [-].
 _UNFOLLOWED, _TRACTION = 0.25, 0.08
@@ -102,11 +106,11 @@ class ContactTracker:
         self._is_apart = False
         self.slips = SlipHistory(self._contact)
         self.roughness = FrictionEstimate(settings, smooth)
-        _, pressed = press_lightly(self._contact, np.log(settings.radius), contact_range[0])
-        self._base = contact_range[0], abs(float(pressed.force_modes[0, DEPTH]))
+        self._base = [(height, self._measure_stiffness(height)) for height in contact_range[0] * _NEXT_TO_CLAMP]
         self._lateral = LateralLoad(torsion, len(keypoints), UNSEEN_TRACTION * settings.friction)
         self._held = HeldWeight(self._lateral.half_width)
         self._hold = HoldHypotheses()
+        self._camera = CommonMotion()
         self.reset()
 
     def reset(self, height: float | None = None) -> None:
@@ -229,6 +233,8 @@ class ContactTracker:
         if held is not None and state["converged"] and state["depth"] >= LOADED_DEPTH and not self._jumped:
             self._follow_traction((asked, spread), noise.gain, dt, gravity)
         self._complete(state)
+        expected = self._search.expectation["mean"], prior
+        self._camera.update(self._search.points, self._search.positions, state, expected, tare)
         state["traction_leak"] = state["by_traction"] - state["force_modes"] @ absorbed
         if held is not None:
             motions = (points - tare.offsets - held - self._search.positions)[:, 1]
@@ -370,10 +376,13 @@ class ContactTracker:
         Within the uncertainty of its state, as by rocking, an object that is clear of the base may press there, and one
         that seems to press there may be clear of it.
         """
-        height, stiffness = self._base
+        return 0.0 if self._is_apart else max(self._find_hidden_at(state, *place) for place in self._base)
+
+    def _find_hidden_at(self, state: ContactState, height: float, stiffness: float) -> float:
+        """Return the same at one height [m], where the unloaded jaw has a stiffness [N/m]."""
         x, indenter = state["x"], self._contact.indenter
         clearance = indenter.find_clearance(x, 0.0, height)
-        if self._is_apart or not np.isfinite(clearance):
+        if not abs(clearance) < _WELL_CLEAR:
             return 0.0
         slope, covariance = np.array([-1.0, 0.0, 0.0]), state["covariance"]
         for i in (SHAPE, HEIGHT):
@@ -386,6 +395,11 @@ class ContactTracker:
         row = max(0, int(np.searchsorted(surface.heights, height)) - 1) * surface.across
         clearance -= self._contact.place_points(self.q)[row, 0] - surface.points[row, 0]
         return stiffness * max(0.0, stddev - abs(clearance) / _APART_SIGMAS)
+
+    def _measure_stiffness(self, height: float) -> float:
+        """Return the stiffness of the unloaded jaw at a height [m] against a round object [N/m]."""
+        _, pressed = press_lightly(self._contact, log(self.settings.radius), height)
+        return abs(float(pressed.force_modes[0, DEPTH]))
 
     def _find_lateral(self, normal: float) -> NDArray:
         """Return what acts laterally, see `LateralLoad`; what a lifted object may do there is uncertainty."""

@@ -377,15 +377,6 @@ def bump_camera(shift: float, turn: float) -> Upset:
     return bump
 
 
-def freeze_camera(_session: Session, steps: list[SessionStep]) -> list[SessionStep]:
-    """Show one image for ever while the force falls."""
-    gone = np.linspace(1.0, 0.0, len(steps))
-    return [
-        replace(s, points=steps[0].points.copy(), force=share * s.force, torque=share * s.torque)
-        for s, share in zip(steps, gone, strict=True)
-    ]
-
-
 def let_points_creep(session: Session, steps: list[SessionStep]) -> list[SessionStep]:
     """Let five key points creep, each its own way."""
     creeping = session.random.permutation(len(session.bench.jaw.keypoints))[:CREEPING]
@@ -425,7 +416,6 @@ UPSETS: dict[str, Upset] = {
     "camera moved by 0.5 mm": bump_camera(0.5e-3, 0.0),
     "camera moved by 2 mm": bump_camera(2e-3, 0.0),
     "camera turned by 1 degree": bump_camera(0.0, np.radians(1.0)),
-    "frozen camera": freeze_camera,
     "five points creep": let_points_creep,
     "stated contact walks": let_contact_walk,
     "more than half of the points off together": shift_most,
@@ -485,7 +475,7 @@ FAMILIES = (
     ),
     press_family(
         "upsets",
-        "bumped and frozen cameras, creeping points, walking contacts",
+        "bumped cameras, creeping points, walking contacts",
         lambda _: UPSETS,
         upset_hold,
         rounds=8,

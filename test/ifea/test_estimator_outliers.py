@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from estimator_fakes import (
+    HELD_5,
     MODELS,
     REST,
     STEPS,
@@ -19,6 +20,7 @@ from estimator_fakes import (
     rms,
     run,
     solved,
+    statuses,
 )
 from mechanics_fakes import BENCH
 
@@ -214,3 +216,61 @@ def test_garbage_gives_no_force_and_is_forgotten_at_once(name, given):
     after = errors(recording, solutions)[152:]
     assert np.isfinite(after).all()
     assert np.abs(after).max() < 0.15
+
+
+# --- cameras that move, and that stop
+
+
+def bump(motion):
+    """Moves all key points by a vector [m], or turns them about one through their middle [rad]."""
+    shift, turn = np.array(motion[:3]), np.array(motion[3:])
+
+    def change(points, likelihood):
+        points += shift + np.cross(turn, points - np.nanmean(points, axis=0))
+
+    return change
+
+
+BUMPS = {
+    "1 mm along x": (1e-3, 0, 0, 0, 0, 0),
+    "-1 mm along z": (0, 0, -1e-3, 0, 0, 0),
+    "1 degree": (0,) * 4 + (0.02, 0),
+}
+
+
+@pytest.mark.parametrize("motion", BUMPS.values(), ids=BUMPS)
+@pytest.mark.parametrize("height", [20, 40, 60])
+def test_camera_that_was_bumped_under_load_is_noticed_within_a_third_of_a_second(height, motion):
+    recording = pressed(height)
+    spoilt = recording.changed(range(HELD_5, len(STEPS)), bump(motion))
+    solutions = run(spoilt, solver="frame")[HELD_5 + 10 : HELD_5 + 35]
+    assert statuses(solutions) == {"unobservable"}
+    assert any("all key points have moved together" in solution.message for solution in solutions)
+
+
+@pytest.mark.parametrize("height", [20, 40, 60])
+def test_camera_that_stands_still_is_not_said_to_have_moved(height):
+    assert not any("moved together" in solution.message for solution in solved(height))
+
+
+def test_tare_of_the_opened_jaw_takes_a_bump_up():
+    recording = pressed()
+    spoilt = recording.changed(range(REST - 20, len(STEPS)), bump((1e-3, 0, 0, 0, 0, 0)))
+    estimator, solutions = make_estimator(solver="frame"), []
+    apart = replace(recording.contact, touching=False)
+    for index, observation in enumerate(spoilt.observations):
+        solutions.append(estimator.update(observation, apart if index < REST else recording.contact))
+        if index == REST - 1:
+            assert "tared 15 key points" in estimator.tare()
+    assert "moved together" in solutions[REST - 5].message
+    assert rms(errors(recording, solutions)[REST + 5 :]) < 0.1
+
+
+def test_key_points_that_repeat_to_the_bit_for_seconds_are_not_believed_once_a_camera_was_seen():
+    recording = pressed()
+    still = recording.observations[HELD_5]
+    frozen = [replace(still, stamp=still.stamp + 0.5 * i) for i in range(1, 14)]
+    stopped = replace(recording, observations=recording.observations[: HELD_5 + 1] + frozen)
+    solutions = run(stopped, solver="frame")[HELD_5 + 1 :]
+    assert [solution.status for solution in solutions] == 10 * ["ok"] + 3 * ["unobservable"]
+    assert "to the bit for 6 s" in solutions[-1].message

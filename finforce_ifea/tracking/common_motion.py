@@ -1,0 +1,291 @@
+"""Whether all key points have moved together since the tare, as when the camera was bumped.
+
+A load bends the jaw, and hardly moves what is next to the clamp; a camera that has moved relative to the jaw shifts and
+turns all key points as one. The residuals r_k of an image, with their derivatives J_k by depth, shape and height, and
+the shift and turn b in the plane that moves them by B_k b,
+
+    r_k = J_k y + B_k b + noise,
+
+are fitted robustly (Geman and McClure). A Kalman filter follows b over the images: it drifts slowly, and jumps where an
+image is beyond chance. With b and its covariance P, the camera has stood still or was bumped by Bayes' rule from
+
+    N(b; 0, P + s^2),    s as errors of the mechanics feign a motion, or as large as a bump.
+"""
+
+from math import exp, log
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from finforce_ifea.tare import Tare
+from finforce_ifea.tracking.contact_state import ContactState, measure_along
+
+_OPTIONS = {"cache": True, "error_model": "numpy"}
+# Probability that a camera was bumped since the tare, of which nothing is known.
+_SELDOM = 0.01
+# Motion by a bump, one standard deviation [m]; that which errors of the mechanics feign, and its share of the bending.
+_BUMP, _FEIGNED, _FEIGNED_SHARE = 1e-3, 0.04e-3, 0.02
+_SIZES = (0.25e-3, 0.5e-3, 1e-3, 2e-3)
+# Drift of the motion from image to image [m]; and squared Mahalanobis distance of three numbers beyond chance.
+_DRIFT, _BEYOND = 0.04e-3, 14.2
+# Fewer key points do not tell. Of the depth, which is free, one standard deviation [m].
+_FEWEST, _FREE = 6, 10e-3
+# Squared distance that keeps a quarter of its weight, median of one in two axes; iterations for the noise, and after.
+_GATE, _MEDIAN_SQUARE, _ROUNDS = 9.0, 1.386, 3
+_STATE, _MOTION = 3, 3
+_SIZE = _STATE + _MOTION
+
+_TRACK = np.dtype([("b", float, _MOTION), ("P", float, (_MOTION, _MOTION)), ("change", float, _STATE)], align=True)
+
+
+class CommonMotion:
+    """Follows the motion of one camera."""
+
+    def __init__(self) -> None:
+        """Start with a camera that has not moved."""
+        self._tare: Tare | None = None
+        self._track = np.zeros((), _TRACK)
+
+    def update(
+        self, points: NDArray, positions: NDArray, state: ContactState, expected: tuple[NDArray, NDArray], tare: Tare
+    ) -> None:
+        """Take one image; its state gets what was found, and its covariance what that would change.
+
+        Args:
+            points: (K,), see `KEYPOINT`.
+            positions: of the deformed model (K, 3) [m].
+            state: of the contact.
+            expected: shape and height (2,), and the variance of both (2,).
+            tare: offsets of the key points.
+        """
+        if tare is not self._tare:
+            self._tare = tare
+            self._track["b"], self._track["P"] = 0.0, _FEIGNED**2 * np.eye(_MOTION)
+        if not tare.is_taken:
+            return
+        evidence = follow_motion(points, positions, state, expected[0] - state["x"][1:], expected[1], self._track)
+        odds = min(max(log(_SELDOM / (1.0 - _SELDOM)) + evidence, -30.0), 30.0)
+        state["bumped"] = 1.0 / (1.0 + exp(-odds))
+        state["motion"] = float(np.linalg.norm(self._track["b"]))
+        state["covariance"] += state["bumped"] * np.outer(self._track["change"], self._track["change"])
+        state["stddev"] = measure_along(state["force"], state["force_modes"], state["covariance"])
+
+
+@njit(**_OPTIONS)
+def follow_motion(points, positions, state, offset, variance, track):
+    """Return the log of the Bayes factor of a bump after another image; the track gets what it tells.
+
+    Args:
+        points: (K,), see `KEYPOINT`.
+        positions: of the deformed model (K, 3) [m].
+        state: of the contact.
+        offset: of the expected shape and height from those of the state (2,).
+        variance: of both (2,).
+        track: the motion so far.
+    """
+    track = track[()]
+    rows, left, bend = _collect_residuals(points, positions)
+    known = np.isfinite(left[:, 0])
+    for i in range(_MOTION):
+        track.P[i, i] += _DRIFT**2
+    if known.sum() >= _FEWEST:
+        H, found = _fit_motion(points, rows, left, (offset, variance))
+        _update_track(H, found, track)
+    feigned = _FEIGNED**2 + _FEIGNED_SHARE**2 * bend
+    still, bumped = _measure_surprise(track.b, track.P, feigned), 0.0
+    for size in _SIZES:
+        bumped += np.exp(0.5 * min(still - _measure_surprise(track.b, track.P, size**2), 60.0)) / len(_SIZES)
+    return np.log(bumped)
+
+
+@njit(**_OPTIONS)
+def _collect_residuals(points, positions):
+    """Return the derivatives (K, 2, 6) of the residuals, these (K, 2) [m], NaN where unused, and the bending [m^2]."""
+    count = len(points)
+    rows, left = np.zeros((count, 2, _SIZE)), np.full((count, 2), np.nan)
+    centre, reach, bend, known = np.zeros(2), 0.0, 0.0, 0
+    for k in range(count):
+        point = points[k]
+        if np.isfinite(point.measured[0] + point.measured[1] + point.measured[2]):
+            lateral = point.measured[1] - positions[k, 1]
+            for a in range(2):
+                left[k, a] = point.measured[2 * a] - positions[k, 2 * a] - point.gain[a] * lateral
+                centre[a] += point.rest[2 * a]
+                bend += (positions[k, 2 * a] - point.rest[2 * a]) ** 2
+            known += 1
+    centre /= max(known, 1)
+    for k in range(count):
+        if np.isfinite(left[k, 0]):
+            reach += (points[k].rest[0] - centre[0]) ** 2 + (points[k].rest[2] - centre[1]) ** 2
+    reach = np.sqrt(reach / max(known, 1)) + 1e-12
+    for k in range(count):
+        for a in range(2):
+            rows[k, a, :_STATE] = points[k].modes[a, :_STATE]
+            rows[k, a, _STATE + a] = 1.0
+        rows[k, 0, 5] = (positions[k, 2] - centre[1]) / reach
+        rows[k, 1, 5] = -(positions[k, 0] - centre[0]) / reach
+    return rows, left, bend / max(known, 1)
+
+
+@njit(**_OPTIONS)
+def _fit_motion(points, rows, left, prior):
+    """Return the Hessian (6, 6) of the log posterior of state and motion, and both (6,) as an image asks for them.
+
+    The prior is mean and variance of shape and height, each (2,).
+    """
+    offset, variance = prior
+    known = np.isfinite(left[:, 0])
+    H, found, level = np.zeros((_SIZE, _SIZE)), np.zeros(_SIZE), 1.0
+    for a in range(2):
+        found[_STATE + a] = np.median(left[known, a])
+    squares = np.empty(len(points))
+    for turn in range(2 * _ROUNDS):
+        if turn == _ROUNDS:
+            level = max(1.0, np.median(squares[known]) / _MEDIAN_SQUARE)
+        H[:] = 0.0
+        g = np.zeros(_SIZE)
+        _add_prior(H, g, 0, -found[0], _FREE**2)
+        for i in range(2):
+            _add_prior(H, g, 1 + i, offset[i] - found[1 + i], variance[i] + i * 30e-3**2)
+        for i in range(_STATE, _SIZE):
+            _add_prior(H, g, i, -found[i], _BUMP**2)
+        for k in range(len(points)):
+            if known[k]:
+                squares[k] = _add_point(points[k], rows[k], left[k], level, found, H, g)
+        L = H.copy()
+        _factorise(L)
+        _substitute(L, g)
+        found += g
+    return H, found
+
+
+@njit(**_OPTIONS)
+def _add_prior(H, g, i, missing, variance):
+    """Add the prior of unknown i, which is off its mean by `missing`, to Hessian and gradient."""
+    H[i, i] += 1.0 / variance
+    g[i] += missing / variance
+
+
+@njit(**_OPTIONS)
+def _add_point(point, rows, left, level, found, H, g):
+    """Add a key point to Hessian and gradient; return its squared distance."""
+    scale = level / max(point.trust, 1e-6)
+    s00, s11 = point.tare_noise[0, 0] * scale + point.bias, point.tare_noise[1, 1] * scale + point.bias
+    s01 = point.tare_noise[0, 1] * scale
+    det = s00 * s11 - s01 * s01
+    r0, r1 = left
+    for i in range(_SIZE):
+        r0 -= rows[0, i] * found[i]
+        r1 -= rows[1, i] * found[i]
+    square = (s11 * r0 * r0 - 2.0 * s01 * r0 * r1 + s00 * r1 * r1) / det
+    weight = 1.0 / (1.0 + square / _GATE) ** 2 / det
+    for i in range(_SIZE):
+        a = weight * (s11 * rows[0, i] - s01 * rows[1, i])
+        b = weight * (s00 * rows[1, i] - s01 * rows[0, i])
+        g[i] += a * r0 + b * r1
+        for j in range(_SIZE):
+            H[i, j] += a * rows[0, j] + b * rows[1, j]
+    return square
+
+
+@njit(**_OPTIONS)
+def _take_state_out(H):
+    """Return the information (3, 3) of a Hessian (6, 6) on the motion, and what that changes of the state (3, 3)."""
+    L, A, change = H[:_STATE, :_STATE].copy(), H[_STATE:, _STATE:].copy(), np.empty((_STATE, _MOTION))
+    _factorise(L)
+    for j in range(_MOTION):
+        change[:, j] = H[:_STATE, _STATE + j]
+        _substitute(L, change[:, j])
+        for i in range(_MOTION):
+            for k in range(_STATE):
+                A[i, j] -= H[_STATE + i, k] * change[k, j]
+    return A, -change
+
+
+@njit(**_OPTIONS)
+def _update_track(H, found, track):
+    """Take what an image tells of the motion, by Hessian (6, 6) and maximum (6,), into the track."""
+    A, change = _take_state_out(H)
+    told = _multiply(A, found[_STATE:])
+    alone = A.copy()
+    for i in range(_MOTION):
+        A[i, i] -= 1.0 / _BUMP**2
+        alone[i, i] -= (1.0 - 1e-3) / _BUMP**2
+    alone = _invert(alone)
+    away = _multiply(alone, told) - track.b
+    if _measure_square(away, alone + track.P) > _BEYOND:
+        for i in range(_MOTION):
+            for j in range(_MOTION):
+                track.P[i, j] += away[i] * away[j]
+    prior = _invert(track.P)
+    track.P[:] = _invert(prior + A)
+    track.b[:] = _multiply(track.P, told + _multiply(prior, track.b))
+    track.change[:] = _multiply(change, track.b)
+
+
+@njit(**_OPTIONS)
+def _multiply(A, b):
+    """Return A b."""
+    out = np.zeros(len(A))
+    for i in range(len(A)):
+        for j in range(len(b)):
+            out[i] += A[i, j] * b[j]
+    return out
+
+
+@njit(**_OPTIONS)
+def _measure_surprise(b, P, variance):
+    """Return minus twice the log of N(b; 0, P + variance), but for a constant."""
+    S = P.copy()
+    for i in range(_MOTION):
+        S[i, i] += variance
+    L = S.copy()
+    return _factorise(L) + _measure_square(b, S)
+
+
+@njit(**_OPTIONS)
+def _measure_square(b, S):
+    """Return b^T S^-1 b."""
+    L, x = S.copy(), b.copy()
+    _factorise(L)
+    _substitute(L, x)
+    return (b * x).sum()
+
+
+@njit(**_OPTIONS)
+def _invert(S):
+    """Return the inverse of a symmetric matrix (n, n)."""
+    L, out = S.copy(), np.eye(len(S))
+    _factorise(L)
+    for i in range(len(S)):
+        _substitute(L, out[i])
+    return out
+
+
+@njit(**_OPTIONS)
+def _factorise(H):
+    """Replace the lower half of H (n, n) by its Cholesky factor; return the log of its determinant."""
+    size = 0.0
+    for j in range(len(H)):
+        for i in range(j, len(H)):
+            total = H[i, j]
+            for k in range(j):
+                total -= H[i, k] * H[j, k]
+            H[i, j] = total / H[j, j] if i > j else np.sqrt(max(total, 1e-300))
+        size += 2.0 * np.log(H[j, j])
+    return size
+
+
+@njit(**_OPTIONS)
+def _substitute(L, b):
+    """Replace b (n,) by the solution of L L^T x = b."""
+    n = len(L)
+    for i in range(n):
+        for k in range(i):
+            b[i] -= L[i, k] * b[k]
+        b[i] /= L[i, i]
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            b[i] -= L[k, i] * b[k]
+        b[i] /= L[i, i]
