@@ -169,7 +169,7 @@ def _find_file(name_or_path: str | Path) -> Path:
     if not path.is_file():
         shipped = [file.name.removesuffix(".yaml") for file in folder.iterdir()]
         advice = suggest(str(name_or_path), sorted(shipped))
-        raise CalibrationError(f"there is no calibration file {str(name_or_path)!r}: {advice}, or a path")
+        raise CalibrationError(f"there is no calibration file {str(name_or_path)!r}, {advice} (or give a path)")
     return path
 
 

@@ -186,7 +186,7 @@ def _find_file(name_or_path: str | Path) -> Path:
     path = Path(name_or_path)
     if not path.is_file():
         raise JawFileError(
-            f"there is no jaw file {str(name_or_path)!r}: {suggest(str(name_or_path), shipped)}, or a path"
+            f"there is no jaw file {str(name_or_path)!r}, {suggest(str(name_or_path), shipped)} (or give a path)"
         )
     if path.suffix.lower() in _SHAPES:
         raise JawFileError(f"{path.name} is a shape, not a jaw file; make one: finforce jaw {path} -o {path.stem}.yaml")
