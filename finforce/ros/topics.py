@@ -176,7 +176,7 @@ class Port:
         self._times.append(perf_counter() - before)
 
     def take_waiting(self) -> Iterator[Any]:
-        """Yield the messages that wait to be taken, which would have their turn later; bytes that are none are dropped.
+        """Yield the messages that wait to be taken, which would have their turn later; malformed ones are dropped.
 
         Of another stage of the same process nothing ever waits.
         """

@@ -41,8 +41,8 @@ class Playing:
         domain: ROS_DOMAIN_ID; None takes one by chance.
         parameter_file: YAML file with further ROS parameters of the solvers.
         composed: detector, contact estimator and solvers in one process.
-        trace: folder in which the nodes note when they were at work; empty for none. Then nobody hears more than the
-            grasp force, which would make more work.
+        trace: folder in which the nodes note when they were at work; empty for none. Then only the grasp
+            force is received: more would add work.
     """
 
     rate: float = 1.0
