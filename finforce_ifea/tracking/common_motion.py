@@ -12,8 +12,6 @@ image is beyond chance. With b and its covariance P, the camera has stood still 
     N(b; 0, P + s^2),    s as errors of the mechanics feign a motion, or as large as a bump.
 """
 
-from math import exp, log
-
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -32,7 +30,7 @@ _DRIFT, _BEYOND = 0.04e-3, 14.2
 # Fewer key points do not tell. Of the depth, which is free, one standard deviation [m].
 _FEWEST, _FREE = 6, 10e-3
 # Squared distance that keeps a quarter of its weight, median of one in two axes; iterations for the noise, and after.
-_GATE, _MEDIAN_SQUARE, _ROUNDS = 9.0, 1.386, 3
+_GATE, _MEDIAN_SQUARE, _FIRST, _ROUNDS = 9.0, 1.386, 3, 6
 _STATE, _MOTION = 3, 3
 _SIZE = _STATE + _MOTION
 
@@ -64,39 +62,44 @@ class CommonMotion:
             self._track["b"], self._track["P"] = 0.0, _FEIGNED**2 * np.eye(_MOTION)
         if not tare.is_taken:
             return
-        evidence = follow_motion(points, positions, state, expected[0] - state["x"][1:], expected[1], self._track)
-        odds = min(max(log(_SELDOM / (1.0 - _SELDOM)) + evidence, -30.0), 30.0)
-        state["bumped"] = 1.0 / (1.0 + exp(-odds))
-        state["motion"] = float(np.linalg.norm(self._track["b"]))
-        state["covariance"] += state["bumped"] * np.outer(self._track["change"], self._track["change"])
-        state["stddev"] = measure_along(state["force"], state["force_modes"], state["covariance"])
+        follow_motion(points, positions, state, *expected, self._track)
 
 
 @njit(**_OPTIONS)
-def follow_motion(points, positions, state, offset, variance, track):
-    """Return the log of the Bayes factor of a bump after another image; the track gets what it tells.
+def follow_motion(points, positions, state, mean, variance, track):
+    """Take an image into the track of the motion, and what that tells into the state of the contact.
 
     Args:
         points: (K,), see `KEYPOINT`.
         positions: of the deformed model (K, 3) [m].
         state: of the contact.
-        offset: of the expected shape and height from those of the state (2,).
+        mean: expected shape and height (2,).
         variance: of both (2,).
         track: the motion so far.
     """
-    track = track[()]
+    state, track = state[()], track[()]
     rows, left, bend = _collect_residuals(points, positions)
-    known = np.isfinite(left[:, 0])
     for i in range(_MOTION):
         track.P[i, i] += _DRIFT**2
-    if known.sum() >= _FEWEST:
-        H, found = _fit_motion(points, rows, left, (offset, variance))
+    if np.isfinite(left[:, 0]).sum() >= _FEWEST:
+        H, found = _fit_motion(points, rows, left, (mean - state.x[1:], variance))
         _update_track(H, found, track)
-    feigned = _FEIGNED**2 + _FEIGNED_SHARE**2 * bend
-    still, bumped = _measure_surprise(track.b, track.P, feigned), 0.0
+    state.bumped = _judge_motion(track.b, track.P, _FEIGNED**2 + _FEIGNED_SHARE**2 * bend)
+    state.motion = np.sqrt((track.b * track.b).sum())
+    for i in range(_STATE):
+        for j in range(_STATE):
+            state.covariance[i, j] += state.bumped * track.change[i] * track.change[j]
+    state.stddev = measure_along(state.force, state.force_modes, state.covariance)
+
+
+@njit(**_OPTIONS)
+def _judge_motion(b, P, feigned):
+    """Return the probability that a motion (3,) of covariance P is a bump, where errors feign some variance."""
+    still, bumped = _measure_surprise(b, P, feigned), 0.0
     for size in _SIZES:
-        bumped += np.exp(0.5 * min(still - _measure_surprise(track.b, track.P, size**2), 60.0)) / len(_SIZES)
-    return np.log(bumped)
+        bumped += np.exp(0.5 * min(still - _measure_surprise(b, P, size**2), 60.0)) / len(_SIZES)
+    bumped *= _SELDOM
+    return bumped / (bumped + 1.0 - _SELDOM)
 
 
 @njit(**_OPTIONS)
@@ -140,8 +143,8 @@ def _fit_motion(points, rows, left, prior):
     for a in range(2):
         found[_STATE + a] = np.median(left[known, a])
     squares = np.empty(len(points))
-    for turn in range(2 * _ROUNDS):
-        if turn == _ROUNDS:
+    for turn in range(_ROUNDS):
+        if turn == _FIRST:
             level = max(1.0, np.median(squares[known]) / _MEDIAN_SQUARE)
         H[:] = 0.0
         g = np.zeros(_SIZE)
@@ -157,6 +160,9 @@ def _fit_motion(points, rows, left, prior):
         _factorise(L)
         _substitute(L, g)
         found += g
+    for i in range(_SIZE):
+        for j in range(i):
+            H[j, i] = H[i, j]
     return H, found
 
 
@@ -169,7 +175,7 @@ def _add_prior(H, g, i, missing, variance):
 
 @njit(**_OPTIONS)
 def _add_point(point, rows, left, level, found, H, g):
-    """Add a key point to Hessian and gradient; return its squared distance."""
+    """Add a key point to the lower half of the Hessian and to the gradient; return its squared distance."""
     scale = level / max(point.trust, 1e-6)
     s00, s11 = point.tare_noise[0, 0] * scale + point.bias, point.tare_noise[1, 1] * scale + point.bias
     s01 = point.tare_noise[0, 1] * scale
@@ -184,7 +190,7 @@ def _add_point(point, rows, left, level, found, H, g):
         a = weight * (s11 * rows[0, i] - s01 * rows[1, i])
         b = weight * (s00 * rows[1, i] - s01 * rows[0, i])
         g[i] += a * r0 + b * r1
-        for j in range(_SIZE):
+        for j in range(i + 1):
             H[i, j] += a * rows[0, j] + b * rows[1, j]
     return square
 
