@@ -133,7 +133,7 @@ def test_memory_after_many_bad_messages_is_what_it_was(probe, sides):
             feed(partial(detector._on_color, f"{CAMERA}/color/image_raw"), mutate(image, number, rng), Image)
             feed(detector._on_depth, mutate(image, number, rng), Image)
 
-    send(2000)
+    send(1000)
     before = memory()
-    send(4000)
-    assert memory() - before < 1e6
+    send(2000)
+    assert memory() - before < 5e5

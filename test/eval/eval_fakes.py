@@ -15,7 +15,9 @@ from lab.scenes import GRASP
 from lab.stress.stress import Family, Trial, attempt
 
 # a grasp of three seconds, of which both jaws touch the rod in one
-QUICK_GRASP = replace(GRASP, changes={"settle": 0.1, "record": 0.4, "closing_speed": 0.04, "clearance": 0.004})
+QUICK_GRASP = replace(
+    GRASP, size="320x240", changes={"settle": 0.1, "record": 0.4, "closing_speed": 0.04, "clearance": 0.004}
+)
 
 PERIOD = 33_333_333
 START = 1_000_000_000_000

@@ -66,6 +66,12 @@ def still(record):
     return record("still")
 
 
+@pytest.fixture
+def two_fingers(monkeypatch):
+    """Of the included fingers, two are tried."""
+    monkeypatch.setattr("finforce_eval.evaluation.check.list_shipped_jaws", lambda: ["bench", "umi"])
+
+
 def check(folder, capsys, tmp_path, *options):
     words = ["--images", str(IMAGES), "--report", str(tmp_path), "--json", str(tmp_path / "check.json")]
     status = main(["check", str(folder), *words, *options])
@@ -94,20 +100,12 @@ def test_a_camera_that_is_elsewhere_is_told_where_it_is(still, capsys, tmp_path)
     np.testing.assert_allclose([float(number) for number in numbers[:3]], ROBOT_CAMERA[:3, 3], atol=1.5e-3)
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (lambda color: color[::-1, ::-1], "upside down"),
-        (lambda color: cv2.GaussianBlur(color, (0, 0), 5.0), "out of focus"),
-        (lambda color: color // 30, "mean brightness"),
-    ],
-)
-def test_a_picture_that_is_wrong_is_named(record, capsys, tmp_path, change, words):
-    status, said = check(record("changed", change), capsys, tmp_path)
-    assert words in said and (status == 1 or "brightness" in words)
+def test_a_picture_that_is_wrong_is_named(two_fingers, record, capsys, tmp_path):
+    status, said = check(record("changed", lambda color: color[::-1, ::-1] // 3), capsys, tmp_path)
+    assert status == 1 and "upside down" in said and "mean brightness" in said
 
 
-def test_extrinsics_of_another_convention_are_named(still, capsys, tmp_path):
+def test_extrinsics_of_another_convention_are_named(two_fingers, still, capsys, tmp_path):
     x, y, z, qx, qy, qz, qw = pose_numbers(ROBOT_CAMERA)
     first = "--extrinsics=" + ",".join(f"{number:.6f}" for number in (x, y, z, qw, qx, qy, qz))
     for option, words in ((as_option(invert_pose(ROBOT_CAMERA)), "inverted"), (first, "begins with w")):
@@ -115,12 +113,12 @@ def test_extrinsics_of_another_convention_are_named(still, capsys, tmp_path):
         assert status == 1 and words in said
 
 
-def test_another_finger_than_in_the_jaw_file_is_named(still, capsys, tmp_path):
+def test_another_finger_than_in_the_jaw_file_is_named(two_fingers, still, capsys, tmp_path):
     status, said = check(still, capsys, tmp_path, "--jaw", "umi")
     assert status == 1 and "the finger is bench" in said
 
 
-def test_jaws_that_are_nowhere_are_said_to_be_so(record, capsys, tmp_path):
+def test_jaws_that_are_nowhere_are_said_to_be_so(two_fingers, record, capsys, tmp_path):
     rng = np.random.default_rng(0)
     folder = record("noise", lambda color: cv2.GaussianBlur(rng.integers(0, 255, color.shape, np.uint8), (0, 0), 1.0))
     status, said = check(folder, capsys, tmp_path)
