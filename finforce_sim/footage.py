@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import re
+from collections import deque
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,7 +18,7 @@ from finforce.camera import CameraIntrinsics
 from finforce.gripper_frames import BENCH_CAMERA, FRONT_CAMERA, HALF_TURN, ROBOT_CAMERA
 from finforce.messages import NANOSECONDS
 from finforce.transforms import invert_pose
-from finforce_sim.gripper import FINGER, TwinGripper
+from finforce_sim.gripper import FINGER, TwinGripper, TwinState
 from finforce_sim.mechanics import Assembly
 from finforce_sim.photographer import DrawnJaw, Photographer, SceneSetting, Shot, TrueJaw
 from finforce_sim.scenarios import Scenario, ScenarioError
@@ -32,6 +35,7 @@ CAMERAS = {
     "bench": BENCH_CAMERA,
 }
 LEAST_SIZE, LARGEST_SIZE = 16, 4096  # [px]
+MOST_WORKERS = 4  # threads, of which each renders an image
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -77,16 +81,32 @@ class Footage:
         rng = np.random.default_rng((self._seed, 3))
         T_camera_gripper = invert_pose(self.T_gripper_camera)
         last = -1
-        for state in self._gripper.states():
+        for state, shot in self._shoot_ahead():
             period = int(state.stamp / TRACKING_PERIOD + 1e-5)
             tracked = state.T_gripper_object is not None and period > last
             last = period if tracked else last
             yield TwinFrame(
-                **vars(self._photographer.shoot(state)),
+                **vars(shot),
                 stamp=START + round(state.stamp * NANOSECONDS),
                 phase=state.phase,
                 T_camera_object=disturb_pose(T_camera_gripper @ state.T_gripper_object, rng) if tracked else None,
             )
+
+    def _shoot_ahead(self) -> Iterator[tuple[TwinState, Shot]]:
+        """Yield states and their images, of which a few are rendered at once."""
+        workers = min(os.cpu_count() or 1, MOST_WORKERS)
+        pool, coming, before = ThreadPoolExecutor(workers), deque(), None
+        try:
+            for state in self._gripper.states():
+                coming.append((state, pool.submit(self._photographer.shoot, state, before)))
+                before = state
+                if len(coming) > workers:
+                    taken, shot = coming.popleft()
+                    yield taken, shot.result()
+            for taken, shot in coming:
+                yield taken, shot.result()
+        finally:
+            pool.shutdown(cancel_futures=True)
 
 
 def build_footage(

@@ -15,7 +15,7 @@ from finforce.camera import CameraIntrinsics
 from finforce.transforms import invert_pose
 from finforce_ifea.grasp_force import Wrench
 from finforce_sim.emulator.mechanism import STROKE
-from finforce_sim.footage import FINGER, disturb_pose, set_stage
+from finforce_sim.footage import FINGER, MOST_WORKERS, disturb_pose, set_stage
 from finforce_sim.gripper import PressedGrasp
 from finforce_sim.photographer import Photographer, Shot
 from finforce_sim.scenarios import Scenario, ScenarioError
@@ -121,7 +121,6 @@ TAKES = 2  # of every opening: a camera that stands still never gives the same i
 COUNTS = 255  # steps of the gripper's position over its stroke
 OPEN_STRIDE = 4  # of those steps between two images where nothing touches
 BEFORE_TOUCH = 1e-3  # [m] of opening from which on every step has its image
-MOST_WORKERS = 4  # threads, of which each renders an image
 _APART = 10.0  # [s] between the stamps that seed the noise, too far for motion blur
 
 

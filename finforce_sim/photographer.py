@@ -193,16 +193,14 @@ class Photographer:
         self._wardrobe = Wardrobe.draw(rng)
         self._look: Lighting = draw_look(rng, setting.light)
         self._T_camera_gripper = invert_pose(setting.T_gripper_camera)
-        self._seed, self._before = seed, None
+        self._seed = seed
 
-    def shoot(self, state: TwinState) -> Shot:
-        """Return the image of a state; the same seed and stamp give the same noise."""
-        smear = self._smear(state, self._before)
-        return self.develop(self.look(state), state.stamp, smear)
+    def shoot(self, state: TwinState, before: TwinState | None = None) -> Shot:
+        """Return the image of a state, given that of the image before; the same seed and stamp give the same noise."""
+        return self.develop(self.look(state, before), state.stamp, self._smear(state, before))
 
-    def look(self, state: TwinState) -> WristView:
+    def look(self, state: TwinState, before: TwinState | None = None) -> WristView:
         """Return what a perfect sensor would see of a state; its upper rows are of a moment before."""
-        before, self._before = self._before, state
         stage = self._build_stage(state)
         jaws = {side: self._look_for(side, state, stage) for side in state.jaws}
         if before is not None and self.setting.readout and before.stamp < state.stamp:

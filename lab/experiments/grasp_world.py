@@ -352,12 +352,14 @@ class ImageSensor(EstimatorSensor):
         super().__init__(pressed, seed)
         self._camera, depth_step = parse_size(size), 1e-3
         self._photographer = Photographer(set_stage(pressed, self._camera, depth_step), seed)
+        self._before: TwinState | None = None
         parameters = DetectorParameters()
         settings = DetectorSettings(quantum=depth_step)
         self._detector = build_detector(load_jaws(parameters), parameters, settings, DotSettings())
 
     def _look(self, state: TwinState) -> Mapping[str, Observation]:
-        shot = self._photographer.shoot(state)
+        shot = self._photographer.shoot(state, self._before)
+        self._before = state
         image = RgbdImage(stamp=state.stamp, color=shot.color, depth=shot.depth, camera=self._camera)
         found = self._detector.detect(image)
         return {side: observe_found(state.stamp, one) for side, one in found.items()}

@@ -89,8 +89,7 @@ def test_rows_of_a_rolling_shutter_are_of_their_own_time(setting, gripper):
     before, state = next((a, b) for a, b in pairwise(states) if a.jaws["left"].origin_x < b.jaws["left"].origin_x)
     readout, height = 0.02, setting.camera.height
     photographer = Photographer(replace(setting, readout=readout), 3)
-    photographer.look(before)
-    rolled, flat = photographer.look(state), Photographer(setting, 3)
+    rolled, flat = photographer.look(state, before), Photographer(setting, 3)
     band = height // BANDS
     for number in (0, BANDS - 1):
         rows = slice(number * band, (number + 1) * band)
