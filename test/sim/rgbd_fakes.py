@@ -67,16 +67,15 @@ class FakePhotographer:
 
     black: tuple = ()
     frozen: tuple = ()
-    shots: int = 0
 
-    def shoot(self, state):
-        rng = np.random.default_rng(0 if self.shots in self.frozen else round(1e6 * state.stamp) + 1)
+    def shoot(self, state, before=None):
+        number = round(30 * state.stamp)
+        rng = np.random.default_rng(0 if number in self.frozen else round(1e6 * state.stamp) + 1)
         size = (CAMERA.height, CAMERA.width)
         patches = rng.integers(0, 255, (size[0] // 8, size[1] // 8, 3), dtype=np.uint8)
         color = patches.repeat(8, axis=0).repeat(8, axis=1)
-        if self.shots in self.black:
+        if number in self.black:
             color[:] = 0
-        self.shots += 1
         depth = rng.uniform(0.1, 0.2, size).astype(np.float32)
         depth[:4] = np.nan
         return Shot(color=color, depth=depth, jaws={side: true_jaw(state, side) for side in state.jaws})
