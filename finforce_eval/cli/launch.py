@@ -57,7 +57,7 @@ def run(options: argparse.Namespace) -> Outcome:
     with StopSignals() as stop, ProcessGroup(processes, {}, quiet=False) as group:
         while not stop.wait(_POLL) and not group.has_finished():
             pass
-    return Outcome({"processes": [process.executable for process in processes]})
+    return Outcome({"system": options.system, "arguments": options.words})
 
 
 def list_parts(system: str, words: Sequence[str]) -> list[Process | Include]:
