@@ -120,14 +120,15 @@ def test_the_lift_stops_when_what_is_held_slips(bench):
     domain = bench.probe.context.get_domain_id()
 
     def slip():
-        if len(bench.lifts) == 20:
+        if len(bench.lifts) >= 20:
             bench.fingers.TOUCH = 0.0
 
     bench.probe.create_timer(0.01, slip)
     done = beside(bench, lambda: run("lift_until_slip.py", domain, "--ros-args", "-p", "way:=5.0", patience=60.0))
     assert done.returncode == 0, done.stdout + done.stderr
     assert "slip" in done.stdout + done.stderr
-    assert bench.lifts[0].twist.linear.z == pytest.approx(0.05)
+    # the first words of a program come before it is heard
+    assert max(lift.twist.linear.z for lift in bench.lifts) == pytest.approx(0.05)
     bench.probe.wait_for(lambda: bench.lifts[-1].twist.linear.z == 0.0)
     assert len(bench.lifts) < 60  # within a second
 

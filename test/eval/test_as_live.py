@@ -91,6 +91,7 @@ def test_images_that_the_detector_does_not_send_have_no_key_points(probe, record
     for number, stamp in enumerate((stamps + shift).tolist()):
         bench.node.detector.was_still = number in StillAt.still
         bench.shoot(stamp)
+        probe.wait_for(lambda number=number: len(bench.node.detector.images) > number)
     bench.wait_for_clouds(12 - 5)
     live = [stamp_of(cloud) - shift for cloud in bench.clouds()]
     found = detect_keypoints(recording, StillAt(recording), as_live=True).jaws["left"]

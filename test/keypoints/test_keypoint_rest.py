@@ -60,6 +60,7 @@ def test_an_image_in_which_nothing_moved_is_answered_with_its_own_stamp_and_coun
     for stamp in stamps:
         bench.shoot(stamp)
     bench.wait_for_clouds(2)
+    bench.wait_for_clouds(2, "right")
     assert [stamp_of(cloud) for cloud in bench.clouds()] == stamps
     assert [stamp_of(pose) for pose in bench.poses("right")] == stamps
     first, second = (np.frombuffer(cloud.data, dtype=np.uint8) for cloud in bench.clouds())
