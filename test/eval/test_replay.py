@@ -218,7 +218,8 @@ def test_one_contact_estimator_serves_both_jaws(tmp_path):
     names = argparse.Namespace(
         jaw="bench", solver="default", mesh="default", contact=["estimate"], calibration=None, object=str(MESH)
     )
-    result = replaying.replay(recording, make_setup(names))
+    # at half speed a machine with other work keeps up as well
+    result = replaying.replay(recording, make_setup(names), playing=replaying.Playing(rate=0.5))
     left, right = (result.evaluation.results[f"both/{side}"] for side in ("left", "right"))
     held = left.solved & right.solved
     assert held.sum() > 0.5 * len(held)
