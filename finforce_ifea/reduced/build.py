@@ -149,6 +149,9 @@ _DENSER = 0.5
 _EARLY = 0.8
 # The rod stops where it needs this many times the force that it needs half way up at full depth.
 _HARDEST = 12.0
+# Longer steps [m] of a solid must agree with its motions at both ends, to this share; the longest of a frame, whose
+# hinged bars snap over.
+_SURE, _APART, _LONGEST = 0.1e-3, 0.1, 0.5e-3
 # Shortest step of a depth [m]; iterations to an equilibrium, and its tolerance [m].
 _SHORTEST, _ITERATIONS, _TOLERANCE = 0.02e-3, 30, 1e-9
 # Quarters of a path that are tried next where it cannot be divided.
@@ -305,6 +308,13 @@ def _divide(largest: float) -> NDArray:
     return largest * ((1.0 - _EARLY) * share + _EARLY * share**2)
 
 
+def _are_joined(start: _Equilibrium, end: _Equilibrium) -> bool:
+    """Whether a jaw went from one equilibrium to another as it moves at both, and not over to another shape."""
+    moved = end.q - start.q
+    along = 0.5 * (end.depth - start.depth) * (start.state.modes[:, 0] + end.state.modes[:, 0])
+    return bool(np.linalg.norm(moved - along) < _APART * np.linalg.norm(moved))
+
+
 class _Rod:
     """A rod at one height, pressed in deeper and deeper."""
 
@@ -319,25 +329,29 @@ class _Rod:
         """Return equilibria at rising depths below first touch, up to where the jaw gives way or resists."""
         path: list[_Equilibrium] = []
         for depth in _divide(self._deepest):
-            path += self._advance(path[-1] if path else None, depth)
+            path += self._advance(path[-1] if path else None, depth, hardest)
             if not path or path[-1].depth < depth or np.linalg.norm(path[-1].state.force) > hardest:
                 break
         if not path:
             raise ContactError(f"the jaw cannot be pressed at a height of {1e3 * self._height:.1f} mm")
         return path
 
-    def _advance(self, start: _Equilibrium | None, depth: float) -> list[_Equilibrium]:
-        """Return the equilibria on the way to a depth [m], the last one there unless the jaw gives way."""
+    def _advance(self, start: _Equilibrium | None, depth: float, hardest: float) -> list[_Equilibrium]:
+        """Return the equilibria on the way to a depth [m], the last one there unless the jaw gives way or resists."""
         way: list[_Equilibrium] = []
         done = start.depth if start else 0.0
-        step = depth - done
-        while done < depth and step > _SHORTEST:
-            found = self._settle(way[-1] if way else start, min(done + step, depth))
-            if found is None:
+        is_solid = isinstance(self._contact.model, SolidModel)
+        step = depth - done if is_solid else min(depth - done, _LONGEST)
+        while done < depth:
+            last = way[-1] if way else start
+            found = self._settle(last, done + step if done + step < depth - 1e-9 else depth)
+            if found is None or (is_solid and step > _SURE and last and not _are_joined(last, found)):
                 step *= 0.5
+                if step < _SHORTEST:
+                    break
             else:
                 way.append(found)
-                done = found.depth
+                done = found.depth if np.linalg.norm(found.state.force) <= hardest else depth
         return way
 
     def divide(self, path: list[_Equilibrium], largest: float) -> list[NDArray] | None:
@@ -350,10 +364,10 @@ class _Rod:
         for depth in _divide(largest):
             below = int(np.searchsorted(depths, depth + 1e-12)) - 1
             start = path[below] if below >= 0 else None
-            found = start if start and start.depth > depth - 1e-12 else self._settle(start, depth)
-            if found is None:
+            way = [start] if start and start.depth > depth - 1e-12 else self._advance(start, depth, np.inf)
+            if not way or way[-1].depth < depth - 1e-12:
                 return None
-            states.append(found.q)
+            states.append(way[-1].q)
         return states
 
     def _settle(self, start: _Equilibrium | None, depth: float) -> _Equilibrium | None:

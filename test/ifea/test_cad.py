@@ -176,6 +176,22 @@ def test_sides_that_are_alike_are_told_and_a_step_of_the_base_bends_no_face():
         assert all(rib.inner[1] > rib.outer[1] for rib in finger.ribs)
 
 
+@pytest.mark.parametrize(
+    ("tooth", "pitch"), [([(0.0, 0.0), (0.9, 0.5), (0.0, 1.0)], 2.0), ([(0.6, 0.0), (0.6, 1.5)], 3.0)]
+)
+def test_teeth_bend_no_face(tooth, pitch):
+    polygon = draw_polygon()
+    for z in np.arange(16.0, 64.0, pitch):
+        corners = [(13.9, z), *((14.0 + x, z + up) for x, up in tooth), (13.9, z + tooth[-1][1])]
+        polygon = polygon.union(shapely.Polygon(corners))
+    metres = [shapely.affinity.scale(each, 1e-3, 1e-3, origin=(0, 0)) for each in (polygon, draw_polygon())]
+    toothed, plain = (recognize(each, 0.02, Overrides(face_x=0.014)) for each in metres)
+    assert toothed.face_deviation == pytest.approx(max(x for x, _ in tooth) * MILLIMETRE, abs=1e-4)
+    assert toothed.clamp_slope == 0.0 and toothed.clamped_z == plain.clamped_z
+    for rib, other in zip(toothed.ribs, plain.ribs, strict=True):
+        np.testing.assert_allclose(rib.outer - rib.inner, other.outer - other.inner, atol=5e-4)
+
+
 def test_a_small_hole_across_is_left_out_with_a_word(tmp_path, surface):
     low, high = surface.bounds
     drill = trimesh.creation.cylinder(0.5, 200.0)
@@ -184,6 +200,17 @@ def test_a_small_hole_across_is_left_out_with_a_word(tmp_path, surface):
     raw = read_mesh(tmp_path, trimesh.boolean.difference([surface, drill], engine="manifold"))
     assert any("hole across" in note for note in raw.notes)
     check_found(recognize(raw.polygon, raw.width, Overrides()))
+
+
+def test_a_void_is_no_body(tmp_path, surface):
+    path, void = tmp_path / "finger.stl", trimesh.creation.box((2.0, 0.5, 2.0))
+    void.apply_translation((0.0, 0.0, 6.0))
+    trimesh.util.concatenate([surface, void]).export(path)
+    with pytest.raises(JawFileError, match="2 bodies"):
+        read_section(path)
+    void.invert()
+    trimesh.util.concatenate([surface, void]).export(path)
+    assert "1 closed voids inside" in read_section(path).notes
 
 
 def test_a_missing_triangle_and_doubled_faces_are_mended_with_a_word(tmp_path, surface):

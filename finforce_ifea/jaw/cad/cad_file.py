@@ -261,7 +261,10 @@ def _choose_body(mesh: trimesh.Trimesh, body: int | None, scale: float, notes: l
     bodies = mesh.split(only_watertight=False, repair=False)
     # what a few triangles enclose is no part of a finger
     bodies = sorted((item for item in bodies if len(item.faces) >= 4), key=lambda item: -np.prod(item.extents))
-    if len(bodies) <= 1 and body in (None, 1):
+    voids = [item for item in bodies[1:] if _is_void(item, bodies[0])]
+    if len(bodies) - len(voids) <= 1 and body in (None, 1):
+        if voids:
+            notes.append(f"{len(voids)} closed voids inside")
         return mesh
     sizes = "; ".join(
         f"{number}: " + " x ".join(f"{1e3 * scale * value:.3g}" for value in item.extents)
@@ -274,6 +277,12 @@ def _choose_body(mesh: trimesh.Trimesh, body: int | None, scale: float, notes: l
         )
     notes.append(f"body {body} of {len(bodies)}")
     return bodies[body - 1]
+
+
+def _is_void(body: trimesh.Trimesh, other: trimesh.Trimesh) -> bool:
+    """Whether a body lies inside another one with its surface turned inwards."""
+    inside = (body.bounds[0] > other.bounds[0]).all() and (body.bounds[1] < other.bounds[1]).all()
+    return bool(inside and body.volume * other.volume < 0.0)
 
 
 def _find_axis(mesh: trimesh.Trimesh) -> tuple[NDArray, float]:

@@ -25,6 +25,8 @@ _CHORD = 4e-6
 _SPACING = 3e-4
 # A side is straight where it leaves its line by less than this share of its length.
 _STRAIGHT = 4e-3
+# Gaps between teeth [m] are narrower than twice this.
+_TEETH = 3e-3
 # The section narrows towards the tip, to less than this share of its width at the base.
 _NARROWER = 0.75
 # A bolt holds about so many of its radii above its middle, and around it.
@@ -306,9 +308,13 @@ def _turn_upright(
     middles = np.array([shapely.Polygon(cell).centroid.coords[0] for cell in cells])
     direction = _find_direction(polygon, middles, overrides)
     side = np.array([-direction[1], direction[0]])
-    faces = _fit_sides(polygon, np.concatenate(cells), middles, direction)
+    straight = _STRAIGHT * np.ptp(np.concatenate(cells) @ direction)
+    outlines = (polygon, shapely.Polygon(polygon.exterior).buffer(_TEETH).buffer(-_TEETH))
+    fits = [_fit_sides(outline, np.concatenate(cells), middles, direction) for outline in outlines]
+    # a side with teeth is as straight as their tips
+    faces = [filled if filled[2] < straight <= plain[2] else plain for plain, filled in zip(*fits, strict=True)]
     chosen = min(faces, key=lambda face: face[2])
-    if all(face[2] < _STRAIGHT * np.ptp(np.concatenate(cells) @ direction) for face in faces):
+    if all(face[2] < straight for face in faces):
         # both are straight: the inner face stands at right angles on the base
         _, base = _find_base(polygon, direction)
         lean = [abs(face[1] @ base) / np.linalg.norm(base) for face in faces]
