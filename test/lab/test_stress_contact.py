@@ -59,6 +59,13 @@ def test_what_an_outline_cannot_describe_is_refused_in_words(name):
     assert not any(trial.sure and trial.force_error > 0.05 for trial in played(name))
 
 
+@pytest.mark.parametrize("name", ["block of 1 m", "wall along the jaw"])
+def test_force_next_to_the_clamp_is_within_its_deviation_or_not_given(name):
+    trials = played(name)
+    assert all(trial.sigmas <= 3.0 for trial in trials if trial.sure)
+    assert all(trial.outcome == "answer" for trial in trials)
+
+
 def test_a_press_begins_clear_of_the_jaw():
     for scene in build_scenes():
         depths = plan_depths(scene.depth)
