@@ -44,8 +44,9 @@ _APART_SIGMAS = 3.0
 # or deeper in, are surely so [m].
 _NEXT_TO_CLAMP, _WELL_CLEAR = np.array([0.2, 0.4, 0.6, 0.8, 1.0]), 3e-3
 _LEAST_VARIANCE = 1e-12
-# What of the friction the mechanics does not follow, and a traction ratio that is never excluded [-].
-_UNFOLLOWED, _TRACTION = 0.25, 0.08
+# Of the traction ratio, what friction does that its history does not follow, and errors in the direction of the force; of
+# what only the jaws hold, a ratio that is never excluded [-].
+_UNFOLLOWED, _MISDIRECTED, _TRACTION = 0.35, 0.04, 0.08
 # What is kept of the averaged residuals where an object slides.
 _KEPT = 0.5
 # Of an unknown weight, as a share of the normal force, and the least normal force that counts [N].
@@ -424,7 +425,7 @@ class ContactTracker:
     def _find_friction(self) -> Coefficient:
         """Return the traction ratio of what something else holds, too."""
         found, mobilised = self.roughness.coefficient, self.slips.mobilised
-        variance = (found.stddev * mobilised) ** 2 + (_UNFOLLOWED * found.mean) ** 2 + _TRACTION**2
+        variance = (found.stddev * mobilised) ** 2 + (_UNFOLLOWED * found.mean) ** 2 + _MISDIRECTED**2
         return Coefficient(found.mean * mobilised, sqrt(variance))
 
 
