@@ -44,8 +44,8 @@ _APART_SIGMAS = 3.0
 # or deeper in, are surely so [m].
 _NEXT_TO_CLAMP, _WELL_CLEAR = np.array([0.2, 0.4, 0.6, 0.8, 1.0]), 3e-3
 _LEAST_VARIANCE = 1e-12
-# Of the traction ratio, what friction does that its history does not follow, and errors in the direction of the force; of
-# what only the jaws hold, a ratio that is never excluded [-].
+# Of the traction ratio: what friction does beyond its history, and errors in the direction of the force; of what only
+# the jaws hold, a ratio that is never excluded [-].
 _UNFOLLOWED, _MISDIRECTED, _TRACTION = 0.35, 0.04, 0.08
 # What is kept of the averaged residuals where an object slides.
 _KEPT = 0.5
