@@ -31,7 +31,6 @@ class PlaneModel(SolidModel):
     that differ in y alone move alike.
     """
 
-    _banded_limit = 0.0
     across: Across = "middle"
 
     def __init__(self, mesh: VolumeMesh, plane: PlaneMesh, section: Section, material: Material) -> None:

@@ -15,7 +15,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from finforce_ifea.fem.elements import centre_gradient, elasticity_matrix, hex_stiffness, tet_stiffness
 from finforce_ifea.fem.model import (
@@ -25,16 +24,12 @@ from finforce_ifea.fem.model import (
     Linearization,
     SparseFactor,
     SparsePlan,
-    factorise_banded,
     order_unknowns,
-    sparse_from_banded,
 )
 from finforce_ifea.jaw.attachment import attach_points
 from finforce_ifea.jaw.jaw_file import Material
 from finforce_ifea.jaw.mesh import VolumeMesh
 
-# Above this many multiplications a sparse factorisation with a fill-reducing order beats the band.
-_BANDED_COST_LIMIT = 1e10
 _ON_PLANE = 1e-9
 
 
@@ -48,12 +43,9 @@ class _Probe(NamedTuple):
 class SolidModel:
     """A co-rotational solid; see `finforce_ifea.fem.model.JawModel` for what its methods take and return.
 
-    The unknowns q (size,) [m] are the free nodal displacements in an order of small bandwidth or, where the band is
-    wide, of little fill. A mesh that mirrors itself in y = 0 is halved unless `symmetric` is False: loads and shapes
-    are symmetric then.
+    The unknowns q (size,) [m] are the free nodal displacements in an order of little fill. A mesh that mirrors itself
+    in y = 0 is halved unless `symmetric` is False: loads and shapes are symmetric then.
     """
-
-    _banded_limit = _BANDED_COST_LIMIT
 
     @property
     def across(self) -> Across:
@@ -99,27 +91,21 @@ class SolidModel:
         self._number_unknowns(master, free)
 
     def _number_unknowns(self, master: NDArray, free: NDArray) -> None:
-        """Number the free (n, 3) of the unclamped nodes, of small bandwidth; others go with their master."""
+        """Number the free (n, 3) of the unclamped nodes; others go with their master."""
         free[self.mesh.clamped] = False
-        ordered = _order_nodes(self._elements)
+        used = np.unique(self._elements)
         number = np.full(free.shape, -1)
-        number[ordered] = np.where(free[ordered], np.cumsum(free[ordered]).reshape(-1, 3) - 1, -1)
-        self.size = int(free[ordered].sum())
+        number[used] = np.where(free[used], np.cumsum(free[used]).reshape(-1, 3) - 1, -1)
+        self.size = int(free[used].sum())
         self.dof = np.where(number[master] >= 0, number[master], self.size)
 
     def _plan_assembly(self) -> None:
         """Prepare where each lower entry of each element matrix goes in the stored tangent."""
-        source, high, low = self._find_entries()
-        self.bandwidth = int((high - low).max())
-        self.banded = self.size * self.bandwidth**2 < self._banded_limit
-        if self.banded:
-            self._source, self._row, self._col = source, high - low, low
-            return
+        _, high, low = self._find_entries()
         self.dof = np.append(order_unknowns(high, low, self.size), self.size)[self.dof]
-        source, high, low = self._find_entries()
+        self._source, high, low = self._find_entries()
         # the upper triangle, column by column: the pattern stays, only values change
         keys, self._slot = np.unique(high * self.size + low, return_inverse=True)
-        self._source = source
         self._pointer = np.searchsorted(keys // self.size, np.arange(self.size + 1))
         self._index = keys % self.size
         self._plan = SparsePlan(self._pointer, self._index)
@@ -153,21 +139,14 @@ class SolidModel:
         return Linearization(force=force, energy=energy, smallest_det=smallest, tangent=stored)
 
     def _assemble(self) -> NDArray:
-        if not self.banded:
-            return np.bincount(self._slot, self._Ke.ravel()[self._source], len(self._index))
-        storage = np.zeros((self.bandwidth + 1, self.size), order="F")
-        _scatter_lower(self._Ke.ravel(), self._source, self._row, self._col, storage)
-        return storage
+        return np.bincount(self._slot, self._Ke.ravel()[self._source], len(self._index))
 
     def factorise(self, tangent: NDArray) -> Factor:
-        """Factorise a stored tangent; Cholesky or alike, or LU where the state is not stable."""
-        factor = factorise_banded(tangent) if self.banded else self._plan.factorise(tangent)
-        return factor or SparseFactor(self.sparse_tangent(tangent))
+        """Factorise a stored tangent; L D L^T, or LU where the state is not stable."""
+        return self._plan.factorise(tangent) or SparseFactor(self.sparse_tangent(tangent))
 
     def sparse_tangent(self, tangent: NDArray) -> sparse.csc_matrix:
         """Return a stored tangent as the full symmetric matrix (size, size) [N/m]."""
-        if self.banded:
-            return sparse_from_banded(tangent)
         upper = sparse.csc_matrix((tangent, self._index, self._pointer), (self.size, self.size))
         return (upper + sparse.triu(upper, 1).T).tocsc()
 
@@ -196,21 +175,8 @@ class SolidModel:
     def stiffen(self, tangent: NDArray, probe: _Probe, q: NDArray, blocks: NDArray) -> None:
         """Add springs blocks (p, 3, 3) [N/m] at a probe's points to a stored tangent, in place."""
         matrix = probe.matrix
-        if self.banded:
-            _add_banded_springs(matrix.indptr, matrix.indices, matrix.data, blocks, tangent)
-            return
         where = self._pointer, self._index
-        _add_sparse_springs(matrix.indptr, matrix.indices, matrix.data, blocks, *where, tangent)
-
-
-def _order_nodes(elements: NDArray) -> NDArray:
-    """Return the nodes of elements (m, k) in reverse Cuthill-McKee order."""
-    used, local = np.unique(elements, return_inverse=True)
-    local = local.reshape(elements.shape)
-    pairs = np.broadcast_to(local[:, :, None], (*local.shape, local.shape[1]))
-    ones = np.ones(pairs.size)
-    graph = sparse.coo_matrix((ones, (pairs.ravel(), pairs.transpose(0, 2, 1).ravel())), (len(used), len(used)))
-    return used[reverse_cuthill_mckee(graph.tocsr(), symmetric_mode=True)]
+        _add_springs(matrix.indptr, matrix.indices, matrix.data, blocks, *where, tangent)
 
 
 def find_mirror_nodes(mesh: VolumeMesh) -> NDArray | None:
@@ -439,29 +405,8 @@ def _add_elements(
 
 
 @njit(cache=True, error_model="numpy")
-def _scatter_lower(values, source, row, col, storage):
-    """Add values[source[i]] to storage[row[i], col[i]] for all i."""
-    for i in range(len(source)):
-        storage[row[i], col[i]] += values[source[i]]
-
-
-@njit(cache=True, error_model="numpy")
-def _add_banded_springs(start, column, weight, blocks, storage):
-    """Add the springs blocks (p, 3, 3) of points, each three rows of a sparse matrix, to lower banded storage."""
-    for p in range(len(blocks)):
-        for a in range(3):
-            for b in range(3):
-                if blocks[p, a, b] == 0.0:
-                    continue
-                for i in range(start[3 * p + a], start[3 * p + a + 1]):
-                    for j in range(start[3 * p + b], start[3 * p + b + 1]):
-                        if column[j] <= column[i]:
-                            storage[column[i] - column[j], column[j]] += weight[i] * blocks[p, a, b] * weight[j]
-
-
-@njit(cache=True, error_model="numpy")
-def _add_sparse_springs(start, column, weight, blocks, pointer, index, values):
-    """Add the springs of points, see `_add_banded_springs`, to the upper triangle's values (k,), by columns."""
+def _add_springs(start, column, weight, blocks, pointer, index, values):
+    """Add springs blocks (p, 3, 3) of points, each three rows of a sparse matrix, to the upper triangle's values."""
     for p in range(len(blocks)):
         for a in range(3):
             for b in range(3):

@@ -34,7 +34,7 @@ from finforce_ifea.reduced.equilibria import Manifold
 from finforce_ifea.reduced.evaluation import ReducedContact, ReducedModel, scale_manifold
 
 # To be raised when what is stored, or how it is found, changes.
-VERSION = 7
+VERSION = 8
 # What reading a damaged archive raises, one or the other by where the damage is.
 _UNREADABLE = (OSError, ValueError, KeyError, EOFError, RuntimeError, BadZipFile, struct.error, zlib.error)
 # Share by which loads and motions of the first equilibria may differ by their compliances: right ones reach 0.001.
