@@ -16,7 +16,7 @@ from section_fakes import BASE, LENGTH, MILLIMETRE, WIDTH, draw_polygon, make_se
 from finforce_eval.cli.main import main
 from finforce_ifea.errors import JawFileError
 from finforce_ifea.jaw.cad.cad_file import read_section
-from finforce_ifea.jaw.cad.make_jaw import choose_keypoints
+from finforce_ifea.jaw.cad.make_jaw import choose_keypoints, make_jaw
 from finforce_ifea.jaw.cad.recognition import Overrides, recognize
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.jaw.section import order_rings
@@ -94,6 +94,9 @@ def test_a_floor_and_a_slot_are_named_with_their_place(tmp_path, surface):
     for mesh, word in ((floor, "a floor"), (slot, "a slot")):
         with pytest.raises(JawFileError, match=f"have another section.*{word}"):
             read_mesh(tmp_path, mesh)
+    with pytest.raises(JawFileError, match="its usual section is drawn in"):
+        make_jaw(tmp_path / "finger.stl", tmp_path / "out" / "jaw.yaml", name="slotted", overrides=Overrides())
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["jaw.png"]
 
 
 @pytest.mark.parametrize(("height", "clamp"), [(8.0, 10.5), (15.0, 15.0), (40.0, None)])

@@ -56,6 +56,14 @@ class RawSection:
     base: shapely.Geometry | None = None
 
 
+class UnlikeSectionsError(JawFileError):
+    """A solid has other sections than its usual one, `section` [m]."""
+
+    def __init__(self, message: str, section: shapely.Polygon) -> None:
+        super().__init__(message)
+        self.section = section
+
+
 def read_section(path: Path, *, unit: str | None = None, body: int | None = None) -> RawSection:
     """Read the section of a finger.
 
@@ -154,7 +162,7 @@ def _cut_surface(mesh: trimesh.Trimesh, unit: str | None, body: int | None) -> R
     if not cuts.is_one:
         base = cuts.find_base()
         if base is None:
-            raise JawFileError(f"is not prismatic along {letters}: {cuts.describe()}")
+            raise UnlikeSectionsError(f"is not prismatic along {letters}: {cuts.describe()}", cuts.section)
         width = _measure_blade(mesh, axis, base)
         notes.append(f"a blade {1e3 * width:.4g} mm wide on a base of {1e3 * cuts.width:.4g} mm")
     notes.append(f"prismatic along {letters} of the file, {1e3 * width:.4g} mm wide")

@@ -10,7 +10,7 @@ import shapely
 from numpy.typing import NDArray
 
 from finforce_ifea.errors import JawFileError
-from finforce_ifea.jaw.cad.cad_file import read_section
+from finforce_ifea.jaw.cad.cad_file import RawSection, UnlikeSectionsError, read_section
 from finforce_ifea.jaw.cad.picture import draw_finger, draw_refused
 from finforce_ifea.jaw.cad.recognition import Overrides, RecognizedFinger, recognize
 from finforce_ifea.jaw.jaw import load_jaw
@@ -57,12 +57,12 @@ def make_jaw(
         JawFileError: The file shows no fin-ray finger; the message says what it shows and what to do.
         MissingDependencyError: An optional reader is not installed.
     """
-    raw = read_section(file, unit=unit, body=body)
+    picture = picture or output.with_suffix(".png")
+    output.parent.mkdir(parents=True, exist_ok=True)
+    raw = _read_section(file, unit, body, picture)
     width = width or raw.width
     if width is None:
         raise JawFileError(f"{file.name}: a drawing has no width; give it in millimetres: --width 25")
-    picture = picture or output.with_suffix(".png")
-    output.parent.mkdir(parents=True, exist_ok=True)
     try:
         finger = recognize(raw.polygon, width, overrides, raw.taper, raw.base)
     except JawFileError as error:
@@ -86,6 +86,17 @@ def make_jaw(
         f"{material}: {spread}, until `finforce calibrate` has measured it (--material)",
     ]
     return [output, section, picture], notes
+
+
+def _read_section(file: Path, unit: str | None, body: int | None, picture: Path) -> RawSection:
+    """Read the section of a finger; draw the usual one of a solid that has others, too."""
+    try:
+        return read_section(file, unit=unit, body=body)
+    except JawFileError as error:
+        if not isinstance(error.__cause__, UnlikeSectionsError):
+            raise
+        draw_refused(error.__cause__.section, str(error), picture)
+        raise JawFileError(f"{error} (its usual section is drawn in {picture})") from error
 
 
 def choose_keypoints(finger: RecognizedFinger) -> dict[str, NDArray]:
