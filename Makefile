@@ -29,11 +29,10 @@ lint: .venv/.$(ROS)-lint
 bench: .venv/.$(ROS)-run
 	$(PYTHON) -m finforce_eval.cli.main bench --json report/bench.json
 
-# Every finger with the fixed seed and with one that is drawn anew and printed.
+# Every finger with the fixed seed and with one that is drawn anew and printed, two at a time.
 stress: .venv/.$(ROS)-run
-	@status=0; for seed in 0 new; do for jaw in $(STRESS_JAWS); do \
-	  $(PYTHON) -m finforce_eval.cli.main stress --seed $$seed --jaw $$jaw --count $(STRESS_COUNT) || status=1; \
-	done; done; exit $$status
+	@for jaw in $(STRESS_JAWS); do echo "0 $$jaw new $$jaw"; done | xargs -n 2 -P 2 sh -c '$(PYTHON) \
+	  -m finforce_eval.cli.main stress --seed "$$0" --jaw "$$1" --count $(STRESS_COUNT)'
 
 docs: .venv/.$(ROS)-docs
 	NO_MKDOCS_2_WARNING=1 $(PYTHON) -m mkdocs build --strict

@@ -42,9 +42,9 @@ def test_names_of_files_do_where_objects_are_expected():
     assert finforce.load_calibration(calibration) is calibration
     assert finforce.ForceEstimator("bench", calibration="bench").jaw.name == "bench"
     assert next(finforce.iter_frames(str(finforce.DEMO))).observation.points.shape == (15, 3)
-    with pytest.raises(ValueError, match="no jaw file 'bnch': did you mean bench?"):
+    with pytest.raises(ValueError, match="no jaw file 'bnch', did you mean bench?"):
         finforce.ForceEstimator("bnch")
-    with pytest.raises(ValueError, match="no calibration file 'twinn': did you mean twin?"):
+    with pytest.raises(ValueError, match="no calibration file 'twinn', did you mean twin?"):
         finforce.load_calibration("twinn")
 
 

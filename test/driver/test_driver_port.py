@@ -36,7 +36,7 @@ def test_a_port_without_permission_names_the_group(monkeypatch):
 
 @pytest.mark.parametrize("path", ["/dev/null", "/"])
 def test_what_is_no_serial_port_is_refused(path):
-    with pytest.raises(LinkError, match="no serial port"):
+    with pytest.raises(LinkError, match="is not a serial port"):
         SerialBus(path).open()
 
 

@@ -101,7 +101,7 @@ def test_a_camera_that_is_elsewhere_is_told_where_it_is(still, capsys, tmp_path)
 
 
 def test_a_picture_that_is_wrong_is_named(two_fingers, record, capsys, tmp_path):
-    status, said = check(record("changed", lambda color: color[::-1, ::-1] // 3), capsys, tmp_path)
+    status, said = check(record("changed", lambda color: color[::-1, ::-1] // 4), capsys, tmp_path)
     assert status == 1 and "upside down" in said and "mean brightness" in said
 
 

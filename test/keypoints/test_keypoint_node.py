@@ -216,7 +216,7 @@ def test_results_and_images_are_reliable_and_names_are_kept(probe):
     assert published("/keypoint_detector/keypoint_names").durability == DurabilityPolicy.TRANSIENT_LOCAL
     # lost pieces of an image come again
     for topic in (*node.parameters.color_topics, node.parameters.depth_topic):
-        assert heard(topic).reliability == ReliabilityPolicy.RELIABLE
+        probe.wait_for(lambda name=topic: heard(name).reliability == ReliabilityPolicy.RELIABLE)
     assert heard(node.parameters.info_topic).reliability == ReliabilityPolicy.BEST_EFFORT
 
 
