@@ -120,7 +120,7 @@ class _Chain:
         self._loop = ForceLoop(contact, bench.estimator)
         self._offsets = OFFSET * random.normal(size=bench.jaw.keypoints.shape)
         self._stamp = 10.0
-        bench.estimator.reset()
+        bench.estimator.forget()
 
     def see(self, frame: PressedImage) -> SessionStep:
         """Return the next image of what is true, with noise; the contact is not known yet."""
