@@ -111,7 +111,7 @@ class ForceEstimator:
     def reset(self) -> None:
         """Forget everything but the jaw: offsets, place, relaxation, stamps."""
         self._stamp: float | None = None
-        self._seen, self._changed = b"", 0.0
+        self._bits, self._changed = b"", 0.0
         self._followed: float | None = None  # stamp of the last image that a tracker took
         self._contact: Contact | None = None
         self._at_rest = self.is_idle = False
@@ -180,9 +180,9 @@ class ForceEstimator:
             self._follow(contact)
         self._contact = contact
         self._stamp = observation.stamp
-        seen = np.asarray(observation.points).tobytes()
-        if seen != self._seen:
-            self._seen, self._changed = seen, self._stamp
+        bits = np.asarray(observation.points).tobytes()
+        if bits != self._bits:
+            self._bits, self._changed = bits, self._stamp
         points = self._gate.accept(observation)
         self._taring.add(points, observation.stddev, apart=contact is not None and contact.touching is False)
         used, self.is_idle = np.isfinite(points[:, 0]), False

@@ -35,7 +35,7 @@ CAMERAS = {
     "bench": BENCH_CAMERA,
 }
 LEAST_SIZE, LARGEST_SIZE = 16, 4096  # [px]
-MOST_WORKERS = 4  # threads, of which each renders an image
+WORKERS = min(os.cpu_count() or 1, 4)  # threads, of which each renders an image
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -94,13 +94,12 @@ class Footage:
 
     def _shoot_ahead(self) -> Iterator[tuple[TwinState, Shot]]:
         """Yield states and their images, of which a few are rendered at once."""
-        workers = min(os.cpu_count() or 1, MOST_WORKERS)
-        pool, coming, before = ThreadPoolExecutor(workers), deque(), None
+        pool, coming, before = ThreadPoolExecutor(WORKERS), deque(), None
         try:
             for state in self._gripper.states():
                 coming.append((state, pool.submit(self._photographer.shoot, state, before)))
                 before = state
-                if len(coming) > workers:
+                if len(coming) > WORKERS:
                     taken, shot = coming.popleft()
                     yield taken, shot.result()
             for taken, shot in coming:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -15,7 +14,7 @@ from finforce.camera import CameraIntrinsics
 from finforce.transforms import invert_pose
 from finforce_ifea.grasp_force import Wrench
 from finforce_sim.emulator.mechanism import STROKE
-from finforce_sim.footage import FINGER, MOST_WORKERS, disturb_pose, set_stage
+from finforce_sim.footage import FINGER, WORKERS, disturb_pose, set_stage
 from finforce_sim.gripper import PressedGrasp
 from finforce_sim.photographer import Photographer, Shot
 from finforce_sim.scenarios import Scenario, ScenarioError
@@ -152,7 +151,7 @@ def render_openings(
         tell: hears how many openings of how many are done; what it raises ends the rendering.
     """
     render = partial(_render_opening, grasp, photographer)
-    takes, pool = [], ThreadPoolExecutor(min(os.cpu_count() or 1, MOST_WORKERS))
+    takes, pool = [], ThreadPoolExecutor(WORKERS)
     try:
         for shots in pool.map(render, openings.tolist(), range(len(openings))):
             tell(len(takes) + 1, len(openings))

@@ -11,7 +11,7 @@ from typing import Any
 from finforce.errors import FinforceError, one_line
 from finforce_eval.annotation.bag import bag_task, new_folder
 from finforce_eval.annotation.dataset_forces import episode_tasks, write_dataset
-from finforce_eval.cli.parser import BAG_HELP, Outcome, add_engine_options, add_run_options, read_engine
+from finforce_eval.cli.parser import BAG_HELP, CommandResult, add_engine_options, add_run_options, read_engine
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.keypoint_source import IMAGES
 from finforce_eval.evaluation.setup import describe_options, print_notes
@@ -34,7 +34,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add_engine_options(parser)
 
 
-def run(options: argparse.Namespace) -> Outcome:
+def run(options: argparse.Namespace) -> CommandResult:
     """Annotate recordings and print a line for each; status 2 where one of them failed."""
     out, manifest = Path(options.out), Manifest(Path(options.out), options.shard)
     named = name_recordings(options.bags, "_")
@@ -59,7 +59,7 @@ def run(options: argparse.Namespace) -> Outcome:
     annotated = sum(map(_has_force, lines))
     print(f"{annotated} of {len(lines)} annotated in {out}; {manifest.path.name} lists them")
     failed = not annotated or any(line["status"] != OK for line in lines)
-    return Outcome({"recordings": lines}, status=2 if failed else 0)
+    return CommandResult({"recordings": lines}, status=2 if failed else 0)
 
 
 def _has_force(line: Line) -> bool:

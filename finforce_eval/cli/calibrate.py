@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from finforce_eval.cli.parser import BAG_HELP, FORCE_HELP, Outcome, add_run_options
+from finforce_eval.cli.parser import BAG_HELP, FORCE_HELP, CommandResult, add_run_options
 from finforce_eval.evaluation.forces import truth_sides
 from finforce_eval.evaluation.setup import make_setup, read_keypoints
 from finforce_ifea.jaw.calibration import name_mechanics, save_calibration
@@ -19,7 +19,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--force", action="store_true", help=FORCE_HELP)
 
 
-def run(options: argparse.Namespace) -> Outcome:
+def run(options: argparse.Namespace) -> CommandResult:
     """Identify the material and write the calibration."""
     from finforce_eval.calibration.calibrate import calibrate, calibration_case, format_fit
 
@@ -40,4 +40,4 @@ def run(options: argparse.Namespace) -> Outcome:
     save_calibration(found, options.output)
     print(f"Calibration: {options.output}")
     left = {"force_rms_N": fit.force_rms, "shape_rms_mm": 1e3 * fit.shape_rms, "plateaus": fit.plateaus}
-    return Outcome({**left, "calibration": found.model_dump(mode="json")})
+    return CommandResult({**left, "calibration": found.model_dump(mode="json")})

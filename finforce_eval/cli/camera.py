@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from finforce.gripper_frames import SIDES, read_extrinsics
 from finforce.transforms import pose_numbers
-from finforce_eval.cli.parser import BAG_HELP, Outcome, add_rest_options
+from finforce_eval.cli.parser import BAG_HELP, CommandResult, add_rest_options
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.check import FITTED, SEEN, draw_jaw, draw_points
 from finforce_eval.evaluation.keypoint_source import choose_images, parse_source
@@ -40,7 +40,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add_rest_options(parser, images=45)
 
 
-def run(options: argparse.Namespace) -> Outcome:
+def run(options: argparse.Namespace) -> CommandResult:
     """Find camera, jaws and covered points in the first images of a source, and write and draw them."""
     from finforce.optional import import_cv2
 
@@ -62,7 +62,9 @@ def run(options: argparse.Namespace) -> Outcome:
     import_cv2().imwrite(str(picture), draw_placement(found, colors[0], recording, jaws)[..., ::-1])
     print(describe_placement(found, jaws))
     print(f"Rig: {output}; {picture}: jaws as found in orange, key points seen in green")
-    return Outcome({"rig": rig.model_dump(mode="json"), "contrast": found.contrast, "residual_px": found.residual})
+    return CommandResult(
+        {"rig": rig.model_dump(mode="json"), "contrast": found.contrast, "residual_px": found.residual}
+    )
 
 
 def choose_pictures(recording: Recording, count: int) -> list[NDArray]:

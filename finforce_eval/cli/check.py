@@ -11,7 +11,7 @@ from finforce.camera_topics import COLOR_TOPIC, COMPRESSED_COLOR, DEPTH_TOPIC, I
 from finforce.errors import MissingDependencyError
 from finforce.messages import read_stamp
 from finforce_eval.cli.extrinsics import read_at_rest
-from finforce_eval.cli.parser import BAG_HELP, Outcome, add_rest_options
+from finforce_eval.cli.parser import BAG_HELP, CommandResult, add_rest_options
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.at_rest import ROUNDS
 from finforce_eval.evaluation.check import FAULT, check_recording
@@ -36,7 +36,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--report", default=".", metavar="DIR", help=f"folder for {PICTURE} (current folder)")
 
 
-def run(options: argparse.Namespace) -> Outcome:
+def run(options: argparse.Namespace) -> CommandResult:
     """Check the first images of a recording, print what fits and what does not, and draw it.
 
     Returns:
@@ -98,7 +98,7 @@ def record_camera(topics: Sequence[str], count: int, folder: Path, domain: int |
     return write_entries(sorted(entries, key=lambda entry: entry.stamp), folder)
 
 
-def _check(options: argparse.Namespace) -> Outcome:
+def _check(options: argparse.Namespace) -> CommandResult:
     from finforce.optional import import_cv2
 
     source, recording = read_at_rest(options)
@@ -113,4 +113,4 @@ def _check(options: argparse.Namespace) -> Outcome:
     outcome = f"{faults} to be changed" if faults else "everything fits"
     print(f"{outcome}; {folder / PICTURE}: grey as given, orange as fitted, green key points")
     findings = [line._asdict() for line in check.findings]
-    return Outcome({"faults": faults, "findings": findings}, status=int(faults > 0))
+    return CommandResult({"faults": faults, "findings": findings}, status=int(faults > 0))

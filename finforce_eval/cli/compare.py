@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from finforce_eval.cli.parser import Outcome
+from finforce_eval.cli.parser import CommandResult
 from finforce_eval.evaluate import read_evaluations
 from finforce_eval.evaluation.comparison import (
     BETTER,
@@ -36,7 +36,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--strict", action="store_true", help="exit with 1 if a recording got worse or is missing")
 
 
-def run(options: argparse.Namespace) -> Outcome:
+def run(options: argparse.Namespace) -> CommandResult:
     """Compare two evaluations and print the table."""
     before, after = (_read(Path(path)) for path in (options.before, options.after))
     changes = compare_evaluations(before, after)
@@ -45,7 +45,7 @@ def run(options: argparse.Namespace) -> Outcome:
     print(format_changes(changes))
     found = {"changes": [asdict(change) for change in changes], "mean": asdict(total_change(changes))}
     worse = options.strict and any(change.verdict in (WORSE, LOST) for change in changes)
-    return Outcome(found, status=WORSE_FOUND if worse else 0)
+    return CommandResult(found, status=WORSE_FOUND if worse else 0)
 
 
 def _read(path: Path) -> Mapping[str, Any]:

@@ -14,7 +14,7 @@ from typing import Any
 from finforce.systems.launch import find_share
 from finforce_eval.annotation.bag import new_folder
 from finforce_eval.cli.main import parse
-from finforce_eval.cli.parser import CONTACT_HELP, Outcome
+from finforce_eval.cli.parser import CONTACT_HELP, CommandResult
 from finforce_eval.cli.twin import RecordingForm, record_scene
 from finforce_eval.errors import RecordingError, SilentReplayError
 from finforce_eval.evaluation.keypoint_source import IMAGES
@@ -39,7 +39,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--report", default="report", metavar="DIR", help="folder of the report (report)")
 
 
-def run(options: argparse.Namespace) -> Outcome:
+def run(options: argparse.Namespace) -> CommandResult:
     """Replay a recording, print the error of the force, write the report.
 
     Raises:

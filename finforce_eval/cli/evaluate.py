@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from finforce_eval.cli.parser import BAG_HELP, Outcome, add_engine_options, add_run_options, read_engine
+from finforce_eval.cli.parser import BAG_HELP, CommandResult, add_engine_options, add_run_options, read_engine
 from finforce_eval.evaluate import evaluate_many
 from finforce_eval.evaluation.setup import make_setup
 from finforce_eval.evaluation.tables import evaluation_json, format_tables
@@ -34,7 +34,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add_engine_options(parser)
 
 
-def run(options: argparse.Namespace) -> Outcome:
+def run(options: argparse.Namespace) -> CommandResult:
     """Evaluate recordings: print the table, write the report; status 2 where one of them failed."""
     setup, engine = make_setup(options), read_engine(options)
     with ExitStack() as stack:
@@ -48,4 +48,4 @@ def run(options: argparse.Namespace) -> Outcome:
 
         print(f"Report: {write_overview(evaluation, options.report, about=setup.about)}")
     more = {"failed": failed} if failed else {}
-    return Outcome(evaluation_json(evaluation, **more, **setup.about), status=2 if failed else 0)
+    return CommandResult(evaluation_json(evaluation, **more, **setup.about), status=2 if failed else 0)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from finforce.camera import ImageError, decode_picture
 from finforce.transforms import pose_numbers, rotation_between
-from finforce_eval.cli.parser import BAG_HELP, Outcome, add_rest_options, length_mm
+from finforce_eval.cli.parser import BAG_HELP, CommandResult, add_rest_options, length_mm
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.at_rest import ROUNDS, approach, first_images
 from finforce_eval.evaluation.keypoint_source import KeypointSource, build_records, choose_images, parse_source
@@ -31,13 +31,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add_rest_options(parser, images=45)
 
 
-def run(options: argparse.Namespace) -> Outcome:
+def run(options: argparse.Namespace) -> CommandResult:
     """Find the camera's pose from the first images of a recording, and print it as the nodes take it."""
     if options.grid is not None:
         above = find_grid_camera(read_picture(Path(options.bags[0])), options.grid)
         print(format_grid_camera(above))
         pose = pose_numbers(above.T_camera_table)
-        return Outcome({"camera": vars(above.camera), "T_camera_table": pose, "residual_px": above.residual})
+        return CommandResult({"camera": vars(above.camera), "T_camera_table": pose, "residual_px": above.residual})
     source, recording = read_at_rest(options)
     start = build_records(source.node_parameters(recording)).parameters
     recording = replace(recording, images=choose_images(recording, start.depth))
@@ -46,7 +46,7 @@ def run(options: argparse.Namespace) -> Outcome:
         found, _ = approach(recording, source, jaws, start.camera_pose, bar.update)
     print(format_extrinsics(found, start.camera_pose))
     pose, stddev = pose_numbers(found.T_gripper_camera), found.stddev.tolist()
-    return Outcome(
+    return CommandResult(
         {"T_gripper_camera": pose, "stddev": stddev, "residual_px": found.residual, "origins": found.origins}
     )
 

@@ -6,7 +6,7 @@ import argparse
 import time
 from pathlib import Path
 
-from finforce_eval.cli.parser import Outcome, length_mm, picture_file
+from finforce_eval.cli.parser import CommandResult, length_mm, picture_file
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -36,7 +36,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--picture", type=lambda name: Path(picture_file(name)), help=text)
 
 
-def run(options: argparse.Namespace) -> Outcome:
+def run(options: argparse.Namespace) -> CommandResult:
     """Read a finger, say what was found, and write jaw file, section and picture."""
     from finforce_ifea.jaw.cad.make_jaw import make_jaw
     from finforce_ifea.jaw.cad.recognition import Overrides
@@ -59,4 +59,4 @@ def run(options: argparse.Namespace) -> Outcome:
     for note in notes:
         print(f"  {note}")
     print(f"{', '.join(str(path) for path in files)}, {time.monotonic() - started:.1f} s")
-    return Outcome({"files": [str(path) for path in files], "notes": notes})
+    return CommandResult({"files": [str(path) for path in files], "notes": notes})

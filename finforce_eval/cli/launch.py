@@ -22,7 +22,7 @@ from finforce.systems.processes import (
     RobotOptions,
     replay_processes,
 )
-from finforce_eval.cli.parser import Outcome
+from finforce_eval.cli.parser import CommandResult
 from finforce_eval.errors import OptionError
 from finforce_eval.replay.processes import ProcessGroup
 
@@ -46,18 +46,18 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-s", "--show-args", action="store_true", help="list the arguments and their defaults")
 
 
-def run(options: argparse.Namespace) -> Outcome:
+def run(options: argparse.Namespace) -> CommandResult:
     """Run the processes of a system until Ctrl-C, or until its recording ends."""
     record, _ = SYSTEMS[options.system]
     if options.show_args:
         for entry in fields(record):
             print(f"{entry.name}:={default_text(entry)}\n    {describe(entry)}")
-        return Outcome({"arguments": {entry.name: default_text(entry) for entry in fields(record)}})
+        return CommandResult({"arguments": {entry.name: default_text(entry) for entry in fields(record)}})
     processes = startable(list_parts(options.system, options.words))
     with StopSignals() as stop, ProcessGroup(processes, {}, quiet=False) as group:
         while not stop.wait(_POLL) and not group.has_finished():
             pass
-    return Outcome({"system": options.system, "arguments": options.words})
+    return CommandResult({"system": options.system, "arguments": options.words})
 
 
 def list_parts(system: str, words: Sequence[str]) -> list[Process | Include]:

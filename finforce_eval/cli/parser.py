@@ -30,7 +30,7 @@ PICTURES = (".png", ".jpg", ".svg", ".pdf")
 
 
 @dataclass(frozen=True)
-class Outcome:
+class CommandResult:
     """What a command has found, as `--json` writes it, and its exit status."""
 
     results: Mapping[str, Any] = field(default_factory=dict)

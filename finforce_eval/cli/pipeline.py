@@ -11,7 +11,7 @@ from finforce.settings import setting
 from finforce.systems.launch import options_from_words
 from finforce.systems.live import gripper_process
 from finforce.systems.processes import GripperOptions, Process, ReplayOptions, finish, merge, replay_processes
-from finforce_eval.cli.parser import Outcome
+from finforce_eval.cli.parser import CommandResult
 from finforce_eval.errors import OptionError
 
 
@@ -50,7 +50,7 @@ def pipeline_process(words: list[str]) -> Process:
     return merge([*processes, *driver])
 
 
-def run(options: argparse.Namespace) -> Outcome:
+def run(options: argparse.Namespace) -> CommandResult:
     """Run the process until Ctrl-C; its exit status is that of the command."""
     process = pipeline_process(options.words)
     try:
@@ -58,4 +58,4 @@ def run(options: argparse.Namespace) -> Outcome:
     except ImportError as error:
         raise MissingDependencyError(f"the pipeline needs ROS 2: pip install 'finforce[ros]' ({error})") from error
     status = main([*process.arguments, "--ros-args"])
-    return Outcome({"processes": [process.executable]}, status=status)
+    return CommandResult({"processes": [process.executable]}, status=status)

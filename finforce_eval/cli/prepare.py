@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from finforce.errors import MissingDependencyError
 from finforce.processors import ALL
-from finforce_eval.cli.parser import Outcome
+from finforce_eval.cli.parser import CommandResult
 from finforce_eval.tasks import progress_bar
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--calibration", default="", metavar="FILE", help=text)
 
 
-def run(options: argparse.Namespace) -> Outcome:
+def run(options: argparse.Namespace) -> CommandResult:
     """Compile and build under a progress bar."""
     count = len(COMPILED) + len(options.jaws)
     prepared = []
@@ -37,7 +37,7 @@ def run(options: argparse.Namespace) -> Outcome:
             prepared.append(done)
             bar.update()
             bar.write(done)
-    return Outcome({"prepared": prepared})
+    return CommandResult({"prepared": prepared})
 
 
 _MOST = 8  # processes, each of some 300 MB

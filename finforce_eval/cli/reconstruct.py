@@ -19,7 +19,7 @@ from finforce_contact.mesh.views import MeshView, RenderedMesh
 from finforce_contact.reconstruction.evidence import GeneratedMesh, ImageEvidence, Reconstruction, collect_evidence
 from finforce_contact.reconstruction.generated import read_generated as read_mesh
 from finforce_contact.reconstruction.reconstruction import FROM_GENERATED, reconstruct
-from finforce_eval.cli.parser import Outcome, picture_file
+from finforce_eval.cli.parser import CommandResult, picture_file
 from finforce_eval.errors import OptionError
 from finforce_eval.figures.figures import BLUE, ORANGE, new_figure
 from finforce_eval.recordings.image_files import read_depth, read_generated_pose, read_image, read_intrinsics, read_mask
@@ -49,7 +49,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--picture", type=picture_file, metavar="PNG", help="draw the mesh over the depth image")
 
 
-def run(options: argparse.Namespace) -> Outcome:
+def run(options: argparse.Namespace) -> CommandResult:
     """Reconstruct, write mesh, pose and picture, and print what came out.
 
     Raises:
@@ -72,7 +72,7 @@ def run(options: argparse.Namespace) -> Outcome:
     if options.picture:
         write_picture(options.picture, result, evidence, color)
         print(f"Picture: {options.picture}")
-    return Outcome(_as_json(result))
+    return CommandResult(_as_json(result))
 
 
 def check_options(options: argparse.Namespace) -> None:

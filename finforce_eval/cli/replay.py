@@ -6,7 +6,7 @@ import argparse
 import math
 from dataclasses import asdict
 
-from finforce_eval.cli.parser import BAG_HELP, Outcome, add_run_options
+from finforce_eval.cli.parser import BAG_HELP, CommandResult, add_run_options
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.keypoint_source import parse_source
 from finforce_eval.evaluation.setup import make_setup, sides_of
@@ -63,7 +63,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--report", metavar="DIR", help="write a page with figures to this folder")
 
 
-def run(options: argparse.Namespace) -> Outcome:
+def run(options: argparse.Namespace) -> CommandResult:
     """Play a recording and score it.
 
     Raises:
@@ -94,4 +94,4 @@ def run(options: argparse.Namespace) -> Outcome:
         print(f"Report: {page}")
     score = result.grasp_score
     grasp = {"grasp": asdict(score.error), "grasp_delay": score.delay}
-    return Outcome(evaluation_json(result.evaluation, **grasp, **setup.about))
+    return CommandResult(evaluation_json(result.evaluation, **grasp, **setup.about))

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from finforce.messages import NANOSECONDS, stamp_of
-from finforce_eval.cli.parser import Outcome
+from finforce_eval.cli.parser import CommandResult
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluate import read_evaluations
 from finforce_eval.evaluation.scoring import match_truth
@@ -34,7 +34,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--title", default="Forces", help="heading of the page (Forces)")
 
 
-def run(options: argparse.Namespace) -> Outcome:
+def run(options: argparse.Namespace) -> CommandResult:
     """Write the page and name it.
 
     Raises:
@@ -60,7 +60,7 @@ def run(options: argparse.Namespace) -> Outcome:
         write_html(recorded, page, title=options.title, about={"version": version()})
     count = len(recorded) or len(evaluation.results)
     print(f"Page: {page}: {count} plots")
-    return Outcome({"page": str(page), "plots": count})
+    return CommandResult({"page": str(page), "plots": count})
 
 
 _FORCE, _STDDEV, _STATUS, _TRUTH = KINDS = ("wrench", "wrench_stddev", "wrench_status", "ground_truth_wrench")

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from finforce_eval.cli.parser import BAG_HELP, Outcome, add_run_options
+from finforce_eval.cli.parser import BAG_HELP, CommandResult, add_run_options
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.keypoint_source import parse_source
 from finforce_eval.evaluation.setup import make_setup, sides_of
@@ -28,7 +28,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--apart", action="store_true", help="run every stage in its own process")
 
 
-def run(options: argparse.Namespace) -> Outcome:
+def run(options: argparse.Namespace) -> CommandResult:
     """Play a recording in real time and print where the time went.
 
     Raises:
@@ -53,7 +53,7 @@ def run(options: argparse.Namespace) -> Outcome:
             lost={name: state["refused"] for name, state in log.health.items() if "refused" in state},
         )
     print(format_trace(trace))
-    return Outcome({"stages": stage_figures(trace), "images": len(trace.images), "lost": trace.lost})
+    return CommandResult({"stages": stage_figures(trace), "images": len(trace.images), "lost": trace.lost})
 
 
 WAY = "image out to grasp force in"

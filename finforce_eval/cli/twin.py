@@ -18,7 +18,7 @@ from finforce.camera_topics import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 from finforce.messages import DEPTH_FORMAT
 from finforce.optional import import_trimesh
 from finforce.transforms import pose_numbers, quaternion_from_pose
-from finforce_eval.cli.parser import Outcome, Parser, add_output_options, whole_number
+from finforce_eval.cli.parser import CommandResult, Parser, add_output_options, whole_number
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.keypoint_source import parse_changes
 from finforce_eval.recordings.images import (
@@ -82,12 +82,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     record.set_defaults(run=run_record)
 
 
-def run_list(options: argparse.Namespace) -> Outcome:
+def run_list(options: argparse.Namespace) -> CommandResult:
     """Print the scenes, with the numbers in which each differs from the default."""
     lengths = {name: float(write_script(scenario).stamps[-1]) for name, scenario in SCENARIOS.items()}
     for name, scenario in SCENARIOS.items():
         print(f"{name:<22} {lengths[name]:5.1f} s  {', '.join(_deviations(scenario))}")
-    return Outcome({"scenes": {name: {"seconds": length} for name, length in lengths.items()}})
+    return CommandResult({"scenes": {name: {"seconds": length} for name, length in lengths.items()}})
 
 
 def _deviations(scenario: Scenario) -> list[str]:
@@ -103,7 +103,7 @@ def _short(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value) or "none"
 
 
-def run_record(options: argparse.Namespace) -> Outcome:
+def run_record(options: argparse.Namespace) -> CommandResult:
     """Render a scene and write the recording, its mesh and its `case.json`.
 
     Raises:
@@ -118,7 +118,7 @@ def run_record(options: argparse.Namespace) -> Outcome:
     size = sum(path.stat().st_size for path in folder.iterdir()) / 1e6
     print(f"Recording: {folder} ({size:.1f} MB)")
     print(f"Score it with: finforce evaluate {folder} --from images")
-    return Outcome({"recording": str(folder), "megabytes": size})
+    return CommandResult({"recording": str(folder), "megabytes": size})
 
 
 def check_new(folder: Path) -> None:

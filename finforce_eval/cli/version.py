@@ -2,7 +2,7 @@
 
 import argparse
 
-from finforce_eval.cli.parser import Outcome
+from finforce_eval.cli.parser import CommandResult
 from finforce_eval.machine import version
 
 
@@ -10,7 +10,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add nothing."""
 
 
-def run(options: argparse.Namespace) -> Outcome:
+def run(options: argparse.Namespace) -> CommandResult:
     """Print the version."""
     print(f"finforce {version()}")
-    return Outcome({"version": version()})
+    return CommandResult({"version": version()})

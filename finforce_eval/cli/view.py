@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from finforce.messages import NANOSECONDS
 from finforce.optional import import_cv2, import_library
-from finforce_eval.cli.parser import BAG_HELP, Outcome, add_run_options
+from finforce_eval.cli.parser import BAG_HELP, CommandResult, add_run_options
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.forces import Estimator, estimate_forces
 from finforce_eval.evaluation.gripper import combine_jaws
@@ -31,7 +31,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add_run_options(parser)
 
 
-def run(options: argparse.Namespace) -> Outcome:
+def run(options: argparse.Namespace) -> CommandResult:
     """Find the forces of a recording and show them with its pictures."""
     if options.save and not options.save.endswith(".rrd"):
         raise OptionError(f"--save {options.save}: expected a name that ends in .rrd")
@@ -47,7 +47,7 @@ def run(options: argparse.Namespace) -> Outcome:
     view.close()
     if options.save:
         print(f"{options.save}: {frames} images of {', '.join(jaws)}; open it with: rerun {options.save}")
-    return Outcome({"file": options.save, "images": frames, "jaws": list(jaws)})
+    return CommandResult({"file": options.save, "images": frames, "jaws": list(jaws)})
 
 
 TIMELINE = "recording"

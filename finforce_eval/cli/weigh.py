@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from finforce_eval.calibration.weighing import find_holds, format_weighing, scale_calibration, weigh
-from finforce_eval.cli.parser import BAG_HELP, FORCE_HELP, Outcome, add_run_options
+from finforce_eval.cli.parser import BAG_HELP, FORCE_HELP, CommandResult, add_run_options
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.forces import estimate_forces
 from finforce_eval.evaluation.setup import make_setup, read_keypoints
@@ -27,7 +27,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--force", action="store_true", help=FORCE_HELP)
 
 
-def run(options: argparse.Namespace) -> Outcome:
+def run(options: argparse.Namespace) -> CommandResult:
     """Find the holds of a recording, and scale the stiffness by the readings of a scale."""
     if options.output and not options.grams:
         raise OptionError("-o needs --grams: the readings of the scale, one for each hold")
@@ -41,7 +41,7 @@ def run(options: argparse.Namespace) -> Outcome:
         for number, hold in enumerate(holds, 1):
             print(f"hold {number}: {hold.start:.1f} to {hold.end:.1f} s, estimated {hold.force:.3f} N")
         print(f"{len(holds)} holds; give their readings with --grams")
-        return Outcome({"holds": [vars(hold) for hold in holds]})
+        return CommandResult({"holds": [vars(hold) for hold in holds]})
     weighing = weigh(holds, options.grams, recording.name)
     print(format_weighing(weighing))
     scaled = scale_calibration(
@@ -53,4 +53,4 @@ def run(options: argparse.Namespace) -> Outcome:
         print(f"Calibration: {options.output}")
     holds = [{**vars(hold), "scale": weight} for hold, weight in zip(holds, weighing.weights.tolist(), strict=True)]
     found = {"factor": weighing.factor, "factor_stddev": weighing.stddev, "misfit": weighing.misfit, "holds": holds}
-    return Outcome({**found, "calibration": scaled.model_dump(mode="json")})
+    return CommandResult({**found, "calibration": scaled.model_dump(mode="json")})

@@ -16,7 +16,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from finforce.elimination import eliminate
 from finforce_ifea.tare import Tare
+from finforce_ifea.tracking.contact_filter import invert_symmetric
 from finforce_ifea.tracking.contact_state import ContactState, measure_along
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
@@ -27,8 +29,8 @@ _BUMP, _FEIGNED, _FEIGNED_SHARE = 1e-3, 0.04e-3, 0.02
 _SIZES = (0.25e-3, 0.5e-3, 1e-3, 2e-3)
 # Drift of the motion from image to image [m]; and squared Mahalanobis distance of three numbers beyond chance.
 _DRIFT, _BEYOND = 0.04e-3, 14.2
-# Fewer key points do not tell. Of the depth, which is free, one standard deviation [m].
-_FEWEST, _FREE = 6, 10e-3
+# Fewer key points do not tell. Standard deviations of the depth, which is free, and of a height that may be wrong [m].
+_FEWEST, _FREE, _ELSEWHERE = 6, 10e-3, 30e-3
 # Squared distance that keeps a quarter of its weight, median of one in two axes; iterations for the noise, and after.
 _GATE, _MEDIAN_SQUARE, _FIRST, _ROUNDS = 9.0, 1.386, 3, 6
 _STATE, _MOTION = 3, 3
@@ -59,7 +61,7 @@ class CommonMotion:
         """
         if tare is not self._tare:
             self._tare = tare
-            self._track["b"], self._track["P"] = 0.0, _FEIGNED**2 * np.eye(_MOTION)
+            self._track["b"], self._track["P"], self._track["change"] = 0.0, _FEIGNED**2 * np.eye(_MOTION), 0.0
         if not tare.is_taken:
             return
         follow_motion(points, positions, state, *expected, self._track)
@@ -147,22 +149,20 @@ def _fit_motion(points, rows, left, prior):
         if turn == _FIRST:
             level = max(1.0, np.median(squares[known]) / _MEDIAN_SQUARE)
         H[:] = 0.0
-        g = np.zeros(_SIZE)
+        g = np.zeros((_SIZE, 1))
         _add_prior(H, g, 0, -found[0], _FREE**2)
-        for i in range(2):
-            _add_prior(H, g, 1 + i, offset[i] - found[1 + i], variance[i] + i * 30e-3**2)
+        _add_prior(H, g, 1, offset[0] - found[1], variance[0])
+        _add_prior(H, g, 2, offset[1] - found[2], variance[1] + _ELSEWHERE**2)
         for i in range(_STATE, _SIZE):
             _add_prior(H, g, i, -found[i], _BUMP**2)
         for k in range(len(points)):
             if known[k]:
                 squares[k] = _add_point(points[k], rows[k], left[k], level, found, H, g)
-        L = H.copy()
-        _factorise(L)
-        _substitute(L, g)
-        found += g
-    for i in range(_SIZE):
-        for j in range(i):
-            H[j, i] = H[i, j]
+        for i in range(_SIZE):
+            for j in range(i):
+                H[j, i] = H[i, j]
+        eliminate(H.copy(), g)
+        found += g[:, 0]
     return H, found
 
 
@@ -170,7 +170,7 @@ def _fit_motion(points, rows, left, prior):
 def _add_prior(H, g, i, missing, variance):
     """Add the prior of unknown i, which is off its mean by `missing`, to Hessian and gradient."""
     H[i, i] += 1.0 / variance
-    g[i] += missing / variance
+    g[i, 0] += missing / variance
 
 
 @njit(**_OPTIONS)
@@ -189,7 +189,7 @@ def _add_point(point, rows, left, level, found, H, g):
     for i in range(_SIZE):
         a = weight * (s11 * rows[0, i] - s01 * rows[1, i])
         b = weight * (s00 * rows[1, i] - s01 * rows[0, i])
-        g[i] += a * r0 + b * r1
+        g[i, 0] += a * r0 + b * r1
         for j in range(i + 1):
             H[i, j] += a * rows[0, j] + b * rows[1, j]
     return square
@@ -198,12 +198,10 @@ def _add_point(point, rows, left, level, found, H, g):
 @njit(**_OPTIONS)
 def _take_state_out(H):
     """Return the information (3, 3) of a Hessian (6, 6) on the motion, and what that changes of the state (3, 3)."""
-    L, A, change = H[:_STATE, :_STATE].copy(), H[_STATE:, _STATE:].copy(), np.empty((_STATE, _MOTION))
-    _factorise(L)
-    for j in range(_MOTION):
-        change[:, j] = H[:_STATE, _STATE + j]
-        _substitute(L, change[:, j])
-        for i in range(_MOTION):
+    A, change = H[_STATE:, _STATE:].copy(), H[:_STATE, _STATE:].copy()
+    eliminate(H[:_STATE, :_STATE].copy(), change)
+    for i in range(_MOTION):
+        for j in range(_MOTION):
             for k in range(_STATE):
                 A[i, j] -= H[_STATE + i, k] * change[k, j]
     return A, -change
@@ -218,14 +216,14 @@ def _update_track(H, found, track):
     for i in range(_MOTION):
         A[i, i] -= 1.0 / _BUMP**2
         alone[i, i] -= (1.0 - 1e-3) / _BUMP**2
-    alone = _invert(alone)
+    alone = invert_symmetric(alone)
     away = _multiply(alone, told) - track.b
     if _measure_square(away, alone + track.P) > _BEYOND:
         for i in range(_MOTION):
             for j in range(_MOTION):
                 track.P[i, j] += away[i] * away[j]
-    prior = _invert(track.P)
-    track.P[:] = _invert(prior + A)
+    prior = invert_symmetric(track.P)
+    track.P[:] = invert_symmetric(prior + A)
     track.b[:] = _multiply(track.P, told + _multiply(prior, track.b))
     track.change[:] = _multiply(change, track.b)
 
@@ -246,52 +244,16 @@ def _measure_surprise(b, P, variance):
     S = P.copy()
     for i in range(_MOTION):
         S[i, i] += variance
-    L = S.copy()
-    return _factorise(L) + _measure_square(b, S)
+    minors = (
+        S[1, 1] * S[2, 2] - S[1, 2] ** 2,
+        S[0, 1] * S[2, 2] - S[1, 2] * S[0, 2],
+        S[0, 1] * S[1, 2] - S[1, 1] * S[0, 2],
+    )
+    size = S[0, 0] * minors[0] - S[0, 1] * minors[1] + S[0, 2] * minors[2]
+    return np.log(size) + _measure_square(b, S)
 
 
 @njit(**_OPTIONS)
 def _measure_square(b, S):
     """Return b^T S^-1 b."""
-    L, x = S.copy(), b.copy()
-    _factorise(L)
-    _substitute(L, x)
-    return (b * x).sum()
-
-
-@njit(**_OPTIONS)
-def _invert(S):
-    """Return the inverse of a symmetric matrix (n, n)."""
-    L, out = S.copy(), np.eye(len(S))
-    _factorise(L)
-    for i in range(len(S)):
-        _substitute(L, out[i])
-    return out
-
-
-@njit(**_OPTIONS)
-def _factorise(H):
-    """Replace the lower half of H (n, n) by its Cholesky factor; return the log of its determinant."""
-    size = 0.0
-    for j in range(len(H)):
-        for i in range(j, len(H)):
-            total = H[i, j]
-            for k in range(j):
-                total -= H[i, k] * H[j, k]
-            H[i, j] = total / H[j, j] if i > j else np.sqrt(max(total, 1e-300))
-        size += 2.0 * np.log(H[j, j])
-    return size
-
-
-@njit(**_OPTIONS)
-def _substitute(L, b):
-    """Replace b (n,) by the solution of L L^T x = b."""
-    n = len(L)
-    for i in range(n):
-        for k in range(i):
-            b[i] -= L[i, k] * b[k]
-        b[i] /= L[i, i]
-    for i in range(n - 1, -1, -1):
-        for k in range(i + 1, n):
-            b[i] -= L[k, i] * b[k]
-        b[i] /= L[i, i]
+    return (b * _multiply(invert_symmetric(S), b)).sum()

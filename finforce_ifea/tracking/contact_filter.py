@@ -257,7 +257,7 @@ def update_state(points, average, extended, forecast, expectation, state):
     _extend_average(average, points, deeper, LONGEST_AVERAGE, extended)
     offset = (forecast.x[1] - expectation.mean[0], forecast.x[2] - expectation.mean[1])
     hessian, gradient = _compute_posterior(points, extended, offset, expectation.variance, information)
-    covariance = _invert_symmetric(hessian)
+    covariance = invert_symmetric(hessian)
     height_doubt = _question_height(hessian, gradient, offset[1], expectation.variance[1], state)
     shift = _find_shift(hessian, covariance, gradient, state)
     largest = (expectation.largest_change, LARGEST_SHIFT)
@@ -422,7 +422,7 @@ def _compute_posterior(points, average, offset, prior_variance, information):
 
 
 @njit(**_OPTIONS)
-def _invert_symmetric(A):
+def invert_symmetric(A):
     """Return the inverse of a symmetric 3 x 3 matrix."""
     c00 = A[1, 1] * A[2, 2] - A[1, 2] * A[1, 2]
     c01 = A[0, 2] * A[1, 2] - A[0, 1] * A[2, 2]
@@ -486,7 +486,7 @@ def _question_height(hessian, gradient, offset, prior_variance, state):
     # a millionth is left of the prior, for where the key points tell nothing
     data[2, 2] -= (1.0 - 1e-6) * pull
     slope[2] += (1.0 - 1e-6) * pull * offset
-    covariance = _invert_symmetric(data)
+    covariance = invert_symmetric(data)
     state.offset = offset
     for i in range(3):
         state.offset += covariance[2, i] * slope[i]

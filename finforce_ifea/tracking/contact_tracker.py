@@ -377,25 +377,31 @@ class ContactTracker:
         Within the uncertainty of its state, as by rocking, an object that is clear of the base may press there, and one
         that seems to press there may be clear of it.
         """
-        return 0.0 if self._is_apart else max(self._find_hidden_at(state, *place) for place in self._base)
-
-    def _find_hidden_at(self, state: ContactState, height: float, stiffness: float) -> float:
-        """Return the same at one height [m], where the unloaded jaw has a stiffness [N/m]."""
-        x, indenter = state["x"], self._contact.indenter
-        clearance = indenter.find_clearance(x, 0.0, height)
-        if not abs(clearance) < _WELL_CLEAR:
+        if self._is_apart:
             return 0.0
+        x, indenter, surface = state["x"], self._contact.indenter, self._contact.surface
+        clearances = [indenter.find_clearance(x, 0.0, height) for height, _ in self._base]
+        if not any(abs(clearance) < _WELL_CLEAR for clearance in clearances):
+            return 0.0
+        moved = self._contact.place_points(self.q)[:, 0] - surface.points[:, 0]
+        hidden = 0.0
+        for clearance, (height, stiffness) in zip(clearances, self._base, strict=True):
+            if abs(clearance) < _WELL_CLEAR:
+                row = max(0, int(np.searchsorted(surface.heights, height)) - 1) * surface.across
+                beyond = self._find_clearance_stddev(state, height) - abs(clearance - moved[row]) / _APART_SIGMAS
+                hidden = max(hidden, stiffness * beyond)
+        return hidden
+
+    def _find_clearance_stddev(self, state: ContactState, height: float) -> float:
+        """Return the standard deviation of the object's clearance at a height by its state [m]."""
+        x, indenter = state["x"], self._contact.indenter
         slope, covariance = np.array([-1.0, 0.0, 0.0]), state["covariance"]
         for i in (SHAPE, HEIGHT):
             step = np.zeros(3)
             step[i] = sqrt(max(covariance[i, i], _LEAST_VARIANCE))
             change = [indenter.find_clearance(x + sign * step, 0.0, height) for sign in (-1.0, 1.0)]
             slope[i] = 0.5 * (change[1] - change[0]) / step[i] if np.isfinite(change).all() else 0.0
-        stddev = sqrt(max(float(slope @ covariance @ slope), 0.0))
-        surface = self._contact.surface
-        row = max(0, int(np.searchsorted(surface.heights, height)) - 1) * surface.across
-        clearance -= self._contact.place_points(self.q)[row, 0] - surface.points[row, 0]
-        return stiffness * max(0.0, stddev - abs(clearance) / _APART_SIGMAS)
+        return sqrt(max(float(slope @ covariance @ slope), 0.0))
 
     def _measure_stiffness(self, height: float) -> float:
         """Return the stiffness of the unloaded jaw at a height [m] against a round object [N/m]."""

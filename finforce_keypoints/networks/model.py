@@ -23,9 +23,8 @@ LARGEST_OFFSET = 20.0
 _LOG_FLOOR = 1e-2  # of the peak: a neighbour below it says nothing of the place between the cells
 _STEP_ROWS, _STEP_COLUMNS = (steps.ravel() - 1 for steps in np.indices((3, 3)))
 _FEW_CELLS = 36
-_LARGEST_PEAK = (
-    0.5  # share of a map's cells that may reach half of its highest score: a map without a peak is not a map
-)
+# share of a map's cells that may reach half of its highest score: a map without a peak is not a map
+_LARGEST_PEAK = 0.5
 _CENTRE = 4  # of the 3 x 3 cells in row order; 3 and 5 are its neighbours in the row, 1 and 7 in the column
 
 

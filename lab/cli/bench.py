@@ -8,7 +8,7 @@ from time import perf_counter
 from typing import Any
 
 from finforce.errors import FinforceError
-from finforce_eval.cli.parser import Outcome, picture_file
+from finforce_eval.cli.parser import CommandResult, picture_file
 from finforce_eval.errors import OptionError
 from finforce_eval.machine import describe_machine, write_figures
 from lab.harness import PARTS, draw_tradeoff, figures_json, format_figures, measure_part, select_parts
@@ -31,7 +31,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--quick", action="store_true", help="measure fewer cases")
 
 
-def run(options: argparse.Namespace) -> Outcome:
+def run(options: argparse.Namespace) -> CommandResult:
     """Measure the parts, print each one's tables, draw the pictures."""
     given = {name: getattr(options, name) for name in ("folder", "jaw", "minutes", "count", "model")}
     given = {name: value for name, value in given.items() if value is not None}
@@ -44,7 +44,7 @@ def run(options: argparse.Namespace) -> Outcome:
         if options.json:  # what comes next may fail
             write_figures(options.json, content)
     print(f"\n{machine['processor']}, {machine['cores']} cores, Python {machine['python']}, {machine['commit']}")
-    return Outcome(content)
+    return CommandResult(content)
 
 
 def _run_part(part: str, quick: bool, given: dict[str, Any], picture: Path | None) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import argparse
 from importlib import import_module
 from pathlib import Path
 
-from finforce_eval.cli.parser import SOURCES, Outcome, add_engine_options, read_engine
+from finforce_eval.cli.parser import SOURCES, CommandResult, add_engine_options, read_engine
 from finforce_eval.errors import OptionError
 from lab.experiments.experiment import PAGE, Experiment, RunOptions, run_experiment
 from lab.harness import figures_json, format_figures
@@ -70,7 +70,7 @@ def read_options(options: argparse.Namespace) -> RunOptions:
     )
 
 
-def run(options: argparse.Namespace) -> Outcome:
+def run(options: argparse.Namespace) -> CommandResult:
     """Run an experiment, print its tables, name its page."""
     _, module = EXPERIMENTS[options.name]
     experiment: Experiment = getattr(import_module(f"lab.experiments.{module}"), options.name.upper())
@@ -78,7 +78,7 @@ def run(options: argparse.Namespace) -> Outcome:
     figures = run_experiment(experiment, chosen, report, read_engine(options), options.shard)
     if figures is None:
         print(f"Part {options.shard} is done; without --shard all parts are put on a page")
-        return Outcome()
+        return CommandResult()
     print(format_figures(figures))
     print(f"Page: {report / experiment.name / PAGE}")
-    return Outcome({experiment.name: figures_json(figures)})
+    return CommandResult({experiment.name: figures_json(figures)})

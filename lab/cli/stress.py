@@ -10,7 +10,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from finforce_eval.cli.parser import MESHES, SOLVERS, Outcome, whole_number
+from finforce_eval.cli.parser import MESHES, SOLVERS, CommandResult, whole_number
 from finforce_eval.errors import OptionError
 from finforce_eval.machine import describe_machine
 from lab.stress import inputs, objects
@@ -102,7 +102,7 @@ def describe_trial(trial: Trial) -> str:
     return f"seed {trial.seed}, {trial.level}: {trial.outcome}, {notes}"
 
 
-def run(options: argparse.Namespace) -> Outcome:
+def run(options: argparse.Namespace) -> CommandResult:
     """Run the families, print the table.
 
     Returns:
@@ -120,7 +120,7 @@ def run(options: argparse.Namespace) -> Outcome:
     content = {"plan": asdict(plan), "tables": {"families": format_summaries(summaries)}}
     content["families"] = collect_figures(summaries, trials)
     status = int(any(broken[family.name] for family in families if family.ruled))
-    return Outcome(content, status=status)
+    return CommandResult(content, status=status)
 
 
 def collect_figures(summaries: Sequence[Mapping[str, Any]], trials: Mapping[str, Sequence[Trial]]) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from eval_fakes import FakeEstimator, make_recording
 
 from finforce_eval.cli import replay
 from finforce_eval.cli.main import COMMANDS, build_parser, main, parse
-from finforce_eval.cli.parser import Outcome
+from finforce_eval.cli.parser import CommandResult
 from finforce_eval.errors import SilentReplayError
 from finforce_eval.recordings.writer import write_entries, write_recording
 
@@ -336,7 +336,7 @@ def test_the_demo_of_a_busy_machine_is_played_once_more_and_slower(monkeypatch, 
         rates.append(options.rate)
         if len(rates) < 2:
             raise SilentReplayError("no wrench came")
-        return Outcome({"rate": options.rate})
+        return CommandResult({"rate": options.rate})
 
     monkeypatch.setattr(replay, "run", play)
     assert main(["demo", "--from", "keypoints", "--rate", "2"]) == 0

@@ -85,7 +85,7 @@ def test_the_same_seed_gives_the_same_images_whatever_the_threads(grasp, monkeyp
     openings = np.linspace(0.0, 0.03, 12)
     reels = []
     for workers in (1, 4):
-        monkeypatch.setattr("finforce_sim.live.MOST_WORKERS", workers)
+        monkeypatch.setattr("finforce_sim.live.WORKERS", workers)
         reels.append(render_openings(grasp, FakeLens(), openings, lambda frame: frame.color))
     np.testing.assert_array_equal(reels[0], reels[1])
 
