@@ -225,11 +225,9 @@ class GivenContactTracker:
         return explain_offsets(modes, tare, stddev)
 
 
-# A pressed object travels along the finger by this share of its depth, one standard deviation: 20 mm becomes 13.8 mm at
-# 10 mm of a cylinder of 35 mm, less with smaller ones and higher up.
-_TRAVEL = 0.3
-# No averaging makes the place that key points ask for surer than this [m]: their answers are those of the unloaded jaw.
-_SUREST = 2e-3
+# No averaging makes the place that key points ask for surer than this share of the heights that the face has: their
+# answers are those of the unloaded jaw.
+_SUREST = 0.03
 
 
 class _LocationWatch:
@@ -240,13 +238,16 @@ class _LocationWatch:
 
         dz = (P U' . r) / (F P U' . P U'),      variance 1 / (F^2 P U' . P U'),
 
-    is the way to the place that they ask for. A place that is off by dz changes the force by (U . U') / (U . U) dz F.
+    is the way to the place that they ask for. A place off by dz changes the force by the factor U . V / (V . V),
+    V = U(z + dz). A round object that presses by d rolls along the face, which turns, by its radius times that angle.
     """
 
     def __init__(self, response: InfluenceCoefficients, settings: EstimatorSettings) -> None:
         """Keep the answers of the unloaded jaw and how well heights are known."""
         self._response = response
         self._prior_variance = settings.height_stddev**2
+        self._radius = settings.radius * float(np.exp(settings.radius_log_stddev**2))  # root mean square
+        self._surest = _SUREST * float(response.heights[-1] - response.heights[0])
         self._memory = LONGEST_AVERAGE
         self._height, self._spread = float(np.median(response.heights)), 0.0
         self.reset()
@@ -261,7 +262,7 @@ class _LocationWatch:
         Shares of a spread load are hardly better known than that it is somewhere there.
         """
         height = float(np.average(heights, weights=weights))
-        if abs(height - self._height) > _SUREST:
+        if abs(height - self._height) > self._surest:
             self.reset()
         self._height = height
         self._spread = float(np.average((heights - height) ** 2, weights=weights))
@@ -284,12 +285,23 @@ class _LocationWatch:
         asked = force * float((weights * beyond_force * left).sum()) / max(information, 1e-300)
         self._average(asked, information)
         depth = force / self._response.stiffness_at(self._height)
-        given = self._prior_variance + self._spread + (_TRAVEL * depth) ** 2
-        spread = 1.0 / max(self._information, 1e-9) + _SUREST**2
+        travel = self._radius * self._response.turn_at(self._height) * depth
+        given = self._prior_variance + self._spread + travel**2
+        spread = 1.0 / max(self._information, 1e-9) + self._surest**2
         mistaken, beyond = question_location(self._offset, spread, given, 0.0)
-        stddev = float(np.sqrt(given + beyond))
+        share = given / (given + spread)
+        stddev = float(np.sqrt((share * self._offset) ** 2 + share * spread + beyond))
         state["offset"], state["mistaken"] = self._offset, mistaken
-        state["height_stddev"], state["location_error"] = stddev, abs(sensitivity) * stddev
+        state["height_stddev"], state["location_error"] = stddev, self._find_error(motion, used, weights, stddev)
+
+    def _find_error(self, motion: NDArray, used: NDArray, weights: NDArray, stddev: float) -> float:
+        """Return the relative error of a force by a place that is off by a standard deviation [m], either way."""
+        error = 0.0
+        for place in (self._height - stddev, self._height + stddev):
+            there = self._response.at(place)[used]
+            factor = float((weights * motion * there).sum()) / max(float((weights * there**2).sum()), 1e-300)
+            error = max(error, abs(factor - 1.0))
+        return error
 
     def _average(self, asked: float, information: float) -> None:
         """Take what a frame asks for [m] with its information [1/m^2] into the average."""

@@ -20,6 +20,8 @@ from finforce_ifea.tare import OFFSET_STDDEV, Tare
 
 _HEIGHTS = 13
 _TOUCH = 3e-5
+# Heights over which the face's turn is measured, to either side [m].
+_BESIDE = 2e-3
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -30,12 +32,14 @@ class InfluenceCoefficients:
         heights: where they touch (m,) [m], rising.
         motions: of the key points in the plane per force (m, K, 2) [m/N].
         stiffness: force over depth (m,) [N/m].
+        turns: of the inner face where they touch, by the depth (m,) [rad/m].
         fits: what `bound_force` has found for the key points that it saw last.
     """
 
     heights: NDArray
     motions: NDArray
     stiffness: NDArray
+    turns: NDArray
     fits: dict = field(default_factory=dict, repr=False)
 
     def at(self, height: float) -> NDArray:
@@ -49,6 +53,10 @@ class InfluenceCoefficients:
     def stiffness_at(self, height: float) -> float:
         """Return force over depth [N/m] at a height [m]; below and above, that of the nearest one."""
         return float(np.interp(height, self.heights, self.stiffness))
+
+    def turn_at(self, height: float) -> float:
+        """Return the turn of the inner face by the depth [rad/m] at a height [m]; beyond, that of the nearest one."""
+        return float(np.interp(height, self.heights, self.turns))
 
     def _interpolate(self, values: NDArray, height: float) -> NDArray:
         """Return values (m, ...) between their heights."""
@@ -96,14 +104,23 @@ def measure_influence(contact: RigidContact, probe: Any, keypoints: int) -> Infl
     low, high = contact.surface.heights[[0, -1]]
     # the ends of the surface are left out: next to the clamp a force moves hardly anything
     heights = np.linspace(low + 0.12 * (high - low), high - 0.05 * (high - low), _HEIGHTS)
-    motions, stiffness = np.zeros((_HEIGHTS, keypoints, 2)), np.zeros(_HEIGHTS)
+    motions, (stiffness, turns) = np.zeros((_HEIGHTS, keypoints, 2)), np.zeros((2, _HEIGHTS))
     shape = 0.5 * (contact.indenter.lowest + contact.indenter.highest)
     for row, height in enumerate(heights):
         q, state = press_lightly(contact, shape, height)
         stiffness[row] = np.linalg.norm(state.force_modes[:, DEPTH])
         modes = contact.model.project(probe, q, state.modes)
         motions[row] = modes[:, ::2, DEPTH] / stiffness[row]
-    return InfluenceCoefficients(heights=heights, motions=motions, stiffness=stiffness)
+        turns[row] = _measure_turn(contact, q, state, height)
+    return InfluenceCoefficients(heights=heights, motions=motions, stiffness=stiffness, turns=turns)
+
+
+def _measure_turn(contact: RigidContact, q: NDArray, state: PressedState, height: float) -> float:
+    """Return by how much the inner face turns at a height [m], by the depth of an object there [rad/m]."""
+    moved = contact.place_points(q + _TOUCH * state.modes[:, DEPTH]) - contact.place_points(q)
+    heights = contact.surface.points[:, 2]
+    beside = np.abs(heights - height) < _BESIDE
+    return abs(float(np.polyfit(heights[beside] - height, moved[beside, 0] / _TOUCH, 1)[0]))
 
 
 def press_lightly(contact: RigidContact, shape: float, height: float) -> tuple[NDArray, PressedState]:

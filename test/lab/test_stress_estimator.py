@@ -104,6 +104,13 @@ def test_a_load_held_in_place_is_stated_with_its_place():
     assert held[1].sigmas < 3.0
 
 
+@pytest.mark.parametrize(("height", "radius"), [(18e-3, 12e-3), (20e-3, 22e-3), (30e-3, 22e-3)])
+def test_a_load_held_in_place_may_have_rolled_along_the_face(height, radius):
+    start = session(height=height, radius=radius, depth=7e-3)
+    held = play([replace(step, contact=replace(start.contact, free=False)) for step in start.press()])[-1]
+    assert held[0].status == "ok" and held[1].sigmas < 2.5
+
+
 # --- contacts that are not where they were said to be
 
 
