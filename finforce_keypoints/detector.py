@@ -26,6 +26,8 @@ __all__ = ["JawKeypoints", "KeypointDetector"]
 _SAME_SIDE = 2e-3  # [m] by which a reference point may lie off the plane of the key points
 _OFF_CENTRE = 6e-3  # [m] by which the middle between two jaws may be off the gripper's
 _FEW, _MEMORY = 0.4, 45  # share of a jaw's key points that are too few on average, and over how many images
+# A lost jaw is looked for in so many images in a row, then at intervals: each search costs as much as ten images with it.
+_SEARCHES, _SEARCH_PERIOD = 30, 0.3  # images, s
 _PRACTICE_SIZE, _RATE = (640, 480), 30.0  # px, Hz
 _SCALE_DRIFT = 1e-3  # [1/s^0.5] random walk of the depth scale's error
 _LEAST_SCALE_STDDEV = 5e-4  # images do not err independently: no average is better than this
@@ -107,6 +109,8 @@ class KeypointDetector:
         self._looks, self._shares = dict.fromkeys(self._jaws, 0), dict.fromkeys(self._jaws, 0.0)
         self._scale = DepthScale(error=0.0, stddev=self.settings.scale_stddev)
         self._sights: dict[float, _Sight] = {}
+        self._searches = dict.fromkeys(self._jaws, 0)
+        self._searched = dict.fromkeys(self._jaws, -np.inf)
         self.was_still = False
         self.counts: Counter[str] = Counter()
 
@@ -222,8 +226,19 @@ class KeypointDetector:
         still = watch.confirm(image) if is_watched else None
         if still is not None:
             return _Sight(is_watched=True, still=still, detections={})
-        expected = {side: jaw.expect(image.stamp) for side, jaw in self._jaws.items()}
-        return _Sight(is_watched=is_watched, still=None, detections=self._pixel_detector.detect(image, expected))
+        detections = self._pixel_detector.detect(image, self._expect(image.stamp))
+        return _Sight(is_watched=is_watched, still=None, detections=detections)
+
+    def _expect(self, stamp: float) -> dict[str, NDArray | None]:
+        """Return where the jaws should be at a time [s], None for a lost one; one not worth a search yet is absent."""
+        expected: dict[str, NDArray | None] = {}
+        for side, jaw in self._jaws.items():
+            pose = jaw.expect(stamp)
+            if pose is None and self._searches[side] >= _SEARCHES and stamp < self._searched[side] + _SEARCH_PERIOD:
+                continue
+            self._searches[side] = 0 if pose is not None else self._searches[side] + 1
+            expected[side], self._searched[side] = pose, stamp
+        return expected
 
     def _find(self, image: RgbdImage, detections: Mapping[str, PixelDetection]) -> dict[str, JawKeypoints]:
         """Return the key points of the jaws in an image that has to be looked at."""

@@ -394,8 +394,9 @@ class KeypointModel:
             batch = batch[..., ::-1]
         if layout.channel_axis == 1:
             batch = batch.transpose(0, 3, 1, 2)
+        batch = np.ascontiguousarray(batch)  # colours as they lie in a picture make steps of three numbers
         if layout.dtype == np.uint8:
-            return np.ascontiguousarray(batch)
+            return batch
         tensor = batch * self._scale
         tensor += self._shift
         return tensor.astype(layout.dtype, copy=False)

@@ -211,7 +211,7 @@ class Network:
         (name, shape, _), *_ = self.inputs
         batch = size_frozen(shape[0]) or 1
         try:
-            outputs = session.run(None, {name: tensor.repeat(batch, axis=0)})
+            outputs = session.run(None, {name: tensor if batch == 1 else tensor.repeat(batch, axis=0)})
         except Exception as error:  # as above
             raise DetectionError(
                 f"the network cannot be computed for an input of {tensor.shape}: {one_line(error)}"

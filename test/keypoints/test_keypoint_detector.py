@@ -247,6 +247,20 @@ def test_a_lost_jaw_is_absent_looked_for_everywhere_and_found_again():
     assert "left" in detector.detect(replace(image, stamp=1.0))
 
 
+def test_a_jaw_that_stays_away_is_looked_for_at_intervals_and_found_again():
+    scene, depth, pixel_detector, detector = build()
+    image, seen = bare_image(0.0, depth.astype(np.float32)), pixel_detector.pixels.pop("left")
+    for n in range(90):
+        assert set(detector.detect(replace(image, stamp=n / RATE))) == {"right"}
+    searches = [n for n, expected in enumerate(pixel_detector.expected) if "left" in expected]
+    assert searches[:30] == list(range(30)) and 4 <= len(searches[30:]) <= 8
+    assert all("right" in expected for expected in pixel_detector.expected)
+    pixel_detector.pixels = {"left": seen, **pixel_detector.pixels}
+    pixel_detector.likelihood["left"] = np.full(16, 0.95)
+    found = [n for n in range(90, 110) if "left" in detector.detect(replace(image, stamp=n / RATE))]
+    assert len(found) > 10 and found == list(range(found[0], 110))  # as soon as it is looked for, and from then on
+
+
 def test_a_jaw_that_no_depth_confirms_is_lost_and_found_again_by_one_that_does():
     scene, depth, pixel_detector, detector = build(lost_images=4)
     whole = bare_image(0.0, depth.astype(np.float32))
