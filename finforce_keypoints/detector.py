@@ -26,7 +26,7 @@ __all__ = ["JawKeypoints", "KeypointDetector"]
 _SAME_SIDE = 2e-3  # [m] by which a reference point may lie off the plane of the key points
 _OFF_CENTRE = 6e-3  # [m] by which the middle between two jaws may be off the gripper's
 _FEW, _MEMORY = 0.4, 45  # share of a jaw's key points that are too few on average, and over how many images
-# A lost jaw is looked for in so many images in a row, then at intervals: each search costs as much as ten images with it.
+# Images in a row in which a lost jaw is looked for, and then the interval: a search costs as much as ten images with it
 _SEARCHES, _SEARCH_PERIOD = 30, 0.3  # images, s
 _PRACTICE_SIZE, _RATE = (640, 480), 30.0  # px, Hz
 _SCALE_DRIFT = 1e-3  # [1/s^0.5] random walk of the depth scale's error
