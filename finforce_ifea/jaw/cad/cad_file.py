@@ -303,7 +303,10 @@ def _find_axis(mesh: trimesh.Trimesh) -> tuple[NDArray, float]:
     best, most = np.array([0.0, 0.0, 1.0]), -1.0
     for cluster in np.argsort(-weight)[:20]:
         axis = (turned * (areas * (number == cluster))[:, None]).sum(axis=0)
-        axis = axis / np.linalg.norm(axis)
+        length = np.linalg.norm(axis)
+        if not length > 0.0:  # triangles without an area
+            break
+        axis = axis / length
         along = np.abs(normals @ axis)
         share = float(areas[(along < _UPRIGHT) | (along > 1.0 - _UPRIGHT**2)].sum() / areas.sum())
         # a box goes with all three of its directions: the one with the smallest end faces has been extruded least
