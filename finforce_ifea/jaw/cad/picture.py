@@ -132,8 +132,14 @@ def _draw_points(axes, finger: RecognizedFinger, jaw: Jaw) -> None:
 
 
 def _draw_solid(axes, mesh: VolumeMesh) -> None:
-    """Draw a mesh as seen from the camera's side."""
-    axes.plot_trisurf(*(1e3 * mesh.nodes.T), triangles=mesh.surface, color=_MATERIAL, linewidth=0.0)
+    """Draw a mesh as seen from the camera's side, without the triangles that look away, which would shine through."""
+    up, around = np.radians([_VIEW["elev"], _VIEW["azim"]])
+    towards = np.array([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
+    corners = mesh.nodes[mesh.surface]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    axes.plot_trisurf(
+        *(1e3 * mesh.nodes.T), triangles=mesh.surface[normals @ towards > 0.0], color=_MATERIAL, linewidth=0.0
+    )
     axes.view_init(**_VIEW)
     axes.set_aspect("equal")
     axes.set_axis_off()
