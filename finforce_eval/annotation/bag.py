@@ -49,7 +49,7 @@ def bag_task(name: str, source: Path, target: Path, options: argparse.Namespace,
 
     `settings` are what `describe_options` says of the options. Where there is no such recording, the task says so.
     """
-    key = hash_settings(settings, list_files(source))
+    key = hash_settings({**settings, "episode": options.episode}, list_files(source))
     given = {"source": source, "target": target, "options": options, "settings": hash_settings(settings), "key": key}
     return Task(name=name, key=key, work=annotate_bag, given=given, output=str(target))
 
@@ -75,11 +75,11 @@ def annotate_bag(source: Path, target: Path, options: argparse.Namespace, settin
     setup, keypoints = share_setup(settings, options), parse_source(options)
     recording = read_recording(source, keypoints.choice, sides_of(options), strict=keypoints.strict)
     setup.contacts.check(recording)
-    recording = keypoints.apply(replace(recording, name=source.stem))
+    recording = keypoints.apply(replace(recording, name=target.name))
     jaws = estimate_forces(recording, setup)
     why = why_unanswered(jaws.values())
     if why:
-        raise RecordingError(f"{source.stem}: {why}")
+        raise RecordingError(f"{target.name}: {why}")
     figures = without_nan(_describe(jaws) | {"notes": list(recording.notes)})
     about = {"key": key, "figures": figures, "settings": dict(setup.about), "version": version()}
     with new_folder(target) as folder:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from shutil import rmtree
 from typing import Any
@@ -15,8 +17,9 @@ from finforce_eval.cli.parser import BAG_HELP, CommandResult, add_engine_options
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.keypoint_source import IMAGES
 from finforce_eval.evaluation.setup import describe_options, print_notes
-from finforce_eval.recordings.bags import name_recordings
+from finforce_eval.recordings.bags import is_buffer, name_recordings
 from finforce_eval.recordings.dataset import is_dataset
+from finforce_eval.recordings.umi import count_episodes
 from finforce_eval.tasks import OK, Line, Manifest, Task, choose_shard, run_tasks
 
 
@@ -46,7 +49,7 @@ def run(options: argparse.Namespace) -> CommandResult:
     bags = choose_shard([(name, path) for name, path in named if name not in datasets], options.shard)
     settings = describe_options(options)
     with manifest.alone():
-        tasks = [bag_task(name, path, out / name, options, settings) for name, path in bags]
+        tasks = [task for name, path in bags for task in _tasks_of(name, path, options, settings)]
         lines = run_tasks(tasks, read_engine(options), manifest)
         for line in lines:
             _print_outcome(line)
@@ -60,6 +63,21 @@ def run(options: argparse.Namespace) -> CommandResult:
     print(f"{annotated} of {len(lines)} annotated in {out}; {manifest.path.name} lists them")
     failed = not annotated or any(line["status"] != OK for line in lines)
     return CommandResult({"recordings": lines}, status=2 if failed else 0)
+
+
+def _tasks_of(name: str, path: Path, options: argparse.Namespace, settings: Mapping[str, Any]) -> list[Task]:
+    """Return the task of a recording, or those of the episodes of a buffer; one that is damaged says so at its work."""
+    count = 0
+    if is_buffer(path):
+        with suppress(FinforceError):
+            count = count_episodes(path)
+    if not count:
+        return [bag_task(name, path, Path(options.out) / name, options, settings)]
+    given = {f"{name}_{number:06d}": vars(options) | {"episode": number} for number in range(count)}
+    return [
+        bag_task(each, path, Path(options.out) / each, argparse.Namespace(**own), settings)
+        for each, own in given.items()
+    ]
 
 
 def _has_force(line: Line) -> bool:

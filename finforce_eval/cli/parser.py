@@ -19,7 +19,8 @@ MESHES = ("default", "coarse", "fine")
 UNITS = ("m", "cm", "mm", "inch")
 SOURCES = ("images", "keypoints", "truth")
 JAWS_CHOICES = ("left", "right", "both")
-BAG_HELP = "rosbag2 folder, .mcap or .db3 file, the folder of a LeRobot dataset, a video, or a folder of pictures"
+BAG_HELP = "rosbag2 folder, .mcap or .db3 file, the folder of a LeRobot dataset, UMI's or UMI-FT's .zarr or "
+BAG_HELP += ".zarr.zip, a video, or a folder of pictures"
 CONTACT_HELP = (
     "contact: estimate, closest or paper, from the object's mesh and pose; fixed:Z_MM, the height of first touch above "
     "the clamped base [mm]; fixed:case, from the case.json next to each recording; NAME=Z_MM, for one "
@@ -106,7 +107,7 @@ def add_detector_options(parser: argparse._ActionsContainer) -> None:
     parser.add_argument("--extrinsics", metavar="POSE", help=text)
     text = "rig file of finforce camera, instead of --jaw, --extrinsics and --intrinsics; a --jaw after it has priority"
     parser.add_argument("--rig", action=_UseRig, metavar="FILE", help=text)
-    text = "topic of the colour images, or feature of a LeRobot dataset (the only one)"
+    text = "topic of the colour images, feature of a LeRobot dataset, or array of a .zarr (the only one)"
     parser.add_argument("--color", metavar="TOPIC", help=text)
     text = "topic of the depth images (the only one in the frame of the colour images)"
     parser.add_argument("--depth", metavar="TOPIC", help=text)
@@ -116,7 +117,7 @@ def add_detector_options(parser: argparse._ActionsContainer) -> None:
     text += "file of ROS, OpenCV, kalibr, BOP or OpenICC (UMI), with the name of the camera if it has several"
     parser.add_argument("--intrinsics", nargs="+", metavar="NUMBER", help=text)
     episode = whole_number(0, 10**9)
-    parser.add_argument("--episode", type=episode, default=0, metavar="N", help="episode of a LeRobot dataset (0)")
+    parser.add_argument("--episode", type=episode, default=0, metavar="N", help="episode of a dataset or .zarr (0)")
 
 
 class _UseRig(argparse.Action):

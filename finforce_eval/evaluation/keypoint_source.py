@@ -18,7 +18,7 @@ from finforce.errors import FinforceError, PoseError, suggest
 from finforce.gripper_frames import read_extrinsics
 from finforce.health import Idling
 from finforce.messages import NANOSECONDS
-from finforce.transforms import pose_numbers, quaternion_from_pose
+from finforce.transforms import pose_from_quaternion, pose_numbers, quaternion_from_pose
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.recordings.images import DEPTH_ENDS, ImageChoice, ImageTrack
 from finforce_eval.recordings.tracks import DetectionTrack, JawTrack, KeypointTrack, PoseTrack, Recording
@@ -222,12 +222,13 @@ def parse_source(options: argparse.Namespace) -> KeypointSource:
     if extrinsics:
         parameters["T_gripper_camera"] = _parse_extrinsics(extrinsics)
     switches = {name: bool(getattr(options, name, False)) for name in ("strict", "as_live")}
-    seconds = parameters.get("sync_tolerance")
+    seconds, pose = parameters.get("sync_tolerance"), parameters.get("T_gripper_camera")
     given = {name: getattr(options, option, None) for name, option in _CHOICES.items()}
     choice = ImageChoice(
         **{name: value for name, value in given.items() if value},
         intrinsics=tuple(getattr(options, "intrinsics", None) or ()),
         camera=rig.intrinsics if rig is not None else None,
+        T_gripper_camera=None if pose is None else pose_from_quaternion(pose[:3], pose[3:]),
         pairing=None if seconds is None or math.isnan(seconds) else round(seconds * NANOSECONDS),
     )
     return KeypointSource(source=source, jaw_file=options.jaw, parameters=parameters, choice=choice, **switches)

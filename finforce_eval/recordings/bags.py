@@ -257,13 +257,14 @@ def check_types(connections: Iterable[Any], expected: Mapping[str, Collection[st
 # what people have recordings in, by the ending of their names, and what makes one of ours of it
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
 PICTURES = (".png", ".jpg", ".jpeg")
+BUFFERS = (".zarr", ".zarr.zip")  # of UMI and UMI-FT
 BAGS = ("metadata.yaml", "*.mcap", "*.db3", "meta/info.json")  # what makes a folder something else than pictures
 _OTHERS = {
     ".bag": "a ROS 1 bag: rosbags-convert --src FILE --dst FOLDER makes a ROS 2 bag of it",
     ".hdf5": "HDF5, as ALOHA and robomimic write it: make a LeRobot dataset of it, with LeRobotDataset.create",
-    ".zarr": "Zarr, as UMI writes it: make a LeRobot dataset of it, with LeRobotDataset.create",
+    ".zip": "a zip file; a replay buffer of UMI is called NAME.zarr.zip",
 }
-_OTHERS |= {".h5": _OTHERS[".hdf5"], ".zip": _OTHERS[".zarr"]}
+_OTHERS[".h5"] = _OTHERS[".hdf5"]
 
 
 def bag_source(path: Path) -> Path:
@@ -301,8 +302,15 @@ def _check_bag(path: Path) -> Path:
     return path
 
 
+def is_buffer(path: Path) -> bool:
+    """Say whether a path is, by its name, a group of Zarr."""
+    return path.name.endswith(BUFFERS)
+
+
 def is_frames(path: Path) -> bool:
-    """Say whether a path is a video, or a folder of pictures and nothing else that is a recording."""
+    """Say whether a path is a buffer, a video, or a folder of pictures and nothing else that is a recording."""
+    if is_buffer(path):
+        return True
     if not path.is_dir():
         return path.suffix.lower() in VIDEOS
     return not any(any(path.glob(pattern)) for pattern in BAGS) and bool(list_pictures(path))
@@ -318,7 +326,9 @@ def list_files(path: Path) -> list[Path]:
     """Return the files of a recording; none where there is no such recording."""
     try:
         source = path if is_frames(path) else bag_source(path)
-        return [source] if source.is_file() else [each for each in source.iterdir() if each.is_file()]
+        if source.is_file():
+            return [source]
+        return [*source.glob("*/*")] if is_buffer(source) else [each for each in source.iterdir() if each.is_file()]
     except (RecordingError, OSError):
         return []
 
@@ -350,6 +360,8 @@ def name_recordings(texts: Sequence[str | Path], between: str) -> list[tuple[str
 
 def _bag_stem(path: Path) -> Path:
     """Return the path of a recording without the ending of its file."""
+    if is_buffer(path):
+        return path.with_name(path.name.removesuffix(".zip").removesuffix(".zarr"))
     with suppress(RecordingError):
         source = path if is_frames(path) else bag_source(path)
         return source.with_suffix("") if source.is_file() else source

@@ -54,6 +54,7 @@ class ImageChoice:
         info: topic of camera_info; "" for that next to the colour images.
         intrinsics: words of --intrinsics, instead of camera_info.
         camera: of a rig file, for images that do not describe theirs; others have to agree with it.
+        T_gripper_camera: (4, 4), for what is recorded in the axes of the camera; None where nothing tells it.
         is_cut: whether images may be the middle of those that the intrinsics are of, scaled.
         episode: of a dataset.
         pairing: greatest distance between the stamps of a colour and a depth image that belong together [ns]; half a
@@ -65,6 +66,7 @@ class ImageChoice:
     info: str = ""
     intrinsics: tuple[str, ...] = ()
     camera: CameraIntrinsics | None = None
+    T_gripper_camera: NDArray[np.float64] | None = None
     is_cut: bool = False
     episode: int = 0
     pairing: int | None = None

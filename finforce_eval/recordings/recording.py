@@ -12,7 +12,7 @@ from finforce.errors import ObservationError
 from finforce.files import FileError, read_json
 from finforce.messages import NANOSECONDS, Keypoints, decode_columns, decode_keypoints, stamp_of
 from finforce_eval.errors import DamagedError, RecordingError
-from finforce_eval.recordings.bags import bag_source, check_messages, check_types, is_frames, open_bag
+from finforce_eval.recordings.bags import bag_source, check_messages, check_types, is_buffer, is_frames, open_bag
 from finforce_eval.recordings.dataset import is_dataset, read_episode
 from finforce_eval.recordings.frames import read_frames
 from finforce_eval.recordings.images import ImageChoice, ImageTrack, find_images
@@ -27,6 +27,7 @@ from finforce_eval.recordings.tracks import (
     WrenchTrack,
     parse_phases,
 )
+from finforce_eval.recordings.umi import read_buffer
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
 WRENCH = "geometry_msgs/msg/WrenchStamped"
@@ -63,14 +64,14 @@ class _Content(NamedTuple):
 def read_recording(
     path: str | Path, choice: ImageChoice | None = None, sides: Sequence[str] = (), *, strict: bool = False
 ) -> Recording:
-    """Read a bag (rosbag2 folder, .mcap or .db3) with its `case.json`, an episode of a dataset, a video, or pictures.
+    """Read a bag with its `case.json`, an episode of a dataset or of a buffer of UMI, a video, or pictures.
 
     Topics that are not ours are not decoded; those of unknown type are named in `notes`. Images are not read yet; a
     recording with images may do without key points, its tracks of them are empty then. One that is damaged is read as
     far as it is good; how much was lost stands in `notes`.
 
     Args:
-        path: the folder or the file.
+        path: rosbag2 folder, .mcap, .db3, folder of a dataset or of pictures, .zarr, .zarr.zip, or video.
         choice: which images.
         sides: jaws that are in the images, whether or not a topic tells of them; both where none tells of any.
         strict: refuse a recording that is damaged.
@@ -83,6 +84,8 @@ def read_recording(
     choice = choice or ImageChoice()
     if is_dataset(Path(path)):
         return read_episode(Path(path), choice, sides)
+    if is_buffer(Path(path)):
+        return read_buffer(Path(path), choice, sides)
     if is_frames(Path(path)):
         return read_frames(Path(path), choice, tuple(sides))
     source = bag_source(Path(path))

@@ -155,7 +155,8 @@ def test_a_file_beside_the_bag_that_leads_elsewhere_is_not_copied(tmp_path, caps
     [
         ("take.bag", "ROS 1 bag: rosbags-convert"),
         ("episode_0.hdf5", "HDF5.*LeRobotDataset.create"),
-        ("replay_buffer.zarr.zip", "Zarr, as UMI"),
+        ("replay_buffer.zip", r"called NAME\.zarr\.zip"),
+        ("replay_buffer.zarr.zip", "git lfs pull"),
         ("pointer.mcap", "git lfs pull"),
     ],
 )

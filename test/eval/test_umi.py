@@ -1,0 +1,200 @@
+"""Claims about UMI's replay buffers and UMI-FT's episodes, which are written here as they are laid out."""
+
+import json
+import sys
+import zipfile
+
+import numpy as np
+import pytest
+
+from finforce.errors import MissingDependencyError
+from finforce.gripper_frames import ROBOT_CAMERA
+from finforce.messages import NANOSECONDS
+from finforce_eval.cli.main import main
+from finforce_eval.errors import RecordingError
+from finforce_eval.evaluation.scoring import match_truth
+from finforce_eval.recordings.images import ImageChoice
+from finforce_eval.recordings.recording import read_recording
+from finforce_keypoints.rig import Rig, RigCamera
+
+CAMERA = RigCamera(width=64, height=48, fx=50.0, fy=50.0, cx=32.0, cy=24.0, model="plumb_bob")
+UPRIGHT = np.diag([-1.0, -1.0, 1.0, 1.0])  # a camera above the gripper, which sees its x run to the left
+CHOICE = ImageChoice(
+    camera=Rig(jaw="umi", camera=CAMERA, T_gripper_camera=(0, 0, 0, 0, 0, 0, 1)).intrinsics, T_gripper_camera=UPRIGHT
+)
+START = 1.7e9  # s, as clocks have them
+PRESSING = np.array([-3.0, 1.0, 0.5])  # N, of an object on the left jaw, as the picture has its axes
+
+
+def write_array(root, key, values, rows=7, columns=None, compressor=None):
+    """Write an array of format 2 in chunks of some rows and columns."""
+    chunks = [min(rows, len(values)), *values.shape[1:]]
+    if columns:
+        chunks[-1] = columns
+    folder = root / key
+    folder.mkdir(parents=True)
+    about = {"zarr_format": 2, "shape": values.shape, "chunks": chunks, "dtype": values.dtype.str}
+    about |= {"compressor": compressor, "fill_value": 0, "order": "C", "filters": None}
+    (folder / ".zarray").write_text(json.dumps(about))
+    for place in np.ndindex(*(-(-side // part) for side, part in zip(values.shape, chunks, strict=True))):
+        part = values[tuple(slice(n * size, (n + 1) * size) for n, size in zip(place, chunks, strict=True))]
+        chunk = np.zeros(chunks, values.dtype)
+        chunk[tuple(map(slice, part.shape))] = part
+        (folder / ".".join(map(str, place))).write_bytes(chunk.tobytes())
+
+
+def make_group(root):
+    root.mkdir(parents=True)
+    (root / ".zgroup").write_text('{"zarr_format": 2}')
+    return root
+
+
+def make_pictures(count):
+    return np.tile((10 * np.arange(1, count + 1, dtype=np.uint8))[:, None, None, None], (1, 48, 64, 3))
+
+
+def write_buffer(root, ends=(4, 10)):
+    make_group(root)
+    write_array(root, "meta/episode_ends", np.array(ends, np.int64))
+    write_array(root, "data/camera0_rgb", make_pictures(ends[-1]), rows=1)
+    write_array(root, "data/robot0_gripper_width", np.full((ends[-1], 1), 0.05, np.float32))
+    return root
+
+
+def write_episode(root, sign=1.0, count=12, changes=()):
+    make_group(root)
+    times, fine = START + np.arange(count)[:, None] / 60.0, START - 0.02 + np.arange(100)[:, None] / 360.0
+    share = 3.0 * (fine - START + 0.1)
+    right = PRESSING * [-1.0, 1.0, 1.0]
+    arrays = {"rgb_0": make_pictures(count), "rgb_time_stamps_0": times, "gripper_0": np.full((count, 1), 0.05)}
+    for side, force in (("left", PRESSING), ("right", right)):
+        arrays[f"wrench_{side}_0"] = sign * share * np.r_[force, 0.1, 0.2, 0.3]
+        arrays[f"wrench_time_stamps_{side}_0"] = fine
+    for name, values in (arrays | dict(changes)).items():
+        if values is not None:
+            write_array(root, f"data/episode_0/{name}", values)
+    return root
+
+
+@pytest.mark.parametrize("zipped", [False, True])
+def test_an_episode_of_a_replay_buffer_has_its_pictures(zipped, tmp_path):
+    path = write_buffer(tmp_path / "dataset.zarr")
+    if zipped:
+        with zipfile.ZipFile(tmp_path / "dataset.zarr.zip", "w") as file:
+            for each in path.rglob("*"):
+                file.write(each, each.relative_to(path))
+        path = tmp_path / "dataset.zarr.zip"
+    recording = read_recording(path, ImageChoice(camera=CHOICE.camera, episode=1), ("left",))
+    assert [int(image.color[0, 0, 0]) for _, image in recording.images] == [50, 60, 70, 80, 90, 100]
+    assert recording.images.stamps[1] == round(NANOSECONDS * 1001 / 60000)
+    assert recording.name == "dataset/episode_000001" and set(recording.jaws) == {"left"}
+    late = recording.images.between(recording.images.stamps[4], 1 << 62)
+    assert [int(image.color[0, 0, 0]) for _, image in late] == [90, 100]
+    with pytest.raises(RecordingError, match="no episode 2; expected 0 to 1"):
+        read_recording(path, ImageChoice(camera=CHOICE.camera, episode=2))
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_wrenches_are_those_of_the_object_on_the_jaw_at_the_times_of_the_pictures(sign, tmp_path):
+    recording = read_recording(write_episode(tmp_path / "ft.zarr", sign), CHOICE)
+    share = 3.0 * (np.arange(12)[:, None] / 60.0 + 0.1)
+    assert recording.images.stamps[1] == pytest.approx(NANOSECONDS / 60, abs=300)  # ns; 1.7e9 s have steps of 240
+    for side in ("left", "right"):  # both jaws are pushed away, along x of their own frames
+        force = match_truth(recording.truth(side), recording.images.stamps)
+        np.testing.assert_allclose(force, share * (PRESSING if side == "right" else [-3.0, -1.0, 0.5]), atol=1e-4)
+    assert sum("other sign" in note for note in recording.notes) == (sign < 0.0)
+    assert sum("here called right" in note for note in recording.notes) == 1
+
+
+def test_left_is_left_where_the_gripper_runs_to_the_right_of_the_picture(tmp_path):
+    path = write_episode(tmp_path / "ft.zarr")
+    recording = read_recording(path, ImageChoice(camera=CHOICE.camera, T_gripper_camera=ROBOT_CAMERA))
+    np.testing.assert_allclose(
+        recording.truth("left").force[-1] * -3.0 / recording.truth("left").force[-1, 0], PRESSING
+    )
+    assert not recording.notes
+    blind = read_recording(path, ImageChoice(camera=CHOICE.camera))  # as finforce camera reads it
+    assert blind.jaws["left"].truth is None and "--rig" in blind.notes[0]
+
+
+NEVER = np.full((100, 1), np.nan)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"wrench_left_0": None}, "no array data/episode_0/wrench_left_0; data/episode_0 has gripper_0, rgb_0"),
+        ({"wrench_left_0": np.zeros((100, 3))}, r"wrench_left_0 is float64 of shape \(100, 3\).*expected 100 x 6"),
+        ({"wrench_left_0": np.zeros((90, 6))}, r"wrench_left_0 .*\(90, 6\).*expected 100 x 6"),
+        ({"wrench_left_0": np.zeros((100, 6), int)}, "wrench_left_0 is int64"),
+        ({"wrench_right_0": np.full((100, 6), np.nan)}, "wrench_right_0: up to nan; expected newtons"),
+        ({"wrench_right_0": np.full((100, 6), 2e4)}, "wrench_right_0: up to 20000"),
+        ({"wrench_time_stamps_left_0": NEVER}, "wrench_time_stamps_left_0.*expected rising seconds"),
+        ({"wrench_time_stamps_left_0": np.arange(100.0)[:, None] * 2.8}, "steps of 2.8"),  # ms
+        ({"wrench_time_stamps_left_0": np.arange(100.0)[:, None] / 360}, "wrench_left_0 lies -17.* one clock"),
+        ({"rgb_time_stamps_0": START + np.arange(11)[:, None] / 60}, r"rgb_time_stamps_0 .*\(11, 1\).*expected 12 x 1"),
+        ({"rgb_0": make_pictures(12).astype(np.uint16)}, "rgb_0 has 12 pictures of uint16"),
+        ({"rgb_0": make_pictures(12).transpose(0, 3, 1, 2)}, r"rgb_0 is uint8 of shape \(12, 3, 48, 64\)"),
+    ],
+)
+def test_arrays_that_are_missing_or_foreign_are_refused_by_name(changes, words, tmp_path):
+    with pytest.raises(RecordingError, match=words):
+        read_recording(write_episode(tmp_path / "ft.zarr", changes=changes), CHOICE)
+
+
+def test_a_chunk_that_is_missing_or_cut_off_is_no_force_of_zero(tmp_path):
+    path = write_episode(tmp_path / "ft.zarr")
+    chunk = path / "data/episode_0/wrench_left_0/3.0"
+    whole = chunk.read_bytes()
+    chunk.write_bytes(whole[:-8])
+    with pytest.raises(RecordingError, match=r"wrench_left_0/3\.0 is damaged"):
+        read_recording(path, CHOICE)
+    chunk.unlink()
+    with pytest.raises(RecordingError, match=r"wrench_left_0/3\.0 is missing"):
+        read_recording(path, CHOICE)
+    chunk.write_bytes(whole)
+    (path / "data/episode_0/rgb_0/1.0.0.0").unlink()
+    with pytest.raises(RecordingError, match=r"rgb_0/1\.0\.0\.0 is missing"):
+        list(read_recording(path, CHOICE).images)
+
+
+def test_other_groups_and_codecs_are_refused_by_name(tmp_path):
+    with pytest.raises(RecordingError, match=r"no array meta/episode_ends; meta has nothing"):
+        read_recording(make_group(tmp_path / "empty.zarr"), CHOICE)
+    newer = tmp_path / "newer.zarr"
+    newer.mkdir()
+    (newer / "zarr.json").write_text("{}")
+    with pytest.raises(RecordingError, match="Zarr format 3; expected a group of Zarr format 2"):
+        read_recording(newer, CHOICE)
+    for name, codec in (("a", "pickle"), ("b", "imagecodecs_webp")):
+        group = make_group(tmp_path / f"{name}.zarr")
+        write_array(group, "meta/episode_ends", np.array([4]), compressor={"id": codec})
+        with pytest.raises(RecordingError, match=f"compressor {codec}; expected blosc"):
+            read_recording(group, CHOICE)
+
+
+def test_every_episode_is_annotated_by_itself(tmp_path, capsys):
+    path = write_buffer(tmp_path / "dataset.zarr")
+    assert main(["annotate", str(path), "--contact", "fixed:40", "--out", str(tmp_path / "out")]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    for number in (0, 1):
+        assert sum(f"dataset_{number:06d}: " in line and "expected --rig" in line for line in lines) == 1
+
+
+def test_compressed_chunks_are_decoded_and_a_missing_library_is_named(tmp_path, monkeypatch):
+    numcodecs = pytest.importorskip("numcodecs")
+    path, codec = write_buffer(tmp_path / "dataset.zarr"), numcodecs.Blosc(cname="zstd")
+    folder = path / "data/camera0_rgb"
+    about = json.loads((folder / ".zarray").read_text()) | {"compressor": codec.get_config()}
+    for chunk in folder.glob("*.0"):
+        chunk.write_bytes(codec.encode(chunk.read_bytes()))
+    (folder / ".zarray").write_text(json.dumps(about))
+    recording = read_recording(path, CHOICE)
+    assert [int(image.color[0, 0, 0]) for _, image in recording.images] == [10, 20, 30, 40]
+    (folder / "1.0.0.0").write_bytes(b"\x02" + bytes(40))
+    with pytest.raises(RecordingError, match=r"camera0_rgb/1\.0\.0\.0 is damaged"):
+        list(recording.images)
+    (folder / ".zarray").write_text(json.dumps(about | {"compressor": {"id": "imagecodecs_jpegxl"}}))
+    monkeypatch.setitem(sys.modules, "imagecodecs", None)
+    with pytest.raises(MissingDependencyError, match="JPEG XL, needs imagecodecs: pip install imagecodecs"):
+        list(read_recording(path, CHOICE).images)
