@@ -27,6 +27,7 @@ from finforce_keypoints.build import build_detector
 from finforce_keypoints.geometry.jaw_localizer import JawKeypoints
 from finforce_keypoints.images import RgbdImage
 from finforce_keypoints.parameters import DetectorParameters
+from finforce_keypoints.rig import read_rig
 
 Camera = CameraIntrinsics | str | Path | Sequence[float]
 
@@ -58,10 +59,11 @@ class ForceSensor:
     """Finds the forces on a gripper in the images of its wrist camera, one after the other.
 
     Args:
-        jaw: name of a shipped jaw, jaw file, or a left jaw.
+        jaw: name of a shipped jaw, jaw file, or a left jaw; None for that of the rig, else "bench".
         camera: intrinsics, a file of them, or the numbers fx, fy, cx, cy [px] and perhaps k1, k2, p1, p2, k3.
         extrinsics: the camera in `gripper_base`: (4, 4), the seven numbers x, y, z [m], qx, qy, qz, qw, or "robot" or
             "bench" for those of the simulator.
+        rig: file by `finforce camera`, which takes the place of these three.
         contact_height: of first touch above the clamped base [m].
         object_mesh: mesh of the object in metres, or its file; `update` then needs its poses. Give one of these two.
         calibration: of the finger; None for the material of the jaw file.
@@ -73,10 +75,11 @@ class ForceSensor:
 
     def __init__(
         self,
-        jaw: str | Path | Jaw = "bench",
+        jaw: str | Path | Jaw | None = None,
         *,
-        camera: Camera,
-        extrinsics: str | ArrayLike,
+        camera: Camera | None = None,
+        extrinsics: str | ArrayLike | None = None,
+        rig: str | Path | None = None,
         contact_height: float | None = None,
         object_mesh: str | Path | ObjectMesh | None = None,
         calibration: str | Path | Calibration | None = None,
@@ -84,10 +87,17 @@ class ForceSensor:
     ) -> None:
         if (contact_height is None) == (object_mesh is None):
             raise OptionError("expected contact_height [m] or object_mesh, one of the two")
+        if (rig is None) == (camera is None) or (rig is None) == (extrinsics is None):
+            raise OptionError("expected rig, or camera and extrinsics, one of the two")
+        if rig is not None:
+            found = read_rig(rig)
+            given = {name: tuple(value) for name, value in found.detector_parameters().items()}
+            jaw, camera = jaw or found.jaw, found.intrinsics
+        else:
+            given = {"T_gripper_camera": pose_numbers(read_extrinsics(extrinsics))}
         self._camera = camera
-        jaws = {side: load_jaw(jaw, side) for side in sides}
-        pose = pose_numbers(read_extrinsics(extrinsics))
-        self._detector = build_detector(jaws, DetectorParameters(T_gripper_camera=pose))
+        jaws = {side: load_jaw(jaw or "bench", side) for side in sides}
+        self._detector = build_detector(jaws, DetectorParameters(**given))
         settings = EstimatorSettings().resolve_held(both=len(sides) == len(SIDES))
         mesh = None if object_mesh is None else load_object_mesh(object_mesh)
         self._loops: dict[str, ForceLoop] = {}
@@ -95,6 +105,11 @@ class ForceSensor:
             force = ForceEstimator(own, settings=settings, calibration=calibration)
             fixed = mesh is None and GivenContact(Contact.fixed(force.jaw, contact_height))
             self._loops[side] = ForceLoop(fixed or ContactEstimator(force.jaw, mesh=mesh), force)
+
+    @property
+    def camera(self) -> Camera:
+        """Intrinsics, or what they are to be read from once the size of the images is known."""
+        return self._camera
 
     def update(
         self, rgb: NDArray, depth: NDArray | None, stamp: float, T_camera_object: ArrayLike | None = None

@@ -20,6 +20,7 @@ THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_
 COMMANDS = {
     "evaluate": "estimate forces in recordings and score them against measured forces",
     "annotate": "add forces to existing recordings and datasets",
+    "live": "show the forces in the images of a webcam, without ROS",
     "compare": "compare two evaluations and report changes beyond chance",
     "view": "show a recording with images, key points, bending jaws, contact and forces in Rerun",
     "replay": "play a recording through the nodes in real time and score the result",

@@ -48,6 +48,8 @@ def test_arrays_go_through_the_detector_to_both_jaws():
         ({}, "expected contact_height .* or object_mesh"),
         ({"contact_height": 0.04, "object_mesh": "can.stl"}, "one of the two"),
         ({"contact_height": 40.0}, "contact height 40000 mm, expected"),
+        ({"contact_height": 0.04, "rig": "rig.yaml"}, "expected rig, or camera and extrinsics"),
+        ({"contact_height": 0.04, "camera": None}, "expected rig, or camera and extrinsics"),
         ({"contact_height": 0.04, "extrinsics": "wrist"}, "expected robot, bench"),
         ({"contact_height": 0.04, "extrinsics": [1.0, 2.0]}, "2 numbers; expected robot"),
     ],
