@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 
@@ -18,7 +19,7 @@ INTRINSICS_FORMS = (
     "names fx, fy, cx, cy"
 )
 _NAMES = ("fx", "fy", "cx", "cy")
-_MODELS = {"radtan": PLUMB_BOB, "none": PLUMB_BOB, "pinhole": PLUMB_BOB, "fisheye": EQUIDISTANT}
+_MODELS = {"radtan": PLUMB_BOB, "none": PLUMB_BOB, "pinhole": PLUMB_BOB, "fisheye": EQUIDISTANT, "equi": EQUIDISTANT}
 _MATRICES = ("K", "k", "camera_matrix", "Camera_Matrix", "cameraMatrix", "cam_K", "intrinsic_matrix")
 _LENSES = ("distortion", "D", "d", "coeffs", "distortion_coefficients", "Distortion_Coefficients", "distCoeffs")
 _LENSES += ("distortion_coeffs", "dist_coeffs")
@@ -29,8 +30,8 @@ def read_camera(path: str | Path, shape: tuple[int, int] | None = None, name: st
     """Return the camera that a file describes.
 
     Args:
-        path: YAML of ROS, OpenCV or kalibr, JSON of BOP (camera, scene_camera) or OpenICC (as UMI uses it), a text
-            of fx fy cx cy or of a 3x3 matrix, or YAML or JSON with these names.
+        path: YAML of ROS, OpenCV or kalibr, XML of OpenCV, JSON of BOP (camera, scene_camera) or OpenICC (as UMI uses
+            it), a text of fx fy cx cy or of a 3x3 matrix, or YAML or JSON with these names.
         shape: height and width of its images; without it the file has to say.
         name: of the camera (kalibr) or image (BOP), where a file has several that differ.
 
@@ -104,9 +105,30 @@ def _parse(text: str) -> Any:
         pass
     if text.lstrip().startswith("{"):
         return parse_json(text)
+    if text.lstrip().startswith("<"):
+        return _parse_xml(text)
     if len(text) > LARGEST_YAML:
         raise FileError(f"has more than {LARGEST_YAML >> 10} KiB")
     return parse_yaml(re.sub(r"^%YAML:.*", "", text, count=1).replace("!!opencv-matrix", ""), text_keys=False)
+
+
+def _parse_xml(text: str) -> dict[str, Any]:
+    """Return the matrices, as lists, and the other entries of an XML text as OpenCV writes it."""
+    named: dict[str, Any] = {}
+    try:
+        if "<!" in text:  # entities can be as large as one likes
+            raise ElementTree.ParseError("declarations; expected none")
+        for node in ElementTree.fromstring(text):
+            words = (node.findtext("data") or node.text or "").split()
+            try:
+                numbers = list(map(float, words))
+            except ValueError:
+                named[node.tag] = " ".join(words)
+            else:
+                named[node.tag] = numbers[0] if len(numbers) == 1 else numbers
+    except ElementTree.ParseError as error:
+        raise FileError(f"is no XML of OpenCV: {error}") from error
+    return named
 
 
 def _choose(content: Any, name: str) -> Mapping[str, Any]:
@@ -137,17 +159,18 @@ def _name_entries(entries: Mapping[str, Any]) -> dict[str, Any]:
     if len(size) == 2:
         named |= {"width": size[0], "height": size[1]}
     matrix = next((each for each in (_numbers(entries.get(name)) for name in _MATRICES) if len(each) == 9), None)
-    intrinsics = entries.get("intrinsics")
+    intrinsics, lens = entries.get("intrinsics"), None
     if matrix:
         named |= name_matrix(matrix)
     elif isinstance(intrinsics, Mapping):
         return named | _from_openicc(intrinsics, str(entries.get("intrinsic_type")))
     elif intrinsics is not None:
-        if entries.get("camera_model", "pinhole") != "pinhole" or len(_numbers(intrinsics)) != 4:
+        kind, _, lens = str(entries.get("camera_model", "pinhole")).partition("-")  # pinhole, or pinhole-equi
+        if kind != "pinhole" or len(_numbers(intrinsics)) != 4:
             raise IntrinsicsError(f"camera_model {entries.get('camera_model')}: expected pinhole, with fu fv pu pv")
         named |= zip(_NAMES, intrinsics, strict=True)
     named["distortion"] = next(filter(None, (_numbers(entries.get(name)) for name in _LENSES)), [])
-    named["model"] = EQUIDISTANT if entries.get("fisheye_model") else entries.get("distortion_model")
+    named["model"] = EQUIDISTANT if entries.get("fisheye_model") else entries.get("distortion_model", lens)
     return named
 
 

@@ -23,6 +23,26 @@ distortion_coefficients: !!opencv-matrix
    dt: d
    data: [ 0.1, -0.2, 1e-3, 2e-3, 0.05 ]
 """
+XML = """<?xml version="1.0"?>
+<opencv_storage>
+<calibration_time>"Mon 1 Jan"</calibration_time>
+<image_Width>640</image_Width>
+<image_Height>480</image_Height>
+<Camera_Matrix type_id="opencv-matrix"><rows>3</rows><cols>3</cols><dt>d</dt>
+  <data>600. 0. 322. 0. 601. 243. 0. 0. 1.</data></Camera_Matrix>
+<Distortion_Coefficients type_id="opencv-matrix"><rows>5</rows><cols>1</cols><dt>d</dt>
+  <data>0.1 -0.2 1e-3 2e-3 0.05</data></Distortion_Coefficients>
+</opencv_storage>
+"""
+ROS = """image_width: 640
+image_height: 480
+camera_name: wrist
+camera_matrix: {rows: 3, cols: 3, data: [600, 0, 322, 0, 601, 243, 0, 0, 1]}
+distortion_model: plumb_bob
+distortion_coefficients: {rows: 1, cols: 5, data: [0.1, -0.2, 1e-3, 2e-3, 0.05]}
+rectification_matrix: {rows: 3, cols: 3, data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}
+projection_matrix: {rows: 3, cols: 4, data: [590, 0, 320, 0, 0, 590, 240, 0, 0, 0, 1, 0]}
+"""
 KALIBR = """%YAML:1.0 # a remark
 cam0:
   camera_model: pinhole
@@ -80,16 +100,27 @@ def test_every_way_to_write_a_pinhole_gives_the_same_camera(content, tmp_path):
     assert not camera.is_distorted
 
 
-def test_the_lens_of_opencv_keeps_its_coefficients_in_their_order(tmp_path):
-    camera = read_camera(write(tmp_path, OPENCV))
-    assert camera.model == "plumb_bob" and numbers_of(camera)[:2] == [640, 480]
+@pytest.mark.parametrize("content", [OPENCV, XML, ROS])
+def test_a_lens_keeps_its_coefficients_in_their_order(content, tmp_path):
+    camera = read_camera(write(tmp_path, content))
+    assert camera.model == "plumb_bob" and numbers_of(camera) == [640, 480, 600.0, 601.0, 322.0, 243.0]
     np.testing.assert_array_equal(camera.distortion, [0.1, -0.2, 1e-3, 2e-3, 0.05])
+
+
+def test_opencv_tells_other_lenses_by_their_coefficients_or_a_flag(tmp_path):
     wide = OPENCV.replace("0.05 ]", "0.05, 0.01, 0.02, 0.03 ]")
     assert read_camera(write(tmp_path, wide)).model == "rational_polynomial"
+    bent = XML.replace("1e-3 2e-3 0.05", "1e-3 2e-3").replace(
+        "<Camera_M", "<fisheye_model>1</fisheye_model>\n<Camera_M", 1
+    )
+    assert read_camera(write(tmp_path, bent)).model == "equidistant"
 
 
 @pytest.mark.parametrize(("model", "expected"), [("radtan", "plumb_bob"), ("equidistant", "equidistant")])
 def test_kalibr_names_the_lens(model, expected, tmp_path):
+    short = KALIBR.replace("  distortion_model: {model}\n", "")
+    short = short.replace("pinhole", f"pinhole-{model.removesuffix('distant')}")
+    assert read_camera(write(tmp_path, short)).model == expected
     camera = read_camera(write(tmp_path, KALIBR.format(model=model)))
     assert camera.model == expected and numbers_of(camera) == [640, 480, 300.0, 301.0, 320.0, 240.0]
     np.testing.assert_array_equal(camera.distortion[:4], [0.01, -0.02, 0.003, -0.004])
@@ -125,6 +156,10 @@ def test_of_several_cameras_one_has_to_be_named(tmp_path):
         ({"aruco_dict": {"predefined": "DICT_4X4_50"}}, "'fx' is missing"),
         ({"intrinsic_type": "DOUBLE_SPHERE", "intrinsics": {}}, "DOUBLE_SPHERE"),
         (KALIBR.format(model="radtan").replace("pinhole", "omni"), "camera_model omni"),
+        (KALIBR.format(model="radtan").replace("pinhole", "ds"), "camera_model ds: expected pinhole"),
+        (XML.replace("</opencv_storage>", ""), "is no XML of OpenCV"),
+        (XML.replace("<opencv_storage>", "<!DOCTYPE a []><opencv_storage>", 1), "declarations; expected none"),
+        (XML.replace("601.", "six"), "'fx' is missing"),
         (KALIBR.format(model="fov"), "distortion model 'fov'"),
         ({"fx": 600, "fy": 600, "cx": 320, "cy": 240}, "intrinsics of no size; expected width and height"),
         (GOPRO | {"image_width": 640, "image_height": 480}, "principal point 1350, 1010 outside images of 640 x 480"),
