@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -113,8 +115,9 @@ class FrameImages:
         raise RecordingError(f"{self.name}: {count} pictures; expected {len(wanted)}")
 
 
-def decode_video(path: Path, name: str, begin: float = 0.0) -> Iterator[NDArray[np.uint8]]:
-    """Yield the frames (h, w, 3) RGB of a video from a time [s] on.
+@contextmanager
+def _open_video(path: Path, name: str) -> Iterator[tuple[Any, Any]]:
+    """Open a video, container and stream of PyAV, for the length of a `with` block.
 
     Raises:
         RecordingError: it is no video, or damaged.
@@ -124,14 +127,19 @@ def decode_video(path: Path, name: str, begin: float = 0.0) -> Iterator[NDArray[
     try:
         check_plain(path)
         with av.open(str(path)) as container:
-            stream = container.streams.video[0]
-            if begin > 0.0:
-                container.seek(int(begin / stream.time_base), stream=stream)
-            for frame in container.decode(stream):
-                if frame.time is None or frame.time >= begin:
-                    yield frame.to_ndarray(format="rgb24")
+            yield container, container.streams.video[0]
     except (FileError, av.FFmpegError, IndexError) as error:
-        raise RecordingError(f"{name}: {path.parent.name}/{path.name}: {error}") from error
+        raise RecordingError(f"{name}: {path.parent.name}/{path.name}: {error}; expected a video") from error
+
+
+def decode_video(path: Path, name: str, begin: float = 0.0) -> Iterator[NDArray[np.uint8]]:
+    """Yield the frames (h, w, 3) RGB of a video from a time [s] on; see `_open_video`."""
+    with _open_video(path, name) as (container, stream):
+        if begin > 0.0:
+            container.seek(int(begin / stream.time_base), stream=stream)
+        for frame in container.decode(stream):
+            if frame.time is None or frame.time >= begin:
+                yield frame.to_ndarray(format="rgb24")
 
 
 def read_picture(path: Path) -> NDArray[np.uint8]:
@@ -185,15 +193,9 @@ def choose_camera(choice: ImageChoice, shape: tuple[int, int], name: str) -> Cam
 
 def _look_at_video(path: Path, name: str) -> tuple[float, int, tuple[int, int]]:
     """Return frames per second, number of frames, and height and width of a video."""
-    av = import_library("av", "reading videos", "'finforce[lerobot]'")
-    try:
-        check_plain(path)
-        with av.open(str(path)) as container:
-            stream = container.streams.video[0]
-            count = stream.frames or sum(bool(packet.size) for packet in container.demux(stream))
-            rate, shape = float(stream.average_rate or 0.0), (stream.height, stream.width)
-    except (FileError, av.FFmpegError, IndexError) as error:
-        raise RecordingError(f"{name}: {path.name}: {error}; expected a video") from error
+    with _open_video(path, name) as (container, stream):
+        count = stream.frames or sum(bool(packet.size) for packet in container.demux(stream))
+        rate, shape = float(stream.average_rate or 0.0), (stream.height, stream.width)
     if not (count and rate > 0.0):
         raise RecordingError(f"{name}: {path.name}: {count} frames at {rate:g} Hz; expected a video")
     return rate, count, shape

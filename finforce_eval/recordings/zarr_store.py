@@ -14,14 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.errors import one_line
-from finforce.files import FileError, check_inside, check_plain, parse_json, raise_budget, read_bytes
+from finforce.files import check_inside, check_plain, parse_json, raise_budget
 from finforce.optional import import_library
 from finforce.sandbox import MEMORY, limit_growth
 from finforce_eval.errors import RecordingError
 
 JPEG_XL = "imagecodecs_jpegxl"
 _CODECS = ("blosc", "zstd", "lz4", "zlib", "gzip", "bz2")  # of numcodecs, one of whose others runs what a file says
-_LARGEST_FILE, _LARGEST_BLOCK = 1 << 28, 1 << 29  # bytes, of a file and of the chunks that hold one row
+_LARGEST_BLOCK = 1 << 29  # bytes of the chunks that hold one row
 
 
 class ZarrStore:
@@ -35,11 +35,11 @@ class ZarrStore:
     """
 
     def __init__(self, path: Path) -> None:
-        self.path, self.name, self._zip = path, path.name, None
+        self.name, self._root = path.name, path
         if path.is_file():
-            with self.damage_named(""):
+            with self.damage_named("the file"):
                 check_plain(path)
-                self._zip = zipfile.ZipFile(path)
+                self._root = zipfile.Path(path)
         if self.find(".zgroup") is None:
             newer = self.find("zarr.json") is not None
             found = "Zarr format 3" if newer else "no .zgroup in it"
@@ -53,27 +53,20 @@ class ZarrStore:
         except (RecordingError, ImportError):
             raise
         except Exception as error:  # of zipfile, zlib, json, and every codec its own
-            raise RecordingError(f"{self.name}: {key or 'the file'} is damaged: {one_line(error)}") from error
+            raise RecordingError(f"{self.name}: {key} is damaged: {one_line(error)}") from error
 
     def find(self, key: str) -> bytes | None:
         """Return the bytes under a key; None where there are none."""
-        with self.damage_named(key):
-            if self._zip is None:
-                path = check_inside(self.path / key, self.path)
-                return read_bytes(path, _LARGEST_FILE) if path.exists() else None
-            if key not in self._zip.NameToInfo:
-                return None
-            if self._zip.getinfo(key).file_size > raise_budget(_LARGEST_FILE):
-                raise FileError(f"{key} has more than {_LARGEST_FILE >> 20} MiB")
-            return self._zip.read(key)
+        part = self._root / key
+        with self.damage_named(key), limit_growth(raise_budget(MEMORY)):
+            if isinstance(part, Path):
+                check_inside(part, self._root)
+            return part.read_bytes() if part.is_file() else None
 
     def list_members(self, group: str) -> list[str]:
         """Return the names of the arrays and groups in a group."""
-        if self._zip is None:
-            folder = self.path / group
-            return sorted(each.name for each in folder.iterdir() if each.is_dir()) if folder.is_dir() else []
-        parts = (name.removeprefix(f"{group}/").split("/") for name in self._zip.namelist() if name.startswith(group))
-        return sorted({part[0] for part in parts if len(part) > 1})
+        folder = self._root / group
+        return sorted(each.name for each in folder.iterdir() if each.is_dir()) if folder.is_dir() else []
 
     def open_array(self, key: str, shape: tuple[int | None, ...], kinds: str) -> ZarrArray:
         """Return an array.
