@@ -7,7 +7,6 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,7 +45,10 @@ def run(options: argparse.Namespace) -> CommandResult:
     shown = -np.inf
     try:
         for stamp, rgb in Webcam(options.camera, sensor.camera):
-            kept.append(find_forces(sensor, rgb, stamp))
+            try:
+                kept.append(sensor.update(rgb, None, stamp))
+            except (ImageError, KeypointError) as error:
+                kept.append(GripperForces(stamp=stamp, jaws={}, status=str(error)))
             if stamp >= shown + _PRINT_PERIOD:
                 shown = stamp
                 print(describe(kept[-1]), flush=True)
@@ -58,13 +60,6 @@ def run(options: argparse.Namespace) -> CommandResult:
     answered = sum(each.status == "ok" for each in kept)
     print(f"a force in {answered} of {len(kept)} images")
     return CommandResult({"images": len(kept), "answered": answered})
-
-
-class WebcamImage(NamedTuple):
-    """An image (h, w, 3) uint8 RGB and its time of receipt, or its place in a file [s]."""
-
-    stamp: float
-    rgb: NDArray[np.uint8]
 
 
 class Webcam:
@@ -93,8 +88,8 @@ class Webcam:
             self._capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # the newest image, not the oldest that waits
         self._period = 1.0 / (self._capture.get(cv2.CAP_PROP_FPS) or 30.0)
 
-    def __iter__(self) -> Iterator[WebcamImage]:
-        """Yield images until the file ends.
+    def __iter__(self) -> Iterator[tuple[float, NDArray[np.uint8]]]:
+        """Yield time of receipt, or place in a file [s], and image (h, w, 3) RGB, until the file ends.
 
         Raises:
             RecordingError: the camera gives none, or images of another size.
@@ -116,20 +111,10 @@ class Webcam:
                         f"{self._name}: image {number} is {bgr.shape[1]} x {bgr.shape[0]}; expected {size[1]} x "
                         f"{size[0]} as the rig has: make a rig of these by finforce camera"
                     )
-                yield WebcamImage(
-                    now if self._is_device else number * self._period, np.ascontiguousarray(bgr[..., ::-1])
-                )
+                yield now if self._is_device else number * self._period, np.ascontiguousarray(bgr[..., ::-1])
                 number, begin = number + 1, time.monotonic()
         finally:
             self._capture.release()
-
-
-def find_forces(sensor: ForceSensor, rgb: NDArray, stamp: float) -> GripperForces:
-    """Return the forces in an image; of one that cannot be used, why."""
-    try:
-        return sensor.update(rgb, None, stamp)
-    except (ImageError, KeypointError) as error:
-        return GripperForces(stamp=stamp, jaws={}, status=str(error))
 
 
 def describe(forces: GripperForces) -> str:

@@ -129,19 +129,12 @@ def _read_wrenches(
         torque = np.full_like(force, np.nan)  # about another point than the jaw's origin
         tracks[side] = WrenchTrack(stamps=_nanoseconds(stamps, times[0]), force=force, torque=torque)
     notes = []
-    if _count_opening(tracks) > _FEEBLE:  # an object can only push a jaw away from it, towards -x
+    sizes = {side: np.linalg.norm(track.force, axis=1) for side, track in tracks.items()}
+    firm = [tracks[side].force[size >= np.percentile(size, _FIRM), 0].mean() for side, size in sizes.items()]
+    if np.mean(firm) > _FEEBLE:  # an object can only push a jaw away from it, towards -x
         tracks = {side: WrenchTrack(**{**vars(track), "force": -track.force}) for side, track in tracks.items()}
         notes.append("wrenches are those of the fingers on the object: taken with the other sign")
     if choice.T_gripper_camera[0][0] < 0.0:
         tracks = {"left": tracks["right"], "right": tracks["left"]}
         notes.append("wrench_left_0 is of the jaw on the left of the picture, here called right")
     return tracks, tuple(notes)
-
-
-def _count_opening(tracks: dict[str, WrenchTrack]) -> float:
-    """Return the mean of the firm forces along x of both jaws [N]."""
-    means = []
-    for track in tracks.values():
-        size = np.linalg.norm(track.force, axis=1)
-        means.append(track.force[size >= np.percentile(size, _FIRM), 0].mean())
-    return float(np.mean(means))

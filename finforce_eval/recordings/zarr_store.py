@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -86,16 +86,8 @@ class ZarrStore:
             raise RecordingError(f"{self.name}: no array {key}; {group} has {there}")
         with self.damage_named(key):
             about = parse_json(text.decode())
-            array = ZarrArray(
-                store=self,
-                key=key,
-                shape=tuple(map(int, about["shape"])),
-                chunks=tuple(map(int, about["chunks"])),
-                dtype=np.dtype(about["dtype"]),
-                compressor=about["compressor"],
-                order=about["order"],
-                separator=about.get("dimension_separator", "."),
-            )
+            sides = {name: tuple(map(int, about[name])) for name in ("shape", "chunks")}
+            array = ZarrArray(store=self, key=key, about=about, dtype=np.dtype(about["dtype"]), **sides)
         fits = len(shape) == len(array.shape) == len(array.chunks) and min(array.chunks) > 0
         fits = fits and all(want in (None, have) for want, have in zip(shape, array.shape, strict=True))
         if not fits or array.dtype.kind not in kinds or about.get("filters"):
@@ -109,16 +101,14 @@ class ZarrStore:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ZarrArray:
-    """An array in a store, whose chunks are read when they are asked for."""
+    """An array in a store, `about` its `.zarray`, whose chunks are read when they are asked for."""
 
     store: ZarrStore
     key: str
+    about: Mapping[str, Any]
     shape: tuple[int, ...]
     chunks: tuple[int, ...]
     dtype: np.dtype
-    compressor: dict[str, Any] | None
-    order: str
-    separator: str
 
     def __len__(self) -> int:
         return self.shape[0]
@@ -148,22 +138,23 @@ class ZarrArray:
 
     def _read_chunk(self, place: tuple[int, ...]) -> NDArray:
         """Return a chunk; one that is missing stands for a fill value in Zarr, and here for a copy that failed."""
-        key = f"{self.key}/{self.separator.join(map(str, place))}"
+        key = f"{self.key}/{self.about.get('dimension_separator', '.').join(map(str, place))}"
         data = self.store.find(key)
         if data is None:
             raise RecordingError(f"{self.store.name}: {key} is missing; expected every chunk of the array")
         with self.store.damage_named(key), limit_growth(raise_budget(MEMORY)):
             content = np.frombuffer(np.ascontiguousarray(self._decode(data)).tobytes(), self.dtype)
-            return content.reshape(self.chunks, order=self.order)
+            return content.reshape(self.chunks, order=self.about["order"])
 
     def _decode(self, data: bytes) -> Any:
         """Return the bytes or the numbers of a chunk."""
-        if self.compressor is None:
+        compressor = self.about["compressor"]
+        if compressor is None:
             return np.frombuffer(data, np.uint8)
-        kind = self.compressor.get("id")
+        kind = compressor.get("id")
         if kind == JPEG_XL:
             return import_library("imagecodecs", f"{self.key}, compressed as JPEG XL,").jpegxl_decode(data)
         if kind not in _CODECS:
             raise ValueError(f"compressor {kind}; expected {', '.join((*_CODECS, JPEG_XL))}")
         codecs = import_library("numcodecs", f"{self.key}, compressed by {kind},", "'finforce[zarr]'")
-        return np.frombuffer(codecs.get_codec(self.compressor).decode(data), np.uint8)
+        return np.frombuffer(codecs.get_codec(compressor).decode(data), np.uint8)
