@@ -17,6 +17,7 @@ from finforce_contact.estimator import ContactEstimator
 from finforce_contact.loop import ForceLoop, GivenContact
 from finforce_contact.mesh.object_mesh import ObjectMesh, load_object_mesh
 from finforce_eval.errors import OptionError
+from finforce_eval.evaluation.keypoint_source import build_records
 from finforce_ifea.estimator import ForceEstimator
 from finforce_ifea.grasp_force import Wrench, combine_wrenches, single_jaw_grasp
 from finforce_ifea.jaw.calibration import Calibration
@@ -26,7 +27,6 @@ from finforce_ifea.settings import EstimatorSettings
 from finforce_keypoints.build import build_detector
 from finforce_keypoints.geometry.jaw_localizer import JawKeypoints
 from finforce_keypoints.images import RgbdImage
-from finforce_keypoints.parameters import DetectorParameters
 from finforce_keypoints.rig import read_rig
 
 Camera = CameraIntrinsics | str | Path | Sequence[float]
@@ -57,9 +57,6 @@ class GripperForces:
 
 class ForceSensor:
     """Finds the forces on a gripper in the images of its wrist camera, one after the other.
-
-    Attributes:
-        camera: intrinsics, or what they are to be read from once the size of the images is known.
 
     Args:
         jaw: name of a shipped jaw, jaw file, or a left jaw; None for that of the rig, else "bench".
@@ -94,13 +91,13 @@ class ForceSensor:
             raise OptionError("expected rig, or camera and extrinsics, one of the two")
         if rig is not None:
             found = read_rig(rig)
-            given = {name: tuple(value) for name, value in found.detector_parameters().items()}
+            records = build_records(found.detector_parameters())
             jaw, camera = jaw or found.jaw, found.intrinsics
         else:
-            given = {"T_gripper_camera": pose_numbers(read_extrinsics(extrinsics))}
-        self.camera = camera
+            records = build_records({"T_gripper_camera": pose_numbers(read_extrinsics(extrinsics))})
+        self._camera = camera
         jaws = {side: load_jaw(jaw or "bench", side) for side in sides}
-        self._detector = build_detector(jaws, DetectorParameters(**given))
+        self._detector = build_detector(jaws, records.parameters, records.settings)
         settings = EstimatorSettings().resolve_held(both=len(sides) == len(SIDES))
         mesh = None if object_mesh is None else load_object_mesh(object_mesh)
         self._loops: dict[str, ForceLoop] = {}
@@ -108,6 +105,11 @@ class ForceSensor:
             force = ForceEstimator(own, settings=settings, calibration=calibration)
             fixed = mesh is None and GivenContact(Contact.fixed(force.jaw, contact_height))
             self._loops[side] = ForceLoop(fixed or ContactEstimator(force.jaw, mesh=mesh), force)
+
+    @property
+    def camera(self) -> Camera:
+        """Intrinsics, or what they are to be read from once the size of the images is known."""
+        return self._camera
 
     def update(
         self, rgb: NDArray, depth: NDArray | None, stamp: float, T_camera_object: ArrayLike | None = None
@@ -126,11 +128,11 @@ class ForceSensor:
             ImageError: the image has another shape, shows nothing, or its stamp does not rise.
             PoseError: the pose makes no sense.
         """
-        if not isinstance(self.camera, CameraIntrinsics):
-            self.camera = _intrinsics(self.camera, rgb.shape[:2])
+        if not isinstance(self._camera, CameraIntrinsics):
+            self._camera = _intrinsics(self._camera, rgb.shape[:2])
         if depth is not None:
             depth = decode_depth(depth, "16UC1" if np.asarray(depth).dtype.kind in "iu" else "32FC1")
-        seen = self._detector.detect(RgbdImage(stamp=stamp, color=rgb, depth=depth, camera=self.camera))
+        seen = self._detector.detect(RgbdImage(stamp=stamp, color=rgb, depth=depth, camera=self._camera))
         T = None if T_camera_object is None else check_pose(T_camera_object, "T_camera_object")
         found = {side: self._solve(self._loops[side], points, T) for side, points in seen.items()}
         return combine_solutions(stamp, {side: found.get(side) for side in self._loops})

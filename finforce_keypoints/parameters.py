@@ -42,6 +42,9 @@ class DetectorParameters(GripperParameters):
     covered: tuple[str, ...] = setting(
         ("",), "Key points hidden by the holder, each as SIDE/NAME, such as left/outer_1 or left/reference"
     )
+    likelihood_odds: float = setting(
+        1.0, "Factor on the odds of likelihoods of small or unusual fingers, as a rig file has it", "1", 1.0, 20.0
+    )
     publish_tf: bool = setting(True, "Whether jaw poses are published on /tf, if tf2_ros is installed")
     image_transport: str = setting(
         AUTO,
@@ -113,14 +116,20 @@ class JawMount:
     Attributes:
         turn: rotation vector (3,) against the gripper's axes, jaw frame [rad].
         covered: names of the key points that are never seen, "reference" for the reference point.
+        odds: factor on the odds of likelihoods: a network is less sure of small fingers than it could be.
     """
 
     turn: NDArray = field(default_factory=lambda: np.zeros(3))
     covered: frozenset[str] = frozenset()
+    odds: float = 1.0
 
     def seen_points(self, jaw: Jaw) -> NDArray[np.bool_]:
         """Return which of a jaw's key points, the reference point last, are not covered (K + 1,)."""
         return np.array([name not in self.covered for name in (*jaw.keypoint_names, REFERENCE)])
+
+    def believe(self, likelihood: NDArray) -> NDArray:
+        """Return likelihoods whose odds are multiplied."""
+        return self.odds * likelihood / (1.0 - likelihood + self.odds * likelihood)
 
 
 def find_mounts(parameters: DetectorParameters, jaws: Mapping[str, Jaw]) -> dict[str, JawMount]:
@@ -144,7 +153,7 @@ def find_mounts(parameters: DetectorParameters, jaws: Mapping[str, Jaw]) -> dict
                 f"covered: got {', '.join(unknown)} of the {side} jaw, expected names of key points of the jaw "
                 f"'{jaw.name}' or {REFERENCE}"
             )
-        mounts[side] = JawMount(turn=turn, covered=covered)
+        mounts[side] = JawMount(turn=turn, covered=covered, odds=parameters.likelihood_odds)
     return mounts
 
 

@@ -9,7 +9,7 @@ points are never seen.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -34,15 +34,18 @@ COARSER, FINER = 4, 2  # times as large as those of the network's pictures are t
 AROUND = 0.1  # of the finger's length: what surrounds the outline
 UNHELD = 0.35  # of the finger's length: what is below is likely to be covered by a holder
 DARK = 30.0  # of 255: what is added to the brightness by which colours are divided
+# Directions of a holder's edge, shares of the finger beyond it, and what a share of it costs in contrast.
+EDGES, HELD, HELD_COST = 12, (0.15, 0.3, 0.45), 0.15
 BEYOND = 0.3  # share of the compared pixels outside the image, from which on nothing is said
 # Where wrist cameras are, in the gripper: y, z [m], tilt down [rad], half opening of the jaws [m].
+WHOLE = 0  # the edge beyond which there is nothing
 LOW, HIGH = np.array([0.04, -0.15, -0.2, 0.015]), np.array([0.18, 0.05, 0.9, 0.08])
-STARTS, KEPT, STEPS = 3000, 6, 300  # places that are tried, improved, and in how many steps
-POLISHED, POLISH = 3, 15  # of these, places whose jaws are turned, too, and in how many steps
+STARTS, KEPT, STEPS = 3000, 4, 300  # places that are tried; improved, whole and up to an edge; and in how many steps
+POLISHED, POLISH = 2, 15  # of each of these, places whose jaws are turned, too, and in how many steps
 SIMPLEX = np.array([0.008, 0.008, 0.05, 0.008, 0.006, 0.02, 0.05])  # [m, m, rad, m, m, rad, rad]
-# Least contrast of outlines that are there, in the mean: where they were searched for, the best of thousands of places
-# explains some picture of no jaw to 0.77. With a guess, a grey finger before a textured ground shows with 0.44.
-LEAST_FOUND, LEAST_GUESSED = 0.8, 0.3
+# Least contrast of outlines that are there, in the mean; a part of them taken for held, the best of thousands of places
+# explains pictures of no jaw better. With a guess, a grey finger before a textured ground shows with 0.44.
+LEAST_FOUND, LEAST_GUESSED = 0.75, 0.3
 ROUNDS = 12  # of finding key points with the place found before
 ALIKE = 8.0  # independent points that all the points of a jaw in a picture are worth: what they err by is shared
 PIXEL = 1.0  # [px] standard deviation of one of those
@@ -53,7 +56,10 @@ MIDDLE_STDDEV = 1e-3  # [m] of the middle between the jaws, which says where the
 CUTS = 48  # directions in which a holder may cover a jaw up to a straight edge
 HIDDEN = 0.1  # likelihood of a point that is never seen, wherever it lies
 LEAST_SEEN = 8  # key points of a jaw
-LEAST_LIKELIHOOD = 0.5  # mean likelihood of points that are not covered
+# Likelihood that a rig makes of that of a typical point: a network is less sure of small and of unusual fingers.
+TYPICAL, LEAST_TYPICAL, MOST_ODDS = 0.75, 0.15, 17.0
+# [px] Root mean square of points seen off their places over their likelihood; without such jaws it is 6 and more.
+MOST_LEFT = 4.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -104,23 +110,43 @@ class OutlineContrast:
         near = cv2.dilate(filled, np.ones((3, 3), np.uint8), iterations=reach) > 0
         heights = self._grid.z + self._grid.scale * np.arange(self._grid.height)
         self._near = near & (heights > low + UNHELD * (high - low))[:, None]
-        inside = cv2.GaussianBlur(filled.astype(float), (0, 0), 0.7)[self._near]
-        self._inside = inside - inside.mean()
+        self._inside = cv2.GaussianBlur(filled.astype(float), (0, 0), 0.7)[self._near, None]
+        rows, columns = np.nonzero(self._near)
+        places = self._grid.places(np.column_stack((columns, rows)))
+        self.edges = [(0.0, np.zeros(2), -1.0)]
+        for angle in np.linspace(0.0, 2.0 * np.pi, EDGES, endpoint=False):
+            across = np.array([np.cos(angle), np.sin(angle)])
+            beyond = np.quantile(places[filled[self._near] > 0] @ across, HELD)
+            self.edges += [(share, across, float(edge)) for share, edge in zip(HELD, beyond, strict=True)]
+        self._open = np.array([places @ across > edge for _, across, edge in self.edges], dtype=float)
+        self._cost = HELD_COST * np.array([share for share, *_ in self.edges])
 
-    def contrast(self, color: NDArray, T_camera_jaw: NDArray, camera: CameraIntrinsics) -> float:
-        """Return which share of the outline's variance the colours of an image explain, 0 to 1.
+    def contrasts(
+        self, color: NDArray, T_camera_jaw: NDArray, camera: CameraIntrinsics, edge: int | None = None
+    ) -> NDArray:
+        """Return which share of the open outline's variance an image's colours explain, for one edge or each (e,).
 
-        R^2 of the regression of inside or outside on red, green, blue, and the shares of red and green in them.
+        R^2 of the regression of inside or outside on red, green, blue, and the shares of red and green in them, less
+        what it costs to take part of the outline for held.
         """
         mapping = map_picture(self._grid, self._side, T_camera_jaw, camera)
         colours = take_picture(color, mapping)[self._near].astype(float)
+        chosen = slice(None) if edge is None else slice(edge, edge + 1)
         brightness = colours.sum(axis=1, keepdims=True)
         if (brightness == 0.0).mean() > BEYOND:
-            return 0.0
-        values = np.hstack((colours, 100.0 * colours[:, :2] / (brightness + DARK)))
-        values -= values.mean(axis=0)
-        covariance, along = values.T @ values + len(values) * 1e-2 * np.eye(5), values.T @ self._inside
-        return float(along @ np.linalg.solve(covariance, along) / (self._inside @ self._inside))
+            return np.zeros(len(self._open[chosen]))
+        shares = 100.0 * colours[:, :2] / (brightness + DARK) - 33.0
+        values = np.hstack((colours - colours.mean(axis=0), shares, self._inside, np.ones_like(self._inside)))
+        first, second = np.triu_indices(7)
+        moments = np.empty((len(self._open[chosen]), 7, 7))
+        moments[:, first, second] = moments[:, second, first] = self._open[chosen] @ (
+            values[:, first] * values[:, second]
+        )
+        count, sums = moments[:, 6:, 6:], moments[:, :6, 6:]
+        spread = moments[:, :6, :6] - sums @ sums.swapaxes(1, 2) / count
+        along = spread[:, :5, 5:]
+        explained = along.swapaxes(1, 2) @ np.linalg.solve(spread[:, :5, :5] + 1e-2 * count * np.eye(5), along)
+        return (explained / spread[:, 5:, 5:])[:, 0, 0] - self._cost[chosen]
 
 
 def place_camera(x: NDArray, right: float) -> NDArray:
@@ -139,8 +165,8 @@ def place_camera(x: NDArray, right: float) -> NDArray:
 
 def search_camera(
     images: Sequence[NDArray], camera: CameraIntrinsics, jaws: Mapping[str, Jaw], progress: Callable[[int], Any]
-) -> list[tuple[NDArray, float]]:
-    """Return T_gripper_camera (4, 4) and half the distance of the jaws' origins [m] where outlines show, best first.
+) -> list[tuple[NDArray, float, int | None]]:
+    """Return T_gripper_camera (4, 4), half the distance of the jaws' origins [m] and the edge where outlines show.
 
     Args:
         images: (h, w, 3) uint8 RGB.
@@ -150,32 +176,36 @@ def search_camera(
     """
     outlines = {side: OutlineContrast(jaw) for side, jaw in jaws.items()}
 
-    def compare(x: NDArray, right: float, colors: Sequence[NDArray]) -> float:
+    def compare(x: NDArray, right: float, colors: Sequence[NDArray], edge: int | None = None) -> NDArray:
         T = place_camera(x, right)
         poses = {side: jaw_in_camera(T, side, _origin(side, x[3])) for side in jaws}
-        return float(
-            np.mean([outlines[side].contrast(color, pose, camera) for side, pose in poses.items() for color in colors])
-        )
+        shown = [
+            outlines[side].contrasts(color, pose, camera, edge) for side, pose in poses.items() for color in colors
+        ]
+        return np.mean(shown, axis=0)
 
     rng, tried = np.random.default_rng(0), []
     for number in range(STARTS):
         x, right = rng.uniform(LOW, HIGH), -1.0 if number % 2 else 1.0
         tried.append((compare(x, right, images[:1]), right, x))
         progress(1)
-    tried.sort(key=lambda each: each[0], reverse=True)
-    best = []
-    for _, right, start in tried[:KEPT]:
-        begin = np.r_[start, 0.0, 0.0, 0.0]
-        fit = minimize(
-            lambda x, right=right: -compare(x, right, images),
-            begin,
-            method="Nelder-Mead",
-            options={"maxfev": STEPS, "initial_simplex": np.vstack((begin, begin + np.diag(SIMPLEX)))},
-        )
-        best.append((fit.fun, right, fit.x))
-        progress(STEPS)
-    best.sort(key=lambda each: each[0])
-    return [(place_camera(x, right), float(x[3])) for _, right, x in best[:POLISHED]]
+    starts = []
+    for edge in (WHOLE, None):  # a holder that is not there explains much where something else stands
+        best = []
+        tried.sort(key=lambda each, edge=edge: each[0].max() if edge is None else each[0][edge], reverse=True)
+        for _, right, start in tried[:KEPT]:
+            begin = np.r_[start, 0.0, 0.0, 0.0]
+            fit = minimize(
+                lambda x, right=right, edge=edge: -compare(x, right, images, edge).max(),
+                begin,
+                method="Nelder-Mead",
+                options={"maxfev": STEPS, "initial_simplex": np.vstack((begin, begin + np.diag(SIMPLEX)))},
+            )
+            best.append((fit.fun, right, fit.x))
+            progress(STEPS)
+        best.sort(key=lambda each: each[0])
+        starts += [(place_camera(x, right), float(x[3]), edge) for _, right, x in best[:POLISHED]]
+    return starts
 
 
 def _origin(side: str, half: float) -> float:
@@ -205,16 +235,24 @@ def find_placement(
     Raises:
         GeometryError: there are no such jaws in the pictures.
     """
-    starts = [(guess, half)] if guess is not None else search_camera(images, camera, jaws, progress)
+    starts = [(guess, half, WHOLE)] if guess is not None else search_camera(images, camera, jaws, progress)
     least = LEAST_FOUND if guess is None else LEAST_GUESSED
-    fits = [_Refinement(images, camera, jaws, locator, *start, least) for start in starts]
-    for fit in fits:
-        fit.polish()
-    fit = max(fits, key=lambda each: each.contrast())
-    for _ in range(ROUNDS):
-        fit.improve()
-        progress(len(images))
-    return fit.describe()
+    found: list[CameraPlacement] = []
+    failures: dict[float, GeometryError] = {}
+    for T, opening, edge in starts:
+        fit = _Refinement(images, camera, jaws, locator, T, opening, least)
+        fit.polish(edge)
+        for _ in range(ROUNDS):
+            fit.improve()
+            progress(len(images))
+        try:
+            found.append(fit.describe())
+        except GeometryError as error:
+            failures[fit.likeliest] = error
+    if not found:
+        raise failures[max(failures)]
+    # ribs look alike: one further along the finger is as likely, but the outline is elsewhere
+    return max(found, key=lambda each: each.contrast)
 
 
 def find_covered(likelihood: NDArray, places: NDArray) -> NDArray[np.bool_]:
@@ -269,26 +307,31 @@ class _Refinement:
         origins = dict(zip(self._jaws, x[6 + 3 * sides :].reshape(sides, count), strict=True))
         return move_pose(self._start, x[:6]), turns, origins
 
-    def contrast(self, x: NDArray | None = None) -> float:
+    def contrast(self, x: NDArray | None = None, edge: int | None = None) -> float:
         """Return the mean contrast of the outlines."""
         T, turns, origins = self._split(self._x if x is None else x)
-        return float(
-            np.mean(
-                [
-                    self._outlines[side].contrast(color, jaw_in_camera(T, side, place, turns[side]), self._camera)
-                    for side in self._jaws
-                    for color, place in zip(self._images, origins[side], strict=True)
-                ]
-            )
+        each = np.mean(
+            [
+                self._outlines[side].contrasts(color, jaw_in_camera(T, side, place, turns[side]), self._camera, edge)
+                for side in self._jaws
+                for color, place in zip(self._images, origins[side], strict=True)
+            ],
+            axis=0,
         )
+        if edge is None:
+            self._edge = int(np.argmax(each))
+        return float(each.max())
 
-    def polish(self) -> None:
-        """Move camera and jaws until the outlines show best."""
+    def polish(self, edge: int | None = None) -> None:
+        """Move camera and jaws until the outlines show best up to an edge, without one up to the best."""
         start = self._x / self._scale
+        if edge is None:
+            self.contrast()
+            edge = self._edge
 
         def judge(x: NDArray) -> float:
             turns = x[6 : 6 + 3 * len(self._jaws)] * 0.03 / TURN_STDDEV
-            return 0.01 * float(turns @ turns) - self.contrast(x * self._scale)
+            return 0.01 * float(turns @ turns) - self.contrast(x * self._scale, edge)
 
         fit = minimize(judge, start, method="L-BFGS-B", options={"maxiter": POLISH, "eps": 0.02})
         self._start, self._x = self._split(fit.x * self._scale)[0], fit.x * self._scale
@@ -342,6 +385,11 @@ class _Refinement:
         self._keep_best()
         self._x = least_squares(self._misses, self._x, x_scale=self._scale, loss="soft_l1").x
 
+    @property
+    def likeliest(self) -> float:
+        """How likely the points are in the mean where they are likeliest."""
+        return self._best[0]
+
     def _keep_best(self) -> None:
         """Remember where the points were most likely so far."""
         score = float(np.mean([each.mean() for each in self._likelihood.values()]))
@@ -359,29 +407,36 @@ class _Refinement:
         self._x = self._best[1]
         self._look()
         (T, turns, origins), contrast = self._split(self._x), self.contrast()
-        usual = np.array([np.median(each, axis=0) for each in self._likelihood.values()]).mean(axis=0)
         first = next(iter(self._jaws))
-        visible = ~find_covered(usual, self._points[first][:, ::2])
-        count, likely = int(visible[:-1].sum()), float(usual[visible].mean()) if visible.any() else 0.0
-        if count < LEAST_SEEN or likely < LEAST_LIKELIHOOD or contrast < self._least_contrast:
+        usual = np.array([np.median(each, axis=0) for each in self._likelihood.values()]).mean(axis=0)
+        typical = self._find_typical(usual, self._points[first][:, ::2])
+        mount = JawMount(odds=float(np.clip(TYPICAL / (1.0 - TYPICAL) * (1.0 - typical) / typical, 1.0, MOST_ODDS)))
+        visible = ~find_covered(mount.believe(usual), self._points[first][:, ::2])
+        sure = {s: visible & (mount.believe(each) >= 0.5) for s, each in self._likelihood.items()}
+        away = np.concatenate([self._away(s, T, turns[s], origins[s])[sure[s]] for s in self._jaws])
+        residual = float(np.sqrt((away**2).sum() / max(len(away), 1)))
+        count, most = int(visible[:-1].sum()), MOST_LEFT * typical
+        if count < LEAST_SEEN or typical < LEAST_TYPICAL or contrast < self._least_contrast or residual > most:
             raise GeometryError(
                 f"no such jaws: outlines of '{self._jaws[first].name}' show with a contrast of {contrast:.2f} (least: "
-                f"{self._least_contrast:g}), {count} key points are seen (at least {LEAST_SEEN}) with a "
-                f"likelihood of {likely:.2f} (at least {LEAST_LIKELIHOOD:g}): another finger, other intrinsics, loaded "
-                "jaws, or none in view? Jaws that look like their background need a guess of T_gripper_camera"
+                f"{self._least_contrast:g}), {count} key points are seen (at least {LEAST_SEEN}) with a likelihood of "
+                f"{typical:.2f} (at least {LEAST_TYPICAL:g}), {residual:.1f} px off (at most {most:.1f}): another "
+                "finger, other intrinsics, a mirrored image, loaded jaws, or none in view? Jaws that look like their "
+                "background need a guess of T_gripper_camera"
             )
-        mounts, away, kept = {}, [], {}
-        for side, jaw in self._jaws.items():
-            names = np.array([*jaw.keypoint_names, REFERENCE])
-            mounts[side] = JawMount(turn=turns[side], covered=frozenset(names[~visible].tolist()))
-            sure = (self._likelihood[side] >= 0.5) & visible
-            kept[side] = np.where(sure[:, :, None], self._seen[side], np.nan)
-            away.append(self._away(side, T, turns[side], origins[side])[sure])
+        names = np.array([*self._jaws[first].keypoint_names, REFERENCE])
+        covered = frozenset(names[~visible].tolist())
         return CameraPlacement(
             T_gripper_camera=T,
-            mounts=mounts,
+            mounts={side: replace(mount, turn=turns[side], covered=covered) for side in self._jaws},
             origins=origins,
             contrast=contrast,
-            residual=float(np.sqrt((np.concatenate(away) ** 2).sum(axis=1).mean())),
-            seen=kept,
+            residual=residual,
+            seen={side: np.where(sure[side][:, :, None], seen, np.nan) for side, seen in self._seen.items()},
         )
+
+    def _find_typical(self, usual: NDArray, places: NDArray) -> float:
+        """Return the likelihood of a typical point that neither the edge of a holder nor that of the image covers."""
+        _, across, edge = next(iter(self._outlines.values())).edges[self._edge]
+        there = usual[(places @ across > edge) & (usual > 0.0)]
+        return float(np.clip(np.median(there), 1e-6, TYPICAL)) if there.size else 1e-6

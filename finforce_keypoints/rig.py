@@ -22,6 +22,9 @@ HEAD = (
 )
 
 
+WIDER = 0.01  # [m] by which a jaw can be farther out than in the pictures of open jaws
+
+
 class RigCamera(FileModel):
     """Intrinsics."""
 
@@ -51,6 +54,9 @@ class Rig(FileModel):
         description="Pose of the camera: x, y, z [m], qx, qy, qz, qw"
     )
     half_opening: Length = Field(0.045, description="Half the distance of the jaws' origins when it was made [m]")
+    likelihood_odds: Annotated[Number, Field(ge=1.0, le=20.0)] = Field(
+        1.0, description="Factor on the odds of likelihoods, which are low on small or unusual fingers"
+    )
     left: RigJaw | None = Field(None, description="The left jaw")
     right: RigJaw | None = Field(None, description="The right jaw")
 
@@ -68,6 +74,8 @@ class Rig(FileModel):
             "T_gripper_camera": list(self.T_gripper_camera),
             **{f"{side}_turn": list(jaw.turn) for side, jaw in jaws.items()},
             "covered": covered or [""],
+            "likelihood_odds": self.likelihood_odds,
+            "detector.opening_max": self.half_opening + WIDER,
         }
 
 

@@ -23,7 +23,7 @@ from finforce_keypoints.build import ANY_FINGER
 from finforce_keypoints.detectors.side_plane import AnyFinger
 from finforce_keypoints.networks.side_network import SideNetwork
 from finforce_keypoints.parameters import NO_DEPTH
-from finforce_keypoints.placement import KEPT, ROUNDS, STARTS, STEPS, CameraPlacement, find_placement
+from finforce_keypoints.placement import KEPT, POLISHED, ROUNDS, STARTS, STEPS, CameraPlacement, find_placement
 from finforce_keypoints.rig import Rig, RigCamera, describe_mount, write_rig
 
 PICTURES = 4  # of the images, which are compared
@@ -53,7 +53,7 @@ def run(options: argparse.Namespace) -> CommandResult:
     locator = AnyFinger(SideNetwork(source.parameters.get("model") or ANY_FINGER), jaws)
     guess = source.node_parameters(recording).get("T_gripper_camera")
     guess = None if guess is None else read_extrinsics(guess)
-    with progress_bar(STARTS + KEPT * STEPS + ROUNDS * len(colors), "step") as bar:
+    with progress_bar(STARTS + 2 * (KEPT * STEPS + POLISHED * ROUNDS * len(colors)), "step") as bar:
         found = find_placement(colors, recording.images.camera, jaws, locator, guess, progress=bar.update)
     output = Path(options.output)
     rig = build_rig(found, recording, options.jaw)
@@ -92,6 +92,7 @@ def build_rig(found: CameraPlacement, recording: Recording, jaw: str) -> Rig:
         jaw=str(Path(jaw).resolve()) if Path(jaw).is_file() else jaw,
         camera=RigCamera(**intrinsics, distortion=tuple(camera.distortion.tolist())),
         T_gripper_camera=tuple(round(float(number), 7) for number in pose_numbers(found.T_gripper_camera)),
+        likelihood_odds=round(next(iter(found.mounts.values())).odds, 1),
         half_opening=round(float(np.mean(halves)), 5),
         **{side: describe_mount(mount, names) for side, mount in found.mounts.items()},
     )

@@ -66,6 +66,7 @@ class KeypointSource:
         parameters: parameters of the detector node that differ from its defaults, by their ROS names.
         strict: refuse recordings that are damaged.
         as_live: leave out the images that the detector's node leaves out.
+        stills: whether nothing of one image is known in the next.
         choice: which images are read.
     """
 
@@ -74,6 +75,7 @@ class KeypointSource:
     parameters: Mapping[str, Any] = field(default_factory=dict)
     strict: bool = False
     as_live: bool = False
+    stills: bool = False
     choice: ImageChoice = field(default_factory=ImageChoice)
 
     def source_of(self, recording: Recording) -> str:
@@ -145,7 +147,7 @@ class KeypointSource:
         images = choose_images(recording, parameters.depth)
         recording = replace(recording, images=replace(images, depth_scale=parameters.depth_scale))
         with progress_bar(len(recording.images), "image", recording.name) as bar:
-            return detect_keypoints(recording, detector, as_live=self.as_live, progress=bar.update)
+            return detect_keypoints(recording, detector, as_live=self.as_live, stills=self.stills, progress=bar.update)
 
 
 def choose_images(recording: Recording, depth: str) -> ImageTrack:
@@ -221,7 +223,7 @@ def parse_source(options: argparse.Namespace) -> KeypointSource:
         parameters |= _parse_parameters(changes)
     if extrinsics:
         parameters["T_gripper_camera"] = _parse_extrinsics(extrinsics)
-    switches = {name: bool(getattr(options, name, False)) for name in ("strict", "as_live")}
+    switches = {name: bool(getattr(options, name, False)) for name in ("strict", "as_live", "stills")}
     seconds, pose = parameters.get("sync_tolerance"), parameters.get("T_gripper_camera")
     given = {name: getattr(options, option, None) for name, option in _CHOICES.items()}
     choice = ImageChoice(
@@ -297,6 +299,7 @@ def detect_keypoints(
     detector: KeypointDetector,
     *,
     as_live: bool = False,
+    stills: bool = False,
     progress: Callable[[int], Any] = lambda images: None,
 ) -> Recording:
     """Return a recording with the key points and jaw poses that a detector finds in its images.
@@ -307,6 +310,7 @@ def detect_keypoints(
         recording: with images.
         detector: a fresh one, of the recording's jaws.
         as_live: whether the images that the detector's node leaves out have no row.
+        stills: whether nothing of one image is known in the next.
         progress: called with the number of images done since its last call.
 
     Raises:
@@ -318,6 +322,8 @@ def detect_keypoints(
     idling, passed = Idling(), set()
     for stamp, image in images:
         begin = perf_counter()
+        if stills:
+            detector.reset()
         try:
             seen = detector.detect(image)
         except (KeypointError, ImageError) as error:

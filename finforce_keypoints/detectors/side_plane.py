@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,7 +28,10 @@ if TYPE_CHECKING:
 SAME_PLACE = 1e-3  # [m] by which a jaw may move before its picture is mapped anew; places are exact all the same
 SEARCH_STEP = 24.0  # [px] between the places where a lost jaw is looked for; the network finds one half as far away
 LEAST_SCORE = 0.35  # mean likelihood of a jaw's points that are not covered, below which it is not there
+LIKELY_SCORE = 0.6  # the same, below which a jaw in a holder is looked for beside its place, too
 STRAIGHT = np.zeros((1, 2))  # pictures of a locator's own grid alone
+# [px] between the pictures of a jaw in a holder: a network is surer of a bent finger in one of them than in the next.
+AROUND = 6.0 * np.array([(x, z) for x in (0, -1, 1) for z in (0, -1, 1)])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -86,37 +89,60 @@ class SidePlaneDetector:
         """Return where the key points of each jaw are; see `PixelDetector`."""
         if image.camera is not self._camera:
             self._kept, self._camera, self._moves = {}, image.camera, {}
-        self._moves = {side: moves for side, moves in self._moves.items() if expected.get(side) is not None}
+        self._moves = {side: moves for side, moves in self._moves.items() if expected.get(side, moves) is not None}
         self._turn = (self._turn + 1) % len(self._locator.shifts)
         views = [view for side, pose in expected.items() for view in self._views_of(side, pose)]
         if not views:
             return {}
         places = self._locate(image, views)
-        scores = [self._score(view, places, number) for number, view in enumerate(views)]
+        scores = self._score(views, places)
         found: dict[str, PixelDetection] = {}
         again: list[_View] = []
-        for side, pose in expected.items():
-            mine = [number for number, view in enumerate(views) if view.side == side]
-            best = max(mine, key=scores.__getitem__)
-            if pose is not None:
-                found[side] = self._describe(views[best], places, best)
-            elif scores[best] >= LEAST_SCORE:
-                again.append(self._view(side, self._centre(views[best], places, best)))
+        for side, number in self._choose(views, scores).items():
+            view, is_held = views[number], not self._seen[side][-1]
+            if expected[side] is None and scores[number] >= LEAST_SCORE:
+                # the jaw lay near the border of the picture it was found in
+                pose = self._centre(view, places, number)
+                again += [self._view(side, pose, shift) for shift in (AROUND if is_held else STRAIGHT)]
+            elif is_held and expected[side] is not None and scores[number] < LIKELY_SCORE:
+                again += [self._view(side, view.T_camera_jaw, shift) for shift in AROUND]
+            elif expected[side] is not None:
+                found[side] = self._describe(view, places, number, scores[number])
         if again:
-            # the jaw lay near the border of the picture it was found in
             places = self._locate(image, again)
-            found |= {view.side: self._describe(view, places, number) for number, view in enumerate(again)}
+            scores = self._score(again, places)
+            for side in {view.side for view in again}:
+                number = max((n for n, view in enumerate(again) if view.side == side), key=scores.__getitem__)
+                found[side] = self._describe(again[number], places, number, scores[number])
+                if expected[side] is not None and scores[number] < LEAST_SCORE:
+                    found |= self.detect(image, {side: None})
         return found
+
+    def _choose(self, views: Sequence[_View], scores: Sequence[float]) -> dict[str, int]:
+        """Return the number of the likeliest view of each jaw; two jaws in holders that are lost close alike."""
+        numbers = {side: [n for n, view in enumerate(views) if view.side == side] for side in self._planes}
+        numbers = {side: each for side, each in numbers.items() if each}
+        best = {side: max(each, key=scores.__getitem__) for side, each in numbers.items()}
+        if len(best) == 2 and not any(self._seen[side][-1] for side in best):
+            left, right = (np.array([scores[n] for n in numbers[side]]) for side in best)
+            if len(left) == len(right) > 1:
+                apart = np.abs(np.subtract.outer(np.arange(len(left)), np.arange(len(right))))
+                pair = np.unravel_index(np.argmax(np.where(apart <= 1, np.add.outer(left, right), -1.0)), apart.shape)
+                best = {side: numbers[side][n] for side, n in zip(best, pair, strict=True)}
+        return best
 
     def _locate(self, image: RgbdImage, views: Sequence[_View]) -> Places:
         pictures = np.stack([take_picture(image.color, view.mapping) for view in views])
         moves = [self._moves.get(view.side) for view in views]
         starts = [None if move is None else move - view.shift for move, view in zip(moves, views, strict=True)]
-        return self._locator.locate(pictures, [view.side for view in views], starts)
+        places = self._locator.locate(pictures, [view.side for view in views], starts)
+        pairs = zip(views, places.likelihood, strict=True)
+        return replace(places, likelihood=np.stack([self._mounts[view.side].believe(each) for view, each in pairs]))
 
-    def _score(self, view: _View, places: Places, number: int) -> float:
-        """Return the mean likelihood of the points that can be seen of the jaw of one picture."""
-        return float(places.likelihood[number][self._seen[view.side]].mean())
+    def _score(self, views: Sequence[_View], places: Places) -> list[float]:
+        """Return the mean likelihoods of the points that can be seen of the jaw of each picture."""
+        pairs = zip(views, places.likelihood, strict=True)
+        return [float(likelihood[self._seen[view.side]].mean()) for view, likelihood in pairs]
 
     def _views_of(self, side: str, pose: NDArray | None) -> list[_View]:
         """Return where to look for one jaw: where it is expected, or all along the closing axis."""
@@ -142,13 +168,15 @@ class SidePlaneDetector:
         sure = places.likelihood[number] >= 0.5
         weight = np.where(sure, 1.0 / (rest[:, 1] - rest[:, 1].min() + 0.01), 0.0)
         if weight.sum() > 0.0:
-            shift = np.nansum(weight * (moved[:, 0] - rest[:, 0])) / weight.sum()
-            jaw[:3, 3] += shift * jaw[:3, 0]
+            shift = np.nansum(weight[:, None] * (moved - rest), axis=0) / weight.sum()
+            jaw[:3, 3] += shift[0] * jaw[:3, 0]
+            if not self._seen[view.side][-1]:
+                jaw[:3, 3] += shift[1] * jaw[:3, 2]
         return jaw
 
-    def _describe(self, view: _View, places: Places, number: int) -> PixelDetection:
+    def _describe(self, view: _View, places: Places, number: int, score: float) -> PixelDetection:
         """Return the detection of one picture, in pixels of the image; the next one begins where its points are."""
-        if places.moves is not None and self._score(view, places, number) >= LEAST_SCORE:
+        if places.moves is not None and score >= LEAST_SCORE:
             self._moves[view.side] = places.moves[number] + view.shift
         plane, grid, camera = self._planes[view.side], view.grid, self._camera
         on_plane = grid.places(places.pixels[number])

@@ -34,6 +34,7 @@ GATES = (5e-3, 2e-3)  # [m] off the known side plane, then off the one found, be
 LEAST_DEPTHS, LEAST_SHARE = 6, 0.4  # samples of the finger with depth that a key point needs, and their share of all
 DEPTH_NOISE = 0.06e-3  # [m] error of the depth that the samples of one point share
 MISFIT = 5.0  # standard deviations of its depth off the fit, above which a key point is not there
+MOST_SLIP = 6e-3  # [m] along its z that a jaw in a holder is off its place; more is another camera or rig
 _LEAST_SEEN = 3  # points, or all there are: fewer likely ones are no jaw
 _LEAST_FOUND = 1 / 3  # share of the points that have to be likely where no jaw was known before
 REASONS = ("image", "likelihood", "depth", "workspace", "covered")
@@ -90,7 +91,7 @@ class JawLocalizer:
         self._origin = OriginEstimator(jaw, T_gripper_camera, settings, self._mount)
         self._track = OriginTrack(settings, self._origin.largest_stddev)
         self._patch, self._rest_check = ReferencePatch(jaw), _RestCheck(jaw.keypoints)
-        self._unconfirmed = 0
+        self._unconfirmed, self._slip, self._astray = 0, 0.0, 0.0
         self._samples = build_side_samples(jaw)
         self._rest = np.vstack((jaw.keypoints, jaw.reference_point))
         self._model = SideModel(places=self._rest[:, ::2])
@@ -105,11 +106,16 @@ class JawLocalizer:
         self._track.reset()
         self._patch.reset()
         self._rest_check.reset()
-        self._unconfirmed = 0
+        self._unconfirmed, self._slip, self._astray = 0, 0.0, 0.0
 
     @property
     def warning(self) -> str:
         """What is suspicious about this jaw, in a sentence; "" for nothing."""
+        if abs(self._astray) > MOST_SLIP:
+            return (
+                f"the jaw lies {1e3 * self._astray:+.0f} mm along its z from where the rig has it: is the image zoomed "
+                "or stabilised, or of another rig?"
+            )
         distance = self._rest_check.distance
         if not distance > self._settings.rest_tolerance:
             return ""
@@ -153,7 +159,7 @@ class JawLocalizer:
     def expect(self, stamp: float) -> NDArray | None:
         """Return T_camera_jaw (4, 4) where the jaw should be at a time [s]; None when it is lost."""
         forecast = self._track.forecast(stamp)
-        return None if forecast is None else self._origin.place(forecast)
+        return None if forecast is None else self._origin.place(replace(forecast, slip=self._slip))
 
     def locate(self, image: RgbdImage, detection: PixelDetection | None, scale: DepthScale) -> JawKeypoints | None:
         """Return the jaw's key points, None when nobody knows where the jaw is.
@@ -167,10 +173,13 @@ class JawLocalizer:
             self._track.update(image.stamp, None)
             return None
         seen = self._look(image, detection)
-        origin = self._track.update(image.stamp, self._measure(seen))
+        measured = self._measure(seen)
+        origin = self._track.update(image.stamp, measured)
+        if measured is not None:
+            self._slip = measured.slip
         if origin is None:
             return None
-        keypoints = self._describe(seen, scale, origin)
+        keypoints = self._describe(seen, scale, replace(origin, slip=self._slip))
         # without one key point that depth confirms, a picture of a jaw would do as well
         self._unconfirmed = 0 if keypoints.valid.any() else self._unconfirmed + 1
         if self._unconfirmed >= self._settings.lost_images:
@@ -194,6 +203,9 @@ class JawLocalizer:
         """Return where one image shows the jaw; None where it does not."""
         measured = self._origin.measure(np.where(seen.likely[:, None], seen.rays, np.nan), seen.ray_stddev)
         if measured is None or not self._is_there(seen.likely):
+            return None
+        self._astray = measured.slip
+        if abs(measured.slip) > MOST_SLIP:
             return None
         if seen.likely[-1]:
             return self._patch.refine(seen.image.color, seen.image.camera, measured, self._origin.place)

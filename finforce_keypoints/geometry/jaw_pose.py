@@ -29,8 +29,9 @@ _SET_ASIDE = 3  # consecutive places off the course that are believed when they 
 _RIGID_STDDEV = 0.3e-3  # [m] bending of the jaw at that height; more with the square of the height
 _ORIGIN_STDDEV = 0.6e-3  # [m] a jaw whose place is less well known is not found
 _COVERED_STDDEV = 3e-3  # [m] the same of a jaw whose rigid part is covered: how sure its place is goes into the force
+_SLIP = 1.5e-3  # [m] standard deviation of how far holder and camera give under load, along the jaw
 _ROUNDS = 6  # of reweighting
-_LEAST_BENT = 8  # points that tell the place of a jaw that may be bent
+_LEAST_BENT = 5  # points that tell the place of a jaw that may be bent
 _ORIGIN_GATE = 3.0  # standard deviations of an origin off the forecast, which mean that the speed has changed
 _ACCELERATION = 2e-3  # [m/s^1.5] random walk of the closing speed; what is more is noticed and followed
 _LONGEST_STEP = 0.5  # [s] without an image, after which the course starts anew
@@ -55,11 +56,13 @@ class Origin:
         x: of the jaw's origin in the gripper base [m].
         stddev: [m].
         shared: the part of it that images in a row have in common [m].
+        slip: by which a jaw in a holder that gives has moved along its own z [m].
     """
 
     x: float
     stddev: float
     shared: float = 0.0
+    slip: float = 0.0
 
 
 class OriginEstimator:
@@ -87,7 +90,8 @@ class OriginEstimator:
         self.largest_stddev = _ORIGIN_STDDEV
         if not mount.seen_points(jaw)[-1]:
             bends = np.insert(find_motions(jaw)[:BENDS], 1, 0.0, axis=2) @ self._T_camera_middle[:3, :3].T
-            self._motions = np.append(bends, np.zeros((BENDS, 1, 3)), axis=1)
+            slip = np.broadcast_to(_SLIP * self._T_camera_middle[:3, 2], (1, *points.shape))
+            self._motions = np.concatenate((slip, np.append(bends, np.zeros((BENDS, 1, 3)), axis=1)))
             self.largest_stddev = _COVERED_STDDEV
 
     @property
@@ -98,7 +102,7 @@ class OriginEstimator:
     def place(self, origin: Origin) -> NDArray:
         """Return T_camera_jaw (4, 4) of an origin."""
         T = self._T_camera_middle.copy()
-        T[:3, 3] += origin.x * self._axis
+        T[:3, 3] += origin.x * self._axis + origin.slip * T[:3, 2]
         return T
 
     def measure(self, rays: NDArray, stddev: NDArray) -> Origin | None:
@@ -134,6 +138,8 @@ class OriginEstimator:
         Least squares with less weight for what is far off, to first order around the median of the points' own places:
 
             r_k - p_k / p_kz = D_k (a x + sum_i c_i m_ki) + e_k,   D_k = dr / dp,   c_i of the motions m_i ~ N(0, 1)
+
+        The first of the motions is the slip of the jaw in its holder, or of the holder before the camera.
         """
         with np.errstate(invalid="ignore"):
             x, _, off = self._solve(rays, stddev)
@@ -149,17 +155,18 @@ class OriginEstimator:
         along = np.broadcast_to(self._axis, (1, *points.shape))
         columns = np.einsum("kab,ikb->kai", slopes, np.concatenate((along, self._motions[:, seen])))
         away = rays[seen, :2] - points[:, :2] / points[:, 2:]
-        prior, variance, doubt = np.diag([0.0, *np.ones(BENDS)]), stddev[seen] ** 2, np.ones(len(points))
+        prior, variance, doubt = np.diag([0.0, *np.ones(1 + BENDS)]), stddev[seen] ** 2, np.ones(len(points))
         for _ in range(_ROUNDS):
             weighted = columns * (doubt / variance)[:, None, None]
             covariance = np.linalg.inv(np.einsum("kai,kaj->ij", weighted, columns) + prior)
             found = covariance @ np.einsum("kai,ka->i", weighted, away)
             # what moves far differs from its shapes more
-            variance = stddev[seen] ** 2 + (SHARE**2) * ((columns[:, :, 1:] @ found[1:]) ** 2).sum(axis=1)
+            variance = stddev[seen] ** 2 + (SHARE**2) * ((columns[:, :, 2:] @ found[2:]) ** 2).sum(axis=1)
             doubt = 1.0 / (1.0 + 0.5 * ((away - columns @ found) ** 2).sum(axis=1) / variance)
         place, spread = middle + float(found[0]), float(np.sqrt(covariance[0, 0]))
         # what a finger differs from its shapes by is the same from image to image
-        return Origin(x=place, stddev=spread, shared=spread) if self._low <= place <= self._high else None
+        origin = Origin(x=place, stddev=spread, shared=spread, slip=_SLIP * float(found[1]))
+        return origin if self._low <= place <= self._high else None
 
     def _agrees(self, origin: Origin, x: NDArray, off: NDArray) -> bool:
         """Say whether the points near the base, by origins (K + 1,) and distances (K + 1,), are of a jaw there."""

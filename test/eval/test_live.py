@@ -15,7 +15,7 @@ from finforce_eval.cli import live
 from finforce_eval.cli.main import main
 from finforce_eval.sensor import ForceSensor, combine_solutions
 from finforce_ifea.observation import blank_solution
-from finforce_keypoints.rig import Rig, RigCamera, RigJaw, write_rig
+from finforce_keypoints.rig import WIDER, Rig, RigCamera, RigJaw, write_rig
 
 CAMERA = RigCamera(width=64, height=48, fx=50.0, fy=50.0, cx=32.0, cy=24.0, model="plumb_bob")
 RIG = Rig(
@@ -140,9 +140,10 @@ def test_a_rig_stands_for_jaw_camera_and_extrinsics(tmp_path, monkeypatch):
     seen = []
     monkeypatch.setattr(sensors, "ForceEstimator", lambda jaw, **given: SimpleNamespace(jaw=jaw))
     monkeypatch.setattr(sensors, "ForceLoop", lambda contact, force: None)
-    monkeypatch.setattr(sensors, "build_detector", lambda jaws, parameters: seen.append((jaws, parameters)))
+    monkeypatch.setattr(sensors, "build_detector", lambda *given: seen.append(given))
     sensor = ForceSensor(rig=tmp_path / "rig.yaml", contact_height=0.04, sides=("left",))
-    ((jaws, parameters),) = seen
+    ((jaws, parameters, settings),) = seen
     assert jaws["left"].name == "bench" and sensor.camera.width == 64
     assert parameters.left_turn == (0.0, 0.05, 0.0) and parameters.covered == ("left/inner_1",)
     assert parameters.T_gripper_camera == pytest.approx(RIG.T_gripper_camera)
+    assert settings.opening_max == pytest.approx(RIG.half_opening + WIDER)

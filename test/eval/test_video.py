@@ -11,6 +11,7 @@ from finforce_contact.loop import GivenContact
 from finforce_eval.cli.main import main
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.forces import STILL_UPDATES, find_forces
+from finforce_eval.evaluation.keypoint_source import detect_keypoints
 from finforce_eval.recordings.images import ImageChoice
 from finforce_eval.recordings.recording import read_recording
 from finforce_keypoints.rig import Rig, RigCamera, write_rig
@@ -80,6 +81,26 @@ def test_pictures_without_a_jaw_have_no_force(tmp_path, capsys):
     assert main([*words, "--out", str(tmp_path / "out")]) == 2
     assert "no key points in 3 images" in capsys.readouterr().err
     assert not (tmp_path / "out" / "stills").exists()
+
+
+def test_no_jaw_of_one_still_is_expected_in_the_next(tmp_path):
+    recording, events = read_recording(write_pictures(tmp_path / "stills"), CHOICE), []
+
+    class Detector:
+        warnings, counts, was_still = {}, {}, False
+
+        def reset(self):
+            events.append("reset")
+
+        def detect(self, image):
+            events.append("detect")
+            return {}
+
+    for stills, expected in ((True, ["reset", "detect"] * 3), (False, ["detect"] * 3)):
+        events.clear()
+        with pytest.raises(RecordingError, match="no key points in 3 images"):
+            detect_keypoints(recording, Detector(), stills=stills)
+        assert events == expected
 
 
 def test_nothing_of_one_still_is_known_in_the_next():

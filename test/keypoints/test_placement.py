@@ -1,19 +1,24 @@
 """Claims about jaws whose holders hide them, and about a camera whose place nobody has measured."""
 
+import re
+
 import numpy as np
 import pytest
 
 from finforce.camera import EQUIDISTANT, CameraIntrinsics, project, rays_from_pixels
 from finforce.gripper_frames import ROBOT_CAMERA, jaw_in_camera
 from finforce.transforms import pose_numbers
+from finforce_eval.evaluation.keypoint_source import build_records
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints import placement
 from finforce_keypoints.detectors.side_plane import AnyFinger, SidePlaneDetector
 from finforce_keypoints.errors import DetectorSettingsError, GeometryError, RigError
+from finforce_keypoints.geometry.depth import DepthScale
+from finforce_keypoints.geometry.jaw_localizer import JawLocalizer
 from finforce_keypoints.geometry.jaw_pose import OriginEstimator
 from finforce_keypoints.geometry.side_picture import PlaneGrid, find_side, project_plane
 from finforce_keypoints.geometry.template import find_motions, find_shape
-from finforce_keypoints.images import RgbdImage
+from finforce_keypoints.images import PixelDetection, RgbdImage
 from finforce_keypoints.networks.side_network import Places, Template
 from finforce_keypoints.parameters import DetectorParameters, DetectorSettings, JawMount, find_mounts
 from finforce_keypoints.placement import OutlineContrast, find_covered, find_placement
@@ -31,6 +36,8 @@ RIG = Rig(
         width=64, height=54, fx=21.0, fy=21.1, cx=32.0, cy=27.0, distortion=(-0.02,) * 4, model=EQUIDISTANT
     ),
     T_gripper_camera=tuple(pose_numbers(ROBOT_CAMERA)),
+    half_opening=0.055,
+    likelihood_odds=3.0,
     left=RigJaw(turn=(0.0, 0.05, 0.0), covered=("reference",)),
 )
 
@@ -85,6 +92,73 @@ def test_points_that_cannot_be_seen_do_not_count_against_a_jaw():
     assert not found["left"].likelihood[[name in hidden for name in (*NAMES, "reference")]].any()
 
 
+class Sighted:
+    """A locator that knows by a picture's brightness where it was taken, and how likely a jaw is there."""
+
+    shifts, name, sha256 = np.zeros((1, 2)), "sighted", ""
+
+    def __init__(self, jaws, likely):
+        self.grids, self.likely, self.count = dict.fromkeys(jaws, PlaneGrid()), likely, 0
+        self.rest = {s: np.vstack((jaw.keypoints, jaw.reference_point))[:, ::2] for s, jaw in jaws.items()}
+
+    def locate(self, pictures, sides, starts=()):
+        self.count += len(pictures)
+        rest = [self.rest[side] for side in sides]
+        levels = zip(sides, pictures[:, 112, 88, 0].astype(float), strict=True)
+        likelihood = np.array([np.full(len(rest[0]), self.likely(*each)) for each in levels])
+        pixels = np.array([PlaneGrid().pixels(each) for each in rest])
+        return Places(pixels=pixels, likelihood=likelihood, stddev=np.full(likelihood.shape, 0.5))
+
+
+@pytest.fixture(scope="module")
+def slope():
+    """An image that grows brighter to the right, and the level of a picture of a jaw taken at x."""
+    color = np.repeat(np.repeat(np.linspace(0, 255, 640)[None, :, None], 480, 0), 3, 2).astype(np.uint8)
+    image, middle = RgbdImage(stamp=1.0, color=color, depth=None, camera=CAMERA), PlaneGrid().places([[88, 112]])
+
+    def level(side, x):
+        place = project_plane(middle, find_side(load_jaw("bench", side)), jaw_in_camera(ROBOT_CAMERA, side, x), CAMERA)
+        return 255.0 * place[0, 0] / 639.0
+
+    return image, level
+
+
+def test_jaws_in_holders_that_are_lost_are_looked_for_at_like_openings(slope):
+    image, level = slope
+    jaws = {side: load_jaw("bench", side) for side in ("left", "right")}
+
+    def likely(side, seen):  # something beside the left jaw looks more like one than the jaw
+        if side == "left" and seen < level("left", -0.065):
+            return 0.95
+        return 0.9 if abs(seen - level(side, -0.035 if side == "left" else 0.035)) < 12.0 else 0.1
+
+    found = {}
+    for covered in (frozenset(), LOW):
+        mounts = {side: JawMount(covered=covered) for side in jaws}
+        detector = SidePlaneDetector(Sighted(jaws, likely), jaws, ROBOT_CAMERA, mounts=mounts)
+        found[covered] = detector.detect(image, dict.fromkeys(jaws))["left"].pixels[0]
+    rest = points_of(jaws["left"], jaw_in_camera(ROBOT_CAMERA, "left", -0.035))[0]
+    assert abs(found[LOW] - rest).max() < 30.0 < abs(found[frozenset()] - rest).max()
+
+
+def test_a_jaw_in_a_holder_that_is_not_where_it_is_expected_is_looked_for_at_once(slope):
+    image, level = slope
+    jaws, there = {"left": load_jaw("bench")}, jaw_in_camera(ROBOT_CAMERA, "left", -0.035)
+
+    def likely(side, seen):
+        return 0.9 if abs(seen - level("left", -0.035)) < 12.0 else 0.1
+
+    counts = []
+    for x in (-0.035, -0.07):
+        locator = Sighted(jaws, likely)
+        detector = SidePlaneDetector(locator, jaws, ROBOT_CAMERA, mounts={"left": JawMount(covered=LOW)})
+        found = detector.detect(image, {"left": jaw_in_camera(ROBOT_CAMERA, "left", x)})["left"]
+        assert found.likelihood.max() == pytest.approx(0.9)
+        assert abs(found.pixels[0] - points_of(jaws["left"], there)[0]).max() < 30.0
+        counts.append(locator.count)
+    assert counts[0] == 1 < counts[1]  # where it is likely, one picture is enough
+
+
 def test_covered_points_lie_beyond_a_straight_edge():
     places = np.array([[x, z] for z in range(10) for x in (0.0, 3.0)])
     likelihood = np.where(places @ (0.3, 1.0) < 3.4, 0.1, 0.85)
@@ -111,11 +185,45 @@ def test_colours_tell_an_outline_where_it_is_and_nowhere_else():
     jaws = {"left": load_jaw("bench")}
     T, outline = jaw_in_camera(ROBOT_CAMERA, "left", -0.04), OutlineContrast(jaws["left"])
     color = paint({"left": T}, jaws)
-    there = outline.contrast(color, T, CAMERA)
+    there = outline.contrasts(color, T, CAMERA)
     aside = jaw_in_camera(ROBOT_CAMERA, "left", -0.02)
-    assert there > 0.8 > 2.0 * outline.contrast(color, aside, CAMERA)
-    assert outline.contrast(np.full_like(color, 90), T, CAMERA) < 0.01
-    assert outline.contrast(color, jaw_in_camera(ROBOT_CAMERA, "left", -0.6), CAMERA) == 0.0  # out of the picture
+    assert there[0] == there.max() > 0.8 > 2.0 * outline.contrasts(color, aside, CAMERA)[0]
+    assert outline.contrasts(np.full_like(color, 90), T, CAMERA).max() < 0.01
+    assert not outline.contrasts(color, jaw_in_camera(ROBOT_CAMERA, "left", -0.6), CAMERA).any()  # out of the picture
+
+
+@pytest.mark.parametrize("back", [1.0, -1.0])
+def test_an_outline_that_a_holder_covers_in_part_shows_beyond_the_edge_of_the_holder(back):
+    from finforce.optional import import_cv2
+
+    jaws = {"left": load_jaw("bench")}
+    T, outline = jaw_in_camera(ROBOT_CAMERA, "left", -0.04), OutlineContrast(jaws["left"])
+    color, held = paint({"left": T}, jaws), np.array([[0.0, 0.0], [0.0, 0.1], [-0.03 * back, 0.1], [-0.03 * back, 0.0]])
+    covered = project_plane(held, find_side(jaws["left"]), T, CAMERA)
+    import_cv2().fillPoly(color, [np.round(covered).astype(np.int32)], (245, 245, 240))
+    contrasts = outline.contrasts(color, T, CAMERA)
+    best = int(np.argmax(contrasts))
+    assert contrasts[best] > 0.7 and contrasts[best] > contrasts[0] + 0.1
+    assert back * outline.edges[best][1][0] > 0.8  # what is open lies on the other side
+    np.testing.assert_allclose(outline.contrasts(color, T, CAMERA, best), contrasts[best], rtol=1e-5)
+
+
+def test_the_odds_of_likelihoods_are_multiplied():
+    likelihood = np.array([0.0, 0.1, 0.5, 1.0])
+    np.testing.assert_allclose(JawMount(odds=9.0).believe(likelihood), [0.0, 0.5, 0.9, 1.0])
+    np.testing.assert_allclose(JawMount().believe(likelihood), likelihood)
+
+
+@pytest.mark.parametrize("slip", [-3e-3, 2e-3])
+def test_a_holder_that_gives_along_the_finger_moves_no_jaw_along_the_closing_axis(slip):
+    jaw, mount = load_jaw("bench"), JawMount(covered=LOW)
+    T = jaw_in_camera(ROBOT_CAMERA, "left", -0.04)
+    pixels = points_of(jaw, T, np.array([0.0, 0.0, slip]))
+    pixels[~mount.seen_points(jaw)] = np.nan
+    estimator = OriginEstimator(jaw, ROBOT_CAMERA, DetectorSettings(), mount)
+    found = estimator.measure(rays_from_pixels(pixels, CAMERA), np.full(len(pixels), 0.3 / CAMERA.fx))
+    assert abs(found.x + 0.04) < min(0.4e-3, 3.0 * found.stddev) and abs(found.slip - slip) < 0.3 * abs(slip)
+    np.testing.assert_allclose(estimator.place(found)[:3, 3], T[:3, 3] + slip * T[:3, 2], atol=1e-3)
 
 
 def test_a_picture_without_jaws_is_refused(monkeypatch):
@@ -148,8 +256,9 @@ def test_a_rig_file_says_what_was_written(tmp_path):
     write_rig(RIG, tmp_path / "rig.yaml")
     again = read_rig(tmp_path / "rig.yaml")
     assert again == RIG and again.intrinsics.model == EQUIDISTANT
-    parameters = DetectorParameters(**{name: tuple(value) for name, value in again.detector_parameters().items()})
-    mount = find_mounts(parameters, {"left": load_jaw("bench")})["left"]
+    records = build_records(again.detector_parameters())
+    mount = find_mounts(records.parameters, {"left": load_jaw("bench")})["left"]
+    assert mount.odds == 3.0 and 0.06 < records.settings.opening_max < 0.07
     np.testing.assert_allclose(mount.turn, [0.0, 0.05, 0.0])
     assert mount.covered == {"reference"} and not mount.seen_points(load_jaw("bench"))[-1]
 
@@ -209,3 +318,16 @@ def test_intrinsics_of_the_middle_of_an_image_show_the_same_rays():
     scale = 540 / 2028
     begin = np.array([(2704 - 640 / scale) / 2, 0.0])  # of the part that is left, in pixels' edges
     np.testing.assert_allclose(project(points, cut), (project(points, camera) + 0.5 - begin) * scale - 0.5, atol=1e-9)
+
+
+@pytest.mark.parametrize(("slip", "told"), [(2e-3, ""), (-9e-3, "-9 mm along its z.*zoomed")])
+def test_a_zoomed_picture_of_jaws_in_holders_is_named(slip, told):
+    jaw, mount = load_jaw("bench"), JawMount(covered=LOW)
+    localizer = JawLocalizer(jaw, ROBOT_CAMERA, DetectorSettings(plane_depth=True), mount)
+    pixels = points_of(jaw, jaw_in_camera(ROBOT_CAMERA, "left", -0.04), np.array([0.0, 0.0, slip]))
+    count = len(pixels)
+    detection = PixelDetection(pixels=pixels, likelihood=np.full(count, 0.9), stddev=np.full(count, 0.3))
+    image = RgbdImage(stamp=1.0, color=np.full((480, 640, 3), 99, np.uint8), depth=None, camera=CAMERA)
+    found = localizer.locate(image, detection, DepthScale(error=0.0, stddev=0.01))
+    assert (found is None) == bool(told)
+    assert re.search(told, localizer.warning) if told else not localizer.warning
