@@ -58,6 +58,9 @@ class GripperForces:
 class ForceSensor:
     """Finds the forces on a gripper in the images of its wrist camera, one after the other.
 
+    Attributes:
+        camera: intrinsics, or what they are to be read from once the size of the images is known.
+
     Args:
         jaw: name of a shipped jaw, jaw file, or a left jaw; None for that of the rig, else "bench".
         camera: intrinsics, a file of them, or the numbers fx, fy, cx, cy [px] and perhaps k1, k2, p1, p2, k3.
@@ -95,7 +98,7 @@ class ForceSensor:
             jaw, camera = jaw or found.jaw, found.intrinsics
         else:
             records = build_records({"T_gripper_camera": pose_numbers(read_extrinsics(extrinsics))})
-        self._camera = camera
+        self.camera = camera
         jaws = {side: load_jaw(jaw or "bench", side) for side in sides}
         self._detector = build_detector(jaws, records.parameters, records.settings)
         settings = EstimatorSettings().resolve_held(both=len(sides) == len(SIDES))
@@ -105,11 +108,6 @@ class ForceSensor:
             force = ForceEstimator(own, settings=settings, calibration=calibration)
             fixed = mesh is None and GivenContact(Contact.fixed(force.jaw, contact_height))
             self._loops[side] = ForceLoop(fixed or ContactEstimator(force.jaw, mesh=mesh), force)
-
-    @property
-    def camera(self) -> Camera:
-        """Intrinsics, or what they are to be read from once the size of the images is known."""
-        return self._camera
 
     def update(
         self, rgb: NDArray, depth: NDArray | None, stamp: float, T_camera_object: ArrayLike | None = None
@@ -128,11 +126,11 @@ class ForceSensor:
             ImageError: the image has another shape, shows nothing, or its stamp does not rise.
             PoseError: the pose makes no sense.
         """
-        if not isinstance(self._camera, CameraIntrinsics):
-            self._camera = _intrinsics(self._camera, rgb.shape[:2])
+        if not isinstance(self.camera, CameraIntrinsics):
+            self.camera = _intrinsics(self.camera, rgb.shape[:2])
         if depth is not None:
             depth = decode_depth(depth, "16UC1" if np.asarray(depth).dtype.kind in "iu" else "32FC1")
-        seen = self._detector.detect(RgbdImage(stamp=stamp, color=rgb, depth=depth, camera=self._camera))
+        seen = self._detector.detect(RgbdImage(stamp=stamp, color=rgb, depth=depth, camera=self.camera))
         T = None if T_camera_object is None else check_pose(T_camera_object, "T_camera_object")
         found = {side: self._solve(self._loops[side], points, T) for side, points in seen.items()}
         return combine_solutions(stamp, {side: found.get(side) for side in self._loops})

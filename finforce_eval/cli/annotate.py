@@ -68,15 +68,12 @@ def run(options: argparse.Namespace) -> CommandResult:
 def _tasks_of(name: str, path: Path, options: argparse.Namespace, settings: Mapping[str, Any]) -> list[Task]:
     """Return the task of a recording, or those of the episodes of a buffer; one that is damaged says so at its work."""
     count = 0
-    if is_buffer(path):
-        with suppress(FinforceError):
-            count = count_episodes(path)
-    if not count:
-        return [bag_task(name, path, Path(options.out) / name, options, settings)]
-    given = {f"{name}_{number:06d}": vars(options) | {"episode": number} for number in range(count)}
+    with suppress(FinforceError):
+        count = count_episodes(path) if is_buffer(path) else 0
+    episodes = {f"{name}_{number:06d}": number for number in range(count)} or {name: options.episode}
     return [
-        bag_task(each, path, Path(options.out) / each, argparse.Namespace(**own), settings)
-        for each, own in given.items()
+        bag_task(each, path, Path(options.out) / each, argparse.Namespace(**vars(options) | {"episode": n}), settings)
+        for each, n in episodes.items()
     ]
 
 

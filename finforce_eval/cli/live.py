@@ -7,7 +7,6 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,11 +18,11 @@ from finforce_eval.cli.parser import CommandResult, length_mm
 from finforce_eval.errors import RecordingError
 from finforce_eval.sensor import ForceSensor, GripperForces
 from finforce_eval.table import ForceSeries, write_table
-from finforce_ifea.observation import Solution
 from finforce_keypoints.errors import KeypointError
 
 _PRINT_PERIOD = 0.1  # [s] of the images between two lines
-_VECTORS = ("force", "torque", "force_stddev", "torque_stddev")
+_COLUMNS = dict.fromkeys(("force", "torque", "force_stddev", "torque_stddev"), np.full(3, np.nan))
+_COLUMNS["magnitude_stddev"] = np.nan
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -46,25 +45,21 @@ def run(options: argparse.Namespace) -> CommandResult:
     shown = -np.inf
     try:
         for stamp, rgb in Webcam(options.camera, sensor.camera):
-            kept.append(find_forces(sensor, rgb, stamp))
+            try:
+                kept.append(sensor.update(rgb, None, stamp))
+            except (ImageError, KeypointError) as error:
+                kept.append(GripperForces(stamp=stamp, jaws={}, status=str(error)))
             if stamp >= shown + _PRINT_PERIOD:
                 shown = stamp
                 print(describe(kept[-1]), flush=True)
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)
     finally:
-        if options.output and kept:
+        if options.output and any(each.jaws for each in kept):
             write_forces(kept, Path(options.output), options)
     answered = sum(each.status == "ok" for each in kept)
-    print(f"a force in {answered} of {len(kept)} images{f': {options.output}' if options.output and kept else ''}")
+    print(f"a force in {answered} of {len(kept)} images")
     return CommandResult({"images": len(kept), "answered": answered})
-
-
-class WebcamImage(NamedTuple):
-    """An image (h, w, 3) uint8 RGB and its time of receipt, or its place in a file [s]."""
-
-    stamp: float
-    rgb: NDArray[np.uint8]
 
 
 class Webcam:
@@ -93,8 +88,8 @@ class Webcam:
             self._capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # the newest image, not the oldest that waits
         self._period = 1.0 / (self._capture.get(cv2.CAP_PROP_FPS) or 30.0)
 
-    def __iter__(self) -> Iterator[WebcamImage]:
-        """Yield images until the file ends.
+    def __iter__(self) -> Iterator[tuple[float, NDArray[np.uint8]]]:
+        """Yield time of receipt, or place in a file [s], and image (h, w, 3) RGB, until the file ends.
 
         Raises:
             RecordingError: the camera gives none, or images of another size.
@@ -116,20 +111,10 @@ class Webcam:
                         f"{self._name}: image {number} is {bgr.shape[1]} x {bgr.shape[0]}; expected {size[1]} x "
                         f"{size[0]} as the rig has: make a rig of these by finforce camera"
                     )
-                yield WebcamImage(
-                    now if self._is_device else number * self._period, np.ascontiguousarray(bgr[..., ::-1])
-                )
+                yield now if self._is_device else number * self._period, np.ascontiguousarray(bgr[..., ::-1])
                 number, begin = number + 1, time.monotonic()
         finally:
             self._capture.release()
-
-
-def find_forces(sensor: ForceSensor, rgb: NDArray, stamp: float) -> GripperForces:
-    """Return the forces in an image; of one that cannot be used, why."""
-    try:
-        return sensor.update(rgb, None, stamp)
-    except (ImageError, KeypointError) as error:
-        return GripperForces(stamp=stamp, jaws={}, status=str(error))
 
 
 def describe(forces: GripperForces) -> str:
@@ -144,23 +129,16 @@ def describe(forces: GripperForces) -> str:
 
 
 def write_forces(kept: list[GripperForces], path: Path, options: argparse.Namespace) -> None:
-    """Write the forces in some images as Parquet."""
+    """Write the forces in some images as Parquet; what is not trusted is NaN."""
     stamps = [round(each.stamp * NANOSECONDS) for each in kept]
-    sides = sorted({side for each in kept for side in each.jaws})
-    series = [
-        ForceSeries.build("live", side, stamps, **_columns([(each.jaws.get(side), each.status) for each in kept]))
-        for side in sides
-    ]
+    series = []
+    for side in sorted({side for each in kept for side in each.jaws}):
+        found = [each.jaws.get(side) for each in kept]
+        columns = {
+            name: [getattr(each, name) if each is not None and each.trusted else missing for each in found]
+            for name, missing in _COLUMNS.items()
+        }
+        columns["status"] = ["not found" if each is None else each.status for each in found]
+        columns["message"] = ["" if each.status == "ok" else each.status for each in kept]
+        series.append(ForceSeries.build("live", side, stamps, **columns, scored=True))
     write_table(path, series, {"rig": options.rig, "camera": options.camera, "contact_height": options.contact_height})
-
-
-def _columns(rows: list[tuple[Solution | None, str]]) -> dict[str, Any]:
-    """Return the columns of one jaw; what is not trusted is NaN."""
-    trusted = [each if each is not None and each.trusted else None for each, _ in rows]
-    columns: dict[str, Any] = {
-        name: [np.full(3, np.nan) if each is None else getattr(each, name) for each in trusted] for name in _VECTORS
-    }
-    columns["magnitude_stddev"] = [np.nan if each is None else each.magnitude_stddev for each in trusted]
-    columns["status"] = ["not found" if each is None else each.status for each, _ in rows]
-    columns["message"] = ["" if each is not None and each.trusted else words for each, words in rows]
-    return columns | {"scored": True}

@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.recordings.bags import allowed_bytes
 from finforce_eval.recordings.frames import FrameImages, choose_camera, decode_video
 from finforce_eval.recordings.images import ImageChoice
-from finforce_eval.recordings.tracks import JAWS, JawTrack, KeypointTrack, Recording
+from finforce_eval.recordings.tracks import Recording
 
 pa.set_memory_pool(pa.system_memory_pool())  # the default one takes a gigabyte at once, which no limit tells from use
 INFO, STATS = Path("meta/info.json"), Path("meta/stats.json")
@@ -103,17 +104,15 @@ def read_episode(folder: Path, choice: ImageChoice, sides: Sequence[str] = ()) -
 
 def recording_of(dataset: Dataset, episode: Episode, camera: CameraIntrinsics, sides: Sequence[str] = ()) -> Recording:
     """Return an episode as a recording whose jaws are still to be found."""
-    name = f"{dataset.folder.name}/episode_{episode.index:06d}"
-    images = EpisodeImages(
-        episode=episode,
-        name=name,
-        feature=dataset.camera,
-        fps=float(dataset.info["fps"]),
-        camera=camera,
-        count=episode.length,
+    name, fps = f"{dataset.folder.name}/episode_{episode.index:06d}", float(dataset.info["fps"])
+    if episode.video is not None:
+        read = partial(decode_video, episode.video, name, episode.begin - 0.5 / fps)
+    else:
+        read = partial(_read_column, episode, dataset.camera, name)
+    images = FrameImages(
+        name=name, fps=fps, camera=camera, count=episode.length, read=read, is_video=episode.video is not None
     )
-    jaws = {side: JawTrack(keypoints=KeypointTrack.empty()) for side in sides or JAWS}
-    return Recording(name=name, path=episode.data, jaws=jaws, images=images)
+    return images.make_recording(episode.data, sides)
 
 
 def is_dataset(path: Path) -> bool:
@@ -264,36 +263,18 @@ def rows_of(table: pa.Table, episode: Episode, name: str) -> pa.Table:
     return table
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class EpisodeImages(FrameImages):
-    """Pictures of an episode; those of its video, or else of the column `feature`."""
-
-    episode: Episode
-    feature: str
-
-    @property
-    def is_video(self) -> bool:
-        """Whether the pictures are those of a video."""
-        return self.episode.video is not None
-
-    def read_all(self) -> Iterator[NDArray[np.uint8]]:
-        """Yield the pictures of the episode, (h, w, 3) RGB."""
-        if self.episode.video is not None:
-            return decode_video(self.episode.video, self.name, self.episode.begin - 0.5 / self.fps)
-        return self._read_column()
-
-    def _read_column(self) -> Iterator[NDArray[np.uint8]]:
-        """Yield the pictures that stand in the episode's rows."""
-        rows = rows_of(read_parquet(self.episode.data), self.episode, self.name)
-        for number, cell in enumerate(rows[self.feature]):
-            stored: Any = cell.as_py()
-            data, what = stored, f"{self.name}: frame {number} of {self.feature}"
-            if isinstance(stored, dict):
-                data = stored.get("bytes")
-            if not isinstance(data, bytes):
-                raise RecordingError(f"{what} is not an image")
-            try:
-                picture = decode_picture(data, what, formats=None)
-            except ImageError as error:
-                raise RecordingError(str(error)) from error
-            yield picture
+def _read_column(episode: Episode, feature: str, name: str) -> Iterator[NDArray[np.uint8]]:
+    """Yield the pictures (h, w, 3) RGB that stand in a column of an episode's rows."""
+    rows = rows_of(read_parquet(episode.data), episode, name)
+    for number, cell in enumerate(rows[feature]):
+        stored: Any = cell.as_py()
+        data, what = stored, f"{name}: frame {number} of {feature}"
+        if isinstance(stored, dict):
+            data = stored.get("bytes")
+        if not isinstance(data, bytes):
+            raise RecordingError(f"{what} is not an image")
+        try:
+            picture = decode_picture(data, what, formats=None)
+        except ImageError as error:
+            raise RecordingError(str(error)) from error
+        yield picture

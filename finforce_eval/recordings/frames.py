@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +20,7 @@ from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.recordings.bags import list_pictures
 from finforce_eval.recordings.image_files import read_intrinsics
 from finforce_eval.recordings.images import ImageChoice, StampedImage
-from finforce_eval.recordings.tracks import JAWS, JawTrack, KeypointTrack, Recording
+from finforce_eval.recordings.tracks import JAWS, JawTrack, KeypointTrack, Recording, WrenchTrack
 from finforce_keypoints.images import RgbdImage, check_image
 
 STILL_RATE = 1.0  # Hz of pictures that say nothing of their times
@@ -33,6 +36,9 @@ class FrameImages:
         fps: frames per second.
         camera: intrinsics.
         count: of all frames.
+        read: begins anew to yield all frames, (h, w, 3) RGB.
+        times: (count,) of the frames [ns]; None where they follow each other at `fps` from zero on.
+        is_video: whether they are those of a camera that ran, compressed, whose still pictures are alike.
         frames: (n,) numbers of those to be read, rising; None for all.
         depth_scale: without meaning.
     """
@@ -41,6 +47,9 @@ class FrameImages:
     fps: float
     camera: CameraIntrinsics
     count: int
+    read: Callable[[], Iterable[NDArray[np.uint8]]]
+    times: NDArray[np.int64] | None = None
+    is_video: bool = True
     frames: NDArray[np.int64] | None = None
     depth_scale: float = MILLIMETRE
     frame_id: str = "camera_color_optical_frame"
@@ -52,15 +61,10 @@ class FrameImages:
         return self.count if self.frames is None else len(self.frames)
 
     @property
-    def is_video(self) -> bool:
-        """Whether the pictures are those of a video."""
-        return True
-
-    @property
     def stamps(self) -> NDArray[np.int64]:
-        """Stamps of the frames (n,) [ns], from zero."""
+        """Stamps of the frames (n,) [ns]."""
         frames = np.arange(self.count) if self.frames is None else self.frames
-        return np.rint(frames * (NANOSECONDS / self.fps)).astype(np.int64)
+        return np.rint(frames * (NANOSECONDS / self.fps)).astype(np.int64) if self.times is None else self.times[frames]
 
     def between(self, start: int, stop: int) -> FrameImages:
         """Return the frames with start <= stamp < stop [ns]."""
@@ -77,9 +81,17 @@ class FrameImages:
 
     colors_alone = all_colors
 
-    def read_all(self) -> Iterator[NDArray[np.uint8]]:
-        """Yield all frames, (h, w, 3) RGB."""
-        raise NotImplementedError
+    def make_recording(
+        self,
+        path: Path,
+        sides: Sequence[str],
+        truth: Mapping[str, WrenchTrack] | None = None,
+        notes: Sequence[str] = (),
+    ) -> Recording:
+        """Return the pictures as a recording of two jaws, or of those that are named, which are still to be found."""
+        truth = truth or {}
+        jaws = {side: JawTrack(keypoints=KeypointTrack.empty(), truth=truth.get(side)) for side in sides or JAWS}
+        return Recording(name=self.name, path=path, jaws=jaws, images=self, notes=tuple(notes))
 
     def __iter__(self) -> Iterator[StampedImage]:
         """Decode the frames in their order.
@@ -89,7 +101,7 @@ class FrameImages:
         """
         frames = range(len(self)) if self.frames is None else self.frames.tolist()
         wanted, count = dict(zip(frames, self.stamps.tolist(), strict=True)), 0
-        for frame, color in enumerate(self.read_all()):
+        for frame, color in enumerate(self.read()):
             if frame in wanted:
                 stamp, count = wanted[frame], count + 1
                 image = RgbdImage(stamp=stamp / NANOSECONDS, color=color, depth=None, camera=self.camera)
@@ -103,31 +115,9 @@ class FrameImages:
         raise RecordingError(f"{self.name}: {count} pictures; expected {len(wanted)}")
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _VideoImages(FrameImages):
-    """Frames of a video file, `path`."""
-
-    path: Path
-
-    def read_all(self) -> Iterator[NDArray[np.uint8]]:
-        """Yield all frames, (h, w, 3) RGB."""
-        return decode_video(self.path, self.name)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _PictureImages(FrameImages):
-    """Pictures of a folder, `paths` in their order."""
-
-    paths: tuple[Path, ...]
-
-    def read_all(self) -> Iterator[NDArray[np.uint8]]:
-        """Yield all pictures, (h, w, 3) RGB."""
-        for path in self.paths:
-            yield read_picture(path)
-
-
-def decode_video(path: Path, name: str, begin: float = 0.0) -> Iterator[NDArray[np.uint8]]:
-    """Yield the frames (h, w, 3) RGB of a video from a time [s] on.
+@contextmanager
+def _open_video(path: Path, name: str) -> Iterator[tuple[Any, Any]]:
+    """Open a video, container and stream of PyAV, for the length of a `with` block.
 
     Raises:
         RecordingError: it is no video, or damaged.
@@ -137,14 +127,19 @@ def decode_video(path: Path, name: str, begin: float = 0.0) -> Iterator[NDArray[
     try:
         check_plain(path)
         with av.open(str(path)) as container:
-            stream = container.streams.video[0]
-            if begin > 0.0:
-                container.seek(int(begin / stream.time_base), stream=stream)
-            for frame in container.decode(stream):
-                if frame.time is None or frame.time >= begin:
-                    yield frame.to_ndarray(format="rgb24")
+            yield container, container.streams.video[0]
     except (FileError, av.FFmpegError, IndexError) as error:
-        raise RecordingError(f"{name}: {path.parent.name}/{path.name}: {error}") from error
+        raise RecordingError(f"{name}: {path.parent.name}/{path.name}: {error}; expected a video") from error
+
+
+def decode_video(path: Path, name: str, begin: float = 0.0) -> Iterator[NDArray[np.uint8]]:
+    """Yield the frames (h, w, 3) RGB of a video from a time [s] on; see `_open_video`."""
+    with _open_video(path, name) as (container, stream):
+        if begin > 0.0:
+            container.seek(int(begin / stream.time_base), stream=stream)
+        for frame in container.decode(stream):
+            if frame.time is None or frame.time >= begin:
+                yield frame.to_ndarray(format="rgb24")
 
 
 def read_picture(path: Path) -> NDArray[np.uint8]:
@@ -155,7 +150,7 @@ def read_picture(path: Path) -> NDArray[np.uint8]:
         raise RecordingError(f"{path.name}: {error}") from error
 
 
-def read_frames(path: Path, choice: ImageChoice, sides: tuple[str, ...] = ()) -> Recording:
+def read_frames(path: Path, choice: ImageChoice, sides: Sequence[str] = ()) -> Recording:
     """Return a video or a folder of pictures as a recording whose jaws are still to be found.
 
     Raises:
@@ -165,15 +160,14 @@ def read_frames(path: Path, choice: ImageChoice, sides: tuple[str, ...] = ()) ->
     """
     name = path.name if path.is_dir() else path.stem
     if path.is_dir():
-        paths = tuple(list_pictures(path))
+        paths = list_pictures(path)
         fps, count, shape = STILL_RATE, len(paths), read_picture(paths[0]).shape[:2]
+        read = partial(map, read_picture, paths)
     else:
         fps, count, shape = _look_at_video(path, name)
+        read = partial(decode_video, path, name)
     camera = choose_camera(choice, shape, name)
-    common = {"name": name, "fps": fps, "camera": camera, "count": count}
-    images = _PictureImages(**common, paths=paths) if path.is_dir() else _VideoImages(**common, path=path)
-    jaws = {side: JawTrack(keypoints=KeypointTrack.empty()) for side in sides or JAWS}
-    return Recording(name=name, path=path, jaws=jaws, images=images)
+    return FrameImages(name=name, fps=fps, camera=camera, count=count, read=read).make_recording(path, sides)
 
 
 def choose_camera(choice: ImageChoice, shape: tuple[int, int], name: str) -> CameraIntrinsics:
@@ -199,15 +193,9 @@ def choose_camera(choice: ImageChoice, shape: tuple[int, int], name: str) -> Cam
 
 def _look_at_video(path: Path, name: str) -> tuple[float, int, tuple[int, int]]:
     """Return frames per second, number of frames, and height and width of a video."""
-    av = import_library("av", "reading videos", "'finforce[lerobot]'")
-    try:
-        check_plain(path)
-        with av.open(str(path)) as container:
-            stream = container.streams.video[0]
-            count = stream.frames or sum(bool(packet.size) for packet in container.demux(stream))
-            rate, shape = float(stream.average_rate or 0.0), (stream.height, stream.width)
-    except (FileError, av.FFmpegError, IndexError) as error:
-        raise RecordingError(f"{name}: {path.name}: {error}; expected a video") from error
+    with _open_video(path, name) as (container, stream):
+        count = stream.frames or sum(bool(packet.size) for packet in container.demux(stream))
+        rate, shape = float(stream.average_rate or 0.0), (stream.height, stream.width)
     if not (count and rate > 0.0):
         raise RecordingError(f"{name}: {path.name}: {count} frames at {rate:g} Hz; expected a video")
     return rate, count, shape

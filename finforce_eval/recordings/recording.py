@@ -87,7 +87,7 @@ def read_recording(
     if is_buffer(Path(path)):
         return read_buffer(Path(path), choice, sides)
     if is_frames(Path(path)):
-        return read_frames(Path(path), choice, tuple(sides))
+        return read_frames(Path(path), choice, sides)
     source = bag_source(Path(path))
     folder = source if source.is_dir() else source.parent
     name = source.name if source.is_dir() else source.stem

@@ -6,7 +6,7 @@ Source: the layouts as universal_manipulation_interface and UMI-FT write them.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +17,8 @@ from finforce.messages import NANOSECONDS
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.frames import FrameImages, choose_camera
 from finforce_eval.recordings.images import ImageChoice
-from finforce_eval.recordings.tracks import JAWS, JawTrack, KeypointTrack, Recording, WrenchTrack
-from finforce_eval.recordings.zarr_store import ZarrArray, ZarrStore
+from finforce_eval.recordings.tracks import JAWS, Recording, WrenchTrack
+from finforce_eval.recordings.zarr_store import ZarrStore
 
 ENDS, CAMERA, CAMERA_FT = "meta/episode_ends", "camera0_rgb", "rgb_0"
 RATE = 60000 / 1001  # Hz of UMI's GoPro: a replay buffer does not tell its times
@@ -69,38 +69,16 @@ def read_buffer(path: Path, choice: ImageChoice, sides: Sequence[str] = ()) -> R
         )
     name = f"{path.name.partition('.')[0]}/episode_{choice.episode:06d}"
     times = _read_times(store, f"{group}/rgb_time_stamps_0", end, _FRAME_STEP) if has_times else None
-    images = BufferImages(
+    images = FrameImages(
         name=name,
-        fps=RATE if times is None else 1.0 / float(np.median(np.diff(times))),
+        fps=RATE,
         camera=choose_camera(choice, pictures.shape[1:3], name),
         count=end - begin,
-        pictures=pictures,
-        begin=begin,
+        read=partial(pictures.rows, begin, end),
         times=None if times is None else _nanoseconds(times, times[0]),
     )
     truth, notes = ({}, ()) if times is None else _read_wrenches(store, group, times, choice)
-    jaws = {side: JawTrack(keypoints=KeypointTrack.empty(), truth=truth.get(side)) for side in sides or JAWS}
-    return Recording(name=name, path=path, jaws=jaws, images=images, notes=notes)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class BufferImages(FrameImages):
-    """Pictures of an episode: the rows of an array from `begin` on, at their `times` (count,) [ns] if it tells them."""
-
-    pictures: ZarrArray
-    begin: int
-    times: NDArray[np.int64] | None
-
-    @property
-    def stamps(self) -> NDArray[np.int64]:
-        """Stamps of the frames (n,) [ns], from zero."""
-        if self.times is None:
-            return super().stamps
-        return self.times if self.frames is None else self.times[self.frames]
-
-    def read_all(self):
-        """Yield all pictures of the episode, (h, w, 3) RGB."""
-        return self.pictures.rows(self.begin, self.begin + self.count)
+    return images.make_recording(path, sides, truth, notes)
 
 
 def _read_times(
@@ -151,19 +129,12 @@ def _read_wrenches(
         torque = np.full_like(force, np.nan)  # about another point than the jaw's origin
         tracks[side] = WrenchTrack(stamps=_nanoseconds(stamps, times[0]), force=force, torque=torque)
     notes = []
-    if _count_opening(tracks) > _FEEBLE:  # an object can only push a jaw away from it, towards -x
+    sizes = {side: np.linalg.norm(track.force, axis=1) for side, track in tracks.items()}
+    firm = [tracks[side].force[size >= np.percentile(size, _FIRM), 0].mean() for side, size in sizes.items()]
+    if np.mean(firm) > _FEEBLE:  # an object can only push a jaw away from it, towards -x
         tracks = {side: WrenchTrack(**{**vars(track), "force": -track.force}) for side, track in tracks.items()}
         notes.append("wrenches are those of the fingers on the object: taken with the other sign")
     if choice.T_gripper_camera[0][0] < 0.0:
         tracks = {"left": tracks["right"], "right": tracks["left"]}
         notes.append("wrench_left_0 is of the jaw on the left of the picture, here called right")
     return tracks, tuple(notes)
-
-
-def _count_opening(tracks: dict[str, WrenchTrack]) -> float:
-    """Return the mean of the firm forces along x of both jaws [N]."""
-    means = []
-    for track in tracks.values():
-        size = np.linalg.norm(track.force, axis=1)
-        means.append(track.force[size >= np.percentile(size, _FIRM), 0].mean())
-    return float(np.mean(means))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,14 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.errors import one_line
-from finforce.files import FileError, check_inside, check_plain, parse_json, raise_budget, read_bytes
+from finforce.files import check_inside, check_plain, parse_json, raise_budget
 from finforce.optional import import_library
 from finforce.sandbox import MEMORY, limit_growth
 from finforce_eval.errors import RecordingError
 
 JPEG_XL = "imagecodecs_jpegxl"
 _CODECS = ("blosc", "zstd", "lz4", "zlib", "gzip", "bz2")  # of numcodecs, one of whose others runs what a file says
-_LARGEST_FILE, _LARGEST_BLOCK = 1 << 28, 1 << 29  # bytes, of a file and of the chunks that hold one row
+_LARGEST_BLOCK = 1 << 29  # bytes of the chunks that hold one row
 
 
 class ZarrStore:
@@ -35,11 +35,11 @@ class ZarrStore:
     """
 
     def __init__(self, path: Path) -> None:
-        self.path, self.name, self._zip = path, path.name, None
+        self.name, self._root = path.name, path
         if path.is_file():
-            with self.damage_named(""):
+            with self.damage_named("the file"):
                 check_plain(path)
-                self._zip = zipfile.ZipFile(path)
+                self._root = zipfile.Path(path)
         if self.find(".zgroup") is None:
             newer = self.find("zarr.json") is not None
             found = "Zarr format 3" if newer else "no .zgroup in it"
@@ -53,27 +53,20 @@ class ZarrStore:
         except (RecordingError, ImportError):
             raise
         except Exception as error:  # of zipfile, zlib, json, and every codec its own
-            raise RecordingError(f"{self.name}: {key or 'the file'} is damaged: {one_line(error)}") from error
+            raise RecordingError(f"{self.name}: {key} is damaged: {one_line(error)}") from error
 
     def find(self, key: str) -> bytes | None:
         """Return the bytes under a key; None where there are none."""
-        with self.damage_named(key):
-            if self._zip is None:
-                path = check_inside(self.path / key, self.path)
-                return read_bytes(path, _LARGEST_FILE) if path.exists() else None
-            if key not in self._zip.NameToInfo:
-                return None
-            if self._zip.getinfo(key).file_size > raise_budget(_LARGEST_FILE):
-                raise FileError(f"{key} has more than {_LARGEST_FILE >> 20} MiB")
-            return self._zip.read(key)
+        part = self._root / key
+        with self.damage_named(key), limit_growth(raise_budget(MEMORY)):
+            if isinstance(part, Path):
+                check_inside(part, self._root)
+            return part.read_bytes() if part.is_file() else None
 
     def list_members(self, group: str) -> list[str]:
         """Return the names of the arrays and groups in a group."""
-        if self._zip is None:
-            folder = self.path / group
-            return sorted(each.name for each in folder.iterdir() if each.is_dir()) if folder.is_dir() else []
-        parts = (name.removeprefix(f"{group}/").split("/") for name in self._zip.namelist() if name.startswith(group))
-        return sorted({part[0] for part in parts if len(part) > 1})
+        folder = self._root / group
+        return sorted(each.name for each in folder.iterdir() if each.is_dir()) if folder.is_dir() else []
 
     def open_array(self, key: str, shape: tuple[int | None, ...], kinds: str) -> ZarrArray:
         """Return an array.
@@ -93,16 +86,8 @@ class ZarrStore:
             raise RecordingError(f"{self.name}: no array {key}; {group} has {there}")
         with self.damage_named(key):
             about = parse_json(text.decode())
-            array = ZarrArray(
-                store=self,
-                key=key,
-                shape=tuple(map(int, about["shape"])),
-                chunks=tuple(map(int, about["chunks"])),
-                dtype=np.dtype(about["dtype"]),
-                compressor=about["compressor"],
-                order=about["order"],
-                separator=about.get("dimension_separator", "."),
-            )
+            sides = {name: tuple(map(int, about[name])) for name in ("shape", "chunks")}
+            array = ZarrArray(store=self, key=key, about=about, dtype=np.dtype(about["dtype"]), **sides)
         fits = len(shape) == len(array.shape) == len(array.chunks) and min(array.chunks) > 0
         fits = fits and all(want in (None, have) for want, have in zip(shape, array.shape, strict=True))
         if not fits or array.dtype.kind not in kinds or about.get("filters"):
@@ -116,16 +101,14 @@ class ZarrStore:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ZarrArray:
-    """An array in a store, whose chunks are read when they are asked for."""
+    """An array in a store, `about` its `.zarray`, whose chunks are read when they are asked for."""
 
     store: ZarrStore
     key: str
+    about: Mapping[str, Any]
     shape: tuple[int, ...]
     chunks: tuple[int, ...]
     dtype: np.dtype
-    compressor: dict[str, Any] | None
-    order: str
-    separator: str
 
     def __len__(self) -> int:
         return self.shape[0]
@@ -155,22 +138,23 @@ class ZarrArray:
 
     def _read_chunk(self, place: tuple[int, ...]) -> NDArray:
         """Return a chunk; one that is missing stands for a fill value in Zarr, and here for a copy that failed."""
-        key = f"{self.key}/{self.separator.join(map(str, place))}"
+        key = f"{self.key}/{self.about.get('dimension_separator', '.').join(map(str, place))}"
         data = self.store.find(key)
         if data is None:
             raise RecordingError(f"{self.store.name}: {key} is missing; expected every chunk of the array")
         with self.store.damage_named(key), limit_growth(raise_budget(MEMORY)):
             content = np.frombuffer(np.ascontiguousarray(self._decode(data)).tobytes(), self.dtype)
-            return content.reshape(self.chunks, order=self.order)
+            return content.reshape(self.chunks, order=self.about["order"])
 
     def _decode(self, data: bytes) -> Any:
         """Return the bytes or the numbers of a chunk."""
-        if self.compressor is None:
+        compressor = self.about["compressor"]
+        if compressor is None:
             return np.frombuffer(data, np.uint8)
-        kind = self.compressor.get("id")
+        kind = compressor.get("id")
         if kind == JPEG_XL:
             return import_library("imagecodecs", f"{self.key}, compressed as JPEG XL,").jpegxl_decode(data)
         if kind not in _CODECS:
             raise ValueError(f"compressor {kind}; expected {', '.join((*_CODECS, JPEG_XL))}")
         codecs = import_library("numcodecs", f"{self.key}, compressed by {kind},", "'finforce[zarr]'")
-        return np.frombuffer(codecs.get_codec(self.compressor).decode(data), np.uint8)
+        return np.frombuffer(codecs.get_codec(compressor).decode(data), np.uint8)

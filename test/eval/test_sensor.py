@@ -37,7 +37,7 @@ def test_arrays_go_through_the_detector_to_both_jaws():
     rgb = np.random.default_rng(1).integers(0, 255, (480, 640, 3), dtype=np.uint8)
     forces = sensor.update(rgb, np.full((480, 640), 150, np.uint16), stamp=1.0)
     assert set(forces.jaws) <= {"left", "right"} and np.isnan(forces.grasp)
-    assert forces.status and sensor._camera.fx == 430.0
+    assert forces.status and sensor.camera.fx == 430.0
     with pytest.raises(ValueError, match="rising stamps"):
         sensor.update(rgb, None, stamp=0.5)
 

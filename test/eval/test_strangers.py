@@ -215,7 +215,7 @@ def test_a_dataset_in_which_no_jaw_is_seen_is_not_annotated(dataset, capsys):
 
 
 def test_what_a_dataset_lacks_is_said_in_one_line_before_its_videos_are_read(dataset, capsys, monkeypatch):
-    monkeypatch.setattr("finforce_eval.recordings.dataset.EpisodeImages.read_all", lambda self: 1 / 0)
+    monkeypatch.setattr("finforce_eval.recordings.dataset.decode_video", lambda *given: 1 / 0)
     assert annotate(dataset, *DATASET[:4]) == 2
     assert "give --contact fixed:Z_MM" in capsys.readouterr().err
     info = json.loads((dataset / "meta/info.json").read_text())
