@@ -91,7 +91,9 @@ class ContactSearch:
         self.state["x"][1:] += change
         self.average["count"] *= kept
 
-    def find(self, contact: RigidContact, traction: Traction, probe: Any, dt: float, *, is_sudden: bool) -> bool:
+    def find(
+        self, contact: RigidContact, traction: Traction, probe: Any, dt: float, *, iterations: int, is_sudden: bool
+    ) -> bool:
         """Find the contact in the image of `points`; False, all as it was, where too few key points agree.
 
         Args:
@@ -99,6 +101,7 @@ class ContactSearch:
             traction: what acts along the surface.
             probe: of its key points.
             dt: time since the last image [s].
+            iterations: at most; the next image goes on from there.
             is_sudden: whether that did not show the speed.
         """
         expectation, forecast, found, model = self.expectation, self._forecast, self._found, contact.model
@@ -108,7 +111,7 @@ class ContactSearch:
         q = self.q + self._modes @ (x_model - self.state["x_model"])
         updated, settled, iteration, share = False, False, 0, 1.0
         last, moved, depth, far, in_vain = np.zeros(3), np.zeros(3), 0.0, np.inf, 0
-        while not settled and iteration < self.settings.iterations and in_vain < 2:
+        while not settled and iteration < iterations and in_vain < 2:
             iteration += 1
             pressed = contact.linearize(q, x_model, traction)
             if not pressed.touches:

@@ -38,6 +38,9 @@ _FARTHEST_HEIGHT = 8.0
 # Shapes so many times as far from the stored ones as these are good for are left to the full mechanics, until the
 # object has gone back to this share of its depth.
 _BEYOND_STORED, _BACK = 1.0, 0.8
+# Iterations of the full mechanics in one image, each as long as a hundred others: a shape that asks for more is wrong or
+# settles over the next images.
+_FULL_ITERATIONS = 3
 # An object is apart from the jaw where its pose says so by this many standard deviations.
 _APART_SIGMAS = 3.0
 # Heights next to the clamp, as shares of the lowest at which key points show a force; objects farther off than this,
@@ -216,7 +219,8 @@ class ContactTracker:
             measured -= self._lateral.motions + held
         self._fill(measured, tare, noise)
         is_sudden = bool(self._released or self._jumped)
-        if not self._search.find(self._contact, self._traction, self._probe, dt, is_sudden=is_sudden):
+        most = _FULL_ITERATIONS if self._fidelity else self.settings.iterations
+        if not self._search.find(self._contact, self._traction, self._probe, dt, iterations=most, is_sudden=is_sudden):
             self._search.lose(_LOST_STDDEV)
             return None
         state = self._search.state
