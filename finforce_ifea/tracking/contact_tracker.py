@@ -38,8 +38,8 @@ _FARTHEST_HEIGHT = 8.0
 # Shapes so many times as far from the stored ones as these are good for are left to the full mechanics, until the
 # object has gone back to this share of its depth.
 _BEYOND_STORED, _BACK = 1.0, 0.8
-# Iterations of the full mechanics in one image, each as long as a hundred others: a shape that asks for more is wrong or
-# settles over the next images.
+# Iterations of the full mechanics in one image, each as long as a hundred others: a shape that asks for more is wrong,
+# or settles over the next images.
 _FULL_ITERATIONS = 3
 # An object is apart from the jaw where its pose says so by this many standard deviations.
 _APART_SIGMAS = 3.0
