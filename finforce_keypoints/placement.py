@@ -60,6 +60,7 @@ LEAST_SEEN = 8  # key points of a jaw
 TYPICAL, LEAST_TYPICAL, MOST_ODDS = 0.75, 0.15, 17.0
 # [px] Root mean square of points seen off their places over their likelihood; without such jaws it is 6 and more.
 MOST_LEFT = 4.0
+AS_GOOD = 0.05  # by which the outlines' contrast differs between a finger and itself one rib off
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -73,6 +74,7 @@ class CameraPlacement:
         contrast: of the outlines, 0 to 1.
         residual: root mean square distance of the points seen from where they should be [px].
         seen: side -> pixels of the points in each picture (n, K + 1, 2), NaN where one was not seen.
+        rival: how far the points are in another placement that outlines hardly tell from it [px]; 0 without one.
     """
 
     T_gripper_camera: NDArray
@@ -81,6 +83,7 @@ class CameraPlacement:
     contrast: float
     residual: float
     seen: Mapping[str, NDArray]
+    rival: float = 0.0
 
     def pose(self, side: str, number: int) -> NDArray:
         """Return T_camera_jaw (4, 4) in a picture."""
@@ -252,7 +255,20 @@ def find_placement(
     if not found:
         raise failures[max(failures)]
     # ribs look alike: one further along the finger is as likely, but the outline is elsewhere
-    return max(found, key=lambda each: each.contrast)
+    best = max(found, key=lambda each: each.contrast)
+    return replace(best, rival=max(measure_rival(best, each, jaws, camera) for each in found))
+
+
+def measure_rival(best: CameraPlacement, other: CameraPlacement, jaws: Mapping[str, Jaw], camera) -> float:
+    """Return the mean distance [px] of the points seen in one placement and in another that is as good, else 0."""
+    if other.contrast < best.contrast - AS_GOOD:
+        return 0.0
+    away = []
+    for side, jaw in jaws.items():
+        points = jaw.keypoints[best.mounts[side].seen_points(jaw)[:-1]]
+        pixels = [project(points @ T[:3, :3].T + T[:3, 3], camera) for T in (best.pose(side, 0), other.pose(side, 0))]
+        away.append(np.linalg.norm(pixels[0] - pixels[1], axis=1))
+    return float(np.mean(np.concatenate(away)))
 
 
 def find_covered(likelihood: NDArray, places: NDArray) -> NDArray[np.bool_]:

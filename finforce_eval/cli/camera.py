@@ -27,6 +27,7 @@ from finforce_keypoints.placement import KEPT, POLISHED, ROUNDS, STARTS, STEPS, 
 from finforce_keypoints.rig import Rig, RigCamera, describe_mount, write_rig
 
 PICTURES = 4  # of the images, which are compared
+RIVAL = 3.0  # [px] between two places of the key points, of which one has to be wrong
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -110,6 +111,11 @@ def describe_placement(found: CameraPlacement, jaws) -> str:
         turned = ", ".join(f"{angle:.1f}" for angle in np.degrees(mount.turn))
         places = ", ".join(f"{1e3 * origin:.1f}" for origin in found.origins[side])
         lines.append(f"{side} jaw: {seen} of {count} key points to be seen, turned by {turned} degrees, at {places} mm")
+    if found.rival > RIVAL:
+        lines.append(
+            f"WARNING: key points {found.rival:.1f} px beside explain the pictures nearly as well (one rib further?): "
+            "check the picture, and give images at several openings"
+        )
     return "\n".join(lines)
 
 

@@ -1,6 +1,7 @@
 """Claims about jaws whose holders hide them, and about a camera whose place nobody has measured."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import pytest
 from finforce.camera import EQUIDISTANT, CameraIntrinsics, project, rays_from_pixels
 from finforce.gripper_frames import ROBOT_CAMERA, jaw_in_camera
 from finforce.transforms import pose_numbers
+from finforce_eval.cli.camera import describe_placement
 from finforce_eval.evaluation.keypoint_source import build_records
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints import placement
@@ -21,7 +23,13 @@ from finforce_keypoints.geometry.template import find_motions, find_shape
 from finforce_keypoints.images import PixelDetection, RgbdImage
 from finforce_keypoints.networks.side_network import Places, Template
 from finforce_keypoints.parameters import DetectorParameters, DetectorSettings, JawMount, find_mounts
-from finforce_keypoints.placement import OutlineContrast, find_covered, find_placement
+from finforce_keypoints.placement import (
+    CameraPlacement,
+    OutlineContrast,
+    find_covered,
+    find_placement,
+    measure_rival,
+)
 from finforce_keypoints.rig import Rig, RigCamera, RigJaw, read_rig, write_rig
 from finforce_sim.sensor import build_d405_vga
 
@@ -331,3 +339,24 @@ def test_a_zoomed_picture_of_jaws_in_holders_is_named(slip, told):
     found = localizer.locate(image, detection, DepthScale(error=0.0, stddev=0.01))
     assert (found is None) == bool(told)
     assert re.search(told, localizer.warning) if told else not localizer.warning
+
+
+@pytest.mark.parametrize(("contrast", "told"), [(0.88, True), (0.7, False)])
+def test_another_place_that_explains_the_pictures_as_well_is_named(contrast, told):
+    jaws = {"left": load_jaw("bench")}
+
+    def placed(x, contrast):
+        return CameraPlacement(
+            T_gripper_camera=ROBOT_CAMERA,
+            mounts={"left": JawMount()},
+            origins={"left": np.array([x])},
+            contrast=contrast,
+            residual=0.5,
+            seen={},
+        )
+
+    best, other = placed(-0.04, 0.9), placed(-0.033, contrast)
+    rival = measure_rival(best, other, jaws, CAMERA)
+    assert rival > 10.0 if told else rival == 0.0
+    assert measure_rival(best, best, jaws, CAMERA) == 0.0
+    assert ("WARNING" in describe_placement(replace(best, rival=rival), jaws)) == told
