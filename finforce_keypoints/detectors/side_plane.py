@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 SAME_PLACE = 1e-3  # [m] by which a jaw may move before its picture is mapped anew; places are exact all the same
 SEARCH_STEP = 24.0  # [px] between the places where a lost jaw is looked for; the network finds one half as far away
+HELD_FINER = 2  # times as close together are those of a jaw in a holder, which may be bent where it is found
 LEAST_SCORE = 0.35  # mean likelihood of a jaw's points that are not covered, below which it is not there
 LIKELY_SCORE = 0.6  # the same, below which a jaw in a holder is looked for beside its place, too
 STRAIGHT = np.zeros((1, 2))  # pictures of a locator's own grid alone
@@ -127,7 +128,9 @@ class SidePlaneDetector:
             left, right = (np.array([scores[n] for n in numbers[side]]) for side in best)
             if len(left) == len(right) > 1:
                 apart = np.abs(np.subtract.outer(np.arange(len(left)), np.arange(len(right))))
-                pair = np.unravel_index(np.argmax(np.where(apart <= 1, np.add.outer(left, right), -1.0)), apart.shape)
+                pair = np.unravel_index(
+                    np.argmax(np.where(apart <= HELD_FINER, np.add.outer(left, right), -1.0)), apart.shape
+                )
                 best = {side: numbers[side][n] for side, n in zip(best, pair, strict=True)}
         return best
 
@@ -147,7 +150,7 @@ class SidePlaneDetector:
     def _views_of(self, side: str, pose: NDArray | None) -> list[_View]:
         """Return where to look for one jaw: where it is expected, or all along the closing axis."""
         if pose is None:
-            step = SEARCH_STEP * self._locator.grids[side].scale
+            step = SEARCH_STEP * self._locator.grids[side].scale / (1.0 if self._seen[side][-1] else HELD_FINER)
             turn = self._mounts[side].turn
             places = self._opening.place_jaw(self._T_gripper_camera, side, step, turn)
             return [self._view(side, place) for place in places]
