@@ -89,7 +89,11 @@ def check_finforce(words):
         assert {option for word in words for option in re.findall(r"--?[a-z][a-z-]*", word)} <= set(known)
         return
     if "--rig" in words:  # whose file is read at once
-        assert "--rig" in build_parser(words[1])._option_string_actions
+        known = build_parser(words[1])._option_string_actions
+        assert "--rig" in known
+        if known["--rig"].required:  # nothing can be parsed without
+            assert {word for word in words if word.startswith("--")} <= set(known)
+            return
         words = words[: words.index("--rig")] + words[words.index("--rig") + 2 :]
     with redirect_stderr(io.StringIO()) as said:
         try:
