@@ -224,11 +224,16 @@ def approach_grid(tables, loads, m, step):
     """Shorten a step (3,) of grid coordinates m (2,), see `find_grid_step`, until it leads nearer to the stored ones.
 
     The step takes the jaw to stay as it is, which it does not where compliances change fast, as at the base.
+
+    Returns:
+        How long the step was if it is left out, else 0 [-].
     """
     largest, there = (1.0 + _SLACK) * step[2] + _SLACK_FLOOR, np.empty(2)
     for _ in range(_HALVINGS):
         there[0], there[1] = m[0] + step[0], m[1] + step[1]
         if _measure_miss(tables, loads, there) <= largest:
-            return
+            return 0.0
         step[0], step[1] = 0.5 * step[0], 0.5 * step[1]
+    left = 2.0**_HALVINGS * max(abs(step[0]), abs(step[1]))
     step[0] = step[1] = 0.0
+    return left

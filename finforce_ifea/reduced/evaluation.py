@@ -279,6 +279,8 @@ _OPTIONS = {"cache": True, "error_model": "numpy"}
 # The grid coordinates wait until a correction is below this share of what is allowed: a shape far from equilibrium says
 # little of the nearest one.
 _CALM = 0.15
+# A jaw that should be by more than this of the grid elsewhere and cannot get there is in no equilibrium that is stored.
+_LARGEST_LEFT = 0.1
 # Below this grid coordinate of the depth a jaw is too little bent to tell the height by its shape.
 _SHALLOW = 0.5
 
@@ -535,6 +537,8 @@ def _find_share(jaw, pressed, pose, traction, points, moves, q, step):
 def _step_grid(jaw, q, moves, steps, size, contact):
     """Return the step (2,) of the grid coordinates after a step of the loads, and the distance from the grid [m].
 
+    Beside it stands the length of a step that had to be left out, 0 for none.
+
     Args:
         jaw: see `_Jaw`.
         q: unknowns (2 n + 2,).
@@ -550,12 +554,12 @@ def _step_grid(jaw, q, moves, steps, size, contact):
     first, last = find_ends(change)
     add_product(jaw.compliance, q[count:], change, first, last, WATCHED, after)
     nearest = find_grid_step(jaw.moves, after, q[count:])
-    if size <= _CALM:
-        approach_grid(tables, there, q[count:], nearest)
+    left = approach_grid(tables, there, q[count:], nearest) if size <= _CALM else 0.0
     if q[count] < _SHALLOW and contact.size > 0.0:
         nearest[1] = _read_grid(jaw.rods, contact.location[2]) - q[count + 1]
         bound_grid_step(nearest, q[count:], jaw.moves)
-    return nearest
+        left = 0.0
+    return nearest, left
 
 
 @njit(**_OPTIONS)
@@ -594,7 +598,7 @@ def linearize_reduced(jaw, pressed, traction, q, x):
     if touches and size > 1.0:
         for k in range(len(steps)):
             steps[k, 0] /= size
-    nearest = _step_grid(jaw, q, moves, steps, size, contact)
+    nearest, left = _step_grid(jaw, q, moves, steps, size, contact)
     correction, modes = np.zeros(count + 2), np.zeros((count + 2, 4))
     turned = max(abs(nearest[0]), abs(nearest[1])) / LARGEST_GRID_STEP
     if size <= _CALM:
@@ -615,7 +619,7 @@ def linearize_reduced(jaw, pressed, traction, q, x):
             correction[k] *= share
         for axis in range(0, 3, 2):
             force[axis] = share * force[axis] + (1.0 - share) * q[axis // 2 : count : 2].sum()
-    far = nearest[2] / jaw.farthest
+    far = max(nearest[2] / jaw.farthest, left / _LARGEST_LEFT)
     return PressedState(touches, correction, modes, force, force_modes, contact.point, contact.location, 1.0, size, far)
 
 

@@ -155,12 +155,14 @@ class ContactTracker:
         """Go on with the full mechanics where the shape is too far from those stored, and back where it bends less."""
         before, pressed = self._contact, float(state["x"][DEPTH])
         if self._fidelity == 0 and state["extrapolation"] > _BEYOND_STORED and len(self._fidelities) > 1:
-            self._left = (self.q.copy(), _BACK * pressed)
+            self._left = (self.q.copy(), pressed)
             q = before.model.expand(self.q)
             self._use(1)
-        elif self._fidelity == 1 and pressed < self._left[1]:
-            q = self._left[0]
+        elif self._fidelity == 1 and pressed < _BACK * self._left[1]:
             self._use(0)
+            # of the shape that was left and the unloaded jaw, the nearer one
+            is_near = pressed > 0.5 * self._left[1]
+            q = self._left[0] if is_near else self._contact.begin(float(state["x"][HEIGHT]))
         else:
             return
         self._contact.set_indenter(before.indenter)

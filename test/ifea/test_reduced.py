@@ -15,6 +15,7 @@ from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.mechanics import build_chosen, build_mechanics
 from finforce_ifea.observation import Contact
 from finforce_ifea.paper_inverse import Problem, solve_inverse
+from finforce_ifea.reduced.equilibria import approach_grid
 from finforce_ifea.settings import EstimatorSettings
 
 DEPTHS = np.array([0.5, 2.0, 5.0, 10.0]) * 1e-3
@@ -223,3 +224,13 @@ def test_points_of_the_inner_face_move_with_its_rows_as_the_full_mechanics_has_t
     small = 1e-6 * state.modes
     moved = np.stack([other.model.positions(probe, b + mode) - found for mode in small.T], axis=2)
     np.testing.assert_allclose(other.model.project(probe, b, small), moved, atol=1e-12)
+
+
+@pytest.mark.parametrize(("direction", "left"), [(1.0, 0.5), (-1.0, 0.0)])
+def test_a_step_that_leads_away_from_the_stored_equilibria_is_left_out_and_told(direction, left):
+    count, grid = 8, (5, 5)
+    stiff = np.eye(count, dtype=np.float32) * np.arange(1.0, 6.0, dtype=np.float32)[:, None, None, None]
+    tables = np.zeros((*grid, count)), np.broadcast_to(stiff, (*grid, count, count)).copy(), np.zeros((*grid, count))
+    m, step = np.array([2.0, 2.0]), np.array([0.5 * direction, 0.0, 3e-6 * np.sqrt(2.0)])
+    assert approach_grid(tables, np.full(count, 1e-6), m, step) == left
+    assert step[0] == (0.0 if left else -0.5)
