@@ -37,8 +37,8 @@ DARK = 30.0  # of 255: what is added to the brightness by which colours are divi
 # Directions of a holder's edge, shares of the finger beyond it, and what a share of it costs in contrast.
 EDGES, HELD, HELD_COST = 12, (0.15, 0.3, 0.45), 0.15
 BEYOND = 0.3  # share of the compared pixels outside the image, from which on nothing is said
-# Where wrist cameras are, in the gripper: y, z [m], tilt down [rad], half opening of the jaws [m].
 WHOLE = 0  # the edge beyond which there is nothing
+# Where wrist cameras are, in the gripper: y, z [m], tilt down [rad], half opening of the jaws [m].
 LOW, HIGH = np.array([0.04, -0.15, -0.2, 0.015]), np.array([0.18, 0.05, 0.9, 0.08])
 STARTS, KEPT, STEPS = 3000, 4, 300  # places that are tried; improved, whole and up to an edge; and in how many steps
 POLISHED, POLISH = 2, 15  # of each of these, places whose jaws are turned, too, and in how many steps
