@@ -122,13 +122,9 @@ class ContactSearch:
             motions = model.project(probe, q, pressed.modes)
             weigh_keypoints(self.points, positions, motions, x, x_model, forecast, expectation, found)
             if found["used"] < max(self.settings.minimum_keypoints, _LEAST_AGREEMENT * found["known"]):
-                # towards the median depth that the points ask for, which disagree with the forecast
-                jump, before = float(found["jump"]), x_model
-                x[DEPTH] += min(max(jump, -_LARGEST_LEAP), _LARGEST_LEAP)
-                x_model, _ = find_x_model(contact, x)
-                q = q + limit_step(model, pressed.modes[:, DEPTH] * (x_model[DEPTH] - before[DEPTH]))
-                in_vain = in_vain + 1 if abs(jump) > far - _LEAST_APPROACH else 0
-                far = abs(jump)
+                q, x_model = self._leap(contact, pressed, q, x, x_model)
+                in_vain = in_vain + 1 if abs(found["jump"]) > far - _LEAST_APPROACH else 0
+                far = float(abs(found["jump"]))
                 continue
             update_state(self.points, self.average, self._extended, forecast, expectation, found)
             updated = True
@@ -152,6 +148,14 @@ class ContactSearch:
         if settled:
             found["ambiguity"] = 0.0
         return True
+
+    def _leap(
+        self, contact: RigidContact, pressed: PressedState, q: NDArray, x: NDArray, x_model: NDArray
+    ) -> tuple[NDArray, NDArray]:
+        """Take x towards the median depth that points ask for which disagree with the forecast; return q, x_model."""
+        x[DEPTH] += min(max(float(self._found["jump"]), -_LARGEST_LEAP), _LARGEST_LEAP)
+        after, _ = find_x_model(contact, x)
+        return q + limit_step(contact.model, pressed.modes[:, DEPTH] * (after[DEPTH] - x_model[DEPTH])), after
 
     def _conclude(self, pressed: PressedState, moved: NDArray) -> None:
         """Complete the state after a search whose last step moved the model from the pressed state by (3,)."""

@@ -154,7 +154,8 @@ class ContactTracker:
     def _change_fidelity(self, state: ContactState) -> None:
         """Go on with the full mechanics where the shape is too far from those stored, and back where it bends less."""
         before, pressed = self._contact, float(state["x"][DEPTH])
-        if self._fidelity == 0 and state["extrapolation"] > _BEYOND_STORED and len(self._fidelities) > 1:
+        is_beyond = state["extrapolation"] > _BEYOND_STORED and state["depth"] > TOUCH_DEPTH
+        if self._fidelity == 0 and is_beyond and len(self._fidelities) > 1:
             self._left = (self.q.copy(), pressed)
             q = before.model.expand(self.q)
             self._use(1)
@@ -188,7 +189,9 @@ class ContactTracker:
 
     def _begin(self) -> None:
         """Start with the undeformed jaw and an object that just touches."""
+        indenter = self._contact.indenter
         self._use(0)
+        self._contact.set_indenter(indenter)
         self._search.begin(self._contact, self._mean)
         self._led = self._mean.copy()
         self.slips.reset()
