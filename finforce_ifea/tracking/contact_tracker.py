@@ -102,6 +102,7 @@ class ContactTracker:
         self._fidelities = [
             _attach(each.contact, keypoints) for each in (mechanics, mechanics.full) if each is not None
         ]
+        self._fidelity = 0
         self._use(0)
         self._search = ContactSearch(len(keypoints), settings)
         self._search.expectation["farthest"] = _FARTHEST_HEIGHT * settings.height_stddev
@@ -132,9 +133,11 @@ class ContactTracker:
         self._begin()
 
     def _use(self, fidelity: int) -> None:
-        """Take one of the mechanics for the next images."""
+        """Take one of the mechanics for the next images, with the object that was pressed into the one before."""
+        indenter = self._fidelities[self._fidelity].contact.indenter
         self._fidelity = fidelity
         self._contact, self._probe, self._rest = self._fidelities[fidelity]
+        self._contact.set_indenter(indenter)
 
     def _press(self, indenter: RoundIndenter | OutlineIndenter) -> None:
         """Take another object, and what the search is allowed with it."""
@@ -153,11 +156,11 @@ class ContactTracker:
 
     def _change_fidelity(self, state: ContactState) -> None:
         """Go on with the full mechanics where the shape is too far from those stored, and back where it bends less."""
-        before, pressed = self._contact, float(state["x"][DEPTH])
+        pressed = float(state["x"][DEPTH])
         is_beyond = state["extrapolation"] > _BEYOND_STORED and state["depth"] > TOUCH_DEPTH
         if self._fidelity == 0 and is_beyond and len(self._fidelities) > 1:
             self._left = (self.q.copy(), pressed)
-            q = before.model.expand(self.q)
+            q = self._contact.model.expand(self.q)
             self._use(1)
         elif self._fidelity == 1 and pressed < _BACK * self._left[1]:
             self._use(0)
@@ -166,7 +169,6 @@ class ContactTracker:
             q = self._left[0] if is_near else self._contact.begin(float(state["x"][HEIGHT]))
         else:
             return
-        self._contact.set_indenter(before.indenter)
         self._search.resume(q)
 
     def vertices(self) -> NDArray:
@@ -189,9 +191,7 @@ class ContactTracker:
 
     def _begin(self) -> None:
         """Start with the undeformed jaw and an object that just touches."""
-        indenter = self._contact.indenter
         self._use(0)
-        self._contact.set_indenter(indenter)
         self._search.begin(self._contact, self._mean)
         self._led = self._mean.copy()
         self.slips.reset()
