@@ -218,7 +218,7 @@ def warn_first_start() -> None:
     """Log, once in a process, that a first start compiles, where nothing was compiled before."""
     if not is_compiled():
         get_logger("finforce").info(
-            "compiling, which takes about a minute once; `finforce prepare` does it ahead of time"
+            "compiling, which takes a minute or two once; `finforce prepare` does it ahead of time"
         )
 
 
