@@ -89,12 +89,11 @@ setup(
         "lerobot": ["av"],  # videos of LeRobot datasets, by the library that they are made with
         "zarr": ["numcodecs"],  # UMI's chunks; the library zarr itself takes a missing chunk for zeros, a force of none
         "completion": ["argcomplete"],  # of the command line, by the shell
-        "ray": ["ray"],  # recordings on a cluster
         "view": ["rerun-sdk"],  # a viewer of pictures, shapes and curves over time
         # training of key point networks; without a GPU, torch's own index has a build of a tenth of the size
         "train": ["torch", "onnx"],
         "test": ["pytest", "pytest-xdist", "pytest-timeout", "hypothesis", "onnx", "python-can>=4.3,!=4.6.0", "xacro"]
-        + ["cascadio", "ezdxf", "svgelements", "av", "ray", "rerun-sdk", "playwright", "argcomplete", "numcodecs"],
+        + ["cascadio", "ezdxf", "svgelements", "av", "rerun-sdk", "playwright", "argcomplete", "numcodecs"],
         "lint": ["ruff", "import-linter"],
     },
     entry_points={

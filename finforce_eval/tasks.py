@@ -1,4 +1,4 @@
-"""A task per recording: carried out here, in processes or on a Ray cluster, each done once even if a run is killed."""
+"""A task per recording: carried out here or in processes, each done once even if a run is killed."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import hashlib
 import json
 import os
 import re
-import socket
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -16,15 +15,12 @@ from time import perf_counter
 from typing import Any, TypeVar
 
 from finforce.errors import FinforceError, one_line
-from finforce.optional import import_library
 from finforce_eval.errors import OptionError
 from finforce_eval.machine import version, without_nan
 
 OK, FAILED = "ok", "failed"
-SEQUENTIAL, PROCESSES, RAY = ENGINES = ("sequential", "processes", "ray")
 DIED = "the process that was at it died: out of memory, or killed"
 _GIGABYTE, _LARGEST_MEMORY = 1 << 30, 1e6
-_ANSWER = 5.0  # [s] in which a Ray cluster answers
 Line = dict[str, Any]
 T = TypeVar("T")
 
@@ -78,19 +74,15 @@ class Task:
 
 @dataclass(frozen=True, kw_only=True)
 class EngineOptions:
-    """How many tasks are carried out, and where; raises OptionError where that cannot be.
+    """How many tasks are carried out at once; raises OptionError where that cannot be.
 
     Attributes:
-        engine: "sequential", "processes" or "ray".
-        workers: at once; 0: one for each processor.
-        memory: that a task of "processes" or "ray" may have [GB]; 0: any.
-        address: of a Ray cluster; "": one of this machine alone.
+        workers: processes; 1: this one, 0: one for each processor.
+        memory: that a task may have in a process of its own [GB]; 0: any.
     """
 
-    engine: str = SEQUENTIAL
-    workers: int = 0
+    workers: int = 1
     memory: float = 4.0
-    address: str = ""
 
     def __post_init__(self) -> None:
         if self.workers < 0:
@@ -165,19 +157,17 @@ def run_tasks(tasks: Sequence[Task], options: EngineOptions, manifest: Manifest,
 
     Args:
         tasks: with names of their own.
-        options: of the engine.
+        options: how many at once.
         manifest: where lines are kept; what it holds as done with the same key is not done again.
         unit: what a task is, for the bar.
-
-    Raises:
-        FinforceError: the engine cannot be used.
     """
     before = manifest.read()
     lines = {task.name: before[task.name] for task in tasks if task.is_done(before.get(task.name))}
     left = [task for task in tasks if task.name not in lines]
+    run = _run_here if options.workers == 1 else _run_in_processes
     with progress_bar(len(tasks), unit) as bar:
         bar.update(len(lines))
-        for line in _RUNNERS[options.engine](left, options):
+        for line in run(left, options):
             manifest.append(line)
             lines[line["name"]] = line
             bar.set_postfix_str(f"{sum(each['status'] == FAILED for each in lines.values())} failed")
@@ -250,50 +240,3 @@ def _run_in_processes(tasks: Sequence[Task], options: EngineOptions) -> Iterator
             if alone:
                 yield left.pop(batch[0].name).line(DIED)
             alone = not alone
-
-
-def _run_on_ray(tasks: Sequence[Task], options: EngineOptions) -> Iterator[Line]:
-    """Yield lines as a Ray cluster ends its tasks; joblib's backend for it gives nothing before all have ended."""
-    ray = import_library("ray", "--engine ray", "'finforce[ray]'")
-    if not tasks:
-        return
-    _check_reachable(options.address)
-    where = {"address": options.address} if options.address else {"num_cpus": options.workers or None}
-    try:
-        ray.init(log_to_driver=False, logging_level="CRITICAL", **where)
-    except (Exception, SystemExit) as error:
-        raise FinforceError(f"no Ray cluster {options.address or 'here'}: {one_line(error)}") from error
-    remote = ray.remote(_run_limited).options(num_cpus=1, max_retries=1)
-    running = {remote.remote(task, options.memory): task for task in tasks}
-    try:
-        while running:
-            (ready,), _ = ray.wait(list(running), num_returns=1)
-            task = running.pop(ready)
-            try:
-                yield ray.get(ready)
-            except ray.exceptions.WorkerCrashedError:
-                yield task.line(DIED)
-    finally:
-        ray.shutdown()
-
-
-def _check_reachable(address: str) -> None:
-    """Refuse an address at which nobody listens; Ray itself would try for minutes.
-
-    Raises:
-        FinforceError: nobody does.
-    """
-    found = re.fullmatch(r"(?:ray://)?\[?([^\[\]/]+?)\]?:(\d{1,5})", address)
-    if not found:
-        return
-    try:
-        socket.create_connection((found[1], int(found[2])), _ANSWER).close()
-    except (OSError, OverflowError) as error:
-        raise FinforceError(f"--address {address}: no Ray cluster: {error}") from error
-
-
-_RUNNERS: dict[str, Callable[[Sequence[Task], EngineOptions], Iterator[Line]]] = {
-    SEQUENTIAL: _run_here,
-    PROCESSES: _run_in_processes,
-    RAY: _run_on_ray,
-}

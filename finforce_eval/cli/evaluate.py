@@ -17,7 +17,7 @@ EXAMPLES = """examples:
   finforce evaluate BAG --calibration twin                             # as recorded, scored
   finforce evaluate BAG --from images --jaw my_finger.yaml --contact fixed:40
   finforce evaluate BAG... --contact estimate --object can.stl --json scores.json --report scores
-  finforce evaluate BAG... --out kept --engine processes               # resumes when run again"""
+  finforce evaluate BAG... --out kept --workers 0                      # resumes when run again"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

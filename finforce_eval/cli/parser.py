@@ -160,16 +160,12 @@ def length_mm(text: str) -> float:
 
 
 def add_engine_options(command: argparse.ArgumentParser) -> None:
-    """Add what says how many recordings are worked at, and where."""
-    from finforce_eval.tasks import ENGINES
-
+    """Add what says how many recordings are worked at."""
     parser = command.add_argument_group("many recordings")
-    parser.add_argument("--engine", default=ENGINES[0], choices=ENGINES, help="how recordings are processed")
-    text = "recordings processed in parallel (one per core)"
-    parser.add_argument("--workers", type=int, default=0, metavar="N", help=text)
+    text = "recordings processed in parallel, each in its own process; 0: one per core (1)"
+    parser.add_argument("--workers", type=int, default=1, metavar="N", help=text)
     text = "memory limit of a parallel task [GB]; 0: none (4)"
     parser.add_argument("--memory", type=float, default=4.0, metavar="GB", help=text)
-    parser.add_argument("--address", default="", help="address of a Ray cluster (local)")
     text = "process the I-th of N parts of the recordings, for batch systems"
     parser.add_argument("--shard", default="", metavar="I/N", help=text)
 
@@ -182,4 +178,4 @@ def read_engine(options: argparse.Namespace) -> EngineOptions:
     """
     from finforce_eval.tasks import EngineOptions
 
-    return EngineOptions(engine=options.engine, workers=options.workers, memory=options.memory, address=options.address)
+    return EngineOptions(workers=options.workers, memory=options.memory)

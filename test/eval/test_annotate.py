@@ -229,21 +229,17 @@ def results(lines):
     return [{name: line[name] for name in ("name", "key", "status", "figures")} for line in lines]
 
 
-@pytest.mark.parametrize("engine", ["processes", "ray"])
-def test_engines_agree(engine, tmp_path, monkeypatch):
-    if engine == "ray":
-        pytest.importorskip("ray")
-        monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
+def test_processes_agree_with_this_one(tmp_path):
     tasks = squares(9, fail=(3,))
     expected = run_tasks(tasks, EngineOptions(), Manifest(tmp_path / "here"))
-    found = run_tasks(tasks, EngineOptions(engine=engine, workers=2), Manifest(tmp_path / engine))
+    found = run_tasks(tasks, EngineOptions(workers=2), Manifest(tmp_path / "there"))
     assert results(found) == results(expected)
     assert found[3]["status"] == "failed" and "no 3" in found[3]["error"]
     assert {line["figures"].get("square") for line in found} == {None, 0, 1, 4, 16, 25, 36, 49, 64}
 
 
 def test_a_process_that_dies_costs_its_own_task_only(tmp_path):
-    lines = run_tasks(squares(4, die=(1,)), EngineOptions(engine="processes", workers=2), Manifest(tmp_path))
+    lines = run_tasks(squares(4, die=(1,)), EngineOptions(workers=2), Manifest(tmp_path))
     assert [line["status"] for line in lines] == ["ok", "failed", "ok", "ok"]
     assert "died" in lines[1]["error"]
 
@@ -297,7 +293,7 @@ def test_a_run_that_is_killed_again_and_again_loses_nothing_and_does_nothing_twi
 
 @pytest.mark.parametrize("words", [["--workers", "-1"], ["--memory", "nan"], ["--memory=-1"], ["--memory", "inf"]])
 def test_engines_that_cannot_be_are_refused(words, source, tmp_path, capsys):
-    assert annotate(tmp_path, source, "--engine", "processes", *words) == 2
+    assert annotate(tmp_path, source, *words) == 2
     assert "expected" in capsys.readouterr().err
     assert not (tmp_path / source.name).exists()
 

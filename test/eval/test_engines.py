@@ -42,18 +42,15 @@ def evaluate(bags, out, *words):
     return without_times(json.loads(out.read_text()))
 
 
-@pytest.mark.parametrize("engine", ["processes", "ray"])
-def test_evaluations_agree(engine, bags, tmp_path, capsys):
-    if engine == "ray":
-        pytest.importorskip("ray")
+def test_evaluations_agree(bags, tmp_path, capsys):
     here = evaluate(bags, tmp_path / "here.json")
-    there = evaluate(bags, tmp_path / "there.json", "--engine", engine, "--workers", "2")
+    there = evaluate(bags, tmp_path / "there.json", "--workers", "2")
     assert there == here
     assert list(here["cases"]) == ["part0", "part1", "part2"]
 
 
 def test_an_experiment_goes_to_processes(tmp_path):
-    figures = Counting().carry_out(tmp_path, EngineOptions(engine="processes", workers=2))
+    figures = Counting().carry_out(tmp_path, EngineOptions(workers=2))
     assert figures.tables["Letters"]["letters"].sum() == 11
 
 
@@ -73,7 +70,7 @@ def test_files_of_a_data_set_are_made_once_and_what_fails_is_named(tmp_path):
             for number, path in paths.items()
         ]
 
-    engine = EngineOptions(engine="processes", workers=2)
+    engine = EngineOptions(workers=2)
     with pytest.raises(TrainingError, match="1 of 5 failed, 3 with: three cannot be made"):
         make_all(tasks(range(5)), engine, tmp_path, "", "file")
     before = (tmp_path / "2.txt").stat().st_mtime_ns
@@ -81,11 +78,3 @@ def test_files_of_a_data_set_are_made_once_and_what_fails_is_named(tmp_path):
     lines = make_all(tasks((0, 1, 2, 4)), engine, tmp_path, "", "file")
     assert sum(line["figures"]["numbers"] for line in lines) == 4
     assert (tmp_path / "2.txt").stat().st_mtime_ns == before and (tmp_path / "1.txt").exists()
-
-
-def test_a_cluster_that_is_not_there_is_one_line(bags, tmp_path, capsys):
-    pytest.importorskip("ray")
-    words = ["annotate", bags[0], "--contact", "fixed:42", "--out", str(tmp_path / "out")]
-    assert main([*words, "--engine", "ray", "--address", "127.0.0.1:9"]) == 2
-    said = capsys.readouterr().err.strip()
-    assert said.count("\n") == 0 and "127.0.0.1:9" in said

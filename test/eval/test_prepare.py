@@ -33,7 +33,7 @@ START = dedent("""
     preparation.compile_solver()
     preparation.compile_contact()
     preparation.compile_detector()
-    words = ["--contact", "estimate", "--calibration", "bench", "--set", "held=yes", "--engine", "sequential"]
+    words = ["--contact", "estimate", "--calibration", "bench", "--set", "held=yes"]
     assert main(["evaluate", str(DEMO), *words]) == 0
     print(compiled)
 """)
