@@ -15,12 +15,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from finforce.camera import CameraIntrinsics
-from finforce.gripper_frames import BENCH_CAMERA, FRONT_CAMERA, HALF_TURN, ROBOT_CAMERA
 from finforce.messages import NANOSECONDS
 from finforce.transforms import invert_pose
 from finforce_sim.gripper import FINGER, TwinGripper, TwinState
-from finforce_sim.mechanics import Assembly
-from finforce_sim.photographer import DrawnJaw, Photographer, SceneSetting, Shot, TrueJaw
+from finforce_sim.photographer import Photographer, Shot, TrueJaw
 from finforce_sim.scenarios import Scenario, ScenarioError
 from finforce_sim.sensor import D405, LENSES, build_d405_vga
 
@@ -28,12 +26,6 @@ START = 1_000 * NANOSECONDS  # [ns] stamp of the first image
 TRACKING_PERIOD = 0.1  # [s]; in the first image of each the object is tracked
 POSITION_STDDEV = 0.3e-3  # [m] of a tracked pose, along each axis
 ANGLE_STDDEV = np.radians(0.3)  # about each axis
-CAMERAS = {
-    "robot": ROBOT_CAMERA,
-    "turned": ROBOT_CAMERA @ HALF_TURN,
-    "front": FRONT_CAMERA,
-    "bench": BENCH_CAMERA,
-}
 LEAST_SIZE, LARGEST_SIZE = 16, 4096  # [px]
 WORKERS = min(os.cpu_count() or 1, 4)  # threads, of which each renders an image
 
@@ -65,14 +57,13 @@ class Footage:
     Args:
         gripper: what is rendered.
         photographer: that renders it.
-        setting: what stands before the camera, and where the camera is.
         seed: of the object tracker's noise.
     """
 
-    def __init__(self, gripper: TwinGripper, photographer: Photographer, setting: SceneSetting, seed: int) -> None:
+    def __init__(self, gripper: TwinGripper, photographer: Photographer, seed: int) -> None:
         self._gripper, self._photographer, self._seed = gripper, photographer, seed
-        self.camera, self.T_gripper_camera, self.mesh = setting.camera, setting.T_gripper_camera, setting.mesh
-        self.depth_step = setting.depth_step
+        self.camera, self.T_gripper_camera = photographer.camera, photographer.T_gripper_camera
+        self.mesh, self.depth_step = photographer.mesh, photographer.depth_step
 
     def __len__(self) -> int:
         return len(self._gripper)
@@ -129,24 +120,7 @@ def build_footage(
         FinforceError: the scenario's object or jaw cannot be used, or a library is missing.
     """
     gripper = TwinGripper(scenario, finger)
-    setting = set_stage(gripper, camera or build_d405_vga(), depth_step)
-    return Footage(gripper, Photographer(setting, seed), setting, seed)
-
-
-def set_stage(assembly: Assembly, camera: CameraIntrinsics, depth_step: float) -> SceneSetting:
-    """Return jaws and object before the scenario's camera, with depth images in steps [m]."""
-    return SceneSetting(
-        shapes={
-            side: DrawnJaw(jaw=jaw, rest=assembly.rest_vertices(side), triangles=assembly.triangles(side))
-            for side, jaw in assembly.jaws.items()
-        },
-        mesh=assembly.object_mesh,
-        camera=camera,
-        T_gripper_camera=CAMERAS[assembly.scenario.camera],
-        light=assembly.scenario.light,
-        readout=assembly.scenario.readout,
-        depth_step=depth_step,
-    )
+    return Footage(gripper, Photographer(gripper, camera or build_d405_vga(), seed, depth_step), seed)
 
 
 def parse_size(text: str, lens: str = D405) -> CameraIntrinsics:

@@ -24,11 +24,9 @@ class JawState(JawShape):
 
     Attributes:
         origin_x: of its frame on the closing axis of `gripper_base` [m].
-        reference: the reference point, which does not deform (3,) [m], jaw frame.
     """
 
     origin_x: float
-    reference: NDArray
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -124,8 +122,7 @@ class TwinGripper(Assembly):
 
     def _jaw_state(self, side: str, posture: Posture, shape: JawShape, wrench: RelaxedWrench) -> JawState:
         relaxed = wrench.update(Wrench(shape.force, shape.torque), 1.0 / self.scenario.rate)
-        rigid = {"origin_x": self.origin_x(side, posture), "reference": self._jaws[side].jaw.reference_point}
-        return JawState(**vars(shape) | relaxed._asdict() | rigid)
+        return JawState(**vars(shape) | relaxed._asdict(), origin_x=self.origin_x(side, posture))
 
 
 STEP = 1e-4  # [m] of each jaw from one solved grasp to the next
@@ -223,7 +220,6 @@ class PressedGrasp(Assembly):
         jaws = {
             side: JawState(
                 origin_x=self.origin_x(side, posture),
-                reference=self.jaws[side].reference_point,
                 vertices=self._read(table.vertices, opening),
                 keypoints=self._read(table.keypoints, opening),
                 **wrenches[side]._asdict(),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,7 +13,7 @@ from finforce.camera import CameraIntrinsics
 from finforce.transforms import invert_pose
 from finforce_ifea.grasp_force import Wrench
 from finforce_sim.emulator.mechanism import STROKE
-from finforce_sim.footage import FINGER, WORKERS, disturb_pose, set_stage
+from finforce_sim.footage import FINGER, WORKERS, disturb_pose
 from finforce_sim.gripper import PressedGrasp
 from finforce_sim.photographer import Photographer, Shot
 from finforce_sim.scenarios import Scenario, ScenarioError
@@ -63,19 +62,34 @@ class LiveScene:
                 f"jaws, expected at most {1e3 * (STROKE - LEAST_CLEARANCE):.0f} mm; give another object or scene"
             )
         self.grasp = grasp
-        self.camera, self.depth_step = photographer.setting.camera, photographer.setting.depth_step
+        self.camera, self.depth_step = photographer.camera, photographer.depth_step
         self.openings, self._takes = np.zeros(0), []
         self._photographer = photographer
         self._relaxation = grasp.relaxation()
-        self._T_camera_gripper = invert_pose(photographer.setting.T_gripper_camera)
+        self._T_camera_gripper = invert_pose(photographer.T_gripper_camera)
         self._rng = np.random.default_rng((seed, 3))
         self._count, self._last = 0, None
 
     def render(self, keep: Callable[[Shot], Any], tell: Callable[[int, int], None]) -> None:
-        """Take the images at all openings of the gripper; see `render_openings`."""
-        openings = choose_openings(self.grasp, 0.0, STROKE)
-        self._takes = render_openings(self.grasp, self._photographer, openings, keep, tell)
+        """Take the images at all openings of the gripper.
+
+        Args:
+            keep: makes of an image what is kept of it; its wrenches are elastic.
+            tell: hears how many openings of how many are done; what it raises ends the rendering.
+        """
+        openings, pool = choose_openings(self.grasp), ThreadPoolExecutor(WORKERS)
+        try:
+            for shots in pool.map(self._shoot, openings.tolist(), range(len(openings))):
+                tell(len(self._takes) + 1, len(openings))
+                self._takes.append([keep(shot) for shot in shots])
+        finally:
+            pool.shutdown(cancel_futures=True)
         self.openings = openings
+
+    def _shoot(self, opening: float, index: int) -> list[Shot]:
+        """Return all takes at one opening [m]."""
+        view = self._photographer.look(self.grasp.state(opening))
+        return [self._photographer.develop(view, _APART * (TAKES * index + take)) for take in range(TAKES)]
 
     def find(self, opening: float) -> int:
         """Return the index of the image that was taken nearest to an opening [m]."""
@@ -112,8 +126,7 @@ def build_live_scene(
         FinforceError: the scenario's object or jaw cannot be used, or a library is missing.
     """
     grasp = PressedGrasp(scenario, finger)
-    setting = set_stage(grasp, camera or build_d405_vga(), depth_step)
-    return LiveScene(grasp, Photographer(setting, seed), seed)
+    return LiveScene(grasp, Photographer(grasp, camera or build_d405_vga(), seed, depth_step), seed)
 
 
 TAKES = 2  # of every opening: a camera that stands still never gives the same image twice
@@ -123,45 +136,12 @@ BEFORE_TOUCH = 1e-3  # [m] of opening from which on every step has its image
 _APART = 10.0  # [s] between the stamps that seed the noise, too far for motion blur
 
 
-def choose_openings(grasp: PressedGrasp, low: float, high: float) -> NDArray:
-    """Return the openings (n,) [m] between two of a gripper's [m] that deserve an image.
+def choose_openings(grasp: PressedGrasp) -> NDArray:
+    """Return the openings (n,) [m] of the gripper that deserve an image.
 
     In contact these are the gripper's own steps, at which it comes to rest; where nothing touches they are coarser.
     """
-    steps = low + (high - low) * np.arange(COUNTS + 1) / COUNTS
+    steps = STROKE * np.arange(COUNTS + 1) / COUNTS
     near = steps < grasp.touch_opening + BEFORE_TOUCH
     kept = near | (np.arange(COUNTS + 1)[::-1] % OPEN_STRIDE == 0)
     return steps[kept & (steps >= grasp.least_opening)]
-
-
-def render_openings(
-    grasp: PressedGrasp,
-    photographer: Photographer,
-    openings: NDArray,
-    keep: Callable[[Shot], Any],
-    tell: Callable[[int, int], None] = lambda done, count: None,
-) -> list[list[Any]]:
-    """Return for each opening what is kept of its images.
-
-    Args:
-        grasp: what is rendered.
-        photographer: that renders it.
-        openings: (n,) [m], growing.
-        keep: makes of an image what is kept of it; its wrenches are elastic.
-        tell: hears how many openings of how many are done; what it raises ends the rendering.
-    """
-    render = partial(_render_opening, grasp, photographer)
-    takes, pool = [], ThreadPoolExecutor(WORKERS)
-    try:
-        for shots in pool.map(render, openings.tolist(), range(len(openings))):
-            tell(len(takes) + 1, len(openings))
-            takes.append([keep(shot) for shot in shots])
-    finally:
-        pool.shutdown(cancel_futures=True)
-    return takes
-
-
-def _render_opening(grasp: PressedGrasp, photographer: Photographer, opening: float, index: int) -> list[Shot]:
-    """Return all takes at one opening [m]."""
-    view = photographer.look(grasp.state(opening))
-    return [photographer.develop(view, _APART * (TAKES * index + take)) for take in range(TAKES)]

@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.camera import CameraIntrinsics, project
-from finforce.gripper_frames import jaw_in_camera
+from finforce.gripper_frames import BENCH_CAMERA, FRONT_CAMERA, HALF_TURN, ROBOT_CAMERA, jaw_in_camera
 from finforce.transforms import invert_pose
-from finforce_contact.mesh.object_mesh import ObjectMesh
-from finforce_ifea.jaw.jaw import Jaw
 from finforce_sim.gripper import TwinState
+from finforce_sim.mechanics import Assembly
 from finforce_sim.render import (
     Body,
     Decal,
@@ -39,13 +38,12 @@ _BOX_TRIANGLES = np.array(
 )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class DrawnJaw:
-    """A jaw as it is drawn: the jaw itself, its vertices (n, 3) [m] at rest and its triangles (m, 3)."""
-
-    jaw: Jaw
-    rest: NDArray
-    triangles: NDArray
+CAMERAS = {
+    "robot": ROBOT_CAMERA,
+    "turned": ROBOT_CAMERA @ HALF_TURN,
+    "front": FRONT_CAMERA,
+    "bench": BENCH_CAMERA,
+}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -71,31 +69,6 @@ class Wardrobe:
         jaw, palm, thing, _ = draw_jaw_paint(rng), draw_paint(rng, ("plain", "noise")), draw_paint(rng), draw_paint(rng)
         radius = float(rng.uniform(*DOT_RADII))
         return cls(jaw=jaw, holder=holder, palm=palm, thing=thing, dot_color=dot, dot_radius=radius)
-
-
-def dress_jaw(shape: DrawnJaw, vertices: NDArray, T_camera_jaw: NDArray, wardrobe: Wardrobe) -> list[Body]:
-    """Return a jaw with deformed vertices (n, 3) [m], jaw frame, and its holder with the reference dot."""
-    dot = Decal(centre=shape.jaw.reference_point, radius=wardrobe.dot_radius, color=wardrobe.dot_color)
-    # a finger whose clamped part is in view carries the dot itself
-    own = (dot,) if shape.jaw.reference_point[2] > 0.0 else ()
-    moved = _move(vertices, T_camera_jaw)
-    jaw = Body(vertices=moved, triangles=shape.triangles, rest=shape.rest, paint=wardrobe.jaw, decals=own)
-    holder = HOLDER.copy()
-    if own:
-        # the holder is as wide as the finger that stands in it
-        low, high = shape.rest.min(axis=0), shape.rest.max(axis=0)
-        holder[:, :2] = np.stack((low[:2], high[:2]))
-    return [jaw, build_box(holder, T_camera_jaw, wardrobe.holder, () if own else (dot,))]
-
-
-def dress_object(mesh: ObjectMesh, T_camera_object: NDArray, wardrobe: Wardrobe) -> Body:
-    """Return the object."""
-    return Body(
-        vertices=_move(mesh.vertices, T_camera_object),
-        triangles=mesh.triangles,
-        rest=mesh.vertices,
-        paint=wardrobe.thing,
-    )
 
 
 def build_box(bounds: NDArray, T: NDArray, paint: Paint, decals: tuple[Decal, ...] = ()) -> Body:
@@ -156,44 +129,28 @@ class WristView:
     jaws: Mapping[str, TrueJaw]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class SceneSetting:
-    """What stands before the camera, and how it is lit.
-
-    Attributes:
-        shapes: of the jaws, by side.
-        mesh: of the object, None without one.
-        camera: intrinsics.
-        T_gripper_camera: (4, 4).
-        light: "bright", "dim" or "any".
-        depth_step: of the depth image [m]; the ROS driver of a D405 gives 1 mm, the camera itself 0.1 mm.
-        readout: from the exposure of the first row to that of the last one, at a state's stamp [s].
-    """
-
-    shapes: Mapping[str, DrawnJaw]
-    mesh: ObjectMesh | None
-    camera: CameraIntrinsics
-    T_gripper_camera: NDArray
-    light: str = "bright"
-    depth_step: float = 1e-3
-    readout: float = 0.0
-
-
 class Photographer:
     """Takes pictures of a gripper; materials, lights and background come from the seed and stay.
 
+    Attributes:
+        T_gripper_camera: (4, 4) of the scenario's camera.
+        mesh: of the object in its own frame; None without one.
+
     Args:
-        setting: what is photographed.
+        assembly: jaws and object, with the scenario's camera, light and rolling shutter.
+        camera: intrinsics.
         seed: of everything that chance decides.
+        depth_step: of the depth image [m]; the ROS driver of a D405 gives 1 mm, the camera itself 0.1 mm.
     """
 
-    def __init__(self, setting: SceneSetting, seed: int) -> None:
+    def __init__(self, assembly: Assembly, camera: CameraIntrinsics, seed: int, depth_step: float = 1e-3) -> None:
         rng = np.random.default_rng((seed, 7))
-        self.setting = setting
+        self.camera, self.depth_step, self.mesh = camera, depth_step, assembly.object_mesh
+        self.T_gripper_camera = CAMERAS[assembly.scenario.camera]
+        self._assembly, self._readout, self._seed = assembly, assembly.scenario.readout, seed
         self._wardrobe = Wardrobe.draw(rng)
-        self._look: Lighting = draw_look(rng, setting.light)
-        self._T_camera_gripper = invert_pose(setting.T_gripper_camera)
-        self._seed = seed
+        self._look: Lighting = draw_look(rng, assembly.scenario.light)
+        self._T_camera_gripper = invert_pose(self.T_gripper_camera)
 
     def shoot(self, state: TwinState, before: TwinState | None = None) -> Shot:
         """Return the image of a state, given that of the image before; the same seed and stamp give the same noise."""
@@ -203,26 +160,25 @@ class Photographer:
         """Return what a perfect sensor would see of a state; its upper rows are of a moment before."""
         stage = self._build_stage(state)
         jaws = {side: self._look_for(side, state, stage) for side in state.jaws}
-        if before is not None and self.setting.readout and before.stamp < state.stamp:
+        if before is not None and self._readout and before.stamp < state.stamp:
             jaws = {side: self._roll_truth(side, true, state, before) for side, true in jaws.items()}
             return WristView(picture=self._roll(state, before), jaws=jaws)
-        return WristView(picture=stage.render(self.setting.camera), jaws=jaws)
+        return WristView(picture=stage.render(self.camera), jaws=jaws)
 
     def _shares(self, rows: NDArray, state: TwinState, before: TwinState) -> NDArray:
         """Return how far back, of the way to the state before, rows (n,) [px] are exposed."""
-        left = 1.0 - rows / (self.setting.camera.height - 1)
-        return left.clip(0.0, 1.0) * self.setting.readout / (state.stamp - before.stamp)
+        left = 1.0 - rows / (self.camera.height - 1)
+        return left.clip(0.0, 1.0) * self._readout / (state.stamp - before.stamp)
 
     def _roll(self, state: TwinState, before: TwinState) -> Picture:
         """Return the image of a rolling shutter, band by band."""
-        edges = np.linspace(0, self.setting.camera.height, BANDS + 1).round().astype(int)
+        edges = np.linspace(0, self.camera.height, BANDS + 1).round().astype(int)
         bands = []
         for share, low, high in zip(
             self._shares(0.5 * (edges[:-1] + edges[1:] - 1), state, before), edges[:-1], edges[1:], strict=True
         ):
-            bands.append(self._build_stage(state.blend(before, share)).render(self.setting.camera, slice(low, high)))
-        layers = ("color", "depth", "owner")
-        return Picture(**{name: np.concatenate([getattr(band, name) for band in bands]) for name in layers})
+            bands.append(self._build_stage(state.blend(before, share)).render(self.camera, slice(low, high)))
+        return Picture(**{name: np.concatenate([getattr(band, name) for band in bands]) for name in ("color", "depth")})
 
     def _roll_truth(self, side: str, true: TrueJaw, state: TwinState, before: TwinState) -> TrueJaw:
         """Return the truth with the pixels at which points are when their own row is exposed."""
@@ -230,7 +186,7 @@ class Photographer:
         pixels = true.pixels
         for _ in range(3):  # in another row it is another time, by which the point has moved by a part of that
             shares = self._shares(np.nan_to_num(pixels[:, 1]), state, before)
-            pixels = project(now + shares[:, None] * (then - now), self.setting.camera)
+            pixels = project(now + shares[:, None] * (then - now), self.camera)
         return replace(true, pixels=pixels)
 
     def _points(self, side: str, state: TwinState) -> NDArray:
@@ -239,7 +195,7 @@ class Photographer:
 
     def _place(self, side: str, state: TwinState) -> NDArray:
         """Return T_camera_jaw (4, 4)."""
-        return jaw_in_camera(self.setting.T_gripper_camera, side, state.jaws[side].origin_x)
+        return jaw_in_camera(self.T_gripper_camera, side, state.jaws[side].origin_x)
 
     def develop(self, view: WristView, stamp: float, smear: NDArray | None = None) -> Shot:
         """Return a view as the sensor gives it.
@@ -250,22 +206,40 @@ class Photographer:
             smear: (2,) standard deviations along the rows and columns by which motion blurs [px].
         """
         rng = np.random.default_rng((self._seed, 8, round(stamp * 1e6)))
-        noise = replace(D405_NOISE, quantum=self.setting.depth_step)
+        noise = replace(D405_NOISE, quantum=self.depth_step)
         color = expose(view.picture.color, self._look.exposure, rng, smear)
-        depth = measure_depth(view.picture.depth, color, self.setting.camera, rng, noise)
+        depth = measure_depth(view.picture.depth, color, self.camera, rng, noise)
         return Shot(color=color, depth=depth, jaws=view.jaws)
 
     def _build_stage(self, state: TwinState) -> RenderedScene:
-        T, bodies = self._T_camera_gripper, [build_box(PALM, self._T_camera_gripper, self._wardrobe.palm)]
-        for side, jaw in state.jaws.items():
-            bodies += dress_jaw(self.setting.shapes[side], jaw.vertices, self._place(side, state), self._wardrobe)
-        if self.setting.mesh is not None and state.T_gripper_object is not None:
-            bodies.append(dress_object(self.setting.mesh, T @ state.T_gripper_object, self._wardrobe))
+        T, mesh = self._T_camera_gripper, self.mesh
+        bodies = [build_box(PALM, T, self._wardrobe.palm)]
+        for side in state.jaws:
+            bodies += self._dress_jaw(side, state)
+        if mesh is not None and state.T_gripper_object is not None:
+            vertices = _move(mesh.vertices, T @ state.T_gripper_object)
+            paint = self._wardrobe.thing
+            bodies.append(Body(vertices=vertices, triangles=mesh.triangles, rest=mesh.vertices, paint=paint))
         return RenderedScene(bodies, self._look, T[:3, :3], T[:3, 3])
+
+    def _dress_jaw(self, side: str, state: TwinState) -> list[Body]:
+        """Return a deformed jaw, and its holder with the reference dot."""
+        wardrobe, T_camera_jaw, rest = self._wardrobe, self._place(side, state), self._assembly.rest_vertices(side)
+        centre, triangles = self._assembly.jaws[side].reference_point, self._assembly.triangles(side)
+        dot = Decal(centre=centre, radius=wardrobe.dot_radius, color=wardrobe.dot_color)
+        # a finger whose clamped part is in view carries the dot itself
+        own = (dot,) if centre[2] > 0.0 else ()
+        moved = _move(state.jaws[side].vertices, T_camera_jaw)
+        jaw = Body(vertices=moved, triangles=triangles, rest=rest, paint=wardrobe.jaw, decals=own)
+        holder = HOLDER.copy()
+        if own:
+            # the holder is as wide as the finger that stands in it
+            holder[:, :2] = np.stack((rest.min(axis=0)[:2], rest.max(axis=0)[:2]))
+        return [jaw, build_box(holder, T_camera_jaw, wardrobe.holder, () if own else (dot,))]
 
     def _look_for(self, side: str, state: TwinState, stage: RenderedScene) -> TrueJaw:
         """Return where the key points of a jaw are and which of them can be seen."""
-        jaw, camera = state.jaws[side], self.setting.camera
+        jaw, camera = state.jaws[side], self.camera
         points = self._points(side, state)
         pixels = project(points, camera)
         size = np.array([camera.width, camera.height])
@@ -285,11 +259,9 @@ class Photographer:
             return np.zeros(2)
         moved = []
         for side in state.jaws:
+            reference = self._assembly.jaws[side].reference_point
             now, then = (
-                project(
-                    _move(np.vstack((one.jaws[side].keypoints, one.jaws[side].reference)), self._place(side, one)),
-                    self.setting.camera,
-                )
+                project(_move(np.vstack((one.jaws[side].keypoints, reference)), self._place(side, one)), self.camera)
                 for one in (state, before)
             )
             moved.append(np.abs(now - then).mean(axis=0))

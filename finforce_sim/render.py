@@ -293,12 +293,10 @@ class Picture:
     Attributes:
         color: (h, w, 3) linear light.
         depth: (h, w) true depth of the pixels' centres [m].
-        owner: (h, w) index of the body seen at the pixels' centres, -1 for the background.
     """
 
     color: NDArray
     depth: NDArray
-    owner: NDArray
 
 
 class RenderedScene:
@@ -345,8 +343,8 @@ class RenderedScene:
         pixels = np.column_stack((column, row + (rows.start or 0)))
         fine = np.nan_to_num(rays_from_pixels((pixels[:, None] + SUBPIXELS).reshape(-1, 2), camera), nan=1.0)
         color[at] = self._shade(fine, self._cast(fine)).reshape(-1, len(SUBPIXELS), 3).mean(axis=1)
-        color[blind], hits.depth[blind], hits.owner[blind] = 0.0, FAR, -1
-        return Picture(color=color.reshape(*shape, 3), depth=hits.depth.reshape(shape), owner=hits.owner.reshape(shape))
+        color[blind], hits.depth[blind] = 0.0, FAR
+        return Picture(color=color.reshape(*shape, 3), depth=hits.depth.reshape(shape))
 
     def sees(self, points: NDArray, tolerance: float = 0.5e-3) -> NDArray:
         """Say of which points (n, 3) [m], camera frame, nothing stands before them by more than a tolerance [m]."""

@@ -134,14 +134,13 @@ def _render(scene: TwinScene, path: Path) -> None:
     from tqdm import tqdm
 
     from finforce_eval.cli.twin import RecordingForm, write_footage
-    from finforce_sim.footage import FINGER, Footage, parse_size, set_stage
+    from finforce_sim.footage import FINGER, Footage, parse_size
     from finforce_sim.gripper import TwinGripper
     from finforce_sim.photographer import Photographer
 
     gripper = TwinGripper(scene.build(), FINGER)
-    setting = set_stage(gripper, parse_size(scene.size), 1e-3)
     smooth = SmoothGripper(gripper, scene.slots)
-    footage = Footage(smooth, Photographer(setting, scene.seed), setting, scene.seed)
+    footage = Footage(smooth, Photographer(gripper, parse_size(scene.size), scene.seed), scene.seed)
     case = {"scene": scene.scenario, "seed": scene.seed, "finger": FINGER, "object": {"kind": scene.build().object}}
     with tqdm(total=len(footage), unit="image", desc=scene.scenario, disable=None, leave=False) as bar:
         form = RecordingForm(farthest=scene.farthest)

@@ -38,7 +38,7 @@ from finforce_keypoints.parameters import DetectorParameters, DetectorSettings, 
 from finforce_sim.emulator.faults import FaultyAdapter, PlannedFault
 from finforce_sim.emulator.firmware import EmulatedGripper
 from finforce_sim.emulator.virtual import VirtualBus, VirtualClock
-from finforce_sim.footage import disturb_pose, parse_size, set_stage
+from finforce_sim.footage import disturb_pose, parse_size
 from finforce_sim.gripper import PressedGrasp, TwinState
 from finforce_sim.photographer import Photographer
 
@@ -351,7 +351,7 @@ class ImageSensor(EstimatorSensor):
     def __init__(self, pressed: PressedGrasp, seed: int, size: str = "640x480") -> None:
         super().__init__(pressed, seed)
         self._camera, depth_step = parse_size(size), 1e-3
-        self._photographer = Photographer(set_stage(pressed, self._camera, depth_step), seed)
+        self._photographer = Photographer(pressed, self._camera, seed, depth_step)
         self._before: TwinState | None = None
         parameters = DetectorParameters()
         settings = DetectorSettings(quantum=depth_step)

@@ -25,8 +25,9 @@ from finforce_eval.evaluation.contact_source import ContactChoice
 from finforce_eval.recordings.objects import require_mesh
 from finforce_eval.recordings.tracks import PoseTrack, Recording
 from finforce_keypoints.images import RgbdImage
-from finforce_sim.footage import CAMERAS, FINGER, START
+from finforce_sim.footage import FINGER, START
 from finforce_sim.gripper import TwinGripper
+from finforce_sim.photographer import CAMERAS
 from finforce_sim.scenarios import build_scenario
 from lab.experiments.experiment import SHARP, Case, Experiment, RunOptions, axis_sharpness, build_setup, keep_poses
 from lab.experiments.grasp import join_jaws, score_grasp

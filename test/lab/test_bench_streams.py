@@ -4,17 +4,15 @@ import struct
 
 import numpy as np
 import pytest
-from rgbd_fakes import CAMERA, MESH, FakeGripper, FakePhotographer
+from rgbd_fakes import FakeGripper, FakePhotographer
 
 from finforce.camera_topics import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
-from finforce.gripper_frames import BENCH_CAMERA
 from finforce.messages import read_stamp
 from finforce_eval.cli.twin import write_footage
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.images import IMAGE
 from finforce_eval.replay.playback import RawMessage
 from finforce_sim.footage import Footage
-from finforce_sim.photographer import SceneSetting
 from lab.bench.chain import (
     FINE_RATE,
     OBJECT_TOPIC,
@@ -40,8 +38,7 @@ SLOTS = [6 * cycle + slot for cycle in range(10) for slot in EVERY_RATE]
 def bag(tmp_path_factory):
     """A recording of seven states of the script, in images of 30, 60 and 90 Hz."""
     gripper = SmoothGripper(FakeGripper(count=7), EVERY_RATE)
-    setting = SceneSetting(shapes={}, mesh=MESH, camera=CAMERA, T_gripper_camera=BENCH_CAMERA)
-    footage = Footage(gripper, FakePhotographer(), setting, 0)
+    footage = Footage(gripper, FakePhotographer(), 0)
     return write_footage(footage, tmp_path_factory.mktemp("bags") / "twin")
 
 

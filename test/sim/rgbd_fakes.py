@@ -13,12 +13,11 @@ from finforce_keypoints.errors import DetectionError
 from finforce_keypoints.images import ImageWatch
 from finforce_sim.footage import Footage
 from finforce_sim.gripper import JawState, TwinState
-from finforce_sim.photographer import SceneSetting, Shot, TrueJaw, WristView
+from finforce_sim.photographer import Shot, TrueJaw, WristView
 
 CAMERA = CameraIntrinsics(width=64, height=48, fx=43.0, fy=43.0, cx=31.5, cy=23.5, distortion=np.full(5, 0.01))
 KEYPOINTS = 4
 REST = np.array([[0.010, 0.01, 0.01], [0.010, 0.01, 0.03], [-0.010, 0.01, 0.02], [0.0, 0.01, 0.07]])
-REFERENCE = np.array([0.0, 0.010, -0.006])
 CUBE = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * 0.01
 CUBE_TRIANGLES = np.array(
     [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1]]
@@ -46,7 +45,6 @@ class FakeGripper:
                 origin_x=-0.055,
                 vertices=np.zeros((3, 3)),
                 keypoints=REST - [1e-4 * index, 0, 0],
-                reference=REFERENCE,
                 force=force,
                 torque=np.cross([0.014, 0.0, 0.04], force),
             )
@@ -67,6 +65,10 @@ class FakePhotographer:
 
     black: tuple = ()
     frozen: tuple = ()
+    mesh: ObjectMesh | None = MESH
+    camera = CAMERA
+    T_gripper_camera = BENCH_CAMERA
+    depth_step = 1e-3
 
     def shoot(self, state, before=None):
         number = round(30 * state.stamp)
@@ -95,9 +97,9 @@ def true_jaw(state, side, T_gripper_camera=BENCH_CAMERA, hidden=1):
 def make_footage(gripper=None, photographer=None, seed=0):
     """Footage of 64 x 48 pixels."""
     gripper = gripper or FakeGripper()
-    mesh = MESH if gripper.has_object else None
-    setting = SceneSetting(shapes={}, mesh=mesh, camera=CAMERA, T_gripper_camera=BENCH_CAMERA)
-    return Footage(gripper, photographer or FakePhotographer(), setting, seed)
+    photographer = photographer or FakePhotographer()
+    photographer.mesh = MESH if gripper.has_object else None
+    return Footage(gripper, photographer, seed)
 
 
 @dataclass(frozen=True)
@@ -154,8 +156,9 @@ CAMERA_POSE = ROBOT_CAMERA
 class FakeLens:
     """Takes what `Photographer` takes, of 64 x 48 pixels; every key point is visible."""
 
+    camera, T_gripper_camera, depth_step = CAMERA, CAMERA_POSE, 1e-3
+
     def __init__(self):
-        self.setting = SceneSetting(shapes={}, mesh=None, camera=CAMERA, T_gripper_camera=CAMERA_POSE)
         self.looks = 0
         self._lock = Lock()
 

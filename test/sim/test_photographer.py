@@ -1,3 +1,4 @@
+from copy import copy
 from dataclasses import replace
 from itertools import pairwise
 
@@ -5,11 +6,12 @@ import numpy as np
 import pytest
 
 from finforce.camera import project
-from finforce.gripper_frames import ROBOT_CAMERA
 from finforce_sim.gripper import TwinGripper
-from finforce_sim.photographer import BANDS, DrawnJaw, Photographer, SceneSetting
+from finforce_sim.photographer import BANDS, Photographer
 from finforce_sim.scenarios import build_scenario
 from finforce_sim.sensor import build_d405_vga
+
+CAMERA = build_d405_vga()
 
 
 @pytest.fixture(scope="module")
@@ -18,30 +20,19 @@ def gripper():
 
 
 @pytest.fixture(scope="module")
-def setting(gripper):
-    shapes = {
-        side: DrawnJaw(jaw=jaw, rest=gripper.rest_vertices(side), triangles=gripper.triangles(side))
-        for side, jaw in gripper.jaws.items()
-    }
-    return SceneSetting(
-        shapes=shapes, mesh=gripper.object_mesh, camera=build_d405_vga(), T_gripper_camera=ROBOT_CAMERA, light="bright"
-    )
-
-
-@pytest.fixture(scope="module")
 def pressed(gripper):
     return next(state for state in gripper.states() if np.linalg.norm(state.jaws["left"].force) > 1.0)
 
 
 @pytest.fixture(scope="module")
-def shot(setting, pressed):
-    return Photographer(setting, 3).shoot(pressed)
+def shot(gripper, pressed):
+    return Photographer(gripper, CAMERA, 3).shoot(pressed)
 
 
-def test_true_pixels_are_the_projected_key_points(shot, setting):
+def test_true_pixels_are_the_projected_key_points(shot):
     for truth in shot.jaws.values():
         points = truth.points @ truth.T_camera_jaw[:3, :3].T + truth.T_camera_jaw[:3, 3]
-        np.testing.assert_allclose(truth.pixels, project(points, setting.camera), atol=1e-9)
+        np.testing.assert_allclose(truth.pixels, project(points, CAMERA), atol=1e-9)
 
 
 def test_depth_at_visible_key_points_is_that_of_the_finger(shot):
@@ -52,44 +43,47 @@ def test_depth_at_visible_key_points_is_that_of_the_finger(shot):
         assert np.nanmedian(np.abs(error[truth.visible])) < 1e-3  # noise and millimetre steps
 
 
-def test_what_the_object_covers_is_not_visible(shot, setting, pressed):
-    bare = Photographer(replace(setting, mesh=None), 3).shoot(pressed)
+def test_what_the_object_covers_is_not_visible(shot, gripper, pressed):
+    photographer = Photographer(gripper, CAMERA, 3)
+    photographer.mesh = None
+    bare = photographer.shoot(pressed)
     for side, truth in bare.jaws.items():
         assert truth.visible.all()
         assert not shot.jaws[side].visible.all()
         assert shot.jaws[side].visible.sum() >= 10
 
 
-def test_the_same_seed_gives_the_same_image_and_another_one_another(shot, setting, pressed):
-    again = Photographer(setting, 3).shoot(pressed)
+def test_the_same_seed_gives_the_same_image_and_another_one_another(shot, gripper, pressed):
+    again = Photographer(gripper, CAMERA, 3).shoot(pressed)
     np.testing.assert_array_equal(again.color, shot.color)
     np.testing.assert_array_equal(again.depth, shot.depth)
-    assert (Photographer(setting, 4).shoot(pressed).color != shot.color).mean() > 0.5
+    assert (Photographer(gripper, CAMERA, 4).shoot(pressed).color != shot.color).mean() > 0.5
 
 
-def test_the_dot_on_the_holder_is_where_the_reference_point_is(shot, setting, pressed):
+def test_the_dot_on_the_holder_is_where_the_reference_point_is(shot, gripper):
     for side, truth in shot.jaws.items():
-        reference = pressed.jaws[side].reference[None] @ truth.T_camera_jaw[:3, :3].T + truth.T_camera_jaw[:3, 3]
-        column, row = np.round(project(reference, setting.camera)[0]).astype(int)
+        point = gripper.jaws[side].reference_point[None]
+        reference = point @ truth.T_camera_jaw[:3, :3].T + truth.T_camera_jaw[:3, 3]
+        column, row = np.round(project(reference, CAMERA)[0]).astype(int)
         dot = shot.color[row - 1 : row + 2, column - 1 : column + 2].mean()
         around = shot.color[row - 14 : row + 15, column - 14 : column + 15].astype(float)
         assert abs(dot - np.median(around)) > 20.0  # grey levels
 
 
-def test_depth_comes_in_the_steps_that_were_asked_for(setting, pressed):
+def test_depth_comes_in_the_steps_that_were_asked_for(gripper, pressed):
     for step in (1e-3, 1e-4):
-        depth = Photographer(replace(setting, depth_step=step), 3).shoot(pressed).depth
+        depth = Photographer(gripper, CAMERA, 3, step).shoot(pressed).depth
         depth = depth[np.isfinite(depth)].astype(float)
         np.testing.assert_allclose(depth / step, np.round(depth / step), atol=1e-3)  # float32 metres
         assert len(np.unique(np.round(depth / step))) > (50 if step == 1e-3 else 500)
 
 
-def test_rows_of_a_rolling_shutter_are_of_their_own_time(setting, gripper):
+def test_rows_of_a_rolling_shutter_are_of_their_own_time(gripper):
     states = gripper.states()
     before, state = next((a, b) for a, b in pairwise(states) if a.jaws["left"].origin_x < b.jaws["left"].origin_x)
-    readout, height = 0.02, setting.camera.height
-    photographer = Photographer(replace(setting, readout=readout), 3)
-    rolled, flat = photographer.look(state, before), Photographer(setting, 3)
+    readout, height, rolling = 0.02, CAMERA.height, copy(gripper)
+    rolling.scenario = replace(gripper.scenario, readout=readout)
+    rolled, flat = Photographer(rolling, CAMERA, 3).look(state, before), Photographer(gripper, CAMERA, 3)
     band = height // BANDS
     for number in (0, BANDS - 1):
         rows = slice(number * band, (number + 1) * band)

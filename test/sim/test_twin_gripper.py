@@ -133,7 +133,6 @@ def test_key_points_move_outwards_where_the_jaw_is_pressed(cylinder):
         # of 6 mm beyond touch nearly all is the inner band's, pressed at this rib
         assert -6e-3 < motion[pressed, 0] < -4e-3
         np.testing.assert_allclose(states[0].jaws[side].keypoints, jaw.keypoints, atol=1e-9)
-        np.testing.assert_allclose(state.reference, jaw.reference_point)
         assert state.vertices.shape == gripper.rest_vertices(side).shape
         assert gripper.triangles(side).max() < len(state.vertices)
 

@@ -8,7 +8,7 @@ from rgbd_fakes import CAMERA_POSE, FakeLens
 
 from finforce.transforms import invert_pose
 from finforce_sim.gripper import PressedGrasp
-from finforce_sim.live import BEFORE_TOUCH, COUNTS, OPEN_STRIDE, TAKES, LiveScene, choose_openings, render_openings
+from finforce_sim.live import BEFORE_TOUCH, COUNTS, OPEN_STRIDE, TAKES, LiveScene, choose_openings
 from finforce_sim.scenarios import ScenarioError, build_scenario
 
 STROKE = 0.048
@@ -28,6 +28,12 @@ def scene(grasp):
     return scene
 
 
+@pytest.fixture
+def few(monkeypatch):
+    """The openings that deserve an image are these."""
+    return lambda openings: monkeypatch.setattr("finforce_sim.live.choose_openings", lambda grasp: np.array(openings))
+
+
 @dataclass
 class Teller:
     """Hears how far the filming is, and may end it."""
@@ -42,7 +48,7 @@ class Teller:
 
 
 def test_every_rest_position_of_the_gripper_has_its_image_where_the_jaws_touch(grasp):
-    openings = choose_openings(grasp, 0.0, STROKE)
+    openings = choose_openings(grasp)
     in_contact = openings[openings < grasp.touch_opening + BEFORE_TOUCH]
     np.testing.assert_allclose(in_contact, COUNT * np.arange(len(in_contact)), atol=1e-12)
     assert in_contact[-1] > grasp.touch_opening + BEFORE_TOUCH - COUNT
@@ -53,7 +59,7 @@ def test_every_rest_position_of_the_gripper_has_its_image_where_the_jaws_touch(g
 
 def test_no_image_is_taken_of_jaws_that_jam(grasp, monkeypatch):
     monkeypatch.setattr(grasp, "least_opening", 0.0105)
-    openings = choose_openings(grasp, 0.0, STROKE)
+    openings = choose_openings(grasp)
     assert 0.0105 <= openings[0] < 0.0105 + COUNT
 
 
@@ -67,33 +73,37 @@ def test_the_nearest_image_is_shown(grasp, opening, place):
     assert scene.find(opening) == place
 
 
-def test_images_are_of_their_openings_and_no_two_takes_are_alike(grasp):
-    openings = np.array([0.0, 0.010, 0.030])
-    teller = Teller()
-    rendered = render_openings(grasp, FakeLens(), openings, lambda frame: frame, teller)
+def test_images_are_of_their_openings_and_no_two_takes_are_alike(grasp, few):
+    few([0.0, 0.010, 0.030])
+    scene, teller = LiveScene(grasp, FakeLens(), 5), Teller()
+    scene.render(lambda frame: frame, teller)
     assert teller.heard == [(1, 3), (2, 3), (3, 3)]
-    pictures = [frame.color.tobytes() for takes in rendered for frame in takes]
+    shown = [(opening, [scene.take(opening, 0.0).picture for _ in range(TAKES)]) for opening in scene.openings]
+    pictures = [frame.color.tobytes() for _, takes in shown for frame in takes]
     assert len(pictures) == len(set(pictures)) == TAKES * 3
-    for opening, takes in zip(openings, rendered, strict=True):
+    for opening, takes in shown:
         state = grasp.state(opening)
         for frame in takes:
             np.testing.assert_array_equal(frame.jaws["left"].points, state.jaws["left"].keypoints)
             np.testing.assert_array_equal(frame.jaws["right"].force, state.jaws["right"].force)
 
 
-def test_the_same_seed_gives_the_same_images_whatever_the_threads(grasp, monkeypatch):
-    openings = np.linspace(0.0, 0.03, 12)
+def test_the_same_seed_gives_the_same_images_whatever_the_threads(grasp, few, monkeypatch):
+    few(np.linspace(0.0, 0.03, 12))
     reels = []
     for workers in (1, 4):
         monkeypatch.setattr("finforce_sim.live.WORKERS", workers)
-        reels.append(render_openings(grasp, FakeLens(), openings, lambda frame: frame.color))
+        scene = LiveScene(grasp, FakeLens(), 5)
+        scene.render(lambda frame: frame.color, lambda done, count: None)
+        reels.append([scene.take(opening, 0.0).picture for opening in scene.openings for _ in range(TAKES)])
     np.testing.assert_array_equal(reels[0], reels[1])
 
 
-def test_filming_that_is_ended_does_not_go_on(grasp):
+def test_filming_that_is_ended_does_not_go_on(grasp, few):
     lens = FakeLens()
+    few(np.linspace(0.0, 0.048, 200))
     with pytest.raises(KeyboardInterrupt):
-        render_openings(grasp, lens, np.linspace(0.0, 0.048, 200), lambda frame: frame, Teller(ends_at=2))
+        LiveScene(grasp, lens, 5).render(lambda frame: frame, Teller(ends_at=2))
     # what the threads had begun, and what they took while the end was on its way
     assert lens.looks < 100
 
