@@ -331,20 +331,14 @@ class GripperDriverNode(Node):
     def _on_stddev(self, side: str, message: WrenchStamped) -> None:
         """Keep how sure a jaw's force is."""
         with self._rejections("standard deviation"):
-            stddev, stamp = (
-                ros.force_stddev(message, self.parameters.jaw_frame(side)),
-                self._enter(f"{side} stddev", message),
-            )
-            self.session.take_stddev(side, stddev, stamp)
+            stddev = ros.force_stddev(message, self.parameters.jaw_frame(side))
+            self.session.take_stddev(side, stddev, self._enter(f"{side} stddev", message))
 
     def _on_slip(self, side: str, message: TwistStamped) -> None:
         """Hand to the grasp how fast the object slides over a jaw."""
         with self._rejections("slip"):
-            speed, stamp = (
-                ros.twist_speed(message, self.parameters.jaw_frame(side)),
-                self._enter(f"{side} slip", message),
-            )
-            force = self.session.take_slip(side, speed, stamp)
+            speed = ros.twist_speed(message, self.parameters.jaw_frame(side))
+            force = self.session.take_slip(side, speed, self._enter(f"{side} slip", message))
             if force is not None:
                 self.get_logger().warning(
                     f"the object slides over the {side} jaw at {1e3 * speed:.1f} mm/s: force raised to {force:.2f} N"
@@ -353,8 +347,8 @@ class GripperDriverNode(Node):
     def _on_contact(self, side: str, cloud: PointCloud2) -> None:
         """Hand to the grasp whether a jaw touches the object."""
         with self._rejections("contact"):
-            touching, stamp = ros.is_touching(cloud, self.parameters.jaw_frame(side)), self._enter(side, cloud)
-            self.session.take_touch(side, touching, stamp)
+            touching = ros.is_touching(cloud, self.parameters.jaw_frame(side))
+            self.session.take_touch(side, touching, self._enter(side, cloud))
 
     def _enter(self, source: str, message: Any) -> float:
         """Return the stamp of a fresh message on the gripper's clock [s]."""

@@ -220,15 +220,10 @@ OUTCOMES = {
 }
 
 
-def describe_faults(faults: Sequence[str]) -> str:
-    """Return what is latched and what would help."""
-    return "; ".join(FAULTS.get(name, UNKNOWN_FAULT) for name in faults) or UNKNOWN_FAULT
-
-
 def describe(phase: Phase, outcome: MoveOutcome, faults: Sequence[str]) -> str:
     """Return the sentence for a phase in which nothing more special is to be said."""
     if phase is Phase.FAULT:
-        return describe_faults(faults)
+        return "; ".join(FAULTS.get(name, UNKNOWN_FAULT) for name in faults) or UNKNOWN_FAULT
     return {
         Phase.DISCONNECTED: "no gripper is connected",
         Phase.PROBING: "waiting for the gripper's first reply",

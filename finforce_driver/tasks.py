@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 from finforce_driver.errors import DriverError, GripperStateError, GripperTimeoutError
@@ -209,10 +209,11 @@ def _check(state: GripperState, what: str) -> GripperState:
 SUCCESSES = (MoveOutcome.REACHED, MoveOutcome.GRASPED)
 
 
+@dataclass(frozen=True)
 class MoveAction:
     """Executes goals of an action of control_msgs, each in the thread that calls.
 
-    Args:
+    Attributes:
         kind: the action's type.
         read: returns the move of a goal, or raises TargetError.
         fill: writes a state into a result or feedback.
@@ -220,31 +221,26 @@ class MoveAction:
         tasks: its commands.
     """
 
-    def __init__(
-        self,
-        kind: Any,
-        read: Callable[[Any], MoveRequest],
-        fill: Callable[[Any, GripperState], None],
-        gripper: Gripper,
-        tasks: GripperTasks,
-    ) -> None:
-        self._kind, self._read, self._fill = kind, read, fill
-        self._gripper, self._tasks = gripper, tasks
+    kind: Any
+    read: Callable[[Any], MoveRequest]
+    fill: Callable[[Any, GripperState], None]
+    gripper: Gripper
+    tasks: GripperTasks
 
     def rejection(self, goal: Any) -> str:
         """Return why a goal cannot be carried out, with what was expected; empty when it can."""
         try:
-            request = self._read(goal)
-            self._gripper.check_move(request.opening, request.speed, request.force)
+            request = self.read(goal)
+            self.gripper.check_move(request.opening, request.speed, request.force)
         except DriverError as error:
             return str(error)
         return ""
 
     def remark(self, goal: Any) -> str:
         """Return what a goal leaves to the settings; empty where it leaves nothing."""
-        if self._read(goal).force is not None:
+        if self.read(goal).force is not None:
             return ""
-        settings = self._gripper.settings
+        settings = self.gripper.settings
         force = settings.force_of(settings.default_current)
         return f"no effort, or 0: {force:.0f} N of grip force by the motor's current, gripper.default_current"
 
@@ -256,24 +252,24 @@ class MoveAction:
         """
 
         def tell(state: GripperState) -> bool:
-            feedback = self._kind.Feedback()
-            self._fill(feedback, state)
+            feedback = self.kind.Feedback()
+            self.fill(feedback, state)
             handle.publish_feedback(feedback)
             return handle.is_cancel_requested
 
         try:
-            state = self._tasks.go(self._read(handle.request), leave=tell)
+            state = self.tasks.go(self.read(handle.request), leave=tell)
             if state.phase is Phase.MOVING:
-                self._tasks.stop()
+                self.tasks.stop()
         except DriverError:
-            state = replace(self._gripper.state, outcome=MoveOutcome.ABORTED)
+            state = replace(self.gripper.state, outcome=MoveOutcome.ABORTED)
         if state.phase is Phase.MOVING:
             handle.canceled()
         elif state.outcome in SUCCESSES:
             handle.succeed()
         else:
             handle.abort()
-        result = self._kind.Result()
-        self._fill(result, state)
+        result = self.kind.Result()
+        self.fill(result, state)
         fill_outcome(result, state)
         return result

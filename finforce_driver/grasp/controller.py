@@ -11,7 +11,7 @@ from statistics import median
 from finforce_driver.errors import BackOffError, GraspError, UnseenForceError
 from finforce_driver.grasp.load_watch import NOISE, ForceFeed, ForceSample, JawPosition, LoadWatch, TouchSample
 from finforce_driver.grasp.plan import FRICTION, MOTOR_MARGIN, GraspPlan
-from finforce_driver.settings import GraspGoal, GraspSettings
+from finforce_driver.settings import GraspGoal, GraspSettings, GripperSettings
 from finforce_driver.state import GraspPhase, GraspStatus, GripperState, MoveRequest, Phase
 
 _ONSET_FORCE = 0.25  # [N] above what was seen without load, that says that something presses
@@ -32,9 +32,8 @@ class ForceGrasp:
     Args:
         goal: force, speed, least opening, time limit.
         settings: limits and expectations.
-        resolution: opening per step of the gripper [m].
-        closed_opening: opening of the closed gripper [m].
-        stroke: of the gripper [m].
+        jaws: closed opening and stroke.
+        resolution: opening per step of the gripper [m]; None: that of its position byte.
         ratios: of the camera's force to the motor's in the first grasps of this gripper, which adds its own.
 
     Raises:
@@ -46,27 +45,18 @@ class ForceGrasp:
         goal: GraspGoal,
         settings: GraspSettings | None = None,
         *,
-        resolution: float,
-        closed_opening: float = 0.0,
-        stroke: float = 0.048,
+        jaws: GripperSettings | None = None,
+        resolution: float | None = None,
         ratios: list[float] | None = None,
     ) -> None:
-        self._ratios = [] if ratios is None else ratios
+        jaws, self._ratios = jaws or GripperSettings(), [] if ratios is None else ratios
         self._below, self._doubts = False, 0
         self.goal, self.settings = goal, settings or GraspSettings()
         self.set_force = self.settings.check_force(goal.force)
         self._feed = ForceFeed(self.settings.stale_after)
         self._load = LoadWatch(self.settings, min(_ONSET_FORCE, 0.5 * goal.force))
         self._position = JawPosition(opening=math.nan, resting=False)
-        self._plan = GraspPlan(
-            goal,
-            self.settings,
-            self._load,
-            self._feed,
-            step=resolution,
-            closed_opening=closed_opening,
-            stroke=stroke,
-        )
+        self._plan = GraspPlan(goal, self.settings, self._load, self._feed, jaws, resolution or jaws.resolution)
         self._pending: deque[ForceSample | TouchSample] = deque()
         self.phase, self._reason = GraspPhase.APPROACH, "waits for the first force"
         self._began = self._held_at = self._reserve = self._saturated = math.nan
@@ -166,7 +156,7 @@ class ForceGrasp:
             here,
             travel_stddev=self._plan.travel_stddev(self._position, here),
             passing=passing,
-            touching=self._feed.is_touching(sample.stamp),
+            touching=bool(self._feed.touching(sample.stamp)),
         )
         if not (self._load.suspect or passing):
             self._position = here

@@ -251,16 +251,10 @@ class ForceFeed:
         """Whether any force was admitted."""
         return not math.isnan(self.stamp)
 
-    def is_touching(self, now: float) -> bool:
-        """Whether the newest fresh report says that the jaws touch."""
-        return (touch := self._fresh_touch(now)) is not None and touch.touching
-
-    def is_apart(self, now: float) -> bool:
-        """Whether the newest fresh report says that the jaws do not touch."""
-        return (touch := self._fresh_touch(now)) is not None and not touch.touching
-
-    def _fresh_touch(self, now: float) -> TouchSample | None:
-        return self.touch if self.touch is not None and now - self.touch.stamp <= self._stale_after else None
+    def touching(self, now: float) -> bool | None:
+        """Return whether the newest fresh report says that the jaws touch; None without one."""
+        fresh = self.touch is not None and now - self.touch.stamp <= self._stale_after
+        return self.touch.touching if fresh else None
 
     @property
     def latency(self) -> float:

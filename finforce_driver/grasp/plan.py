@@ -16,7 +16,7 @@ from collections.abc import Callable
 
 from finforce_driver.errors import GraspError
 from finforce_driver.grasp.load_watch import ForceFeed, JawPosition, LoadWatch
-from finforce_driver.settings import GraspGoal, GraspSettings
+from finforce_driver.settings import GraspGoal, GraspSettings, GripperSettings
 from finforce_driver.state import GripperState
 
 MOTOR_MARGIN = 4.0  # [N] of the motor's force above the camera's, friction included, at which a grasp backs off
@@ -60,9 +60,8 @@ class GraspPlan:
         settings: limits and expectations.
         load: force, stiffness, contact.
         feed: latency and period.
+        jaws: closed opening and stroke.
         step: of the gripper [m].
-        closed_opening: of the closed gripper [m].
-        stroke: of the gripper [m].
     """
 
     def __init__(
@@ -71,17 +70,15 @@ class GraspPlan:
         settings: GraspSettings,
         load: LoadWatch,
         feed: ForceFeed,
-        *,
+        jaws: GripperSettings,
         step: float,
-        closed_opening: float,
-        stroke: float,
     ) -> None:
-        self.step, self._closed, self.widest = step, closed_opening, closed_opening + stroke
+        self.step, self._closed, self.widest = step, jaws.closed_opening, jaws.largest_opening
         self.target, self.speed, self.stepping = math.nan, 0.0, False
         self._goal, self._settings, self._load, self._feed = goal, settings, load, feed
         self._settling = settings.reaction + SETTLING
         self._arrives = self._powered_from = math.inf
-        self._least = max(self.snap(goal.least_opening), closed_opening)
+        self._least = max(self.snap(goal.least_opening), jaws.closed_opening)
         self._rest = (math.nan, math.nan)  # target [m] and force [N] of the last image at rest
         self._step_force = 0.0  # [N] that a step of the jaws was seen to change, where that was beyond expectation
 
@@ -145,7 +142,7 @@ class GraspPlan:
         """Share of the speed that the force's stated deviation and the contact's state leave."""
         load, feed = self._load, self._feed
         share = min(1.0, _CERTAIN / max(load.stddev, 1e-9)) if load.loaded else 1.0
-        return _CONTRADICTED * share if load.loaded and feed.is_apart(feed.stamp) else share
+        return _CONTRADICTED * share if load.loaded and feed.touching(feed.stamp) is False else share
 
     @property
     def _uncertainty(self) -> float:

@@ -129,9 +129,8 @@ class GraspSession:
             self._grasp = ForceGrasp(
                 self.goal,
                 self._settings,
+                jaws=gripper.settings,
                 resolution=gripper.resolution,
-                closed_opening=gripper.settings.closed_opening,
-                stroke=gripper.settings.stroke,
                 ratios=self._ratios,
             )
             self._slips.begin(self.goal.force)

@@ -19,7 +19,7 @@ from finforce_driver.can.protocol import (
 )
 from finforce_driver.machine.knowledge import Knowledge
 from finforce_driver.machine.move import CLEAR_CURRENT, CONTACT_TIME, GRACE, Arrival, MoveJob, Orders, push_direction
-from finforce_driver.machine.procedures import CalibrationRun, EmergencyStop, Recovery, Step, StopStage
+from finforce_driver.machine.procedures import CalibrationRun, EmergencyStop, Recovery, Step
 from finforce_driver.settings import SLOWEST_BYTE, GripperSettings
 from finforce_driver.state import HALF_CALIBRATED, STOP_PENDING, GripperState, MoveOutcome, Phase, describe
 
@@ -205,7 +205,7 @@ class Drive:
         self._searched = settings.node_id
         self._second_stop: Request | None = None
         self._sources = (
-            self._stop_request,
+            lambda now: self.end_stop() or self.begin_stop(now),
             self._urgent_order,
             lambda now: self.exchange.marker(),
             self._order,
@@ -327,7 +327,7 @@ class Drive:
             calibrated=placed,
             activated=bool(reply and reply.activated) and not known.asleep,
             faults=faults,
-            stop_pending=self.stop.stage is StopStage.WANTED,
+            stop_pending=self.stop.pending,
             estopped=stopped or "E-stop" in faults,
             outcome=self.outcome,
             message=self._sentence(phase, faults),
@@ -355,7 +355,7 @@ class Drive:
 
     def _sentence(self, phase: Phase, faults: tuple[str, ...]) -> str:
         """Return how the gripper is, and what would help."""
-        if self.stop.stage is StopStage.WANTED:
+        if self.stop.pending:
             return STOP_PENDING
         if self.note and phase is not Phase.FAULT:
             return self.note
@@ -396,10 +396,6 @@ class Drive:
         """Return the second message of an emergency stop, its own command; None when it was sent."""
         request, self._second_stop = self._second_stop, None
         return request
-
-    def _stop_request(self, now: float) -> Request | None:
-        """The emergency stop until it is acknowledged: an order with its flag, and its own command."""
-        return self.end_stop() or self.begin_stop(now)
 
     def _quiet(self, now: float) -> bool:
         """Whether the gripper boots and nothing is to be sent; an emergency stop is sent all the same."""

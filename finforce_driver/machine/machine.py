@@ -15,8 +15,9 @@ from typing import Any
 from finforce_driver.can.protocol import CanMessage, Command, Flag, Reply, decode_move, decode_reply, encode_watchdog
 from finforce_driver.errors import GripperStateError
 from finforce_driver.machine.drive import GO, USABLE, Drive, Request
+from finforce_driver.machine.knowledge import Telemetry
 from finforce_driver.machine.move import CLEAR_CURRENT, Arrival, Goal, MoveJob, OrderWatch
-from finforce_driver.machine.procedures import CalibrationRun, Recovery, Step, StopStage
+from finforce_driver.machine.procedures import CalibrationRun, Recovery, Step, Travel
 from finforce_driver.settings import SLOWEST_BYTE, GripperSettings, check_numbers
 from finforce_driver.state import (
     HALF_CALIBRATED,
@@ -173,7 +174,7 @@ class GripperMachine(Drive):
         if self.phase is Phase.FAULT and self.recovery is None:
             self._abort()
             self.recovery = Recovery(unflag=self.stop.active or bool(self.known.reply and self.known.reply.estopped))
-            self.stop.begin_clearing()
+            self.stop.rest()
 
     @_command
     def activate(self, on: bool) -> None:
@@ -258,7 +259,6 @@ class GripperMachine(Drive):
             self.known.doubt = self.known.doubt or (HALF_CALIBRATED if self.known.calibrated else "")
             self.calibration = None
         self.recovery = None
-        self.stop.end_clearing(False)
         self._abort(reason)
         self.known.forget()
         self.exchange.reset()
@@ -286,8 +286,8 @@ class GripperMachine(Drive):
         elif message.node != self.settings.node_id:
             self.note = OTHER_NODE.format(node=self.settings.node_id, other=message.node)
             self.refresh()
-        elif not request.counted:
-            self._take_answer(message, now)
+        elif not request.counted and (asker := self._asker(request)) is not None:
+            asker.take(message, now)
         return True
 
     def on_silence(self, now: float, suspicion: str = "") -> None:
@@ -299,7 +299,8 @@ class GripperMachine(Drive):
         if request.move is not None and self.orders.urgent and self.orders.wanted.drives:
             self._postpone_hold()
         if not request.counted:
-            self._miss_answer(request, now)
+            if (asker := self._asker(request)) is not None:
+                asker.miss(now)
             return
         if self.exchange.misses >= (PROBES if self.known.reply is None else SHORT_SILENCE) and not self.silent:
             self.silent = True
@@ -308,19 +309,11 @@ class GripperMachine(Drive):
             self.note = self.note or suspicion or SILENT.format(node=self.settings.node_id)
             self.refresh()
 
-    def _take_answer(self, message: CanMessage, now: float) -> None:
-        """Take the answer to a question."""
-        if message.command != Command.ENCODER:
-            self.known.telemetry.take(message, now)
-        elif self.calibration is not None:
-            self.calibration.travel.take(message, now)
-
-    def _miss_answer(self, request: Request, now: float) -> None:
-        """Note that a question was not answered."""
+    def _asker(self, request: Request) -> Telemetry | Travel | None:
+        """Return what a question was asked for; None once nobody wants to know."""
         if request.answer != Command.ENCODER:
-            self.known.telemetry.miss(now)
-        elif self.calibration is not None:
-            self.calibration.travel.miss()
+            return self.known.telemetry
+        return None if self.calibration is None else self.calibration.travel
 
     # Within
 
@@ -408,11 +401,11 @@ class GripperMachine(Drive):
         reply = decode_reply(message, now)
         believed = self.known.take(reply, order, speed)
         self.counts["unconfirmed replies"] = self.known.filter.rejected
-        if believed is None:
-            self._renew_order(reply)
-        else:
+        if believed is not None:
             self._conclude(before, believed)
             self.refresh()
+        elif self._watch.rests and self.orders.wanted == self.orders.taken and self._watch.strays(reply):
+            self.orders.renew()  # true or not, a reply shows jaws that leave their place: this undoes a foreign order
 
     def _take_echo(self, request: Request, now: float) -> None:
         """Note that an order was answered."""
@@ -432,7 +425,8 @@ class GripperMachine(Drive):
         if self.silent or before is None:
             self.silent, self.note = False, ""
         self.known.asleep |= reply.error
-        self.stop.take(reply)
+        if self.recovery is None:
+            self.stop.take(reply)
         self._follow_recovery(reply)
         self._follow_fault(before, reply)
         if self.calibration is not None:
@@ -472,11 +466,11 @@ class GripperMachine(Drive):
             return
         recovery.take(reply)
         if recovery.step.over:
-            cleared = recovery.step is Step.DONE
             self.recovery, self.known.asleep = None, True
-            self.stop.end_clearing(cleared)
             self._abort()
-            if not cleared:
+            if recovery.step is Step.DONE:
+                self.stop.end()
+            else:
                 self.known.telemetry.ask_errors(reply.time)
 
     def _follow_fault(self, before: Reply | None, reply: Reply) -> None:
@@ -484,7 +478,7 @@ class GripperMachine(Drive):
         if reply.faults == (before.faults if before is not None else NO_FAULTS):
             return
         self.known.telemetry.ask_errors(reply.time)
-        if reply.error and self.recovery is None and self.stop.stage is not StopStage.CLEARING:
+        if reply.error and self.recovery is None:
             self._abort()
 
     def _follow_calibration(self, reply: Reply) -> None:
@@ -564,8 +558,3 @@ class GripperMachine(Drive):
         self.known.doubt = LOST.format(what=what)
         self.orders.want(stop, urgent=True)
         self.refresh()
-
-    def _renew_order(self, reply: Reply) -> None:
-        """Give the order anew when a reply, true or not, shows jaws that leave their place: it undoes a foreign one."""
-        if self._watch.rests and self.orders.wanted == self.orders.taken and self._watch.strays(reply):
-            self.orders.renew()

@@ -294,11 +294,6 @@ class Orders:
         return True
 
 
-def _says_the_same(first: Move, second: Move) -> bool:
-    """Return whether two orders differ in their free flags at most."""
-    return replace(first, flags=first.flags | FREE_FLAGS) == replace(second, flags=second.flags | FREE_FLAGS)
-
-
 LASTING = 3  # replies: what the gripper was told may cross with what it says
 STRAY = 3.0  # [counts] that the jaws may be off their way: truncation, and what the gripper calls reached
 EXCESS = 1.25  # times the current limit, and `CLEAR_CURRENT`, that the motor does not exceed
@@ -332,8 +327,10 @@ class OrderWatch:
     def send(self, order: Move, now: float, position: float) -> None:
         """Note an order that was answered, when the jaws were at a position [counts]."""
         before, self._order = self._order, order
-        if before is not None and before.flags != order.flags and _says_the_same(before, order):
-            return  # given anew, against another one
+        if before is not None and before.flags != order.flags:
+            one, other = (replace(move, flags=move.flags | FREE_FLAGS) for move in (before, order))
+            if one == other:
+                return  # given anew, against another one
         self.heard = self.heard and order == before
         self._sent, self._odd, self._arrived = now, 0, False
         self._low, self._high = sorted((order.position if math.isnan(position) else position, order.position))

@@ -12,60 +12,46 @@ REPEAT = 0.02  # [s] between two tries
 TRIES = 3  # after which the error bit alone is believed: another fault may hide the stop's own bit
 
 
-class StopStage(Enum):
-    """How far an emergency stop has come."""
-
-    NONE = 0
-    WANTED = 1  # asked for, not acknowledged
-    LATCHED = 2
-    CLEARING = 3
-
-
 class EmergencyStop:
     """Asked for once, it is sent until acknowledged and sent again when it vanishes without having been cleared.
 
     Attributes:
-        stage: how far it has come.
+        active: anything but standing still is forbidden.
+        pending: it was asked for, and is not acknowledged yet.
     """
 
     def __init__(self) -> None:
-        self.stage = StopStage.NONE
+        self.active = self.pending = False
         self._next_time = 0.0
         self._tries = 0
 
-    @property
-    def active(self) -> bool:
-        """Whether anything but standing still is forbidden."""
-        return self.stage is not StopStage.NONE
-
     def demand(self) -> None:
         """Stop, whatever happened before; what is on its way already is not sent anew."""
-        if self.stage is not StopStage.WANTED:
-            self.stage, self._next_time, self._tries = StopStage.WANTED, 0.0, 0
+        if not self.pending:
+            self.active = self.pending = True
+            self._next_time, self._tries = 0.0, 0
 
     def due(self, now: float) -> bool:
         """Return whether its messages are to be sent now, and count that as done."""
-        if self.stage is not StopStage.WANTED or now < self._next_time:
+        if not self.pending or now < self._next_time:
             return False
         self._next_time = now + REPEAT
         self._tries += 1
         return True
 
-    def begin_clearing(self) -> None:
-        """Note that it is being cleared."""
-        if self.active:
-            self.stage = StopStage.CLEARING
+    def rest(self) -> None:
+        """Send it no more: it is being cleared."""
+        self.pending = False
 
-    def end_clearing(self, cleared: bool) -> None:
-        """Note how the clearing ended, unless a new stop came between."""
-        if self.stage is StopStage.CLEARING:
-            self.stage = StopStage.NONE if cleared else StopStage.LATCHED
+    def end(self) -> None:
+        """Forget it: it was cleared."""
+        self.active = False
 
     def take(self, reply: Reply) -> None:
-        """Compare with what the gripper says."""
-        if self.stage is StopStage.WANTED and (reply.estopped or (reply.error and self._tries >= TRIES)):
-            self.stage = StopStage.LATCHED
-        elif self.stage is StopStage.LATCHED and not reply.error:
+        """Compare with what the gripper says while nothing is being cleared."""
+        if self.pending:
+            self.pending = not (reply.estopped or (reply.error and self._tries >= TRIES))
+        elif self.active and not reply.error:
             self.demand()
 
 
@@ -148,7 +134,7 @@ JITTER = 60  # [ticks] by which a count may differ from the last one in addition
 SILENCES = 3  # questions without any answer after which there is none to be had
 
 
-class _Travel:
+class Travel:
     """The travel of the motor during a calibration, by the counts of its encoder.
 
     A count is believed when it continues the last one: a digit that was corrupted on the line is a count, too.
@@ -179,7 +165,7 @@ class _Travel:
         """Note that the encoder is asked."""
         self._next_time = now + self._period
 
-    def miss(self) -> None:
+    def miss(self, _: float) -> None:
         """Note that no answer came."""
         self._silences += 1
 
@@ -235,7 +221,7 @@ class CalibrationRun:
 
     def __init__(self, settings: GripperSettings, *, calibrated: bool, reset: bool) -> None:
         self._settings = settings
-        self.travel = _Travel(settings)
+        self.travel = Travel(settings)
         self.step = Step.RESET if reset else Step.START
         self.reason = ""
         self._was_calibrated = calibrated and not reset
@@ -260,7 +246,7 @@ class CalibrationRun:
         self._starts += 1
         self._begun, self.step = now, Step.WATCH
         self._first, self._runs, self._moved = None, False, False
-        self.travel = _Travel(self._settings)
+        self.travel = Travel(self._settings)
         return Command.CALIBRATE
 
     def take(self, reply: Reply) -> None:

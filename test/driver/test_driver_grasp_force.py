@@ -21,7 +21,7 @@ from finforce_driver.grasp.load_watch import (
     TouchSample,
 )
 from finforce_driver.grasp.plan import GraspPlan
-from finforce_driver.settings import GraspGoal, GraspSettings
+from finforce_driver.settings import GraspGoal, GraspSettings, GripperSettings
 from finforce_driver.state import GraspPhase, GripperState, Phase
 
 STEP = 0.048 / 255
@@ -141,8 +141,8 @@ def test_latency_and_period_are_medians():
 def test_touch_is_believed_while_it_is_fresh():
     feed = ForceFeed(0.25)
     assert feed.admit_touch(TouchSample(stamp=1.0, touching=True), 1.1)
-    assert feed.is_touching(1.2)
-    assert not feed.is_touching(1.3)
+    assert feed.touching(1.2)
+    assert feed.touching(1.3) is None
     assert feed.touched_since == 1.0
     assert not feed.admit_touch(TouchSample(stamp=0.9, touching=False), 1.1)
     assert not feed.admit_touch(TouchSample(stamp=1.2, touching=False), 1.1)
@@ -203,7 +203,7 @@ def plan(closed_opening=0.0):
     """A plan for jaws that have had no command yet."""
     limits = GraspSettings()
     watch, feed = LoadWatch(limits, 0.25), ForceFeed(limits.stale_after)
-    return GraspPlan(GraspGoal(force=1.0), limits, watch, feed, step=STEP, closed_opening=closed_opening, stroke=0.048)
+    return GraspPlan(GraspGoal(force=1.0), limits, watch, feed, GripperSettings(closed_opening=closed_opening), STEP)
 
 
 def test_openings_snap_towards_open():

@@ -111,7 +111,7 @@ def test_the_first_reply_that_says_calibrated_does_not_end_a_calibration():
     run = CalibrationRun(GripperSettings(), calibrated=False, reset=False)
     run.start(0.0)
     for _ in range(3):
-        run.travel.miss()  # it does not tell its encoder
+        run.travel.miss(0.0)  # it does not tell its encoder
     steps = []
     for time, position, calibrated in ((0.5, 0, False), (1.0, 255, False), (2.0, 255, True), (2.02, 255, True)):
         run.take(reply(time=time, position=position, calibrated=calibrated, current_mA=-400))
