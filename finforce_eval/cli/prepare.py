@@ -10,6 +10,8 @@ from contextlib import suppress
 from multiprocessing import get_context
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from finforce.errors import MissingDependencyError
 from finforce.processors import ALL
 from finforce_eval.cli.parser import CommandResult
@@ -71,14 +73,30 @@ def prepare(jaws: Sequence[str], calibration: str) -> Iterator[str]:
             pool.shutdown(cancel_futures=True)
 
 
-def compile_solver() -> None:
-    """Compile the solver with a jaw that is taken to be linear, which needs no equilibria."""
+def compile_mechanics() -> None:
+    """Compile the mechanics that an image is solved with, by a jaw taken to be linear, which needs no equilibria."""
+    from finforce_ifea.jaw.jaw import load_jaw
+    from finforce_ifea.mechanics import build_mechanics
+    from finforce_ifea.settings import EstimatorSettings
+
+    jaw = load_jaw("bench")
+    mechanics = build_mechanics(jaw, EstimatorSettings(solver="linear"))
+    contact, model = mechanics.contact, mechanics.model
+    state = np.array([0.0, 0.0, np.median(jaw.candidates[:, 2])])
+    rest, keypoints = contact.begin(state[2]), model.attach(jaw.keypoints)
+    step = contact.linearize(rest, state).correction
+    model.positions(keypoints, contact.approach(rest, step, state))
+    model.project(keypoints, rest, step[:, None])
+
+
+def compile_tracking() -> None:
+    """Compile what follows contact and force, by a jaw whose mechanics need neither equilibria nor those compiled."""
     from finforce_ifea.estimator import ForceEstimator
     from finforce_ifea.jaw.jaw import load_jaw
     from finforce_ifea.settings import EstimatorSettings
 
     for held in ("no", "yes"):
-        ForceEstimator(load_jaw("bench"), settings=EstimatorSettings(solver="linear", held=held)).warm_up()
+        ForceEstimator(load_jaw("bench"), settings=EstimatorSettings(solver="frame", held=held)).warm_up()
 
 
 def _load(name: str, calibration: str) -> Jaw:
@@ -135,7 +153,8 @@ def compile_detector() -> None:
 
 # The longest first.
 COMPILED = {
-    compile_solver: "solver compiled",
+    compile_tracking: "tracking of contact and force compiled",
+    compile_mechanics: "mechanics compiled",
     compile_detector: "detector compiled",
     compile_contact: "contact estimator compiled",
 }

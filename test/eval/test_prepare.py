@@ -30,7 +30,8 @@ START = dedent("""
     from finforce_eval.cli.main import main
     from finforce_eval.recordings.recording import DEMO
 
-    preparation.compile_solver()
+    preparation.compile_mechanics()
+    preparation.compile_tracking()
     preparation.compile_contact()
     preparation.compile_detector()
     words = ["--contact", "estimate", "--calibration", "bench", "--set", "held=yes"]
@@ -42,7 +43,8 @@ START = dedent("""
 def test_after_it_a_start_and_a_first_grasp_that_is_held_compile_nothing(capsys):
     assert main(["prepare", "--calibration", "bench"]) == 0
     said = capsys.readouterr().out
-    assert all(word in said for word in ("solver compiled", "equilibria of bench", "contact estimator", "detector"))
+    parts = ("tracking", "mechanics", "equilibria of bench", "contact estimator", "detector")
+    assert all(part in said for part in parts)
     done = subprocess.run([sys.executable, "-c", START], capture_output=True, text=True, timeout=300, check=True)
     assert done.stdout.splitlines()[-1] == "[]"
 
