@@ -7,9 +7,6 @@ the arrival of the grasp force. The error is counted twice: at the image's own t
 time, the newest force that has arrived, against the truth at that time. A force sets in where the true grasp force
 crosses 0.02 N, and shows when a grasp force above 0.1 N has arrived.
 
-For some minutes, the same grasp is played again and again from images to all stages in one process: growth of memory,
-lost images, and drift of the force.
-
 Messages are decoded before they are played, so that the player takes no time from the nodes.
 """
 
@@ -17,7 +14,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -31,7 +28,7 @@ from finforce.camera_topics import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 from finforce.health import IDLE
 from finforce.messages import NANOSECONDS
 from finforce.systems.processes import Process, ReplayOptions, compose, replay_processes
-from finforce_eval.errors import OptionError, RecordingError
+from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.keypoint_source import TRUTH, KeypointSource
 from finforce_eval.evaluation.scoring import delay_stats, force_delays, match_truth, rms
 from finforce_eval.recordings.objects import require_mesh
@@ -40,9 +37,8 @@ from finforce_eval.recordings.tracks import Recording
 from finforce_eval.recordings.writer import write_recording
 from finforce_eval.replay.live import ReplayLog
 from finforce_eval.replay.node_run import OBJECT_TOPIC, NodeRun, describe_load, run_nodes
-from finforce_eval.replay.playback import Playback, RawMessage, read_playback
-from finforce_eval.replay.processes import resident_bytes
-from lab.harness import Figures, Tradeoff, percentiles
+from finforce_eval.replay.playback import Playback, RawMessage
+from lab.harness import Figures, percentiles
 from lab.scenes import GRASP, GRASP_FAST, find_scene
 
 
@@ -52,13 +48,9 @@ class SyntheticStream:
 
     Attributes:
         messages: in the order of their times.
-        repeats: how often they are played, each time as if it had gone on.
-        period: from the beginning of one time to that of the next [ns].
     """
 
     messages: Sequence[RawMessage]
-    repeats: int = 1
-    period: int = 0
 
     @property
     def begin(self) -> int:
@@ -71,15 +63,10 @@ class SyntheticStream:
         return {message.topic: message.msgtype for message in self.messages}
 
     def __len__(self) -> int:
-        return self.repeats * len(self.messages)
+        return len(self.messages)
 
     def __iter__(self) -> Iterator[RawMessage]:
         yield from self.messages
-        for number in range(1, self.repeats):
-            shift = number * self.period
-            for message in self.messages:
-                data = message.restamped(message.stamp + shift)
-                yield message._replace(time=message.time + shift, data=data)
 
 
 def stream_images(source: Path, rate: int) -> SyntheticStream:
@@ -93,7 +80,7 @@ def stream_images(source: Path, rate: int) -> SyntheticStream:
         RecordingError: the scene has no images at this rate.
     """
     topics = {COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC, OBJECT_TOPIC}
-    return thin_messages(read_playback(source), topics, rate)
+    return thin_messages(Playback(source), topics, rate)
 
 
 def stream_keypoints(source: Path, rate: int) -> SyntheticStream:
@@ -106,7 +93,7 @@ def stream_keypoints(source: Path, rate: int) -> SyntheticStream:
     with TemporaryDirectory() as folder:
         plain = write_recording(replace(recording, images=None), Path(folder) / "truth")
         topics = {f"/{side}/{name}" for side in recording.jaws for name in ("keypoints", "jaw_pose")}
-        return thin_messages(read_playback(plain), topics | {OBJECT_TOPIC}, rate)
+        return thin_messages(Playback(plain), topics | {OBJECT_TOPIC}, rate)
 
 
 def thin_messages(messages: Playback, topics: set[str], rate: int) -> SyntheticStream:
@@ -125,7 +112,7 @@ def thin_messages(messages: Playback, topics: set[str], rate: int) -> SyntheticS
         raise RecordingError(
             f"the scene has {len(images)} images at {rate} Hz, some are missing; expected one for {rate} Hz"
         )
-    return SyntheticStream(messages=kept, period=len(images) * step * NANOSECONDS // FINE_RATE)
+    return SyntheticStream(messages=kept)
 
 
 FINE_RATE = 180  # [Hz] of the slots in which images can lie; 30, 60 and 90 divide it
@@ -143,8 +130,6 @@ IMAGES, KEYPOINTS = "images", "key points"
 TOGETHER, APART, BUSY, SKIPPING = "one process", "four processes", "one, a core taken", "one, skipping"
 BURN = "while True: pass"
 TARE = 1.8  # [s] from the first image, in which the solvers take their tare and give no force
-SETTLED = 8  # grasps until memory is taken, and the fingers' material has bent as often as it remembers
-EDGE = 0.1  # share of the grasps whose mean errors are compared, at either end
 STEP = 1e-3  # [s] between two times at which the error now is taken
 SIDES = ("left", "right")
 
@@ -161,22 +146,16 @@ class TrueGrasp:
         return np.interp(stamps, self.stamps, self.force, left=np.nan, right=np.nan)
 
 
-def measure(quick: bool, minutes: float = 0.0) -> Figures:
+def measure(quick: bool) -> Figures:
     """Return latency and force error from images and from key points at every rate.
 
     Args:
         quick: at 30 Hz alone.
-        minutes: for which one grasp is played again and again instead, when above zero.
 
     Raises:
         MissingDependencyError: ROS 2 is not installed.
-        OptionError: the minutes are no duration.
         FinforceError: the scene cannot be rendered, or a node ended early.
     """
-    if not 0.0 <= minutes < np.inf:
-        raise OptionError(f"--minutes {minutes:g}: expected a duration above zero")
-    if minutes:
-        return measure_long(minutes)
     scene = find_scene(GRASP if quick else GRASP_FAST)
     recording = read_recording(scene)
     truth, rows = true_grasp(recording), []
@@ -192,59 +171,7 @@ def measure(quick: bool, minutes: float = 0.0) -> Figures:
             f"Largest true grasp force {np.nanmax(truth.force):.2f} N; now: the newest force that has arrived.",
             describe_load(table["other load/%"][table["stages in"] != BUSY]),
         ],
-        picture=Tradeoff(
-            table="chain",
-            method=("chain from", "stages in"),
-            text="Hz",
-            time="latency p50/ms",
-            slow="latency p99/ms",
-            error="error now/N",
-            answered="answered/%",
-            title="Whole chain: latency against error of the force now",
-        ),
     )
-
-
-def measure_long(minutes: float) -> Figures:
-    """Return growth of memory, lost images and drift of the force of a grasp that is repeated for some minutes."""
-    path = find_scene(GRASP)
-    recording, once = read_recording(path), stream_images(path, RATES[0])
-    stream = replace(once, repeats=max(SETTLED + 2, round(60.0 * minutes * NANOSECONDS / once.period)))
-    memory: list[float] = []
-
-    def note_memory(pids: Mapping[str, int], message: RawMessage) -> None:
-        if message.time >= stream.begin + len(memory) * stream.period:
-            memory.append(1e-6 * sum(resident_bytes(pid) for pid in pids.values()))
-
-    processes = chain_processes(recording, images=True, off=(IDLE,))
-    run = run_nodes(processes, stream, SIDES, heard=(), watch=note_memory)
-    grasps = divide_grasps(run.log, true_grasp(recording), stream).assign(**{"memory/MB": memory})
-    settled = grasps[SETTLED:]
-    edge = max(1, int(EDGE * len(settled)))
-    bias = settled["bias/N"]
-    row = {
-        "minutes": run.seconds / 60.0,
-        "grasps": len(grasps),
-        "images": int(grasps["images"].sum()),
-        "lost": int((grasps["images"] - grasps["answered"]).sum()),
-        "growth/MB": settled["memory/MB"].iloc[-1] - settled["memory/MB"].iloc[0],
-        "drift/N": bias.iloc[-edge:].mean() - bias.iloc[:edge].mean(),
-        **percentiles(list(run.log.grasp_latency.values()), "latency"),
-        "process/% of a core": sum(run.cpu.values()),
-    }
-    notes = [describe_load([run.others])]
-    return Figures(tables={"long": pd.DataFrame([row])}, notes=notes, more={"grasps": grasps.to_dict("records")})
-
-
-def divide_grasps(log: ReplayLog, truth: TrueGrasp, stream: SyntheticStream) -> pd.DataFrame:
-    """Return images, answers and mean error of each grasp after the tare, beside the truth of the first one."""
-    sent = np.array(sorted(log.sent[SIDES[0]]))
-    sent = sent[sent >= sent[0] + TARE * NANOSECONDS]
-    number = (sent - stream.messages[0].stamp) // stream.period
-    force = np.array([log.grasp.get(int(stamp), np.nan) for stamp in sent])
-    groups = pd.DataFrame({"error": force - truth.at(sent - number * stream.period)}).groupby(number)["error"]
-    answered = pd.Series(np.isfinite(force)).groupby(number).sum()
-    return pd.DataFrame({"images": groups.size(), "answered": answered, "bias/N": groups.mean()})
 
 
 def _run(source: str, setup: str, stream: SyntheticStream, recording: Recording) -> NodeRun:

@@ -1,17 +1,16 @@
-"""`finforce bench`: parts measured one after the other, each with tables, JSON and a picture."""
+"""`finforce bench`: parts measured one after the other, each with tables and JSON."""
 
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 from finforce.errors import FinforceError
-from finforce_eval.cli.parser import CommandResult, picture_file
+from finforce_eval.cli.parser import CommandResult
 from finforce_eval.errors import OptionError
 from finforce_eval.machine import describe_machine, write_figures
-from lab.harness import PARTS, draw_tradeoff, figures_json, format_figures, measure_part, select_parts
+from lab.harness import PARTS, figures_json, format_figures, measure_part, select_parts
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -20,35 +19,29 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("folder", nargs="?", metavar="FOLDER", help=text)
     text = "jaw files or included jaws for the part images, comma-separated"
     parser.add_argument("--jaw", metavar="NAME", help=text)
-    parser.add_argument("--minutes", type=float, metavar="N", help="minutes for which the part chain repeats one grasp")
     text = "number of seeds per scene of the part images"
     parser.add_argument("--count", type=int, metavar="N", help=text)
     parser.add_argument("--model", metavar="FOLDER", help="network for the part images (the included one)")
     text = f"parts to measure: {', '.join(PARTS)} (those of `make bench`)"
     parser.add_argument("--parts", metavar="A,B", help=text)
-    text = "picture of the first part; the name of the part is added for others"
-    parser.add_argument("--figure", type=picture_file, metavar="PNG", help=text)
     parser.add_argument("--quick", action="store_true", help="measure fewer cases")
 
 
 def run(options: argparse.Namespace) -> CommandResult:
-    """Measure the parts, print each one's tables, draw the pictures."""
-    given = {name: getattr(options, name) for name in ("folder", "jaw", "minutes", "count", "model")}
+    """Measure the parts and print each one's tables."""
+    given = {name: getattr(options, name) for name in ("folder", "jaw", "count", "model")}
     given = {name: value for name, value in given.items() if value is not None}
     machine, content = describe_machine(), {}
-    for number, part in enumerate(select_parts(options.parts)):
-        picture = Path(options.figure) if options.figure else None
-        if picture and number:
-            picture = picture.with_stem(f"{picture.stem}_{part}")
-        content[part] = _run_part(part, options.quick, given, picture)
+    for part in select_parts(options.parts):
+        content[part] = _run_part(part, options.quick, given)
         if options.json:  # what comes next may fail
             write_figures(options.json, content)
     print(f"\n{machine['processor']}, {machine['cores']} cores, Python {machine['python']}, {machine['commit']}")
     return CommandResult(content)
 
 
-def _run_part(part: str, quick: bool, given: dict[str, Any], picture: Path | None) -> dict[str, Any]:
-    """Measure one part, print and draw it; return it as plain values."""
+def _run_part(part: str, quick: bool, given: dict[str, Any]) -> dict[str, Any]:
+    """Measure one part and print it; return it as plain values."""
     print(f"\n{PARTS[part]}\n")
     begin = perf_counter()
     try:
@@ -59,8 +52,4 @@ def _run_part(part: str, quick: bool, given: dict[str, Any], picture: Path | Non
         print(f"not measured: {error}")
         return {"not_measured": str(error)}
     print(format_figures(figures))
-    if picture and figures.picture:
-        picture.parent.mkdir(parents=True, exist_ok=True)
-        draw_tradeoff(figures, picture)
-        print(f"\nPicture: {picture}")
     return {**figures_json(figures), "took_s": round(perf_counter() - begin, 1)}

@@ -23,7 +23,7 @@ from finforce_eval.replay.processes import resident_bytes
 from finforce_ifea.jaw.jaw import load_jaw
 from lab import harness
 from lab.cli import bench
-from lab.harness import PARTS, Figures, Tradeoff, percentiles, select_parts, time_calls
+from lab.harness import PARTS, Figures, percentiles, select_parts, time_calls
 
 ROOT = Path(__file__).parents[2]
 
@@ -35,12 +35,7 @@ def recording():
 
 def figures_of(name):
     rows = [{"way": name, "p50/ms": 1.0, "p99/ms": 2.0, "error/N": 0.5, "answered/%": 100.0}]
-    return Figures(tables={"rows": pd.DataFrame(rows)}, notes=[f"note of {name}"], picture=PICTURE)
-
-
-PICTURE = Tradeoff(
-    table="rows", method=("way",), time="p50/ms", slow="p99/ms", error="error/N", answered="answered/%", title="t"
-)
+    return Figures(tables={"rows": pd.DataFrame(rows)}, notes=[f"note of {name}"])
 
 
 @pytest.fixture
@@ -89,11 +84,6 @@ def test_times_become_percentiles_in_milliseconds():
     assert nothing["n"] == 0 and np.isnan(nothing["p50/ms"])
 
 
-def test_front_holds_what_no_other_beats_in_both():
-    points = pd.DataFrame({"t": [6.0, 2.0, 5.0, 1.0, np.nan], "e": [1.0, 4.0, 1.0, 3.0, 0.1]})
-    assert harness.find_front(points, "t", "e")["t"].tolist() == [1.0, 5.0]
-
-
 def test_a_table_has_words_first_and_nothing_where_nothing_was_measured():
     text = harness.format_table(pd.DataFrame({"x/N": [0.12345, np.nan], "name": ["a", "b"], "n": [1, 20]}))
     assert [cell.strip() for cell in text.splitlines()[2].split("|")[1:-1]] == ["a", "0.1235", "1"]
@@ -126,14 +116,13 @@ def test_every_listed_part_can_be_measured():
         assert "quick" in inspect.signature(import_module(f"lab.bench.{part}").measure).parameters, part
 
 
-def test_command_prints_tables_and_writes_json_and_a_picture_for_each_part(two_parts, tmp_path, capsys):
-    out, picture = tmp_path / "new" / "bench.json", tmp_path / "new" / "p.png"
-    assert main(["bench", "--quick", "--json", str(out), "--figure", str(picture)]) == 0
+def test_command_prints_tables_and_writes_json(two_parts, tmp_path, capsys):
+    out = tmp_path / "new" / "bench.json"
+    assert main(["bench", "--quick", "--json", str(out)]) == 0
     assert two_parts == [("first", True, None), ("second", True, None)]
     content = json.loads(out.read_text())
     assert {"processor", "python", "commit"} <= content["machine"].keys()
     assert [content[name]["rows"]["rows"][0]["way"] for name in ("first", "second")] == ["first", "second"]
-    assert picture.is_file() and picture.with_name("p_second.png").is_file()
     printed = capsys.readouterr().out
     assert "Title of first" in printed and "note of second" in printed
 

@@ -1,12 +1,9 @@
 """The benchmark of the chain: what was dropped where, how late and how wrong, in counts that are known."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
 from finforce.messages import NANOSECONDS
-from finforce_eval.errors import OptionError
 from finforce_eval.replay.live import ReplayLog
 from finforce_eval.replay.node_run import NodeRun
 from lab.bench.chain import (
@@ -15,10 +12,8 @@ from lab.bench.chain import (
     TOGETHER,
     TrueGrasp,
     describe_run,
-    divide_grasps,
     error_now,
     find_delays,
-    measure,
 )
 
 FIRST = 10**12
@@ -95,27 +90,6 @@ def test_nothing_answered_is_no_error_and_not_zero(run, truth):
     row = describe_run(IMAGES, TOGETHER, 10, run, truth)
     assert row["answered/%"] == 0.0
     assert all(np.isnan(row[name]) for name in ("error/N", "error now/N", "latency p50/ms"))
-
-
-def test_losses_and_errors_belong_to_their_grasps(truth):
-    """Four grasps, each of which is 0.1 N farther off than the one before."""
-    first = SimpleNamespace(stamp=FIRST)
-    stream = SimpleNamespace(messages=[first], period=COUNT * PERIOD)
-    log, lost = ReplayLog(("left", "right")), {COUNT + 1, COUNT + 2, 2 * COUNT}
-    for index in range(4 * COUNT):
-        log.sent["left"][stamp_of(index)] = 0.0
-        if index not in lost:
-            log.grasp[stamp_of(index)] = 0.1 * (index % COUNT) + 0.1 * (index // COUNT)
-    grasps = divide_grasps(log, truth, stream)
-    assert grasps["images"].tolist() == [22, 40, 40, 40]
-    assert (grasps["images"] - grasps["answered"]).tolist() == [0, 2, 1, 0]
-    assert grasps["bias/N"].tolist() == pytest.approx([0.0, 0.1, 0.2, 0.3])
-
-
-@pytest.mark.parametrize("minutes", [-1.0, np.inf, np.nan])
-def test_a_time_that_is_none_is_refused(minutes):
-    with pytest.raises(OptionError, match="--minutes .*expected a duration above zero"):
-        measure(False, minutes=minutes)
 
 
 @pytest.mark.parametrize("phase", [0.0, 0.3, 0.9])

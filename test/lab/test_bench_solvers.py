@@ -70,11 +70,8 @@ def test_frame_finds_the_forces_of_the_independent_program():
 def test_shape_errors_tell_a_wrong_modulus_from_a_wrong_shape():
     runs = [perfect(press, factor) for press, factor in zip(PRESSES, (2.0, 4.0, 8.0), strict=True)]
     errors = score_shapes(runs)
-    assert errors["nothing fitted/N"] > errors["one factor/N"] > 0.1
+    assert errors["nothing fitted/N"] > 0.1
     assert errors["a factor per height/N"] == pytest.approx(0.0, abs=1e-9)
-    assert {"lower/N", "middle/N", "upper/N"} <= errors.keys()
-    same = score_shapes([perfect(press, 4.0) for press in PRESSES])
-    assert same["one factor/N"] == pytest.approx(0.0, abs=1e-9)
 
 
 def test_unanswered_frames_are_counted_and_in_no_error():

@@ -2,12 +2,10 @@
 
 import struct
 
-import numpy as np
 import pytest
 from rgbd_fakes import FakeGripper, FakePhotographer
 
 from finforce.camera_topics import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
-from finforce.messages import read_stamp
 from finforce_eval.cli.twin import write_footage
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.images import IMAGE
@@ -64,16 +62,6 @@ def test_topics_that_nobody_asked_for_are_left_out():
 def test_a_scene_without_all_images_of_the_rate_is_refused(slots, rate):
     with pytest.raises(RecordingError, match=f"{rate} Hz"):
         thin_messages([message(slot) for slot in slots], {"/left/keypoints"}, rate)
-
-
-def test_a_film_that_is_played_twice_goes_on_where_it_ended():
-    stream = thin_messages([message(slot) for slot in SLOTS], {"/left/keypoints"}, 60)
-    twice = type(stream)(messages=stream.messages, repeats=2, period=stream.period)
-    stamps = np.array([kept.stamp for kept in twice])
-    assert len(twice) == len(stamps) == 40
-    # rounding to whole nanoseconds
-    np.testing.assert_allclose(np.diff(stamps), 1e9 / 60.0, atol=2)
-    assert [read_stamp(kept.data) for kept in twice] == stamps.tolist() == [kept.time for kept in twice]
 
 
 def test_images_of_a_recording_come_decoded_with_their_camera(bag):
