@@ -1,11 +1,12 @@
-"""Scores as tables, for a terminal and in Markdown."""
+"""Scores as tables, for a terminal, a page and JSON."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from itertools import groupby
+from dataclasses import asdict
 from typing import Any
+
+import pandas as pd
 
 from finforce_eval.evaluation.comparison import error_blocks
 from finforce_eval.evaluation.scoring import PHASES, CaseScore, Evaluation, Stats
@@ -32,58 +33,10 @@ _SIGHT = (
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class ScoreTable:
-    """One row per case and one for all.
-
-    Attributes:
-        head: group, short and full name of each column.
-        rows: cells.
-        meaning: of the columns.
-        words: columns of words at the beginning.
-    """
-
-    head: Sequence[tuple[str, str, str]]
-    rows: Sequence[Sequence[str]]
-    meaning: str = ""
-    words: int = 1
-
-    @property
-    def names(self) -> list[str]:
-        """Full names of the columns."""
-        return [name for _, _, name in self.head]
-
-    def terminal(self, *, has_total: bool = False) -> list[str]:
-        """Return the lines for a terminal; `has_total` with a rule before the last row."""
-        head = [short for _, short, _ in self.head]
-        widths = [max(map(len, column)) for column in zip(head, *self.rows, strict=True)]
-        titles = []
-        for group, members in groupby(zip(self.head, widths, strict=True), key=lambda entry: entry[0][0]):
-            inner = [width for _, width in members]
-            titles.append(f" {group} ".center(sum(inner) + 2 * (len(inner) - 1), "-" if group else " "))
-        lines = [_join(row, widths) for row in (head, *self.rows)]
-        rule = "-" * len(lines[0])
-        lines[1:1] = [rule]
-        if has_total:
-            lines[-1:-1] = [rule]
-        return ["  ".join(titles).rstrip(), *lines]
-
-    def markdown(self) -> list[str]:
-        """Return the lines in Markdown."""
-        return markdown_rows(self.names, self.rows, self.words)
-
-
-def _join(cells: Sequence[str], widths: Sequence[int]) -> str:
-    """Set the first cell to the left and the others to the right."""
-    rest = (cell.rjust(width) for cell, width in zip(cells[1:], widths[1:], strict=True))
-    return "  ".join([cells[0].ljust(widths[0]), *rest])
-
-
-def markdown_rows(head: Sequence[str], rows: Sequence[Sequence[str]], words: int = 1) -> list[str]:
-    """Return the lines of a table whose first `words` columns are words, the others numbers, to the right."""
-    rule = "|---" * words + "|---:" * (len(head) - words) + "|"
-    first, *rest = ("| " + " | ".join(row) + " |" for row in (head, *rows))
-    return [first, rule, *rest]
+def build_table(head: Sequence[tuple[str, str]], rows: Sequence[Sequence[str]]) -> pd.DataFrame:
+    """Return a table of texts with a row per case and one for all: group and name of each column, and the cells."""
+    table = pd.DataFrame(rows, columns=pd.MultiIndex.from_tuples([("", "case"), *head]))
+    return table.set_index(("", "case")).rename_axis(index=None)
 
 
 def _score_rows(evaluation: Evaluation) -> list[tuple[str, CaseScore]]:
@@ -100,10 +53,9 @@ def _numbers(values: Sequence[float | None], digits: int = 2) -> list[str]:
     return [_number(value, digits) for value in values]
 
 
-def score_table(evaluation: Evaluation) -> ScoreTable:
+def score_table(evaluation: Evaluation) -> pd.DataFrame:
     """Return RMSE, NRMSD (mean ± standard deviation over the cycles) and maximum error of each phase, and bias."""
-    head = [("", "case", "case")]
-    head += [(phase, name, f"{phase}: {name}") for phase in PHASES for name in ("RMSE/N", "NRMSD/%", "max/N")]
+    head = [(phase, name) for phase in PHASES for name in ("RMSE/N", "NRMSD/%", "max/N")]
     rows = []
     for name, score in _score_rows(evaluation):
         cells = [name]
@@ -112,7 +64,7 @@ def score_table(evaluation: Evaluation) -> ScoreTable:
             cells.append(_number(getattr(score, phase).max_error_N))
         solved = 100.0 * (1.0 - score.record_skipped / max(score.record_frames, 1))
         rows.append([*cells, _number(score.all.bias_N), f"{solved:.1f}"])
-    return ScoreTable(head=[*head, ("", "bias/N", "bias/N"), ("", "solved/%", "solved/%")], rows=rows)
+    return build_table([*head, ("", "bias/N"), ("", "solved/%")], rows)
 
 
 def _spread(spread: dict[str, float | None]) -> str:
@@ -121,11 +73,10 @@ def _spread(spread: dict[str, float | None]) -> str:
     return mean if spread["std"] is None else f"{mean}±{spread['std']:.2f}"
 
 
-def vector_table(evaluation: Evaluation) -> ScoreTable:
+def vector_table(evaluation: Evaluation) -> pd.DataFrame:
     """Return how good force and stated deviations are axis by axis; no row where the truth is a magnitude."""
-    head = [("", "case", "case"), ("", "images", "images"), ("", "n", "n"), ("", "RMSE/N", "vector RMSE/N")]
-    for group, name in (("RMSE/N", "RMSE/N"), ("within 3 sigma/%", "within 3σ/%"), ("sharpness", "sharpness")):
-        head += [(group, axis, f"{axis}: {name}") for axis in AXES]
+    groups = ("RMSE/N", "within 3 sigma/%", "sharpness")
+    head = [("", "images"), ("", "n"), ("", "RMSE/N"), *((group, axis) for group in groups for axis in AXES)]
     rows = []
     for name, score in _score_rows(evaluation):
         for images, stats in (("record", score.all), ("moving", score.moving)):
@@ -134,18 +85,17 @@ def vector_table(evaluation: Evaluation) -> ScoreTable:
             within, sharp = stats.within_3_sigma_pct or [None] * 3, stats.sharpness or [None] * 3
             cells = [*_numbers([stats.vector_rmse_N, *stats.axis_rmse_N]), *_numbers(within, 1), *_numbers(sharp, 1)]
             rows.append([name, images, str(stats.n), *cells, str(stats.n_off)])
-    return ScoreTable(head=[*head, ("", "off", "off by > 0.3 N")], rows=rows, meaning=_VECTOR, words=2)
+    return build_table([*head, ("", "off")], rows)
 
 
-def contact_table(evaluation: Evaluation) -> ScoreTable:
+def contact_table(evaluation: Evaluation) -> pd.DataFrame:
     """Return where the contact came from, location, onset and time; no row where nobody says."""
-    head = [("", "", "case"), ("", "contact", "contact")]
-    for group in ("given", "solved"):
-        head += [(f"{group}/mm", "median", f"{group}: median/mm"), (f"{group}/mm", "p95", "p95/mm")]
-        head.append((f"{group}/mm", "max", "max/mm"))
-    onset = {"median": "onset: median", "first": "earliest", "last": "latest", "missed": "missed"}
-    head += [("onset/frames", short, name) for short, name in (onset | {"false/%": "false touches/%"}).items()]
-    head += [("ms", "p50", "p50/ms"), ("ms", "p99", "p99/ms")]
+    head = [
+        ("", "contact"),
+        *((f"{group}/mm", name) for group in ("given", "solved") for name in ("median", "p95", "max")),
+    ]
+    head += [("onset/frames", name) for name in ("median", "first", "last", "missed", "false/%")]
+    head += [("ms", "p50"), ("ms", "p99")]
     rows = []
     for name, score in _score_rows(evaluation):
         distances = [part[number] for part in (score.place, score.solved_place) for number in _DISTANCES]
@@ -156,18 +106,14 @@ def contact_table(evaluation: Evaluation) -> ScoreTable:
         source = _contact_source(evaluation.results.get(name))
         rows.append([name, source, *_numbers(distances), *frames, missed, _number(onset["false_pct"], 1), *times])
     known = any(map(_contact_source, evaluation.results.values()))
-    return ScoreTable(head=head, rows=rows if known else [], meaning=_CONTACT, words=2)
+    return build_table(head, rows if known else [])
 
 
-def sight_table(evaluation: Evaluation) -> ScoreTable:
+def sight_table(evaluation: Evaluation) -> pd.DataFrame:
     """Return how well key points were seen, and how late the force shows; no row where no detector ran."""
-    head = [("", "", "case")]
-    for group, short in (("pixels/px", "px"), ("points/mm", "mm")):
-        head += [(group, "median", f"{group.split('/')[0]}: median/{short}"), (group, "p95", f"p95/{short}")]
-    head += [("share/%", "hidden+", "hidden accepted/%"), ("share/%", "visible-", "visible lost/%")]
-    head += [("detector/ms", "p50", "detector: p50/ms"), ("detector/ms", "p95", "p95/ms")]
-    after = {"median": "force shows after/ms", "max": "largest/ms", "missed": "missed", "rise": "true rise/ms"}
-    head += [("force shows after/ms", short, name) for short, name in after.items()]
+    head = [("pixels/px", "median"), ("pixels/px", "p95"), ("points/mm", "median"), ("points/mm", "p95")]
+    head += [("share/%", "hidden+"), ("share/%", "visible-"), ("detector/ms", "p50"), ("detector/ms", "p95")]
+    head += [("force shows after/ms", name) for name in ("median", "max", "missed", "rise")]
     rows = []
     for name, score in _score_rows(evaluation):
         sight, delay = score.sight, score.delay
@@ -178,27 +124,19 @@ def sight_table(evaluation: Evaluation) -> ScoreTable:
         shown = [*_numbers([delay["median_ms"], delay["max_ms"]], 0), missed, _number(delay["rise_ms"], 0)]
         rows.append([name, *_numbers(exact), *_numbers(shares, 1), *shown])
     known = any(result.has("detector_ms") for result in evaluation.results.values())
-    return ScoreTable(head=head, rows=rows if known else [], meaning=_SIGHT)
+    return build_table(head, rows if known else [])
 
 
 def format_tables(evaluation: Evaluation) -> str:
     """Return all tables for a terminal, with a line of summary below the first."""
-    lines = [*score_table(evaluation).terminal(has_total=True), "", *summary_lines(evaluation)]
-    for table in (vector_table(evaluation), contact_table(evaluation), sight_table(evaluation)):
-        if table.rows:
-            lines += ["", *table.terminal(), table.meaning]
+    lines = [score_table(evaluation).to_string(), "", *summary_lines(evaluation)]
+    for make, meaning in ((vector_table, _VECTOR), (contact_table, _CONTACT), (sight_table, _SIGHT)):
+        table = make(evaluation)
+        if len(table):
+            lines += ["", table.to_string(), meaning]
     if evaluation.manipulation:
         lines += ["", *format_manipulation(evaluation.manipulation)]
     return "\n".join(lines)
-
-
-def markdown_tables(evaluation: Evaluation) -> list[str]:
-    """Return the lines of all tables in Markdown, with what they mean."""
-    lines = [*score_table(evaluation).markdown(), "", *summary_lines(evaluation)]
-    for table in (vector_table(evaluation), contact_table(evaluation), sight_table(evaluation)):
-        if table.rows:
-            lines += ["", *table.markdown(), "", table.meaning]
-    return lines
 
 
 def summary_lines(evaluation: Evaluation) -> list[str]:

@@ -9,12 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.errors import MissingDependencyError
-from finforce_eval.evaluation.scoring import LEAST_FORCE, ONSET_FORCE
 from finforce_eval.table import ForceSeries, Snapshot
 
 try:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.colors import ListedColormap
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 except ImportError as error:
@@ -38,60 +36,6 @@ def style_axes(axes: Any) -> None:
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(color="#dddddd", linewidth=0.6)
     axes.set_axisbelow(True)
-
-
-def find_runs(mask: NDArray[np.bool_]) -> list[NDArray[np.integer]]:
-    """Return the runs of frames in which the mask is true."""
-    rows = np.flatnonzero(mask)
-    if rows.size == 0:
-        return []
-    return np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)
-
-
-def shade_phases(axes: Any, result: ForceSeries, *, labelled: bool) -> None:
-    """Shade the record phases of loading and unloading, with entries for the legend if `labelled`."""
-    time = result.seconds
-    for direction, colour in COLOURS.items():
-        for count, run in enumerate(find_runs(result.scored & (result.column("direction") == direction))):
-            label = f"record, {LABELS[direction]}" if labelled and count == 0 else None
-            axes.axvspan(time[run[0]], time[run[-1]], color=colour, alpha=0.13, linewidth=0, label=label)
-
-
-def draw_force(result: ForceSeries) -> Figure:
-    """Draw estimate and truth over time, with twice the standard deviation and the error below."""
-    figure = new_figure(11, 5.4)
-    force, error = figure.subplots(2, 1, sharex=True, height_ratios=[3, 1])
-    time = result.seconds
-    for axes in (force, error):
-        style_axes(axes)
-        shade_phases(axes, result, labelled=axes is force)
-    stddev = result.column("magnitude_stddev")
-    low, high = result.magnitude - 2 * stddev, result.magnitude + 2 * stddev
-    force.fill_between(
-        time, np.maximum(low, 0), high, color=GREEN, alpha=0.3, linewidth=0, label="± 2 standard deviations"
-    )
-    force.plot(time, result.magnitude, color=GREEN, linewidth=1.1, label="estimate")
-    force.plot(time, result.true_magnitude, color=BLACK, linewidth=1.1, dashes=(4, 1.5), label="measured")
-    _draw_error(error, result)
-    figure.legend(loc="outside upper right", ncols=6, frameon=False, fontsize=9)
-    highest = np.nanmax(np.r_[result.magnitude, result.true_magnitude, 0.1])
-    force.set(ylabel="force on the jaw [N]", ylim=(0, 1.08 * highest))
-    error.set(xlabel="time [s]", ylabel="error [N]", xlim=(time[0], max(time[-1], 1e-3)))
-    force.set_title(result.name, loc="left", fontsize=11)
-    return figure
-
-
-def _draw_error(axes: Any, result: ForceSeries) -> None:
-    """Draw the error of the scored frames, and a mark for each frame without an estimate."""
-    time = result.seconds
-    axes.axhline(0.0, color=BLACK, linewidth=0.8)
-    for direction, colour in [*COLOURS.items(), ("", GREY)]:
-        chosen = result.counted & (result.column("direction") == direction)
-        axes.plot(time[chosen], result.error[chosen], ".", markersize=2, color=colour)
-    lost = time[~result.solved]
-    if lost.size:
-        style = {"transform": axes.get_xaxis_transform(), "clip_on": False}
-        axes.plot(lost, np.zeros(lost.size), "|", color=GREY, markersize=7, label="no estimate", **style)
 
 
 def draw_unity(results: Sequence[ForceSeries]) -> Figure:
@@ -125,83 +69,6 @@ def _phase_legend(figure: Figure, results: Sequence[ForceSeries]) -> None:
     if any((result.column("direction") != "").any() for result in results):
         patches = [Patch(color=colour, label=LABELS[key]) for key, colour in COLOURS.items()]
         figure.legend(handles=patches, loc="outside upper right", ncols=2, frameon=False, fontsize=9)
-
-
-def draw_keypoints(result: ForceSeries, names: Sequence[str]) -> Figure:
-    """Draw which key points entered the estimate, over time.
-
-    Args:
-        result: the time series.
-        names: K names of the key points.
-    """
-    figure = new_figure(11, 0.6 + 0.24 * len(names) + 0.8)
-    axes = figure.subplots()
-    time = result.seconds
-    used = result.column("used")
-    picture = np.where(used, 1, 0).T
-    extent = (time[0], max(time[-1], 1e-3), len(names) - 0.5, -0.5)
-    colours = ListedColormap(["#e9e9e9", BLUE])
-    axes.imshow(picture, aspect="auto", extent=extent, cmap=colours, vmin=0, vmax=1, interpolation="nearest")
-    for line in range(1, len(names)):
-        axes.axhline(line - 0.5, color="white", linewidth=1.5)
-    shares = 100 * used.mean(axis=0)
-    labels = [f"{name}  {share:3.0f} %" for name, share in zip(names, shares, strict=True)]
-    axes.set_yticks(range(len(names)), labels, fontsize=8)
-    axes.spines[:].set_visible(False)
-    axes.set_xlabel("time [s]")
-    title = f"{result.name}: key points used (blue), with their share of the frames"
-    axes.set_title(title, loc="left", fontsize=11)
-    return figure
-
-
-def draw_contact(result: ForceSeries) -> Figure:
-    """Draw the heights of given and found contact with the true one, their errors, and when they touch.
-
-    Args:
-        result: with a contact series.
-    """
-    figure = new_figure(11, 6.4)
-    height, error, touch = figure.subplots(3, 1, sharex=True, height_ratios=[3, 1.6, 0.7])
-    time = result.seconds
-    for axes in (height, error):
-        style_axes(axes)
-        shade_phases(axes, result, labelled=axes is height)
-    _draw_heights(height, error, result)
-    _draw_touching(touch, result)
-    figure.legend(loc="outside upper right", ncols=6, frameon=False, fontsize=9)
-    height.set(ylabel="height on the\nundeformed surface [mm]")
-    height.set_title(f"{result.name}, contact: {result.column('contact_source')[0]}", loc="left", fontsize=11)
-    error.set(ylabel="off the pressure\ncentre [mm]")
-    touch.set(xlabel="time [s]", xlim=(time[0], max(time[-1], 1e-3)))
-    return figure
-
-
-def _draw_heights(height: Any, error: Any, result: ForceSeries) -> None:
-    """Draw the heights, and their distance from the truth where the truth presses."""
-    time, given, solved = result.seconds, result.column("contact_height"), result.column("contact_location")[:, 2]
-    pressed = result.true_magnitude > LEAST_FORCE
-    truth = np.where(pressed, result.column("true_height"), np.nan)
-    height.plot(time, 1e3 * given, color=ORANGE, linewidth=0.9, label="contact given to the solver")
-    height.plot(time, 1e3 * solved, color=GREEN, linewidth=0.9, label="found by the solver")
-    height.plot(time, 1e3 * truth, color=BLACK, linewidth=1.3, dashes=(4, 1.5), label="pressure centre of the truth")
-    error.axhline(0.0, color=BLACK, linewidth=0.8)
-    for heights, colour in ((given, ORANGE), (solved, GREEN)):
-        error.plot(time, 1e3 * (heights - truth), color=colour, linewidth=0.8)
-
-
-def _draw_touching(axes: Any, result: ForceSeries) -> None:
-    """Draw bars for the true contact and for the one reported."""
-    rows = [("measured", np.nan_to_num(result.true_magnitude) > ONSET_FORCE, BLACK)]
-    if result.has("touching"):
-        rows.append(("touching", result.column("touching").astype(bool), BLUE))
-    for line, (_, mask, colour) in enumerate(rows):
-        time = np.r_[result.seconds, 2 * result.seconds[-1] - result.seconds[-2 if len(mask) > 1 else -1]]
-        bars = [(time[run[0]], time[run[-1] + 1] - time[run[0]]) for run in find_runs(mask)]
-        axes.broken_barh(bars, (line - 0.35, 0.7), color=colour, linewidth=0)
-    axes.set_yticks(range(len(rows)), [name for name, *_ in rows], fontsize=9)
-    axes.set_ylim(len(rows) - 0.5, -0.5)
-    axes.tick_params(axis="y", colors=GREY, labelcolor=BLACK)
-    axes.spines[["top", "right"]].set_visible(False)
 
 
 SIDE = (0, 2)  # seen along y: x to the right, z upwards

@@ -11,14 +11,12 @@ from numpy.typing import NDArray
 from finforce_eval.figures.figures import GREY, new_figure
 from finforce_eval.recordings.tracks import DetectionTrack, JawTrack, Recording
 from finforce_eval.table import ForceSeries
-from finforce_keypoints.diagnostics import COLORS, draw_keypoints
+from finforce_keypoints.diagnostics import COLORS
 
 COUNT, COLUMNS = 6, 2
 WIDTH = 11.0  # [in] of a figure
 MARGIN = 0.08  # of the jaws' extent in the image that is left on each side of them
 LEAST_MARGIN = 12  # [px]
-TILE = 640  # [px] at least, to which an image is enlarged
-RADIUS = 7.0  # [px] there, of what marks a key point that was found
 MEANING = {
     "": "used",
     "likelihood": "likelihood too low",
@@ -26,6 +24,7 @@ MEANING = {
     "workspace": "outside the workspace",
     "image": "outside the image",
 }
+COLOURS = {reason: np.array(COLORS[reason]) / 255.0 for reason in MEANING}
 WHITE, BLACK = "white", "black"
 
 
@@ -36,14 +35,6 @@ class Region(NamedTuple):
     top: int
     width: int
     height: int
-
-
-class FoundPixels(NamedTuple):
-    """Key points of one jaw in a picture, as `finforce_keypoints.diagnostics` draws them."""
-
-    pixels: NDArray
-    valid: NDArray
-    reasons: NDArray
 
 
 def choose_images(stamps: NDArray[np.int64], largest: int | None = None) -> NDArray[np.int64]:
@@ -102,14 +93,14 @@ def draw_images(recording: Recording, results: Sequence[ForceSeries], skeleton: 
         axes.set_axis_off()
     reasons: set[str] = set()
     for axes, taken in zip(panels, recording.images.at(stamps), strict=False):
-        found = [found_at(track.detection, taken.stamp) for track in detected_jaws(recording).values()]
-        picture, scale = enlarge(taken.image.color, region)
-        axes.imshow(draw_keypoints(picture, [moved(entry, region, scale) for entry in found], skeleton, radius=RADIUS))
+        axes.imshow(taken.image.color)
         for track in detected_jaws(recording).values():
-            _draw_truth(axes, track, taken.stamp, (region, scale))
+            reasons |= _draw_found(axes, track.detection, taken.stamp, skeleton)
+            _draw_truth(axes, track, taken.stamp)
+        axes.set_xlim(region.left - 0.5, region.left + region.width - 0.5)
+        axes.set_ylim(region.top + region.height - 0.5, region.top - 0.5)
         is_largest = largest is not None and taken.stamp == largest.stamp
         axes.set_title(describe_image(recording, results, taken.stamp, is_largest), loc="left", fontsize=9)
-        reasons |= {str(reason) for entry in found for reason in entry.reasons[np.isfinite(entry.pixels).all(axis=1)]}
     _explain(figure, reasons, has_truth=any(track.sight is not None for track in detected_jaws(recording).values()))
     return figure
 
@@ -129,42 +120,28 @@ def known_pixels(recording: Recording, stamps: NDArray[np.int64]) -> NDArray[np.
     return np.concatenate(pixels)
 
 
-def enlarge(color: NDArray[np.uint8], region: Region) -> tuple[NDArray[np.uint8], int]:
-    """Return a part of an image (h, w, 3), enlarged, and by how much."""
-    from PIL import Image
-
-    scale = max(1, -(-TILE // region.width))
-    left, top, width, height = region
-    part = Image.fromarray(np.ascontiguousarray(color[top : top + height, left : left + width]))
-    return np.asarray(part.resize((scale * width, scale * height), Image.Resampling.BICUBIC)), scale
-
-
-def place_pixels(pixels: NDArray[np.float64], region: Region, scale: int) -> NDArray[np.float64]:
-    """Return pixels (n, 2) of an image in the enlarged part; whole numbers are the middles of pixels in both."""
-    return (pixels - [region.left, region.top] + 0.5) * scale - 0.5
-
-
-def moved(found: FoundPixels, region: Region, scale: int) -> FoundPixels:
-    """Return what was found in an image, by the pixels of the enlarged part."""
-    return found._replace(pixels=place_pixels(found.pixels, region, scale))
-
-
-def found_at(detection: DetectionTrack, stamp: int) -> FoundPixels:
-    """Return what was found in the image at a stamp [ns]."""
+def _draw_found(axes: Any, detection: DetectionTrack, stamp: int, skeleton: Sequence[Sequence[int]]) -> set[str]:
+    """Draw the key points found in the image at a stamp [ns], coloured by why they are not used; return these words."""
     row = int(np.searchsorted(detection.stamps, stamp))
-    return FoundPixels(detection.pixels[row], detection.accepted[row], detection.reasons[row])
+    pixels, reasons = detection.pixels[row], detection.reasons[row]
+    for pair in skeleton:
+        if detection.accepted[row][list(pair)].all():
+            axes.plot(*pixels[list(pair)].T, color=COLOURS[""], linewidth=0.8)
+    found = np.isfinite(pixels).all(axis=1)
+    for reason in set(reasons[found].tolist()):
+        style = {"markeredgecolor": BLACK, "markeredgewidth": 0.6, "markersize": 5}
+        axes.plot(*pixels[found & (reasons == reason)].T, "o", color=COLOURS[reason], **style)
+    return set(reasons[found].tolist())
 
 
-def _draw_truth(axes: Any, track: JawTrack, stamp: int, part: tuple[Region, int]) -> None:
+def _draw_truth(axes: Any, track: JawTrack, stamp: int) -> None:
     """Draw a cross at each true key point, black where it is hidden."""
     if track.sight is None:
         return
     for row in np.flatnonzero(track.sight.stamps == stamp):
-        pixels, visible = place_pixels(track.sight.pixels[row], *part), track.sight.visible[row]
+        visible = track.sight.visible[row]
         for chosen, color in ((visible, WHITE), (~visible, BLACK)):
-            axes.plot(
-                *pixels[chosen].T, "+", color=color, markersize=4, markeredgewidth=0.8, scalex=False, scaley=False
-            )
+            axes.plot(*track.sight.pixels[row][chosen].T, "+", color=color, markersize=4, markeredgewidth=0.8)
 
 
 def describe_image(recording: Recording, results: Sequence[ForceSeries], stamp: int, is_largest: bool = False) -> str:
@@ -191,7 +168,7 @@ def _explain(figure: Any, reasons: Iterable[str], *, has_truth: bool) -> None:
 
     style = {"linestyle": "", "markeredgecolor": "black", "markeredgewidth": 0.6}
     entries = [
-        Line2D([], [], marker="o", color=np.array(COLORS[reason]) / 255.0, label=label, **style)
+        Line2D([], [], marker="o", color=COLOURS[reason], label=label, **style)
         for reason, label in MEANING.items()
         if reason in reasons
     ]

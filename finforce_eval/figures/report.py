@@ -1,4 +1,4 @@
-"""A folder of pictures with a Markdown page that shows them, and a page whose plots zoom."""
+"""A report of an evaluation: one page with its scores, pictures, and plots that zoom."""
 
 from __future__ import annotations
 
@@ -13,11 +13,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from finforce_eval.evaluation.scoring import Evaluation, rms
-from finforce_eval.evaluation.tables import markdown_tables, score_table
+from finforce_eval.evaluation.tables import score_table
 from finforce_eval.recordings.tracks import DIRECTIONS, Recording
 from finforce_eval.table import ForceSeries
 
-TITLE = "Force from key points"
+TITLE, PAGE = "Force from key points", "report.html"
+# Pictures of a recording or a case by the ends of their names, with what they show.
+PICTURES = {
+    "images": "Key points in the images",
+    "jaw": "The jaw at the largest force",
+}
 
 
 def write_report(
@@ -27,9 +32,8 @@ def write_report(
     keypoint_names: Sequence[str],
     about: Mapping[str, str],
     recordings: Sequence[Recording] = (),
-    title: str = TITLE,
 ) -> Path:
-    """Write pictures, README.md and report.html of an evaluation.
+    """Write the pictures and the page of an evaluation.
 
     Args:
         evaluation: scores and time series.
@@ -37,7 +41,6 @@ def write_report(
         keypoint_names: K names of the key points of the jaw.
         about: what was run: solver, jaw, contact, ...
         recordings: of the evaluation; where key points were found in images, some of these are shown.
-        title: heading of the page.
 
     Returns:
         The page.
@@ -48,7 +51,7 @@ def write_report(
     """
     results = list(evaluation.results.values())
     draw_results(results, Path(folder), keypoint_names=keypoint_names, recordings=recordings)
-    return write_overview(evaluation, folder, about=about, title=title)
+    return write_overview(evaluation, folder, about=about)
 
 
 def draw_results(
@@ -59,25 +62,32 @@ def draw_results(
     recordings: Sequence[Recording] = (),
 ) -> None:
     """Draw recordings and the series of their jaws, in the folder of a report; see `write_report`."""
+    from finforce_eval.figures.figures import draw_jaw
+
     folder.mkdir(parents=True, exist_ok=True)
+    for name in {*(recording.name for recording in recordings), *(result.name for result in results)}:
+        for end in PICTURES:  # of an earlier report
+            _picture(folder, name, end).unlink(missing_ok=True)
     for recording in recordings:
         own = [result for result in results if _recording_of(result) == recording.name]
         _draw_images(recording, own, folder, keypoint_names)
     for result in results:
-        _draw_case(result, folder, keypoint_names)
+        if result.snapshot is not None:
+            seconds = (result.snapshot.stamp - int(result.stamps[0])) * 1e-9
+            title = f"{result.name}, largest force, t = {seconds:.1f} s"
+            draw_jaw(result.snapshot, title).savefig(_picture(folder, result.name, "jaw"))
 
 
-def write_overview(evaluation: Evaluation, folder: str | Path, *, about: Mapping[str, str], title: str = TITLE) -> Path:
-    """Write the pages of a report, and the pictures of all cases together; those of each are there already.
+def write_overview(evaluation: Evaluation, folder: str | Path, *, about: Mapping[str, str]) -> Path:
+    """Write the page of a report, and the picture of all cases together; those of each are there already.
 
     Args:
         evaluation: scores and time series.
         folder: where `draw_results` has drawn.
         about: what was run: solver, jaw, contact, ...
-        title: heading of the page.
 
     Returns:
-        README.md, which shows the pictures.
+        The page.
     """
     from finforce_eval.figures.figures import draw_unity
 
@@ -85,37 +95,11 @@ def write_overview(evaluation: Evaluation, folder: str | Path, *, about: Mapping
     folder.mkdir(parents=True, exist_ok=True)
     results = list(evaluation.results.values())
     draw_unity(results).savefig(folder / "unity.png")
-    page = folder / "README.md"
-    zooming = ["The same over time, to zoom: [report.html](report.html)", ""]
-    head = [f"# {title}", "", *(f"- {key}: {value}" for key, value in about.items()), "", *zooming]
-    lines = [*head, *_overview(evaluation)]
-    for name in dict.fromkeys(map(_recording_of, results)):
-        lines += _show_pictures(folder, f"Images of {name}", _stem(name), IMAGES)
-    for name in evaluation.results:
-        lines += _show_pictures(folder, name, _stem(name), PICTURES)
-    # names of recordings may hold HTML; none of it is ours
-    page.write_text("\n".join(lines).replace("<", "&lt;") + "\n", encoding="utf-8")
-    names = [f"{_stem(each.name)}_jaw.png" for each in results]
-    names += [f"{_stem(_recording_of(each))}_images.png" for each in results]
-    pictures = [folder / name for name in (*reversed(names), "unity.png") if (folder / name).exists()]
-    write_page(evaluation, folder / "report.html", about=about, title=title, picture=pictures[0])
-    return page
-
-
-# Pictures of a recording and of a case by the ends of their names, with what they show.
-IMAGES = {"images": "Key points in the images"}
-PICTURES = {
-    "force": "Force over time",
-    "jaw": "The jaw at the largest force",
-    "contact": "Contact over time",
-    "keypoints": "Key points used",
-}
-
-
-def _show_pictures(folder: Path, name: str, stem: str, pictures: Mapping[str, str]) -> list[str]:
-    """Return a section of the page with those pictures that are there; no line without any."""
-    shown = {text: f"{stem}_{end}.png" for end, text in pictures.items() if (folder / f"{stem}_{end}.png").exists()}
-    return ["", f"## {name}", "", *(f"![{text}]({file})" for text, file in shown.items())] if shown else []
+    names = dict.fromkeys([*map(_recording_of, results), *evaluation.results])
+    pictures = {f"{name}: {text}": _picture(folder, name, end) for end, text in PICTURES.items() for name in names}
+    pictures = {caption: path for caption, path in pictures.items() if path.exists()}
+    pictures["Estimated against measured force"] = folder / "unity.png"
+    return write_page(evaluation, folder / PAGE, about=about, title=TITLE, pictures=pictures)
 
 
 def _recording_of(result: ForceSeries) -> str:
@@ -123,8 +107,19 @@ def _recording_of(result: ForceSeries) -> str:
     return result.name.removesuffix(f"/{result.side}")
 
 
+def _picture(folder: Path, name: str, end: str) -> Path:
+    """Return the file of a picture of a case or a recording."""
+    stem = re.sub(r"[^\w.-]+", "_", name)
+    return folder / f"{stem}_{end}.png"
+
+
 def write_page(
-    evaluation: Evaluation, path: Path, *, about: Mapping[str, str], title: str, picture: Path | None = None
+    evaluation: Evaluation,
+    path: Path,
+    *,
+    about: Mapping[str, str],
+    title: str,
+    pictures: Mapping[str, Path] | None = None,
 ) -> Path:
     """Write one HTML page with the scores and plots that zoom; it needs no other file.
 
@@ -133,65 +128,28 @@ def write_page(
         path: of the page.
         about: what was run: solver, jaw, contact, ...
         title: heading of the page.
-        picture: PNG file that is shown on top.
+        pictures: PNG files by what they show, the first of them on top.
 
     Raises:
         OSError: it cannot be written.
     """
     table, results = score_table(evaluation), list(evaluation.results.values())
-    return write_html(results, path, title=title, about=about, columns=table.names, rows=table.rows, picture=picture)
-
-
-def _overview(evaluation: Evaluation) -> list[str]:
-    """Return the table and the pictures of all cases together."""
-    return [
-        *markdown_tables(evaluation),
-        "",
-        "Errors are norm of the estimate minus norm of the measured force, over the record phases.",
-        "",
-        "![Estimated against measured force](unity.png)",
-    ]
-
-
-def _stem(name: str) -> str:
-    """Return the name of a case or a recording as the beginning of file names."""
-    return re.sub(r"[^\w.-]+", "_", name)
+    columns = ["case", *(" ".join(filter(None, names)) for names in table.columns)]
+    rows = [[name, *row] for name, row in zip(table.index, table.to_numpy().tolist(), strict=True)]
+    return write_html(results, path, title=title, about=about, columns=columns, rows=rows, pictures=pictures)
 
 
 def _draw_images(
     recording: Recording, results: Sequence[ForceSeries], folder: Path, keypoint_names: Sequence[str]
 ) -> None:
     """Draw what the detector made of a recording's images, where it did."""
-    stem = _forget_pictures(folder, recording.name, IMAGES)
     if recording.images is None or all(track.detection is None for track in recording.jaws.values()):
         return
     from finforce_eval.figures.images import draw_images
     from finforce_keypoints.diagnostics import build_skeleton
 
-    draw_images(recording, results, build_skeleton(keypoint_names)).savefig(folder / f"{stem}_images.png")
-
-
-def _draw_case(result: ForceSeries, folder: Path, keypoint_names: Sequence[str]) -> None:
-    """Draw one case."""
-    from finforce_eval.figures.figures import draw_contact, draw_force, draw_jaw, draw_keypoints
-
-    stem = _forget_pictures(folder, result.name, PICTURES)
-    draw_force(result).savefig(folder / f"{stem}_force.png")
-    draw_keypoints(result, keypoint_names).savefig(folder / f"{stem}_keypoints.png")
-    if result.snapshot is not None:
-        seconds = (result.snapshot.stamp - int(result.stamps[0])) * 1e-9
-        title = f"{result.name}, largest force, t = {seconds:.1f} s"
-        draw_jaw(result.snapshot, title).savefig(folder / f"{stem}_jaw.png")
-    if result.has("contact_height"):
-        draw_contact(result).savefig(folder / f"{stem}_contact.png")
-
-
-def _forget_pictures(folder: Path, name: str, pictures: Mapping[str, str]) -> str:
-    """Remove the pictures of an earlier report, and return the beginning of their names."""
-    stem = _stem(name)
-    for end in pictures:
-        (folder / f"{stem}_{end}.png").unlink(missing_ok=True)
-    return stem
+    figure = draw_images(recording, results, build_skeleton(keypoint_names))
+    figure.savefig(_picture(folder, recording.name, "images"))
 
 
 TEMPLATE = Path(__file__).parents[1] / "data" / "page" / "report.html"
@@ -208,7 +166,7 @@ def write_html(
     about: Mapping[str, str],
     columns: Sequence[str] = (),
     rows: Sequence[Sequence[str]] = (),
-    picture: Path | None = None,
+    pictures: Mapping[str, Path] | None = None,
 ) -> Path:
     """Write the page.
 
@@ -219,7 +177,7 @@ def write_html(
         about: what was run, name by name.
         columns: of a table above the plots; the first holds names.
         rows: of the table: one for each series, in their order, and any after them; without one, images and answers.
-        picture: PNG file that is shown on top.
+        pictures: PNG files by what they show, the first of them on top.
 
     Returns:
         The page.
@@ -232,7 +190,10 @@ def write_html(
     content = {
         "title": title,
         "headline": describe_series(series),
-        "picture": picture and "data:image/png;base64," + b64encode(picture.read_bytes()).decode(),
+        "pictures": [
+            [caption, "data:image/png;base64," + b64encode(path.read_bytes()).decode()]
+            for caption, path in (pictures or {}).items()
+        ],
         "about": dict(about),
         "columns": list(columns),
         "rows": [list(row) for row in rows],

@@ -62,7 +62,7 @@ def test_evaluate_prints_the_table_and_writes_json_and_report(tmp_path, bag, exa
     assert content["cases"].keys() == {"pressed"}
     assert content["cases"]["pressed"]["all"] == content["all"]["all"]
     assert content["all"]["all"]["bias_N"] > 0
-    assert (report / "README.md").exists()
+    assert (report / "report.html").exists()
 
 
 def test_recordings_of_one_name_are_told_apart_by_their_folders(tmp_path, exact, capsys):

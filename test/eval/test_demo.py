@@ -152,7 +152,7 @@ def test_the_demo_plays_its_recording_and_ends_with_figures_and_report(rendered,
 
     def report(evaluation, folder, **given):
         asked.update(given)
-        return Path(folder) / "README.md"
+        return Path(folder) / "report.html"
 
     monkeypatch.setattr(replay, "replay", play)
     monkeypatch.setattr("finforce_eval.figures.report.write_report", report)
@@ -161,5 +161,5 @@ def test_the_demo_plays_its_recording_and_ends_with_figures_and_report(rendered,
     assert (asked["calibration"], asked["source"], asked["about"]["contact"]) == ("twin", "images", "estimate")
     assert asked["recordings"] == [played]
     lines = capsys.readouterr().out.splitlines()
-    assert lines[-2] == f"Report: {tmp_path / 'report' / 'README.md'}" and "launch" in lines[-1]
+    assert lines[-2] == f"Report: {tmp_path / 'report' / 'report.html'}" and "launch" in lines[-1]
     assert [line.split(":")[0] for line in lines[-5:-2]] == ["Grasp force", "Key points", "Delay"]
