@@ -86,8 +86,6 @@ def press_jaw(
     rigid: RigidObject,
     height: float,
     depths: Sequence[float],
-    *,
-    partial: bool = False,
 ) -> list[PressState]:
     """Press a rigid object into the inner surface, displacement driven, frictionless.
 
@@ -98,7 +96,6 @@ def press_jaw(
         rigid: the object.
         height: of its centre above the clamped base [m].
         depths: rising depths [m]; steps between them are cut to half a millimetre, and further where needed.
-        partial: whether the depths that are reached are enough, however few.
 
     Raises:
         ContactError: No stable equilibrium is found that is reached without a snap; the message says at which depth.
@@ -114,8 +111,6 @@ def press_jaw(
                 state, reached, iterations = trial, target, iterations + trial.iterations
                 continue
             step *= 0.5
-            if step < _SHORTEST_STEP and partial:
-                return results
             if step < _SHORTEST_STEP:
                 raise ContactError(
                     f"no equilibrium beyond a depth of {1e3 * reached:.3f} mm: the jaw buckles or slips off"

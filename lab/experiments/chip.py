@@ -11,7 +11,6 @@ import numpy as np
 import pandas as pd
 
 from finforce_eval.errors import OptionError
-from finforce_eval.evaluation.scoring import measure_sharpness
 from finforce_eval.figures.figures import BLACK, BLUE, GREEN, ORANGE
 from finforce_sim.gripper import PressedGrasp
 from finforce_sim.scenarios import build_scenario
@@ -76,7 +75,6 @@ def run(options: RunOptions, case: Case, folder: Path) -> dict[str, Any]:
         "is_broken": bool(forces.max(initial=0.0) >= BREAKS),
         "error": course.error,
         "within_3_sigma_pct": 100.0 * float((np.abs(off) <= 3.0 * stated).mean()) if told else float("nan"),
-        "sharp": float(measure_sharpness(stated[:, None], off[:, None])[0]),
         "untold": [[round(stamp - start, 3), words] for stamp, words in untold],
         "violations": sum(course.violations.values()),
         "drawn": {
@@ -95,7 +93,7 @@ def find(options: RunOptions, figures: Mapping[str, Mapping[str, Any]], folder: 
         for column, heading in (("peak_N", "peak/N"), ("end_N", "at the end/N")):
             spread = grasps[column].agg(["min", "mean", "max"]).tolist()
             row |= {f"{heading}: {name}": value for name, value in zip(SPREAD, spread, strict=True)}
-        row |= {"within 3σ/%": grasps.within_3_sigma_pct.mean(), "sharp": grasps.sharp.mean()}
+        row["within 3σ/%"] = grasps.within_3_sigma_pct.mean()
         row["ended early"] = int(grasps.error.astype(bool).sum())
         row["images without force"] = int(grasps.untold.map(len).sum())
         rows.append(row | {"violations": int(grasps.violations.sum())})

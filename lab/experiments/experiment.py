@@ -5,8 +5,6 @@ Those of grasps are scenes of the twin or recordings of one's own, read with key
 
 from __future__ import annotations
 
-import hashlib
-import json
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -23,15 +21,13 @@ from finforce.gripper_frames import SIDES
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.contact_source import ContactChoice
 from finforce_eval.evaluation.keypoint_source import KeypointSource
-from finforce_eval.evaluation.scoring import Evaluation
 from finforce_eval.evaluation.setup import EvaluationSetup, hash_files
 from finforce_eval.figures.figures import new_figure, style_axes
 from finforce_eval.machine import commit, version, write_figures
 from finforce_eval.recordings.bags import bag_source
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.tracks import Recording
-from finforce_eval.table import AXES
-from finforce_eval.tasks import OK, EngineOptions, Manifest, Task, choose_shard, run_tasks
+from finforce_eval.tasks import OK, EngineOptions, Manifest, Task, choose_shard, hash_settings, run_tasks
 from finforce_ifea.jaw.calibration import load_calibration
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.settings import EstimatorSettings
@@ -162,14 +158,6 @@ def build_setup(settings: Mapping[str, Any], contact: ContactChoice | None = Non
     )
 
 
-SHARP = {f"sharpness {axis}": f"sharp {axis}" for axis in AXES}  # headings by column of `tabulate`
-
-
-def axis_sharpness(evaluation: Evaluation) -> dict[str, float | None]:
-    """Return how sharp the stated deviations of all jaws' forces were along x, y and z, see `Stats.sharpness`."""
-    return dict(zip(AXES, evaluation.total.all.sharpness or (None,) * 3, strict=True))
-
-
 def keep_poses(recording: Recording, seen: NDArray) -> Recording:
     """Return a recording with those poses of the object (n,) alone that are seen."""
     track = recording.object_pose
@@ -178,7 +166,6 @@ def keep_poses(recording: Recording, seen: NDArray) -> Recording:
 
 
 PAGE = "README.md"
-EDITION = 1  # of what is kept of a case; another one does not go on where an older one ended
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -201,12 +188,6 @@ class Experiment:
     list_cases: Callable[[RunOptions], Sequence[Case]]
     run: Callable[[RunOptions, Case, Path], dict[str, Any]]
     find: Callable[[RunOptions, Mapping[str, Mapping[str, Any]], Path], Figures]
-
-
-def hash_case(case: Case) -> str:
-    """Return what tells a case from one of the same name with other settings, or of another version."""
-    content = json.dumps([EDITION, version(), commit(), dict(case.settings)], sort_keys=True)
-    return hashlib.sha256(content.encode()).hexdigest()[:16]
 
 
 def run_case(experiment: Experiment, options: RunOptions, case: Case, folder: str) -> dict[str, Any]:
@@ -242,8 +223,9 @@ def run_experiment(
     cases = experiment.list_cases(options)
     manifest = Manifest(folder, shard)
     given = [{"experiment": experiment, "options": options, "case": case, "folder": str(folder)} for case in cases]
+    code = {"version": version(), "commit": commit()}
     tasks = [
-        Task(name=case.name, key=hash_case(case), work=run_case, given=each)
+        Task(name=case.name, key=hash_settings(code | dict(case.settings)), work=run_case, given=each)
         for case, each in zip(cases, given, strict=True)
     ]
     with manifest.alone():

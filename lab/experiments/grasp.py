@@ -13,15 +13,13 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from finforce_eval.evaluate import evaluate_all
-from finforce_eval.evaluation.scoring import ONSET_FORCE, Evaluation, force_delays, measure_sharpness, rms
+from finforce_eval.evaluation.scoring import ONSET_FORCE, Evaluation, force_delays, rms
 from finforce_eval.figures.figures import BLACK, BLUE, GREEN, ORANGE
 from lab.experiments.experiment import (
-    SHARP,
     Case,
     Experiment,
     RunOptions,
     average,
-    axis_sharpness,
     build_setup,
     draw_panels,
     keep_poses,
@@ -90,7 +88,6 @@ def score_grasp(grasp: pd.DataFrame) -> dict[str, Any]:
         "max_error_N": float(np.abs(error[known]).max(initial=0.0)),
         "answered_pct": 100.0 * float(known.sum() / max(held.sum(), 1)),
         "within_3_sigma_pct": 100.0 * float(within.mean()) if known.any() else float("nan"),
-        "sharp": float(measure_sharpness(grasp[["stddev"]].to_numpy()[known], error[known, None])[0]),
         "delay_ms": (1e3 * delays[:, 0]).tolist(),
     }
 
@@ -113,15 +110,13 @@ def run(options: RunOptions, case: Case, folder: Path) -> dict[str, Any]:
     """Return the figures of a grasp."""
     with options.open_case(_with_displacement(case), folder) as recording:
         setup = build_setup(case.settings)
-        evaluation = evaluate_all([recording], setup)
-        grasp = join_jaws(evaluation, recording.name)
+        grasp = join_jaws(evaluate_all([recording], setup), recording.name)
         loading = np.flatnonzero(find_phases(grasp)["load"])
         full = int(grasp.stamp.iloc[loading[-1] if loading.size else -1])
         hidden = keep_poses(recording, recording.object_pose.stamps < full)
         unseen = join_jaws(evaluate_all([hidden], setup), recording.name)
     drawn = grasp[["seconds", "truth", "found"]].iloc[::DRAWN_EVERY].round(4).to_dict("list")
-    told = {"sharpness": axis_sharpness(evaluation), "hidden": score_grasp(unseen), "drawn": drawn}
-    return score_grasp(grasp) | told
+    return score_grasp(grasp) | {"hidden": score_grasp(unseen), "drawn": drawn}
 
 
 def find(options: RunOptions, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Figures:
@@ -149,18 +144,14 @@ COLUMNS = {
     "bias_N": "bias/N",
     "answered_pct": "answered/%",
     "within_3_sigma_pct": "within 3σ/%",
-    "sharp": "sharp",
-    **SHARP,
     "delay_ms": "shows after/ms",
 }
 NOTE = (
     "Mean and standard deviation over the grasps of each grasp's error of min(|F_left|, |F_right|), while the true "
     "force is above 0.02 N; loading ends at 97 % of the largest force, letting go begins at 75 %. NRMSD: of each "
-    "grasp's own range of force. Sharp: root mean square of the stated deviation over that of the error, of the grasp "
-    "force, and of both jaws' forces along x, y and z; less than 1 is too little. Shows after: from 0.02 N of true "
-    "force to an estimate above 0.1 N, computed. The paper, 135 grasps without its worst case (the highest force at "
-    "the lower place): RMSE 0.19 to 0.78 N, loading 0.08 to 0.56 N, NRMSD 1.8 to 7.0 %, loading 0.7 to 5.1 %, shows "
-    "after 250 ms."
+    "grasp's own range of force. Shows after: from 0.02 N of true force to an estimate above 0.1 N, computed. The "
+    "paper, 135 grasps without its worst case (the highest force at the lower place): RMSE 0.19 to 0.78 N, loading "
+    "0.08 to 0.56 N, NRMSD 1.8 to 7.0 %, loading 0.7 to 5.1 %, shows after 250 ms."
 )
 
 

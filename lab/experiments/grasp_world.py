@@ -93,17 +93,6 @@ class NoisySensor:
         return abs(force + self._noise * self._random.standard_normal())
 
 
-def build_spring(stiffness: float, rise: float = 1.0, over: float = 0.004) -> Callable[[float], float]:
-    """Return the force [N] at an opening [m] of a spring [N/m] whose stiffness grows `rise` times within `over` [m]."""
-
-    def force_at(opening: float) -> float:
-        way = max(0.0, WIDTH - opening)
-        part = min(way, over)
-        return stiffness * (way + (rise - 1.0) * (0.5 * part**2 / over + way - part))
-
-    return force_at
-
-
 @dataclass(frozen=True, kw_only=True)
 class GraspCase:
     """One grasp: what is held, how hard and how fast, and how late the camera is."""

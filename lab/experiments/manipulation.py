@@ -12,15 +12,14 @@ from numpy.typing import NDArray
 
 from finforce.gripper_frames import SIDES
 from finforce_eval.evaluate import evaluate_all
-from finforce_eval.evaluation.scoring import join_net, measure_sharpness, rms
+from finforce_eval.evaluation.scoring import join_net, rms
 from finforce_eval.evaluation.setup import EvaluationSetup
-from finforce_eval.figures.figures import BLACK, BLUE, new_figure
 from finforce_eval.recordings.tracks import Recording
 from finforce_eval.table import AXES, ForceSeries
 from finforce_ifea.grasp_force import R_GRIPPER_JAW
 from finforce_sim.footage import START
 from finforce_sim.scenarios import build_scenario, write_script
-from lab.experiments.experiment import SHARP, Case, Experiment, RunOptions, average, build_setup, tabulate
+from lab.experiments.experiment import Case, Experiment, RunOptions, average, build_setup, tabulate
 from lab.harness import Figures
 
 MASS, SPEED = 0.1, 1.2  # [kg], [rad/s]
@@ -67,36 +66,16 @@ def run(options: RunOptions, case: Case, folder: Path) -> dict[str, Any]:
 
 def find(options: RunOptions, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Figures:
     """Return errors along gravity by light."""
-    draw_weights(figures).savefig(folder / "weights.png")
-    turns = tabulate(figures).reindex(columns=list(COLUMNS))
-    turns[["axis", "light"]] = turns[["axis", "light"]].fillna("")
     errors = {"along_rmse_N": "along gravity/N", "told_along_rmse_N": "with gravity/N"}
+    turns = tabulate(figures).reindex(columns=["axis", "light", *errors])
+    turns[["axis", "light"]] = turns[["axis", "light"]].fillna("")
     lights = average(turns, ("axis", "light"), errors)
     lights["paper/N"] = [PAPER.get(key, "") for key in zip(lights.axis, lights.light, strict=True)]
     note = (
         "RMSE of the net force of both jaws (Eq. 3) along the true one, while that is above 0.5 N: mean and "
         "standard deviation over the turns; with gravity: the solvers know its direction in the gripper."
     )
-    each = turns[["case", *KEYS]].rename(columns=COLUMNS)
-    return Figures(
-        tables={"By axis and light": lights, "Each turn": each},
-        notes=[note],
-        drawn={"Net force along gravity over its direction in the gripper": "weights.png"},
-    )
-
-
-KEYS = {
-    "along_rmse_N": "along gravity/N",
-    "along_bias_N": "bias/N",
-    "across_rmse_N": "across/N",
-    "x_rmse_N": "x/N",
-    "y_rmse_N": "y/N",
-    "z_rmse_N": "z/N",
-    "within_3_sigma_pct": "within 3σ/%",
-    **SHARP,
-    "answered_pct": "answered/%",
-}
-COLUMNS = {"case": "turn", "axis": "axis", "light": "light", "told_along_rmse_N": "with gravity/N", **KEYS}
+    return Figures(tables={"By axis and light": lights}, notes=[note])
 
 
 def score_turn(recording: Recording, setup: EvaluationSetup) -> dict[str, Any]:
@@ -121,7 +100,7 @@ def tell_gravity(recording: Recording, gravity: Mapping[int, NDArray]) -> Record
 
 
 def score_weight(net: ForceSeries) -> dict[str, Any]:
-    """Return errors of a net force along the true one and across it, and what is drawn."""
+    """Return errors of a net force along the true one and across it."""
     answered, net = 100.0 * float(net.solved.mean()) if len(net) else None, net.at(net.solved)
     size = net.true_magnitude
     held = size > LEAST
@@ -131,40 +110,14 @@ def score_weight(net: ForceSeries) -> dict[str, Any]:
     stated = net.column("force_stddev")[held]
     known = bool(np.isfinite(stated).any())
     sigma = np.sqrt(np.einsum("ij,ij->i", stated**2, down**2)) if known else None
-    # the plane in which gravity turns: the two main directions of what it was
-    plane = np.linalg.svd(down, full_matrices=False)[2][:2] if held.any() else np.zeros((2, 3))
-    angle = np.unwrap(np.arctan2(*(down @ plane.T).T[::-1])) if held.any() else np.zeros(0)
-    found = np.einsum("ij,ij->i", net.force[held], down)
     return {
         "along_rmse_N": rms(along),
         "along_bias_N": float(along.mean()) if held.any() else float("nan"),
         "across_rmse_N": rms(np.linalg.norm(error - along[:, None] * down, axis=1)),
         **{f"{axis}_rmse_N": rms(error[:, row]) for row, axis in enumerate(AXES)},
         "within_3_sigma_pct": 100.0 * float((np.abs(along) <= 3.0 * sigma).mean()) if known else float("nan"),
-        "sharpness": dict(zip(AXES, measure_sharpness(stated, error).tolist(), strict=True)),
         "answered_pct": answered,
-        "drawn": {
-            "angle": np.round(angle, 4).tolist(),
-            "truth": np.round(size[held], 4).tolist(),
-            "found": np.round(found, 4).tolist(),
-        },
     }
-
-
-def draw_weights(figures: Mapping[str, Mapping[str, Any]]) -> Any:
-    """Return a figure of the net force along gravity over gravity's direction in the gripper, a panel for each turn."""
-    columns = min(len(figures), 4)
-    rows = -(-len(figures) // columns)
-    figure = new_figure(3.2 * columns, 3.4 * rows + 0.2)
-    for number, (name, row) in enumerate(figures.items()):
-        axes = figure.add_subplot(rows, columns, number + 1, projection="polar")
-        drawn = row["drawn"]
-        axes.plot(drawn["angle"], drawn["found"], color=BLUE, linewidth=0.9)
-        axes.plot(drawn["angle"], drawn["truth"], color=BLACK, linewidth=1.0, dashes=(4, 2))
-        axes.set_title(f"{name.replace('_', ', ')} [N]", fontsize=10)
-        axes.set_rlim(0.0, 1.3 * max([*drawn["truth"], 0.1]))
-        axes.tick_params(labelsize=7)
-    return figure
 
 
 MANIPULATION = Experiment(

@@ -17,7 +17,7 @@ from finforce_eval.evaluation.scoring import ONSET_FORCE, Evaluation
 from finforce_eval.evaluation.setup import EvaluationSetup
 from finforce_eval.recordings.tracks import Recording
 from finforce_eval.table import AXES
-from lab.experiments.experiment import SHARP, Case, Experiment, RunOptions, axis_sharpness, build_setup
+from lab.experiments.experiment import Case, Experiment, RunOptions, build_setup
 from lab.harness import Figures
 
 # Ø [mm] and height of the axis [mm] of the twin's cylinders, whose finger the paper's heights do not fit
@@ -88,25 +88,18 @@ def measure_contacts(
 
 
 def score_contact(recording: Recording, setup: EvaluationSetup) -> dict[str, Any]:
-    """Return RMSE, its spread over the cycles, bias and solved share of a recording, or why there are none."""
+    """Return RMSE, NRMSD, bias and solved share of a recording, or why there are none."""
     try:
         evaluation = evaluate_all([recording], setup)
     except RecordingError as error:
         return {"rmse_N": float("nan"), "solved_pct": 0.0, "reason": str(error)}
     score = evaluation.total
-    cycles = {phase: score.cycles[phase]["rmse_N"] for phase in ("all", "load", "unload")}
     return {
         "rmse_N": score.all.rmse_N,
-        "std_N": cycles["all"]["std"],
-        "load_N": cycles["load"]["mean"],
-        "unload_N": cycles["unload"]["mean"],
         "nrmsd_pct": score.cycles["all"]["nrmsd_pct"]["mean"],
         "bias_N": score.all.bias_N,
         "within_3_sigma_pct": score.all.within_3_sigma_pct,
-        "sharpness": axis_sharpness(evaluation),
         "solved_pct": _share_solved(evaluation),
-        "place_median_mm": score.place["median_mm"],
-        "place_p95_mm": score.place["p95_mm"],
     }
 
 
@@ -180,13 +173,12 @@ def find_places(options: RunOptions, figures: Mapping[str, Mapping[str, Any]], f
 
 
 def tabulate_deviations(figures: Mapping[str, Mapping[str, Any]]) -> dict[str, pd.DataFrame]:
-    """Return how many errors of each case and contact are within three stated deviations, and how sharp these are."""
+    """Return how many errors of each case and contact are within three stated deviations."""
     rows = [
         {
             "case": name,
             "contact": contact,
             **{f"{axis} within 3σ/%": share for axis, share in zip(AXES, cell["within_3_sigma_pct"], strict=True)},
-            **{heading: cell["sharpness"][column[-1]] for column, heading in SHARP.items()},
         }
         for name, row in figures.items()
         for contact, cell in row["contacts"].items()

@@ -13,11 +13,10 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from finforce.transforms import invert_pose, pose_from_quaternion, quaternion_from_pose, rotation_between
+from finforce.transforms import pose_from_quaternion, quaternion_from_pose
 from finforce_contact.errors import PoseLostError
 from finforce_contact.mesh.object_mesh import load_object_mesh
 from finforce_contact.mesh.views import MeshView
-from finforce_contact.pose.symmetry import Symmetry, read_symmetry
 from finforce_contact.pose.tracker import PoseTracker
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluate import evaluate_all
@@ -25,11 +24,7 @@ from finforce_eval.evaluation.contact_source import ContactChoice
 from finforce_eval.recordings.objects import require_mesh
 from finforce_eval.recordings.tracks import PoseTrack, Recording
 from finforce_keypoints.images import RgbdImage
-from finforce_sim.footage import FINGER, START
-from finforce_sim.gripper import TwinGripper
-from finforce_sim.photographer import CAMERAS
-from finforce_sim.scenarios import build_scenario
-from lab.experiments.experiment import SHARP, Case, Experiment, RunOptions, axis_sharpness, build_setup, keep_poses
+from lab.experiments.experiment import Case, Experiment, RunOptions, build_setup, keep_poses
 from lab.experiments.grasp import join_jaws, score_grasp
 from lab.harness import Figures
 
@@ -47,21 +42,8 @@ DELAYS = {"on time": 0, "100 ms late": 100 * MILLISECOND, "200 ms late": 200 * M
 FLIPPED = 0.1  # share of the poses that are turned
 GAP, GAPS_EVERY = 0.8, 2.0  # [s] without poses, and from one such gap to the next
 WORST, TRACKER = "200 ms late, flips, gaps", "built-in tracker"
-SOURCES = {"on time": "recorded poses", WORST: "as FoundationPose, at its worst", TRACKER: "built-in tracker, CPU"}
-POSE_FIGURES = {
-    "rate_Hz": "rate/Hz",
-    "delay_ms": "delay/ms",
-    "position_median_mm": "position: median/mm",
-    "position_p95_mm": "position: 95 %/mm",
-    "rotation_median_deg": "turn: median/°",
-    "rotation_p95_deg": "turn: 95 %/°",
-}
 EACH = "Each grasp, RMSE [N]"
-NOTES = (
-    "Grasp force: mean over the grasps of each one's RMSE while the true force is above 0.02 N.",
-    "By source: FoundationPose needs a GPU and is not run: its figures are those of a publisher that behaves like it. "
-    "Delay of the built-in tracker: the median of its computation here.",
-)
+NOTE = "Grasp force: mean over the grasps of each one's RMSE while the true force is above 0.02 N."
 ON_MESH = 4e-3  # [m] within which a pixel's depth is that of the object, for the first pose
 FIRST_WITHIN = 50_000_000  # [ns] between the first pose that is known and an image
 NANOSECOND = 1e-9
@@ -99,22 +81,18 @@ def run(options: RunOptions, case: Case, folder: Path) -> dict[str, Any]:
         flipped, lost = flip_poses(recording, options.seed), drop_poses(recording)
         ways = {name: (recording, delay) for name, delay in DELAYS.items()}
         ways |= {"flips": (flipped, 0), "gaps": (lost, 0), WORST: (drop_poses(flipped), DELAYS["200 ms late"])}
-        truth, found, seen_mm = {} if options.bags else true_poses(case.settings), {}, {}
+        found = {}
         if recording.images is not None and recording.images.has_depth:
             tracked = track_object(recording)
             ways[TRACKER] = (tracked.recording, tracked.delay)
-        for way in set(SOURCES) & set(ways):
-            seen, delay = ways[way]
-            seen_mm[way] = {"delay_ms": 1e-6 * delay, **score_poses(seen, truth)}
         for way, (seen, delay) in ways.items():
             setup = build_setup(case.settings, ContactChoice(mode="estimate", pose_delay=delay))
             evaluation = evaluate_all([seen], setup)
             places = [score.solved_place["median_mm"] for score in evaluation.scores.values()]
             known = [place for place in places if place is not None]
             score = score_grasp(join_jaws(evaluation, recording.name))
-            score |= {"sharpness": axis_sharpness(evaluation)}
             found[way] = {**score, "place_median_mm": max(known) if known else float("nan")}
-    return {"ways": found, "poses": seen_mm}
+    return {"ways": found}
 
 
 def find(options: RunOptions, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Figures:
@@ -135,24 +113,9 @@ def find(options: RunOptions, figures: Mapping[str, Mapping[str, Any]], folder: 
         "place: worst median/mm": ways.place_median_mm.max(),
         "answered/%": ways.answered_pct.mean(),
         "within 3σ/%": ways.within_3_sigma_pct.mean(),
-        **{heading: ways[column].mean() for column, heading in SHARP.items()},
     }
     by_way = pd.DataFrame(summary).loc[errors.columns].reset_index()
-    tables = {"By way": by_way, "By source": _source_table(figures, errors.mean()), EACH: errors.reset_index()}
-    return Figures(tables=tables, notes=NOTES)
-
-
-def _source_table(figures: Mapping[str, Mapping[str, Any]], errors: pd.Series) -> pd.DataFrame:
-    """Return what poses and forces are worth by where the poses come from."""
-    rows = [
-        {"way": way, **{heading: one.get(key) for key, heading in POSE_FIGURES.items()}}
-        for row in figures.values()
-        for way, one in row["poses"].items()
-    ]
-    means = pd.DataFrame(rows).groupby("way").mean().reindex(SOURCES).dropna(how="all")
-    means["force/N"] = errors.reindex(means.index)
-    means.insert(0, "source", [SOURCES[way] for way in means.index])
-    return means
+    return Figures(tables={"By way": by_way, EACH: errors.reset_index()}, notes=[NOTE])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -224,48 +187,6 @@ def find_pose(
         return tracker.locate(image.stamp, image.depth, mask, [T_first]).T_camera_object
     except PoseLostError:
         return None
-
-
-def true_poses(settings: Mapping[str, Any]) -> dict[int, NDArray]:
-    """Return T_camera_object (4, 4) of a scene of the twin by the stamps of its images [ns]."""
-    scenario = build_scenario(settings["scene"], **settings["changes"])
-    T_camera_gripper = invert_pose(CAMERAS[scenario.camera])
-    return {
-        START + round(state.stamp / NANOSECOND): T_camera_gripper @ state.T_gripper_object
-        for state in TwinGripper(scenario, FINGER).states()
-        if state.T_gripper_object is not None
-    }
-
-
-def score_poses(recording: Recording, truth: Mapping[int, NDArray]) -> dict[str, float]:
-    """Return how often poses come [Hz], and their median and 95th percentile of distance [mm] and turn [°] from truth.
-
-    Distances are of the middle of the object; of what looks the same turned the nearest turn counts. Without truth only
-    the rate is known.
-    """
-    mesh = load_object_mesh(require_mesh(recording))
-    symmetry = read_symmetry("auto", mesh)
-    track = recording.object_pose
-    pairs = zip(track.stamps.tolist(), _read_poses(track), strict=True)
-    errors = np.array([_measure(T, truth[stamp], symmetry) for stamp, T in pairs if stamp in truth])
-    seconds = NANOSECOND * float(np.ptp(track.stamps))
-    rate = {"rate_Hz": (len(track.stamps) - 1) / seconds if seconds > 0.0 else float("nan")}
-    if not len(errors):
-        return rate
-    away, turn = 1e3 * errors[:, 0], np.degrees(errors[:, 1])
-    return rate | {
-        "position_median_mm": float(np.median(away)),
-        "position_p95_mm": float(np.quantile(away, 0.95)),
-        "rotation_median_deg": float(np.median(turn)),
-        "rotation_p95_deg": float(np.quantile(turn, 0.95)),
-    }
-
-
-def _measure(T: NDArray, T_true: NDArray, symmetry: Symmetry) -> tuple[float, float]:
-    """Return distance [m] of the middle and turn [rad] of a pose from the true one."""
-    middle = symmetry.middle
-    away = np.linalg.norm(T[:3, :3] @ middle + T[:3, 3] - T_true[:3, :3] @ middle - T_true[:3, 3])
-    return float(away), rotation_between(symmetry.nearest(T, T_true), T_true)
 
 
 def _read_poses(track: PoseTrack) -> list[NDArray]:

@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 from fault_trials import Tally
+from grasp_fakes import build_spring
 
 from finforce_driver.errors import BackOffError, DriverError, GripperTimeoutError
 from finforce_driver.grasp.load_watch import ForceSample
@@ -32,7 +33,7 @@ from finforce_driver.settings import GraspGoal, GraspSettings
 from finforce_driver.state import GraspPhase, GraspStatus, GripperState, MoveOutcome, Phase
 from finforce_sim.emulator.control import Mode
 from finforce_sim.emulator.faults import FaultKind, PlannedFault
-from lab.experiments.grasp_world import GraspCase, NoisySensor, Plant, World, build_spring
+from lab.experiments.grasp_world import GraspCase, NoisySensor, Plant, World
 
 LIMIT = GraspSettings().force_limit  # [N]
 FAULTS_FROM, PERIOD, MOST = 1.2, 0.5, 6  # [s], [s], faults of the line and the gripper

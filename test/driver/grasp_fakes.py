@@ -19,6 +19,15 @@ DT = 0.002
 RELAXATION = ((0.08, 2.0), (0.07, 10.0))  # shares and times [s], as the twin draws them
 
 
+WIDTH = 0.025  # [m] of an object between springs
+
+
+def build_spring(stiffness: float, rise: float = 1.0) -> Callable[[float], float]:
+    """The force [N] at an opening [m] of a spring [N/m] whose stiffness grows `rise` times within 4 mm."""
+    bend = spring(stiffness, rise, 0.004)
+    return lambda opening: bend(WIDTH - opening)
+
+
 def spring(stiffness: float, rise: float = 1.0, over: float = 0.005) -> Callable[[float], float]:
     """The force [N] over the closing [m] of a spring whose stiffness grows `rise` times within `over` [m]."""
 

@@ -5,14 +5,14 @@ from functools import partial
 
 import pytest
 from geometry_msgs.msg import Vector3, Wrench, WrenchStamped
-from grasp_fakes import STEP, Bench, Camera, Fingers, Jaws, spring
+from grasp_fakes import STEP, Bench, Camera, Fingers, Jaws, build_spring, spring
 
 from finforce.errors import ObservationError
 from finforce.ros.messages import force_stddev
 from finforce_driver.gripper import Gripper
 from finforce_driver.settings import GraspGoal, GraspSettings, GripperSettings
 from finforce_driver.state import GraspPhase
-from lab.experiments.grasp_world import GraspCase, NoisySensor, Plant, World, build_spring
+from lab.experiments.grasp_world import GraspCase, NoisySensor, Plant, World
 
 
 def build(force=2.0, stddev=0.0, share=1.0, **parts):

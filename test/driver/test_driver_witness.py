@@ -4,13 +4,13 @@ from contextlib import nullcontext
 
 import numpy as np
 import pytest
-from grasp_fakes import STEP
+from grasp_fakes import STEP, build_spring
 
 from finforce_driver.errors import UnseenForceError
 from finforce_driver.grasp.controller import ForceGrasp
 from finforce_driver.settings import GraspGoal
 from finforce_driver.state import GripperState, Phase
-from lab.experiments.grasp_world import GraspCase, NoisySensor, Plant, World, build_spring
+from lab.experiments.grasp_world import GraspCase, NoisySensor, Plant, World
 
 
 class FrozenSensor:

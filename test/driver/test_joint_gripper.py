@@ -5,6 +5,7 @@ from itertools import count
 
 import numpy as np
 import pytest
+from grasp_fakes import build_spring
 from joint_fakes import LEROBOT, ROBOTIQ, EmulatedJoint
 
 from finforce_driver.errors import GraspError, GripperStateError, GripperTimeoutError, TargetError
@@ -13,7 +14,7 @@ from finforce_driver.grasp.session import hold_force
 from finforce_driver.settings import GraspGoal, GraspSettings, JointSettings
 from finforce_driver.state import GraspPhase, MoveOutcome, Phase
 from finforce_ifea.relaxation import Relaxation
-from lab.experiments.grasp_world import TERMS, build_spring
+from lab.experiments.grasp_world import TERMS
 
 MAKERS = pytest.mark.parametrize("maker", [ROBOTIQ, LEROBOT], ids=["robotiq", "lerobot"])
 

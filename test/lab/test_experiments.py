@@ -16,7 +16,6 @@ from finforce_eval.cli.main import main
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.contact_source import RecordedContact
 from finforce_eval.machine import describe_sources
-from finforce_eval.recordings.images import StampedImage
 from finforce_eval.recordings.objects import ObjectTrack
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.writer import write_recording
@@ -38,9 +37,8 @@ from lab.experiments.experiment import (
 )
 from lab.experiments.grasp import GRASP, find_phases, score_grasp
 from lab.experiments.manipulation import MANIPULATION, score_weight, tell_gravity, true_gravity
-from lab.experiments.network import HEIGHT, NETWORK, SHOWN, WIDTH, ForceNetwork, reduce_image
 from lab.experiments.paper_tables import BENCH
-from lab.experiments.pose import POSE, drop_poses, flip_poses, score_poses, track_object, true_poses
+from lab.experiments.pose import POSE, drop_poses, flip_poses, track_object
 from lab.harness import Figures, format_figures
 from lab.scenes import find_scene
 
@@ -215,7 +213,6 @@ def test_a_weight_is_scored_along_gravity():
     assert score["along_bias_N"] == pytest.approx(0.1)
     assert score["across_rmse_N"] == pytest.approx(0.3)
     assert score["within_3_sigma_pct"] == 100.0
-    assert np.ptp(score["drawn"]["angle"]) == pytest.approx(2.0 * np.pi, rel=0.01)
 
 
 def test_gravity_is_told_in_each_jaws_frame():
@@ -247,7 +244,6 @@ def test_quick_cases_are_some_of_the_others():
         CHIP,
         BENCH,
         POSE,
-        NETWORK,
     )
     for kind in kinds:
         every, few = ([c.name for c in kind.list_cases(RunOptions(quick=q))] for q in (False, True))
@@ -292,7 +288,7 @@ def test_images_without_a_force_are_told_with_what_the_jaws_said(monkeypatch):
 def test_why_a_grasp_ended_early_is_on_the_page(tmp_path):
     row = {"way": "force", "peak_N": 3.0, "end_N": 2.9, "is_broken": False, "error": "", "violations": 0,
            "drawn": {"seconds": [0.0], "force": [0.0]}, "untold": []}  # fmt: skip
-    row |= {"within_3_sigma_pct": 100.0, "sharp": 1.5}
+    row |= {"within_3_sigma_pct": 100.0}
     early = {"error": "the newest force is 0.27 s old", "untold": [[0.1, "left waiting"], [0.2, "right unobservable"]]}
     findings = CHIP.find(RunOptions(), {"force_00": row, "force_01": row | early}, tmp_path)
     assert "force_01 ended early: the newest force is 0.27 s old (right unobservable)" in findings.notes[1]
@@ -343,18 +339,14 @@ def test_the_built_in_tracker_stands_in_for_the_recorded_poses(tmp_path):
     pytest.importorskip("open3d", reason="the tracker casts rays: pip install open3d")
     changes = {"clearance": 0.001, "displacement": 0.001, "closing_speed": 0.01, "settle": 0.1, "record": 0.1}
     case = RunOptions(size="320x240").scene_case("small", "grasp_asymmetric", changes, 0)
-    truth = true_poses(case.settings)
     recording = read_recording(find_scene(build_scene(case.settings), tmp_path))
-    assert set(recording.object_pose.stamps.tolist()) <= set(truth)
     tracked = track_object(recording)
     assert tracked.lost == 0
-    recorded, found = score_poses(recording, truth), score_poses(tracked.recording, truth)
-    assert (recorded["rate_Hz"], found["rate_Hz"]) == pytest.approx((10.0, 30.0), rel=0.01)
-    assert 0.3 < recorded["position_median_mm"] < 0.7  # 0.3 mm along each axis
-    assert found["position_median_mm"] < recorded["position_median_mm"]
-    assert score_poses(recording, {}) == {"rate_Hz": recorded["rate_Hz"]}
-    turned = flip_poses(recording, 3)
-    assert score_poses(turned, truth)["rotation_p95_deg"] > 90.0
+    found, recorded = tracked.recording.object_pose, recording.object_pose
+    rows = np.searchsorted(found.stamps, recorded.stamps)
+    assert len(found.stamps) > 2 * len(recorded.stamps) and (found.stamps[rows] == recorded.stamps).all()
+    away = np.linalg.norm(found.position[rows] - recorded.position, axis=1)
+    assert 0.3e-3 < np.median(away) < 0.8e-3  # the recorded ones have noise of 0.3 mm along each axis
     with pytest.raises(RecordingError, match="the built-in tracker needs depth images"):
         track_object(replace(recording, images=recording.images.colors_alone()))
 
@@ -414,52 +406,16 @@ def test_averages_are_of_what_is_known_in_the_order_of_the_groups():
     assert means["±error/N"].tolist() == pytest.approx([1.0, np.nan], nan_ok=True)
 
 
-def test_the_end_to_end_network_needs_ten_images():
-    pytest.importorskip("onnxruntime", reason="the network runs on onnxruntime: pip install onnxruntime")
-    network = ForceNetwork()
-    rng = np.random.default_rng(0)
-    pictures = [rng.integers(0, 255, (96, 128, 3), dtype=np.uint8) for _ in range(12)]
-    images = [StampedImage(7 * number, SimpleNamespace(color=color)) for number, color in enumerate(pictures)]
-    stamps, forces = network.follow(images)
-    assert stamps.tolist() == [7 * number for number in range(12)]
-    assert np.isnan(forces[: SHOWN - 1]).all()
-    assert np.isfinite(forces[SHOWN - 1 :]).all()
-    last = np.stack([reduce_image(color) for color in pictures[-SHOWN:]])
-    assert last.shape == (SHOWN, HEIGHT, WIDTH, 3)
-    assert network.predict(last[None]) == pytest.approx(forces[-1:], abs=1e-5)
-
-
-def test_both_methods_are_compared_by_what_the_network_has_seen(tmp_path):
-    series = {"seconds": [0.0, 1.0], "truth": [0.0, 2.0], "found": [0.0, 2.1], "network": [None, 1.0]}
-    row = {"peak_N": 2.0, "span_N": 2.0, "network_bias_N": 0.0, "answered_pct": 100.0, "drawn": series}
-    row |= {"sharpness": {"x": 1.5, "y": None, "z": 2.0}}
-    figures = {
-        "known": {**row, "group": "as trained", "rmse_N": 0.1, "network_rmse_N": 0.2},
-        "new": {**row, "group": "another object", "rmse_N": 0.1, "network_rmse_N": 0.6},
-        "newer": {**row, "group": "another object", "rmse_N": 0.3, "network_rmse_N": 1.0},
-    }
-    groups = first_table(NETWORK.find(RunOptions(), figures, tmp_path)).set_index("group")
-    assert groups["network : finforce"].to_dict() == pytest.approx({"as trained": 2.0, "another object": 4.0})
-    assert groups["network: NRMSD/%"]["another object"] == pytest.approx(40.0)
-    assert (tmp_path / "network.png").stat().st_size > 1000
-
-
 def test_what_each_way_of_poses_adds_is_counted_from_those_on_time(tmp_path):
     def grasp(*errors):
         ways = ("on time", "late")
         scores = {"answered_pct": 99.0, "place_median_mm": 1.0, "within_3_sigma_pct": 100.0}
-        scores |= {"sharpness": {"x": 1.5, "y": 1.0, "z": 2.0}}
-        return {
-            "ways": {way: {"rmse_N": {"all": error}, **scores} for way, error in zip(ways, errors, strict=True)},
-            "poses": {"on time": {"rate_Hz": 10.0, "delay_ms": 0.0}},
-        }
+        return {"ways": {way: {"rmse_N": {"all": error}, **scores} for way, error in zip(ways, errors, strict=True)}}
 
     found = POSE.find(RunOptions(), {"one": grasp(0.1, 0.1), "two": grasp(0.1, 0.4)}, tmp_path)
     rows = first_table(found).set_index("poses")
     assert rows["added/N"].to_dict() == pytest.approx({"on time": 0.0, "late": 0.15})
     assert rows["most added/N"]["late"] == pytest.approx(0.3)
-    assert rows["sharp x"]["late"] == pytest.approx(1.5)
-    assert found.tables["By source"]["rate/Hz"].tolist() == [10.0]
 
 
 def test_grasps_and_turns_are_put_in_tables(tmp_path):
@@ -467,12 +423,10 @@ def test_grasps_and_turns_are_put_in_tables(tmp_path):
     series = {"seconds": [0.0, 1.0], "truth": [0.0, 2.0], "found": [0.0, 2.1]}
     score = {"rmse_N": phases, "nrmsd_pct": phases, "peak_N": 2.0, "bias_N": 0.0, "max_error_N": 0.1}
     score |= {"answered_pct": 100.0, "within_3_sigma_pct": 100.0, "delay_ms": [100.0, None]}
-    score |= {"sharp": 1.2, "sharpness": {"x": 1.5, "y": None, "z": 2.0}}
     row = {**score, "hidden": score, "drawn": series, "object": "cube", "place": "upper", "level": "low"}
     found = GRASP.find(RunOptions(), {"one": row}, tmp_path)
     assert first_table(found).force.tolist() == ["low", "all"]
     assert first_table(found)["shows after/ms"].tolist() == [100.0, 100.0]
-    assert first_table(found)["sharp z"].tolist() == [2.0, 2.0]
     one = np.eye(3)[:2]
     net = ForceSeries.build("one", "gripper", np.arange(2), force=one, true_force=one)
     turn = score_weight(net) | {"axis": "roll", "light": "dim"}
