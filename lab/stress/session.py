@@ -165,13 +165,9 @@ def judge(solution: Solution, step: SessionStep) -> Trial:
     stated = (*solution.force_stddev, solution.magnitude_stddev, solution.torque_stddev[1])
     wrench = np.concatenate([solution.force, solution.torque, solution.force_stddev, solution.torque_stddev])
     return Trial(
-        converged=solution.converged,
         sure=solution.trusted,
-        residual=solution.residual,
-        kkt=solution.kkt,
         errors=tuple(np.abs([*error, magnitude, solution.torque[1] - step.torque[1]]).tolist()),
         stated=tuple(map(float, stated)),
-        condition=solution.condition,
         nan=not np.isfinite([*wrench, solution.magnitude_stddev]).all(),
         note=f"{solution.status}: true {np.linalg.norm(step.force):.3g} N",
     )

@@ -16,10 +16,8 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from finforce.errors import FinforceError
-from finforce_eval.evaluation.scoring import measure_sharpness
 from lab.harness import format_table
 
 TIME_LIMIT = 60.0
@@ -40,14 +38,10 @@ class Trial:
     Attributes:
         seed: of the trial, so that it can be run alone.
         level: what was set in this trial, such as "noise 2 mm".
-        converged: whether the answer is a converged one.
         sure: whether it was given as one that may be published.
-        residual: weighted root mean square of the used key points' residuals [m].
-        kkt: scaled residual of the optimality conditions.
         errors: sizes of the errors along `AXES` [N, N m]; none where there is no truth to compare with.
         stated: standard deviations that were stated along `AXES` [N, N m].
         step_time: CPU time of the step [s]; NaN where it is not to be compared with the others.
-        condition: condition number of what was solved.
         nan: whether something that is not finite left in an answer that was sure.
         outcome: "answer", "refused" by one of our errors, "crashed" by any other, or "hung".
         note: the error's words, or what else is to be known.
@@ -55,14 +49,10 @@ class Trial:
 
     seed: int = 0
     level: str = ""
-    converged: bool = False
     sure: bool = False
-    residual: float = math.nan
-    kkt: float = math.nan
     errors: tuple[float, ...] = ()
     stated: tuple[float, ...] = ()
     step_time: float = math.nan
-    condition: float = math.nan
     nan: bool = False
     outcome: str = "answer"
     note: str = ""
@@ -71,11 +61,6 @@ class Trial:
     def force_error(self) -> float:
         """Norm of the difference of the forces [N]; NaN without truth."""
         return float(np.linalg.norm(self.errors[:3])) if self.errors else math.nan
-
-    @property
-    def stddev(self) -> float:
-        """Standard deviation of the force's magnitude that was stated [N]; NaN without truth."""
-        return self.stated[AXES.index("magnitude")] if self.stated else math.nan
 
     @property
     def sigmas(self) -> float:
@@ -234,24 +219,18 @@ def _run_once(family: Family, plan: Plan) -> list[Trial]:
 
 SIGMAS = 3.0
 SHARE_WITHIN = 0.99
-TRIAL = ("converged", "sure", "residual", "kkt", "step_time", "condition", "nan", "outcome")
-JUDGED = ("force_error", "stddev", "sigmas")
+TRIAL = ("sure", "step_time", "nan", "outcome")
+JUDGED = ("force_error", "sigmas")
 # the figures of a summary that are printed: heading and factor
 PRINTED = {
     "n": ("n", 1),
-    "converged": ("conv. %", 100),
     "sure": ("trusted %", 100),
-    "worst_residual": ("residual", 1),
-    "worst_kkt": ("KKT", 1),
     "worst_error": ("error N", 1),
     "worst_sigmas": ("worst σ", 1),
     "within": ("in 3σ %", 100),
     "median_sigmas": ("median σ", 1),
-    "median_stddev": ("stated N", 1),
-    **{f"sharpness_{axis}": (f"sharp {axis}", 1) for axis in AXES[:4]},
     "step_p50": ("p50 ms", 1000),
     "step_ratio": ("max/p50", 1),
-    "worst_condition": ("cond.", 1),
     "nans": ("NaN", 1),
     "refused": ("refused", 1),
     "crashed": ("crashed", 1),
@@ -266,37 +245,22 @@ def summarise(name: str, trials: Sequence[Trial], *, least_sure: float = 0.0, ti
     crashes, or leaves that is not finite; no step exceeds ten times the median; enough answers are sure.
     """
     table = pd.DataFrame([vars(trial) for trial in trials], columns=TRIAL)
-    table[list(JUDGED)] = np.array([[getattr(trial, name) for name in JUDGED] for trial in trials]).reshape(-1, 3)
-    sure, converged = (table[table[column].astype(bool)] for column in ("sure", "converged"))
+    table[list(JUDGED)] = np.array([[getattr(trial, name) for name in JUDGED] for trial in trials]).reshape(-1, 2)
+    sure = table[table.sure.astype(bool)]
     judged, outcomes = sure.sigmas.dropna(), Counter(table.outcome)
     figures = {
         "n": len(table),
-        "converged": table.converged.mean(),
         "sure": table.sure.mean(),
-        "worst_residual": converged.residual.max(),
-        "worst_kkt": sure.kkt.max(),
         "worst_error": sure.force_error.max(),
         "worst_sigmas": judged.max(),
         "within": (judged <= SIGMAS).mean(),
         "median_sigmas": judged.median(),
-        "median_stddev": sure.stddev.median(),
         "step_p50": table.step_time.median(),
         "step_ratio": measure_longest(trials),
-        "worst_condition": table.condition.max(),
-        **dict(zip((f"sharpness_{axis}" for axis in AXES), _measure_sharpness(trials), strict=True)),
     }
     counts = {"nans": int(table.nan.sum()), **{name: outcomes[name] for name in ("refused", "crashed", "hung")}}
     figures = {key: value if key == "n" else float(value) for key, value in figures.items()} | counts
     return {"name": name, **figures, "broken": list(_find_broken(figures, least_sure, timed))}
-
-
-def _measure_sharpness(trials: Sequence[Trial]) -> NDArray:
-    """Return the sharpness of the sure answers along `AXES`, see `lab.harness.measure_sharpness`."""
-    judged = [trial for trial in trials if trial.sure and trial.errors]
-    stated, errors = (
-        np.array([getattr(trial, name) for trial in judged]).reshape(-1, len(AXES)) for name in ("stated", "errors")
-    )
-    return measure_sharpness(stated, errors)
 
 
 def summarise_family(family: Family, trials: Sequence[Trial]) -> dict[str, Any]:

@@ -238,7 +238,7 @@ def drawn_hues(path):
 def answers(count, *, error=0.01, stddev=0.01, **fields):
     """Sure, converged answers with the same error and the same stated standard deviation [N]."""
     told = {"errors": (error, 0.0, 0.0, error, 0.0), "stated": (stddev,) * 5}
-    usual = {"converged": True, "sure": True, **told, "step_time": 1e-3}
+    usual = {"sure": True, **told, "step_time": 1e-3}
     return [Trial(seed=i, **{**usual, **fields}) for i in range(count)]
 
 
@@ -256,7 +256,7 @@ def divide():
 
 def fail_with(work, **options):
     """The trial of a step that does not return."""
-    return attempt(7, work, lambda got: Trial(converged=True), level="made", **options)
+    return attempt(7, work, lambda got: Trial(sure=True), level="made", **options)
 
 
 def evaluate_recording(recording, jaw, source, estimator, side="left"):
