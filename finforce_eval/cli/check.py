@@ -103,14 +103,14 @@ def _check(options: argparse.Namespace) -> CommandResult:
 
     source, recording = read_at_rest(options)
     with progress_bar(ROUNDS * len(recording.images), "image") as bar:
-        check = check_recording(recording, source, bar.update)
-    for line in check.findings:
+        found, picture = check_recording(recording, source, bar.update)
+    for line in found:
         print(f"{line.severity:<8}{line.text}")
     folder = Path(options.report)
     folder.mkdir(parents=True, exist_ok=True)
-    import_cv2().imwrite(str(folder / PICTURE), check.picture[..., ::-1])
-    faults = sum(line.severity == FAULT for line in check.findings)
+    import_cv2().imwrite(str(folder / PICTURE), picture[..., ::-1])
+    faults = sum(line.severity == FAULT for line in found)
     outcome = f"{faults} to be changed" if faults else "everything fits"
     print(f"{outcome}; {folder / PICTURE}: grey as given, orange as fitted, green key points")
-    findings = [line._asdict() for line in check.findings]
+    findings = [line._asdict() for line in found]
     return CommandResult({"faults": faults, "findings": findings}, status=int(faults > 0))

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from finforce_eval.cli.parser import CommandResult
 from finforce_eval.evaluate import read_evaluations
@@ -63,17 +64,19 @@ def _read(path: Path) -> Mapping[str, Any]:
 
 def format_changes(changes: Sequence[Change]) -> str:
     """Return the table of the changes and a sentence about them."""
-    rows = [*changes, total_change(changes)]
-    width = max(len(row.name) for row in rows)
-    head = f"{'':{width}}  before/N  after/N  difference/N  chance/N  answered/%    verdict"
-    lines = [head, "-" * len(head)]
-    for row in rows:
-        chance = f"{row.stddev:8.4f}" if np.isfinite(row.stddev) else "       -"
-        shares = f"{row.answered[0]:5.1f} {row.answered[1]:5.1f}"
-        lines.append(
-            f"{row.name:{width}}  {row.before:8.4f} {row.after:8.4f}  {row.difference:+12.4f}  {chance}  {shares}  "
-            f" {row.verdict}"
-        )
+    rows = [
+        {
+            "": row.name,
+            "before/N": row.before,
+            "after/N": row.after,
+            "difference/N": row.difference,
+            "chance/N": row.stddev if np.isfinite(row.stddev) else np.nan,
+            "answered/%": "{:.1f} {:.1f}".format(*row.answered),
+            "verdict": row.verdict,
+        }
+        for row in (*changes, total_change(changes))
+    ]
+    lines = [pd.DataFrame(rows).set_index("").to_string(float_format="{:.4f}".format, na_rep="-")]
     counts = {verdict: sum(change.verdict == verdict for change in changes) for verdict in (BETTER, WORSE, SAME)}
     rest = len(changes) - sum(counts.values())
     lines.append(
@@ -81,4 +84,4 @@ def format_changes(changes: Sequence[Change]) -> str:
         "chance: one standard deviation of the difference, by how it varies within the recording; better and worse are "
         "beyond three of them, worse also where 5 % fewer frames are answered."
     )
-    return "\n".join(lines).replace("nan", "  -")
+    return "\n".join(lines)

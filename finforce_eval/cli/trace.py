@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -46,36 +45,15 @@ def run(options: argparse.Namespace) -> CommandResult:
             source=keypoints,
         ).log
         sent = {stamp: time for times in log.sent.values() for stamp, time in times.items()}
-        trace = Trace(
-            spans=read_spans(Path(folder), log.offset, sent),
-            late={stamp: 1e3 * late for stamp, late in log.grasp_latency.items()},
-            images=sorted(sent),
-            lost={name: state["refused"] for name, state in log.health.items() if "refused" in state},
-        )
-    print(format_trace(trace))
-    return CommandResult({"stages": stage_figures(trace), "images": len(trace.images), "lost": trace.lost})
+        figures = stage_figures(read_spans(Path(folder), log.offset, sent), list(log.grasp_latency.values()))
+    lost = {name: state["refused"] for name, state in log.health.items() if "refused" in state}
+    print(format_trace(figures, len(sent), lost))
+    return CommandResult({"stages": figures, "images": len(sent), "lost": lost})
 
 
 WAY = "image out to grasp force in"
 PERCENTS = (50, 95, 99)
 OTHER_WORK = ("/diagnostics", "/clock", "/camera/camera/color/camera_info")
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Trace:
-    """The ways of the images of a recording.
-
-    Attributes:
-        spans: see `read_spans`.
-        late: stamp -> from the image's leaving to the grasp force's arrival [ms]; of answered images.
-        images: stamps of all images.
-        lost: reason -> how many images no grasp force came of, as the nodes say.
-    """
-
-    spans: pd.DataFrame
-    late: Mapping[int, float]
-    images: Sequence[int]
-    lost: Mapping[str, str]
 
 
 def read_spans(folder: Path, offset: int, sent: Mapping[int, float]) -> pd.DataFrame:
@@ -122,27 +100,31 @@ def _own_times(spans: Sequence[tuple[int, int]]) -> list[int]:
     return own
 
 
-def stage_figures(trace: Trace) -> dict[str, dict[str, Any]]:
-    """Return by stage how often it was at work, for how long itself, and when it began [ms], and the whole way."""
+def stage_figures(spans: pd.DataFrame, latencies: Sequence[float]) -> dict[str, dict[str, Any]]:
+    """Return by stage how often it was at work, for how long itself, and when it began [ms], and the whole way.
+
+    Args:
+        spans: see `read_spans`.
+        latencies: of answered images, from leaving to the grasp force's arrival [s].
+    """
     found = {
         stage: {"n": len(rows), "own_ms": _percentiles(rows["own"]), "begin_ms": _percentiles(rows["begin"])}
-        for stage, rows in trace.spans.groupby("stage", sort=False)
+        for stage, rows in spans.groupby("stage", sort=False)
     }
     ordered = dict(sorted(found.items(), key=lambda entry: entry[1]["begin_ms"][0]))
-    late = list(trace.late.values())
-    return {**ordered, WAY: {"n": len(late), "own_ms": _percentiles(late), "begin_ms": [0.0] * len(PERCENTS)}}
+    late = _percentiles(1e3 * np.asarray(latencies))
+    return {**ordered, WAY: {"n": len(latencies), "own_ms": late, "begin_ms": [0.0] * len(PERCENTS)}}
 
 
 def _percentiles(values: Sequence[float]) -> list[float]:
     return np.percentile(values, PERCENTS).tolist() if len(values) else [float("nan")] * len(PERCENTS)
 
 
-def format_trace(trace: Trace) -> str:
-    """Return a table of the stages in Markdown, and what was lost."""
+def format_trace(stages: Mapping[str, Mapping[str, Any]], images: int, lost: Mapping[str, str]) -> str:
+    """Return a table of the stages in Markdown, and by which node how many of all images were lost."""
     lines = ["| stage | images | begins at p50/ms | takes p50/ms | p95 | p99 |", "|---|---:|---:|---:|---:|---:|"]
-    for name, figures in stage_figures(trace).items():
+    for name, figures in stages.items():
         times = " | ".join(f"{value:.2f}" for value in (figures["begin_ms"][0], *figures["own_ms"]))
         lines.append(f"| {name} | {figures['n']} | {times} |")
-    lines += ["", f"{len(trace.late)} of {len(trace.images)} images answered. Where the others went, by the nodes "
-              "themselves:"]  # fmt: skip
-    return "\n".join([*lines, *(f"- {name}: {why}" for name, why in trace.lost.items())])
+    lines += ["", f"{stages[WAY]['n']} of {images} images answered. Where the others went, by the nodes themselves:"]
+    return "\n".join([*lines, *(f"- {name}: {why}" for name, why in lost.items())])

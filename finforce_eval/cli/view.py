@@ -11,15 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.messages import NANOSECONDS
-from finforce.optional import import_cv2, import_library
+from finforce.optional import import_cv2, import_library, import_trimesh
 from finforce_eval.cli.parser import BAG_HELP, CommandResult, add_run_options
 from finforce_eval.errors import OptionError
-from finforce_eval.evaluation.forces import Estimator, estimate_forces
+from finforce_eval.evaluation.forces import estimate_forces
 from finforce_eval.evaluation.gripper import combine_jaws
 from finforce_eval.evaluation.setup import make_setup, read_keypoints
 from finforce_eval.recordings.tracks import JawTrack, Recording
 from finforce_eval.table import ForceSeries
 from finforce_eval.tasks import progress_bar
+from finforce_ifea.estimator import ForceEstimator
 from finforce_ifea.messages import ARROW, CONTACT, CONTACT_DIAMETER, FORCE, NEWTONS_PER_METRE
 
 
@@ -112,14 +113,15 @@ class _RerunView:
             points = self._rr.Points2D(found.pixels[row][seen], colors=colours, radii=2.5)
             self._stream.log(f"camera/{side}", points)
 
-    def show_shape(self, side: str, stamp: int, estimator: Estimator) -> None:
+    def show_shape(self, side: str, stamp: int, estimator: ForceEstimator) -> None:
         """Send how a jaw bends in an image [ns], as its estimator has found it."""
         self._at(stamp)
         vertices, triangles = np.array(estimator.surface()), np.asarray(estimator.surface_triangles)
+        normals = import_trimesh().Trimesh(vertices, triangles, process=False).vertex_normals
         mesh = self._rr.Mesh3D(
             vertex_positions=vertices.astype(np.float32),
             triangle_indices=triangles,
-            vertex_normals=_vertex_normals(vertices, triangles),
+            vertex_normals=normals.astype(np.float32),
             albedo_factor=(150, 170, 190),
         )
         self._stream.log(f"jaws/{side}/surface", mesh)
@@ -177,17 +179,6 @@ class _RerunView:
 
 def _to_bytes(colour: tuple[float, ...]) -> list[int]:
     return [round(255 * part) for part in colour]
-
-
-def _vertex_normals(vertices: NDArray, triangles: NDArray) -> NDArray[np.float32]:
-    """Return the mean normals of the triangles around each vertex (n, 3)."""
-    corners = vertices[triangles]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    total = np.zeros_like(vertices)
-    for corner in range(3):
-        np.add.at(total, triangles[:, corner], normals)
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    return (total / np.where(length > 0.0, length, 1.0)).astype(np.float32)
 
 
 def _lay_out(rrb: Any) -> Any:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -48,28 +48,18 @@ class Finding(NamedTuple):
     text: str
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Check:
-    """What a check found.
-
-    Attributes:
-        findings: line by line.
-        picture: (h, w, 3) uint8, the mean image with what was expected (grey) and what was found.
-    """
-
-    findings: Sequence[Finding]
-    picture: NDArray
-
-
 def check_recording(
     recording: Recording, source: KeypointSource, progress: Callable[[int], Any] = lambda images: None
-) -> Check:
-    """Return whether the images of jaws at rest show what camera, jaw file and extrinsics say.
+) -> tuple[list[Finding], NDArray]:
+    """Return whether the images of jaws at rest show what camera, jaw file and extrinsics say, and draw it.
 
     Args:
         recording: with images of jaws that are open, still and unloaded.
         source: the detector's parameters, the jaw file among them.
         progress: called with the number of images done since its last call.
+
+    Returns:
+        The findings, and the mean image (h, w, 3) uint8 with what was expected (grey) and what was found.
 
     Raises:
         FinforceError: an image is damaged, or the detector cannot be built.
@@ -84,14 +74,14 @@ def check_recording(
     except (RecordingError, KeypointError, ImageError) as error:
         findings.append(Finding(FAULT, f"no jaw to rely on: {one_line(error)}"))
         findings += _find_reasons(mean, source, recording, parameters.camera_pose)
-        return Check(findings=findings, picture=_draw(mean, jaws, parameters.camera_pose, None, None))
+        return findings, _draw(mean, jaws, parameters.camera_pose, None, None)
     for side, jaw in look.jaws.items():
         seen = np.isfinite(jaw.pixels).all(axis=1)
         findings.append(Finding(OK, f"{side} jaw: {seen.sum()} of {len(seen)} key points seen"))
     findings += _judge_pose(found, look, recording, parameters.camera_pose)
     if found.residual > GOOD_RESIDUAL:
         findings += _find_reasons(mean, source, recording, parameters.camera_pose)
-    return Check(findings=findings, picture=_draw(mean, jaws, parameters.camera_pose, found, look))
+    return findings, _draw(mean, jaws, parameters.camera_pose, found, look)
 
 
 def judge_picture(color: NDArray) -> list[Finding]:

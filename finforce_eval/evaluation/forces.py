@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Collection
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from finforce.errors import ObservationError
 from finforce.health import Idling
@@ -20,10 +19,10 @@ from finforce_eval.evaluation.scoring import ONSET_FORCE, compare_detection, mat
 from finforce_eval.recordings.tracks import JAWS, Recording
 from finforce_eval.table import AXES, ForceSeries, Snapshot
 from finforce_eval.tasks import progress_bar
-from finforce_ifea.observation import Contact, Observation
 
 if TYPE_CHECKING:
     from finforce_eval.evaluation.setup import EvaluationSetup
+    from finforce_ifea.estimator import ForceEstimator
 
 _VECTORS = ("force", "torque", "force_stddev", "torque_stddev", "contact_location", "contact_point")
 _NUMBERS = ("magnitude_stddev", "residual", "step_ms", "contact_ms", "contact_height", "true_height")
@@ -34,24 +33,6 @@ NOT_FOUND = "not found"  # status of a jaw that is in none of the images
 STILL_UPDATES, STILL_PERIOD = 30, 0.03  # as often, and so far apart [s], is a still seen, for its contact to settle
 PICKED_STDDEV = 1e-3  # [m] of key points that say nothing of it: picked by hand, they scatter by a millimetre or two
 LEAST_ANSWERED = 0.1  # share of the images with a force, below which there is no such finger in them
-
-
-class Estimator(Protocol):
-    """What is asked of an estimator; `ForceEstimator` satisfies it.
-
-    Attributes:
-        surface_triangles: (t, 3) vertex indices.
-        is_idle: whether the jaw was at rest in the last image, its object out of reach.
-    """
-
-    surface_triangles: NDArray[np.integer]
-    is_idle: bool
-
-    def update(self, observation: Observation, contact: Contact | None) -> Any:
-        """Return the Solution for one observation."""
-
-    def surface(self) -> NDArray[np.float64]:
-        """Return the deformed vertices (n, 3) [m]."""
 
 
 def evaluate_jaws(recording: Recording, setup: EvaluationSetup) -> list[ForceSeries]:
@@ -90,7 +71,7 @@ def estimate_forces(
     *,
     strict: bool = False,
     progress: Callable[[int], Any] = lambda images: None,
-    watch: Callable[[str, int, Estimator], Any] | None = None,
+    watch: Callable[[str, int, ForceEstimator], Any] | None = None,
 ) -> dict[str, ForceSeries]:
     """Return the forces on some jaws of a recording that has key points, and the distance of two.
 
@@ -187,14 +168,14 @@ def find_forces(
     recording: Recording,
     jaw: Any,
     source: ContactSource,
-    estimator: Estimator,
+    estimator: ForceEstimator,
     side: str = "left",
     *,
     strict: bool = True,
     as_live: bool = False,
     stills: bool = False,
     progress: Callable[[int], Any] = lambda steps: None,
-    watch: Callable[[str, int, Estimator], Any] | None = None,
+    watch: Callable[[str, int, ForceEstimator], Any] | None = None,
 ) -> ForceSeries:
     """Return the force on one jaw in every image that has key points, and where it was measured, the true one.
 

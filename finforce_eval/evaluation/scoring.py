@@ -196,7 +196,9 @@ def score_case(cases: Sequence[ForceSeries], span: float) -> CaseScore:
         place=distances([given_distance(case) for case in cases]),
         solved_place=distances([solved_distance(case) for case in cases]),
         onset=onset_stats(cases),
-        delay=delay_stats([case_delays(case) for case in cases]),
+        delay=delay_stats(
+            [force_delays(1e-9 * case.stamps, case.true_magnitude, case.magnitude, case.lag) for case in cases]
+        ),
         sight=detection_stats([case.table for case in cases]),
         detector_ms=_times(detector.values()),
     )
@@ -446,11 +448,6 @@ def _touch_delay(touching: NDArray[np.bool_], loaded: NDArray[np.bool_], onset: 
     apart = np.flatnonzero(~touching[released : end + 1])
     begin = released + int(apart[-1]) + 1 if apart.size else released
     return begin - onset if begin <= end else None
-
-
-def case_delays(case: ForceSeries) -> NDArray[np.float64]:
-    """Return what the estimate took to show after each onset of the true force; see `force_delays`."""
-    return force_delays(case.stamps * 1e-9, case.true_magnitude, case.magnitude, case.lag)
 
 
 def force_delays(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -91,27 +90,19 @@ def read_mask(path: Path | str) -> NDArray:
 
 
 def _read_array(path: Path) -> NDArray:
-    """Return the array of an .npy file, whose header has to agree with its size.
+    """Return the array of an .npy file.
 
     Raises:
         OptionError: it is none, or of something else than numbers.
     """
     content = _read_file(path)
-    file = io.BytesIO(content)
     try:
-        version = np.lib.format.read_magic(file)
-        readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-        shape, turned, dtype = readers[version](file)
+        array = np.load(io.BytesIO(content), allow_pickle=False)
     except Exception as error:  # whatever a header can hold
         raise OptionError(f"{path.name}: no .npy file of numbers ({one_line(error)})") from error
-    begin, wanted = file.tell(), dtype.itemsize * math.prod(shape)
-    if dtype.kind not in "buif" or not math.prod(shape):
-        raise OptionError(f"{path.name}: {dtype} of shape {shape}; expected numbers")
-    if len(content) - begin != wanted:
-        raise OptionError(
-            f"{path.name}: {len(content) - begin} bytes of numbers; expected the {wanted} of {dtype} of shape {shape}"
-        )
-    return np.frombuffer(content, dtype, offset=begin).reshape(shape, order="F" if turned else "C")
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "buif" or not array.size:
+        raise OptionError(f"{path.name}: expected an .npy file of numbers")
+    return array
 
 
 def read_intrinsics(words: Sequence[str], shape: tuple[int, int], *, is_cut: bool = False) -> CameraIntrinsics:

@@ -26,7 +26,7 @@ from finforce.ros import node as ros
 from finforce.settings import setting
 from finforce_eval.recordings.tracks import JAWS
 from finforce_eval.replay.live import ReplayLog
-from finforce_eval.replay.playback import Playback, RawMessage, ReadAhead, read_playback
+from finforce_eval.replay.playback import Playback, RawMessage, ReadAhead
 
 # what is heard while messages are being sent waits its turn; nothing of it may be lost
 HEARD = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
@@ -189,7 +189,7 @@ def find_awaited(types: Iterable[str], parameters: PlayerParameters) -> set[str]
 def play_recording(node: PlayerNode, _: Executor) -> None:
     """Play the recording that the parameters name, once."""
     parameters = ros.declare_record(node, PlayerParameters)
-    messages = read_playback(parameters.bag)
+    messages = Playback(parameters.bag)
     node.offer(messages)
     awaited = find_awaited(messages.types, parameters)
     if not node.wait_for(lambda: node.has_listeners(awaited), parameters.patience):

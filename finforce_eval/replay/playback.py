@@ -58,7 +58,7 @@ class Playback:
     Camera topics come out where the nodes listen, and compressed images as plain ones.
 
     Args:
-        source: the bag.
+        path: rosbag2 folder, .mcap or .db3 file.
         without: topics to be left out.
         images: which are played to the nodes; without it those of the usual names.
 
@@ -66,8 +66,8 @@ class Playback:
         RecordingError: the bag cannot be read, or holds nothing to be played.
     """
 
-    def __init__(self, source: Path, without: Collection[str], images: ImageTrack | None = None) -> None:
-        self._source = source
+    def __init__(self, path: str | Path, without: Collection[str] = (), images: ImageTrack | None = None) -> None:
+        self._source = source = bag_source(Path(path))
         given = {} if images is None else dict(zip((*images.topics, images.info), PLAYED, strict=True))
         with open_bag(source, source.name) as bag:
             known = [entry for entry in bag.connections if entry.topic not in without and bag.knows(entry.msgtype)]
@@ -92,20 +92,6 @@ class Playback:
                 topic, kind = self._topics[raw.topic], bag.types[raw.topic]
                 data = _decompress(bag, raw, topic) if kind == COMPRESSED else bytes(raw.data)
                 yield RawMessage(raw.time, topic, _played_type(kind), data, self._headed[raw.topic])
-
-
-def read_playback(path: str | Path, without: Collection[str] = (), images: ImageTrack | None = None) -> Playback:
-    """Return the messages of a bag in the order of their receipt.
-
-    Args:
-        path: rosbag2 folder, .mcap or .db3 file.
-        without: topics to be left out.
-        images: which are played to the nodes; without it those of the usual names.
-
-    Raises:
-        RecordingError: the bag cannot be read, or holds nothing to be played.
-    """
-    return Playback(bag_source(Path(path)), without, images)
 
 
 def _played_topic(topic: str) -> str:

@@ -25,7 +25,7 @@ from finforce_eval.recordings.tracks import JAWS, Recording
 from finforce_eval.recordings.writer import write_recording
 from finforce_eval.replay.live import ReplayLog, live_result, with_heard_keypoints
 from finforce_eval.replay.node_run import run_nodes
-from finforce_eval.replay.playback import read_playback
+from finforce_eval.replay.playback import Playback
 from finforce_ifea.jaw.jaw import Jaw
 
 RESULTS = ("wrench", "wrench_stddev", "surface", "markers", "contact", "object_outline")
@@ -141,7 +141,7 @@ def play_to_nodes(
         images = recording.images if from_images else None
         if images is not None and not images.info:
             raise RecordingError(f"{recording.name}: replay needs a bag with camera_info; evaluate does without")
-        messages = read_playback(recording.source, _results_of(sides) | _unplayed(sides, from_images), images)
+        messages = Playback(recording.source, _results_of(sides) | _unplayed(sides, from_images), images)
         options = _graph_options(recording, setup, calibration_file, playing)
         processes = replay_processes(replace(options, images=from_images, composed=False), Path())
         processes = _for_scores(processes, recording, setup, keypoints)

@@ -1,99 +1,22 @@
-"""Networks in bytes: weights and activations of their convolutions, half the time on a processor.
-
-`python -m lab.training.quantize FOLDER RECORDING... --jaw FILE -o FOLDER` does it to a DeepLabCut network: every
-twelfth picture that the detector shows it in the recordings measures its activations; those half-way between judge it.
-"""
+"""Networks in bytes: weights and activations of their convolutions, half the time on a processor."""
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
-from shutil import copy
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_eval.evaluation.keypoint_source import KeypointSource
-from finforce_eval.recordings.recording import read_recording
-from finforce_keypoints.networks.metadata import METADATA_FILE
-from finforce_keypoints.networks.model import KeypointModel
 from finforce_keypoints.networks.side_network import COARSE, COARSE_LAYOUT, FINE, SideNetwork
-from lab.training.commands import TrainingError, import_onnx, one_line_errors
+from lab.training.commands import import_onnx
 from lab.training.pictures import FingerPictures
 
 PICTURES = 48  # by which the ranges of the activations are measured
-EVERY = 12  # batches, of which one counts
-LIKELY = 0.5  # likelihood of the points that are compared
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Write the network and print by how much its points have moved."""
-    parser = argparse.ArgumentParser(prog="python -m lab.training.quantize", description=__doc__)
-    parser.add_argument("network", type=Path, help="folder of the network, with pytorch_config.yaml")
-    parser.add_argument("recordings", nargs="+", help="recordings with images")
-    parser.add_argument("-o", "--output", type=Path, required=True, help="folder of the network in bytes")
-    parser.add_argument("--jaw", default="bench", help="jaw file, or name of an included jaw")
-    parser.add_argument("--method", choices=("network", "frame"), default="network", help="what shows it pictures")
-    options = parser.parse_args(arguments)
-    with one_line_errors():
-        run(options)
-
-
-def run(options: argparse.Namespace) -> None:
-    """Quantize as the options say.
-
-    Raises:
-        TrainingError: the recordings showed the network too little.
-    """
-    before = KeypointModel(options.network)
-    parameters = {"model": str(options.network), "detection_method": options.method}
-    with watch_batches() as batches:
-        for path in options.recordings:
-            recording = read_recording(path)
-            KeypointSource(source="images", jaw_file=options.jaw, parameters=parameters).apply(recording)
-    shown, judged = batches[::EVERY], batches[EVERY // 2 :: EVERY]
-    if len(judged) < 2:
-        raise TrainingError(f"{len(batches)} pictures were shown to the network, expected some {4 * EVERY} or more")
-    name = import_onnx().load(str(before.path)).graph.input[0].name
-    inputs = [{name: before.preprocess(batch[[row]]).copy()} for batch in shown for row in range(len(batch))]
-    options.output.mkdir(parents=True, exist_ok=True)
-    quantize_file(before.path, options.output / before.path.name, inputs)
-    copy(before.path.parent / METADATA_FILE, options.output / METADATA_FILE)
-    moved = measure_motion(before, KeypointModel(options.output), judged)
-    print(f"{len(moved)} points moved by {np.median(moved):.3f} px (median), {np.percentile(moved, 95):.3f} px (95 %)")
-
-
-@contextmanager
-def watch_batches() -> Iterator[list[NDArray]]:
-    """Give the batches of pictures (B, H, W, 3) uint8 that any network of key points is shown meanwhile."""
-    batches: list[NDArray] = []
-    locate = KeypointModel.locate
-
-    def watched(model: KeypointModel, batch: NDArray):
-        batches.append(batch.copy())
-        return locate(model, batch)
-
-    KeypointModel.locate = watched
-    try:
-        yield batches
-    finally:
-        KeypointModel.locate = locate
-
-
-def measure_motion(before: KeypointModel, after: KeypointModel, batches: Sequence[NDArray]) -> NDArray:
-    """Return by how much the likely points of some batches move from one network to the other (n,) [px]."""
-    moved = []
-    for batch in batches:
-        old, new = before.locate(batch), after.locate(batch)
-        likely = (old.likelihood >= LIKELY) & (new.likelihood >= LIKELY)
-        moved.append(np.linalg.norm(new.pixels - old.pixels, axis=-1)[likely])
-    return np.concatenate(moved)
 
 
 def quantize_network(folder: Path, pictures: FingerPictures) -> None:
@@ -202,7 +125,3 @@ class _RecordingNetwork(SideNetwork):
     def _run(self, session, names: tuple[str, ...], inputs: tuple[NDArray, ...]) -> list[NDArray]:
         self.inputs[names != COARSE_LAYOUT[0]].append(dict(zip(names, inputs, strict=True)))
         return super()._run(session, names, inputs)
-
-
-if __name__ == "__main__":
-    main()

@@ -131,8 +131,6 @@ def _draw_miss(rest: torch.Tensor) -> torch.Tensor:
     return torch.where(far[..., None], anywhere, NEAR * torch.randn(rest.shape, device=rest.device))
 
 
-torch = import_torch()
-
 CHECKPOINT, LOG = "checkpoint.pt", "log.jsonl"
 SMOOTHING = 0.98  # part of the shown losses that stays in each step
 FINETUNING_DIM = 0.15  # probability of little light: less than in the first training, as the user's light is known

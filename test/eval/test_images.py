@@ -18,7 +18,7 @@ from finforce_eval.recordings.images import ImageChoice, compress_depth
 from finforce_eval.recordings.objects import find_mesh
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.writer import write_entries
-from finforce_eval.replay.playback import read_playback
+from finforce_eval.replay.playback import Playback
 from finforce_sim.footage import encode_depth
 
 FORMS = {
@@ -230,7 +230,7 @@ def test_compressed_images_are_played_as_plain_ones_under_the_names_the_nodes_li
     from sensor_msgs.msg import Image
 
     folder = write_footage(make_footage(), tmp_path / "twin")
-    played = list(read_playback(folder))
+    played = list(Playback(folder))
     color = [deserialize_message(message.data, Image) for message in played if message.topic == COLOR_TOPIC]
     depth = [deserialize_message(message.data, Image) for message in played if message.topic == DEPTH_TOPIC]
     frames = list(make_footage())

@@ -12,7 +12,7 @@ from finforce.camera_topics import COLOR_TOPIC
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.writer import write_recording
 from finforce_eval.replay.node import PlayerParameters, find_awaited
-from finforce_eval.replay.playback import RawMessage, ReadAhead, read_playback
+from finforce_eval.replay.playback import Playback, RawMessage, ReadAhead
 
 
 @pytest.fixture(scope="module", params=["mcap", "sqlite3"])
@@ -22,7 +22,7 @@ def folder(request, tmp_path_factory):
 
 
 def test_messages_come_in_the_order_of_their_receipt_with_their_stamps(folder):
-    messages = read_playback(folder)
+    messages = Playback(folder)
     times = [message.time for message in messages]
     assert times == sorted(times) and times[0] == START
     clouds = [message for message in messages if message.topic == "/left/keypoints"]
@@ -31,12 +31,12 @@ def test_messages_come_in_the_order_of_their_receipt_with_their_stamps(folder):
 
 
 def test_topics_can_be_left_out(folder):
-    topics = {message.topic for message in read_playback(folder, without={"/left/keypoints"})}
+    topics = {message.topic for message in Playback(folder, without={"/left/keypoints"})}
     assert "/left/ground_truth_wrench" in topics and "/left/keypoints" not in topics
 
 
 def test_a_new_stamp_changes_nothing_but_the_stamp(folder):
-    message = next(m for m in read_playback(folder) if m.topic == "/left/keypoints")
+    message = next(m for m in Playback(folder) if m.topic == "/left/keypoints")
     before = deserialize_message(message.data, PointCloud2)
     after = deserialize_message(message.restamped(1_700_000_000_123_456_789), PointCloud2)
     assert (after.header.stamp.sec, after.header.stamp.nanosec) == (1_700_000_000, 123_456_789)
@@ -45,7 +45,7 @@ def test_a_new_stamp_changes_nothing_but_the_stamp(folder):
 
 
 def test_a_message_without_a_header_keeps_its_bytes(folder):
-    message = next(m for m in read_playback(folder) if m.topic == "/bench/phase")
+    message = next(m for m in Playback(folder) if m.topic == "/bench/phase")
     assert message.stamp == message.time
     assert message.restamped(1) == message.data
     assert deserialize_message(message.data, String).data.startswith("0:load")
@@ -59,9 +59,9 @@ def test_big_endian_stamps_are_read_and_written():
 
 
 def test_a_bag_without_anything_to_play_is_refused(folder):
-    every = {message.topic for message in read_playback(folder)}
+    every = {message.topic for message in Playback(folder)}
     with pytest.raises(RecordingError, match="nothing to be played"):
-        read_playback(folder, without=every)
+        Playback(folder, without=every)
 
 
 def test_messages_are_read_before_they_are_asked_for_up_to_the_depth():

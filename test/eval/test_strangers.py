@@ -21,7 +21,7 @@ from finforce_eval.recordings.dataset import read_parquet
 from finforce_eval.recordings.images import ImageChoice
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.writer import write_entries
-from finforce_eval.replay.playback import read_playback
+from finforce_eval.replay.playback import Playback
 
 OWN = {f"/left/{name}" for name in ("ground_truth_wrench", "ground_truth_keypoints", "ground_truth_jaw_pose")}
 USB = {COLOR_TOPIC: "/image_raw", INFO_TOPIC: "/camera_info"}
@@ -75,7 +75,7 @@ def test_the_only_camera_of_a_bag_is_found_whatever_its_topics_are_called(names,
     assert images.topics[0] == names[COLOR_TOPIC] and images.info == names[INFO_TOPIC]
     assert images.has_depth == has_depth and images.camera.fx == CAMERA.fx
     assert len(list(images)) == 12 and set(recording.jaws) == {"left", "right"}
-    played = {message.topic for message in read_playback(recording.source, images=images)}
+    played = {message.topic for message in Playback(recording.source, images=images)}
     assert played == {COLOR_TOPIC, INFO_TOPIC} | ({DEPTH_TOPIC} if has_depth else set())
 
 

@@ -10,7 +10,6 @@ from std_msgs.msg import Header
 from finforce.ros import tracing
 from finforce_eval.cli.trace import (
     WAY,
-    Trace,
     format_trace,
     read_spans,
     stage_figures,
@@ -40,10 +39,6 @@ def ways(tmp_path):
     return read_spans(tmp_path, OFFSET, {10: 0.010, 20: 0.030})
 
 
-def make_trace(ways):
-    return Trace(spans=ways, late={10: 9.5, 20: 4.0, 40: 30.0}, images=[10, 20, 30, 40], lost={"left jaw": "1 late"})
-
-
 def test_spans_are_those_of_images_that_left_and_begin_with_them(ways):
     assert ways["image"].tolist() == [10, 10, 10, 20]
     first = ways[ways["image"] == 10]
@@ -56,10 +51,10 @@ def test_what_a_stage_called_is_not_its_own_time_and_another_process_is_none_of_
 
 
 def test_figures_come_in_the_order_of_the_way_with_the_whole_of_it_last(ways):
-    figures = stage_figures(make_trace(ways))
+    figures = stage_figures(ways, [9.5e-3, 4e-3, 30e-3])
     assert list(figures) == ["detector: color", "solver: left/keypoints", "other: left/wrench", WAY]
-    assert figures["detector: color"]["n"] == 2 and figures[WAY]["own_ms"][0] == 9.5
-    text = format_trace(make_trace(ways))
+    assert figures["detector: color"]["n"] == 2 and figures[WAY]["own_ms"][0] == pytest.approx(9.5)
+    text = format_trace(figures, 4, {"left jaw": "1 late"})
     assert "3 of 4 images answered" in text and "left jaw: 1 late" in text
     assert "| solver: left/keypoints | 1 | 3.00 | 3.00 |" in text
 

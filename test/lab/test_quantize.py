@@ -7,10 +7,7 @@ onnx = pytest.importorskip("onnx")
 
 from onnx import TensorProto, helper, numpy_helper  # noqa: E402
 
-from finforce_eval.recordings.recording import DEMO  # noqa: E402
-from finforce_keypoints.build import BENCH  # noqa: E402
-from finforce_keypoints.networks.model import KeypointModel  # noqa: E402
-from lab.training.quantize import find_ends, main, quantize_file, watch_batches  # noqa: E402
+from lab.training.quantize import find_ends, quantize_file  # noqa: E402
 
 
 def write_chain(path):
@@ -50,18 +47,3 @@ def test_first_and_last_convolutions_stay_as_they_are(tmp_path):
     kinds = {item.name: item.data_type for item in onnx.load(str(tmp_path / "bytes.onnx")).graph.initializer}
     assert kinds["middle_weights_quantized"] == TensorProto.INT8
     assert all(kinds[f"{name}_weights"] == TensorProto.FLOAT for name in ("first", "left", "right"))
-
-
-def test_what_a_network_is_shown_is_kept_as_long_as_it_is_watched():
-    model, batch = KeypointModel(BENCH), np.random.default_rng(2).integers(0, 255, (2, 224, 176, 3)).astype(np.uint8)
-    with watch_batches() as batches:
-        model.locate(batch)
-    assert len(batches) == 1 and (batches[0] == batch).all()
-    model.locate(batch)
-    assert len(batches) == 1
-
-
-def test_recordings_without_images_are_refused(tmp_path):
-    with pytest.raises(SystemExit, match="images: not in this recording"):
-        main([str(BENCH), str(DEMO), "-o", str(tmp_path / "out")])
-    assert not (tmp_path / "out").exists()
