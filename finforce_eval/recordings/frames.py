@@ -66,10 +66,6 @@ class FrameImages:
         frames = np.arange(self.count) if self.frames is None else self.frames
         return np.rint(frames * (NANOSECONDS / self.fps)).astype(np.int64) if self.times is None else self.times[frames]
 
-    def between(self, start: int, stop: int) -> FrameImages:
-        """Return the frames with start <= stamp < stop [ns]."""
-        return self.at(self.stamps[(self.stamps >= start) & (self.stamps < stop)])
-
     def at(self, stamps: NDArray[np.int64]) -> FrameImages:
         """Return the frames at some stamps [ns]."""
         everything = np.arange(self.count) if self.frames is None else self.frames

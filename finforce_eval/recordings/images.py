@@ -111,11 +111,6 @@ class ImageTrack:
     def __len__(self) -> int:
         return len(self.stamps)
 
-    def between(self, start: int, stop: int) -> ImageTrack:
-        """Return the images with start <= stamp < stop [ns]."""
-        chosen = (self.stamps >= start) & (self.stamps < stop)
-        return replace(self, stamps=self.stamps[chosen], depth_stamps=self.depth_stamps[chosen])
-
     def at(self, stamps: NDArray[np.int64]) -> ImageTrack:
         """Return the images at some stamps [ns]."""
         chosen = np.isin(self.stamps, stamps)

@@ -31,13 +31,11 @@ class ObjectTrack:
         stamps: (n,) image time [ns], rising.
         poses: T_jaw_object (n, 4, 4) [m].
         cameras: (n, 3) position of the camera in the jaw frame [m]; None when it is not known.
-        unpaired: poses left out because no pose of the jaw is of their time.
     """
 
     stamps: NDArray[np.int64]
     poses: NDArray[np.float64]
     cameras: NDArray[np.float64] | None = None
-    unpaired: int = 0
 
 
 def find_mesh(recording: Recording, object_file: str | None = None) -> Path | None:
@@ -111,7 +109,6 @@ def track_object(recording: Recording, side: str) -> ObjectTrack:
         stamps=stamps[paired],
         poses=T_jaw_camera @ T_parent_object[paired],
         cameras=T_jaw_camera[:, :3, 3],
-        unpaired=int((~paired).sum()),
     )
 
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,10 +20,6 @@ if TYPE_CHECKING:
 JAWS = ("left", "right")
 DIRECTIONS = ("load", "unload")
 STAGES = ("ramp", "settle", "record")
-
-TrackT = TypeVar(
-    "TrackT", "KeypointTrack", "WrenchTrack", "PoseTrack", "PhaseTrack", "DetectionTruth", "DetectionTrack"
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -222,35 +218,6 @@ class Recording:
             "direction": np.where(row >= 0, phases.direction[row], ""),
             "scored": (row >= 0) & (phases.stage[row] == "record"),
         }
-
-    def between(self, start: int, stop: int) -> Recording:
-        """Return the part with start <= stamp < stop [ns]; a phase under way at start begins there."""
-        jaws = {
-            side: JawTrack(**{name: part and _cut(part, start, stop) for name, part in vars(track).items()})
-            for side, track in self.jaws.items()
-        }
-        phases = self.phases
-        if phases is not None:
-            phases = _cut(replace(phases, stamps=_clip_running(phases.stamps, start)), start, stop)
-        pose = self.object_pose and _cut(self.object_pose, start, stop)
-        images = self.images and self.images.between(start, stop)
-        return replace(self, jaws=jaws, object_pose=pose, phases=phases, images=images)
-
-
-def _clip_running(stamps: NDArray[np.int64], start: int) -> NDArray[np.int64]:
-    """Move the last stamp before start to start."""
-    moved = stamps.copy()
-    running = np.searchsorted(stamps, start, side="right") - 1
-    if running >= 0:
-        moved[running] = start
-    return moved
-
-
-def _cut(track: TrackT, start: int, stop: int) -> TrackT:
-    """Return the rows of a track with start <= stamp < stop."""
-    rows = slice(*np.searchsorted(track.stamps, [start, stop], side="left"))
-    arrays = {name: value[rows] for name, value in vars(track).items() if isinstance(value, np.ndarray)}
-    return replace(track, **arrays)
 
 
 def parse_phases(stamps: Sequence[int], texts: Sequence[str], name: str) -> PhaseTrack:

@@ -120,9 +120,9 @@ class ZarrArray:
             block = self._read_block(number)
             yield from block[max(begin - number * length, 0) : stop - number * length]
 
-    def read(self, begin: int = 0, stop: int | None = None) -> NDArray:
-        """Return rows from one to before another; see `rows`."""
-        return np.array(list(self.rows(begin, stop)), dtype=self.dtype).reshape(-1, *self.shape[1:])
+    def read(self) -> NDArray:
+        """Return all rows; see `rows`."""
+        return np.array(list(self.rows()), dtype=self.dtype).reshape(self.shape)
 
     def _read_block(self, number: int) -> NDArray:
         """Return the chunks of the rows number * chunks[0] and on."""

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from eval_fakes import evaluate_recording
+from eval_fakes import cut, evaluate_recording
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
@@ -34,7 +34,7 @@ def source(tmp_path_factory):
 def short_bag(folder, *, storage="mcap", begin=0):
     recording = read_recording(DEMO)
     start = int(recording.jaw("left").keypoints.stamps[0]) + begin
-    return write_recording(recording.between(start, start + SECONDS * 10**9), folder, storage=storage)
+    return write_recording(cut(recording, start, start + SECONDS * 10**9), folder, storage=storage)
 
 
 def annotate(out, *words):
@@ -131,8 +131,7 @@ def test_what_is_annotated_already_is_refused_unless_aside(annotated, tmp_path, 
     assert annotate(tmp_path / "aside", annotated, "--side-file") == 0
 
 
-@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-@pytest.mark.parametrize("share", [0.6, 0.9])
+@pytest.mark.parametrize(("storage", "share"), [("mcap", 0.9), ("sqlite3", 0.6)])
 def test_a_recording_that_was_cut_off_is_read_up_to_the_damage(tmp_path, capsys, storage, share):
     source = short_bag(tmp_path / "cut", storage=storage)
     (file,) = [path for path in source.iterdir() if path.suffix in (".mcap", ".db3")]

@@ -103,7 +103,7 @@ def test_table_and_json_tell_the_same(files, tmp_path, capsys):
     assert main(["compare", *files, "--json", str(out)]) == 0
     said = capsys.readouterr().out
     assert "solver: reduced -> solid" in said
-    assert "1 worse" in said and "100.0  90.0" in said
+    assert "1 worse" in said and "100.0 90.0" in said
     assert json.loads(out.read_text())["changes"][0]["verdict"] == "worse"
     assert main(["compare", *files, "--strict"]) == 1
     assert main(["compare", files[0], files[0], "--strict"]) == 0

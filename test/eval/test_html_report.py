@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
 import pytest
-from eval_fakes import FakeEstimator, FakeJaw, evaluate_recording, make_recording
+from eval_fakes import FakeEstimator, FakeJaw, cut, evaluate_recording, make_recording
 
 from finforce_contact.loop import GivenContact
 from finforce_eval.cli.main import main
@@ -228,7 +228,7 @@ def test_forces_of_an_annotated_recording_are_read_as_they_were_written(tmp_path
 
     whole = read_recording(DEMO)
     begin = int(whole.jaws["left"].keypoints.stamps[0])
-    bag = write_recording(whole.between(begin, begin + 8 * 10**9), tmp_path / "short")
+    bag = write_recording(cut(whole, begin, begin + 8 * 10**9), tmp_path / "short")
     out = tmp_path / "out"
     assert main(["annotate", str(bag), "--out", str(out), "--contact", "fixed:42", "--calibration", "bench"]) == 0
     (course,) = read_forces(out / "short")

@@ -119,13 +119,6 @@ def test_reading_holds_few_images_at_a_time(tmp_path):
     assert peak < 0.5 * whole  # a chunk of the file, 1 MB, is read at once, and its index is kept
 
 
-def test_a_part_in_time_has_the_images_of_that_time(written):
-    _, folder = written
-    images = read_recording(folder).images
-    part = read_recording(folder).between(int(images.stamps[2]), int(images.stamps[5])).images
-    assert [stamp for stamp, _ in part] == images.stamps[2:5].tolist()
-
-
 def test_images_without_camera_info_are_refused(tmp_path):
     with pytest.raises(RecordingError, match="camera_info"):
         read_recording(write_without(tmp_path / "bag", INFO_TOPIC))

@@ -217,17 +217,6 @@ def test_phase_holds_from_its_stamp_to_the_next():
     assert phases.index_at(np.array([9, 10, 19, 20, 99])).tolist() == [-1, 0, 0, 1, 1]
 
 
-def test_part_of_a_recording_keeps_the_phase_under_way():
-    whole = make_recording(frames=60)
-    part = whole.between(START + 7 * PERIOD, START + 20 * PERIOD)
-    keypoints = part.jaws["left"].keypoints
-    assert keypoints.stamps.tolist() == [START + k * PERIOD for k in range(7, 20)]
-    np.testing.assert_array_equal(keypoints.points, whole.jaws["left"].keypoints.points[7:20])
-    assert part.phases.stamps[0] == START + 7 * PERIOD
-    row = whole.phases.index_at(keypoints.stamps)
-    assert part.phases.stage[part.phases.index_at(keypoints.stamps)].tolist() == whole.phases.stage[row].tolist()
-
-
 @pytest.mark.parametrize("text", ["{", "[1]"])
 def test_malformed_case_is_refused(tmp_path, text):
     folder = write_recording(make_recording(), tmp_path / "bag")

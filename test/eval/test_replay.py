@@ -13,7 +13,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from eval_fakes import with_both_jaws
+from eval_fakes import cut, with_both_jaws
 from process_fakes import running
 
 from finforce.ros.transport import free_domain
@@ -37,7 +37,7 @@ def short(tmp_path_factory):
     recording = read_recording(SHIPPED)
     start = recording.jaws["left"].keypoints.stamps[0]
     folder = tmp_path_factory.mktemp("bags") / "short"
-    return write_recording(recording.between(start, start + 4 * SECOND), folder)
+    return write_recording(cut(recording, start, start + 4 * SECOND), folder)
 
 
 def run(*words, timeout=240):
