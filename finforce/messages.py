@@ -61,11 +61,15 @@ class EncodedCloud(NamedTuple):
 
 
 class Keypoints(NamedTuple):
-    """Key points of one cloud: `points (K, 3)` [m], NaN = none; `likelihood (K,)` in [0, 1]; `stddev (K, 3)` [m]."""
+    """Key points of one cloud: `points (K, 3)` [m], NaN = none; `likelihood (K,)` in [0, 1]; `stddev (K, 3)` [m].
+
+    `shared` [m] is the standard deviation of a shift that all of them share.
+    """
 
     points: NDArray[np.float64]
     likelihood: NDArray[np.float64]
     stddev: NDArray[np.float64] | None
+    shared: float = 0.0
 
 
 _LARGEST_POINT = 1 << 16  # bytes
@@ -229,14 +233,15 @@ def decode_keypoints(cloud: Any) -> Keypoints:
         ObservationError: the cloud has no x, y, z, its buffer is too short, it has some of the fields `stddev_x`,
             `stddev_y`, `stddev_z` and not all, or a point states what is no standard deviation.
     """
-    columns = decode_columns(cloud, ("x", "y", "z"), ("likelihood", "valid", *STDDEV_COLUMNS))
+    columns = decode_columns(cloud, ("x", "y", "z"), ("likelihood", "valid", "shared", *STDDEV_COLUMNS))
     points = _stack(columns, ("x", "y", "z"))
     valid, likelihood = columns.get("valid"), columns.get("likelihood")
     if valid is not None:
         points[valid == 0] = np.nan
     ones = np.ones(len(points))
     stddev = _stated(columns, points)
-    return Keypoints(points, ones if likelihood is None else likelihood.astype(np.float64), stddev)
+    shared = float(columns["shared"].max()) if "shared" in columns and len(points) else 0.0
+    return Keypoints(points, ones if likelihood is None else likelihood.astype(np.float64), stddev, shared)
 
 
 def _stated(columns: Mapping[str, NDArray], points: NDArray[np.float64]) -> NDArray[np.float64] | None:

@@ -139,7 +139,9 @@ class ForceSensor:
         """Return the force on one jaw."""
         points = np.where(seen.valid[:, None], seen.points, np.nan)
         stddev = np.where(np.isfinite(points), seen.stddev, np.nan)
-        observation = Observation(stamp=seen.stamp, points=points, likelihood=seen.likelihood, stddev=stddev)
+        observation = Observation(
+            stamp=seen.stamp, points=points, likelihood=seen.likelihood, stddev=stddev, shared=seen.shared
+        )
         if T_camera_object is None:
             return loop.update(observation)
         return loop.update(observation, [(seen.stamp, invert_pose(seen.T_camera_jaw) @ T_camera_object)])

@@ -207,7 +207,7 @@ class ForceEstimator:
         dt = 0.0 if self._followed is None else min(self._stamp - self._followed, _LONGEST_GAP)
         self._followed = self._stamp
         try:
-            state = self._tracker.update(points, self._taring.tare, dt, observation.stddev, observation.gravity)
+            state = self._tracker.update(points, self._taring.tare, dt, observation)
         except UnobservableError as error:
             return self._fail("unobservable", str(error), used)
         return self._conclude(state, used)

@@ -40,9 +40,9 @@ def observation_from_cloud(cloud: Any, frame: str, gravity: NDArray | None = Non
         ObservationError: the frame, the height, the fields, a standard deviation or the buffer are wrong.
     """
     check_cloud(cloud, frame, "the key points")
-    points, likelihood, stddev = decode_keypoints(cloud)
+    seen = decode_keypoints(cloud)
     stamp = cloud.header.stamp.sec + 1e-9 * cloud.header.stamp.nanosec
-    return Observation(stamp=stamp, points=points, likelihood=likelihood, stddev=stddev, gravity=gravity)
+    return Observation(stamp=stamp, gravity=gravity, **seen._asdict())
 
 
 def contact_from_cloud(cloud: Any, frame: str, *, free: bool) -> Contact:

@@ -31,6 +31,8 @@ class Observation:
         likelihood: (K,) in [0, 1]; None: every point that is there is certain.
         stddev: (K, 3) [m] of each point along the axes of the jaw frame, above zero where there is a point; None when
             the detector states none.
+        shared: standard deviation [m] of a shift, beyond `stddev`, that all points of the image share because the jaw's
+            place is not known better; they may then turn together by a degree, too.
         gravity: unit vector (3,) along which things fall, jaw frame; None where unknown. Who gives it says that
             next to nothing but its weight, 0.1 N, acts along and across the fingers on what they hold.
     """
@@ -39,6 +41,7 @@ class Observation:
     points: NDArray
     likelihood: NDArray | None = None
     stddev: NDArray | None = None
+    shared: float = 0.0
     gravity: NDArray | None = None
 
     def __post_init__(self) -> None:
@@ -170,6 +173,8 @@ def check_observation(observation: Observation, count: int, last_stamp: float | 
         raise ObservationError(f"likelihoods from {likelihood.min():g} to {likelihood.max():g}, expected 0 to 1")
     if observation.stddev is not None:
         check_stddev(np.asarray(observation.stddev), points)
+    if not 0.0 <= observation.shared < np.inf:
+        raise ObservationError(f"shared standard deviation {observation.shared} m, expected a number from zero up")
     gravity = observation.gravity
     if gravity is not None and not (np.shape(gravity) == (3,) and abs(np.linalg.norm(gravity) - 1.0) < _UNIT):
         raise ObservationError(f"gravity {np.asarray(gravity).tolist()}, expected a unit vector of three numbers")

@@ -116,6 +116,7 @@ def keypoint_columns(found: JawKeypoints) -> dict[str, NDArray]:
         "valid": np.asarray(found.valid, dtype=np.uint8),
         "reason": reason_codes(found.reasons),
         **dict(zip(("stddev_x", "stddev_y", "stddev_z"), stddev, strict=True)),
+        "shared": np.full(len(u), found.shared, dtype=np.float32),
     }
 
 

@@ -412,6 +412,7 @@ def _with_detection(
         points=passed,
         likelihood=np.nan_to_num(_rows(seen, "likelihood", (count,))),
         stddev=np.where(np.isfinite(passed), stddev, np.nan),
+        shared=np.nan_to_num(_rows(seen, "shared", ())),
     )
     unfound = np.full(count, "")
     reasons = [unfound if each is None else each.reasons for each in seen]

@@ -31,6 +31,7 @@ class KeypointTrack:
         points: (n, K, 3) [m], jaw frame; NaN = none.
         likelihood: (n, K) in [0, 1].
         stddev: (n, K, 3) one standard deviation [m], jaw frame, NaN = not known; None when nothing says.
+        shared: (n,) standard deviation of a shift that the points of an image share [m]; None: 0.
         gravity: (n, 3) its direction, jaw frame; None when nothing says.
     """
 
@@ -38,6 +39,7 @@ class KeypointTrack:
     points: NDArray[np.float64]
     likelihood: NDArray[np.float64]
     stddev: NDArray[np.float64] | None = None
+    shared: NDArray[np.float64] | None = None
     gravity: NDArray[np.float64] | None = None
 
     @classmethod
@@ -57,6 +59,7 @@ class KeypointTrack:
             points=self.points[index],
             likelihood=self.likelihood[index],
             stddev=None if self.stddev is None else self.stddev[index],
+            shared=0.0 if self.shared is None else float(self.shared[index]),
             gravity=None if self.gravity is None else self.gravity[index],
         )
 

@@ -199,6 +199,8 @@ def _keypoint_entries(track: KeypointTrack, side: str) -> Iterator[Entry]:
         columns["likelihood"] = track.likelihood[index]
         if track.stddev is not None:
             columns |= {name: track.stddev[index, :, i] for i, name in enumerate(STDDEV_COLUMNS)}
+        if track.shared is not None:
+            columns["shared"] = np.full(track.count, track.shared[index])
         cloud = cloud_message(stamp, f"{side}_jaw", {name: value.astype(np.float32) for name, value in columns.items()})
         yield Entry(int(stamp), f"/{side}/keypoints", cloud)
 

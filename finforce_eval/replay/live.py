@@ -139,6 +139,7 @@ def heard_keypoints(cloud: Any, T_camera_jaw: NDArray[np.float64]) -> JawKeypoin
         stddev=np.full_like(seen.points, np.nan) if seen.stddev is None else seen.stddev,
         T_camera_jaw=T_camera_jaw,
         reasons=np.array(["", *REASONS])[columns["reason"]],
+        shared=seen.shared,
     )
 
 

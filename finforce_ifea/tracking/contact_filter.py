@@ -25,6 +25,7 @@ EXPECTATION = np.dtype(
         ("gate", float),  # residual that keeps a quarter of its weight, in standard deviations
         ("stiffness", float),  # of the jaw at first touch [N/m], 0 where unknown
         ("has_corners", bool),  # whether the object may rock
+        ("shared", float),  # standard deviation of a shift that all key points of an image share [m]
     ],
     align=True,
 )
@@ -83,6 +84,12 @@ _LEAST_WEIGHT = 0.02
 # Median of a squared distance in three axes; what more is chance; and fewer points do not tell the noise.
 MEDIAN_SQUARE, _CHANCE, _FEWEST = 2.37, 1.5, 5
 _BELIEVED = 0.25
+# One standard deviation: by how much a holder gives (1 degree) and a network has a bent finger turned (1.5 degrees)
+# [rad], and by how much longer a side seems that leans [-]. Rounds of weights: points that are not believed must not
+# tell what all share.
+_SHARED_TURN, _SHARED_STRETCH, _SHARED_ROUNDS = 0.03, 0.02, 3
+# Columns: shift along x and z, turn, stretch; residual; derivatives by the state and the traction ratio.
+_SHARED, _SHARED_COLUMNS = 4, 9
 # Beyond this noise key points are not noisy but something else than key points.
 _LOUDEST = 20.0
 # A forecast is never wider than this [m].
@@ -108,8 +115,17 @@ def weigh_keypoints(points, positions, motions, x, x_model, forecast, expectatio
         state: see `CONTACT_STATE`; gets the numbers of key points and the jump.
     """
     state, expectation, forecast = state[()], expectation[()], forecast[()]
+    for k in range(len(points)):
+        points[k].weight = points[k].trust
+    for _ in range(_SHARED_ROUNDS if expectation.shared > 0.0 else 1):
+        state.known, state.jump = _measure_residuals(points, positions, motions, x[0] - x_model[0], expectation)
+        _weigh_residuals(points, x, forecast, expectation, state)
+
+
+@njit(**_OPTIONS)
+def _weigh_residuals(points, x, forecast, expectation, state):
+    """Fill in the weights of measured residuals, and take these to the forecast; see `weigh_keypoints`."""
     depth_variance = min(forecast.spread[0, 0], _WIDEST_FORECAST**2)
-    state.known, state.jump = _measure_residuals(points, positions, motions, x[0] - x_model[0], expectation)
     level = _measure_noise_level(points, state.jump)
     state.used = state.agreed = 0
     for k in range(len(points)):
@@ -163,11 +179,72 @@ def _measure_residuals(points, positions, motions, below, expectation):
         point.lateral = point.measured[1] - positions[k, 1]
         point.r[0] = point.measured[0] - positions[k, 0] - point.gain[0] * point.lateral - h0 * below
         point.r[1] = point.measured[2] - positions[k, 2] - point.gain[1] * point.lateral - h1 * below
+    if expectation.shared > 0.0:
+        take_shared_out(points, positions, expectation.shared)
+    for k in range(count):
+        point = points[k]
+        if np.isnan(point.lateral):
+            continue
+        h0, h1 = point.modes[0, 0], point.modes[1, 0]
         information[k] = h0 * h0 + h1 * h1
         asked[k] = (h0 * point.r[0] + h1 * point.r[1]) / max(information[k], 1e-12)
         information[k] *= point.trust * least / (point.tare_noise[0, 0] + point.tare_noise[1, 1])
         known += 1
     return known, _weighted_median(asked, information)
+
+
+@njit(**_OPTIONS)
+def _collect_shared(points, positions, shared):
+    """Return B, residual and derivatives of each point (K, 2, 9), zero where unused, and its information (K, 2, 2)."""
+    rows, metric = np.zeros((len(points), 2, _SHARED_COLUMNS)), np.zeros((len(points), 2, 2))
+    for k in range(len(points)):
+        point = points[k]
+        if np.isnan(point.lateral):
+            continue
+        s00, s11, s01 = point.tare_noise[0, 0] + point.bias, point.tare_noise[1, 1] + point.bias, point.tare_noise[0, 1]
+        scale = point.weight / (s00 * s11 - s01 * s01)
+        metric[k, 0, 0], metric[k, 1, 1], metric[k, 0, 1] = s11 * scale, s00 * scale, -s01 * scale
+        metric[k, 1, 0] = metric[k, 0, 1]
+        rows[k, 0, 0] = rows[k, 1, 1] = shared
+        rows[k, 0, 2], rows[k, 1, 2] = _SHARED_TURN * positions[k, 2], -_SHARED_TURN * positions[k, 0]
+        rows[k, 1, 3] = _SHARED_STRETCH * positions[k, 2]
+        for a in range(2):
+            rows[k, a, _SHARED] = point.r[a]
+            rows[k, a, _SHARED + 1 :] = point.modes[a]
+    return rows, metric
+
+
+@njit(**_OPTIONS)
+def take_shared_out(points, positions, shared):
+    """Weigh residuals and their derivatives r against shift, turn and stretch that all points of an image share.
+
+    With N the covariance of the points, and B b, b ~ N(0, I), what the shared motion adds,
+
+        r <- N^1/2 (N + B B^T)^-1/2 r,
+
+    so that they count as if the points erred independently; one column q of N^-1/2 B after the other,
+
+        (I + q q^T)^-1/2 = I - q q^T (1 - (1 + q^T q)^-1/2) / (q^T q).
+
+    Args:
+        points: (K,), measured.
+        positions: of the deformed model (K, 3) [m].
+        shared: standard deviation of the shift [m].
+    """
+    rows, metric = _collect_shared(points, positions, shared)
+    for j in range(_SHARED):
+        inner = np.zeros(_SHARED_COLUMNS)
+        for k in range(len(points)):
+            for a in range(2):
+                inner += (metric[k, a, 0] * rows[k, 0, j] + metric[k, a, 1] * rows[k, 1, j]) * rows[k, a]
+        inner *= (1.0 - 1.0 / np.sqrt(1.0 + inner[j])) / max(inner[j], 1e-300)
+        for i in range(j + 1, _SHARED_COLUMNS):
+            rows[:, :, i] -= inner[i] * rows[:, :, j]
+    for k in range(len(points)):
+        for a in range(2):
+            if np.isfinite(points[k].lateral):
+                points[k].r[a] = rows[k, a, _SHARED]
+                points[k].modes[a, :] = rows[k, a, _SHARED + 1 :]
 
 
 @njit(**_OPTIONS)

@@ -15,7 +15,7 @@ from finforce_ifea.contact_mechanics.friction import FRICTIONLESS, constant_trac
 from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, SHAPE, OutlineIndenter, RoundIndenter, expect_object
 from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics, RigidContact
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE
-from finforce_ifea.observation import Contact
+from finforce_ifea.observation import Contact, Observation
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tare import PointNoise, Tare
 from finforce_ifea.tracking.common_motion import CommonMotion
@@ -205,19 +205,17 @@ class ContactTracker:
         self._led = self._mean.copy()
         self._search.forget(self._mean)
 
-    def update(
-        self, points: NDArray, tare: Tare, dt: float, stddev: NDArray | None = None, gravity: NDArray | None = None
-    ) -> ContactState | None:
+    def update(self, points: NDArray, tare: Tare, dt: float, observation: Observation) -> ContactState | None:
         """Take the key points of an image; return None when too few agree.
 
         Args:
             points: (K, 3) [m], NaN where unused.
             tare: offsets and noise.
             dt: time since the last image [s].
-            stddev: stated standard deviations (K, 3) [m].
-            gravity: its direction (3,) in the jaw's frame; None where unknown.
+            observation: that the points are of.
         """
-        noise = tare.point_noise(stddev)
+        noise = tare.point_noise(observation.stddev)
+        self._search.expectation["shared"] = observation.shared
         measured = points - tare.offsets
         held = self._lateral.by_force * self._held.lateral if self._is_known else None
         if held is not None:
@@ -241,10 +239,11 @@ class ContactTracker:
         prior = self._search.expectation["variance"]
         asked, spread, absorbed = measure_traction(self._search.points, self._search.average, prior)
         if held is not None and state["converged"] and state["depth"] >= LOADED_DEPTH and not self._jumped:
-            self._follow_traction((asked, spread), noise.gain, dt, gravity)
+            self._follow_traction((asked, spread), noise.gain, dt, observation.gravity)
         self._complete(state)
         expected = self._search.expectation["mean"], prior
-        self._camera.update(self._search.points, self._search.positions, state, expected, tare)
+        if not observation.shared:  # else common motion is expected
+            self._camera.update(self._search.points, self._search.positions, state, expected, tare)
         state["traction_leak"] = state["by_traction"] - state["force_modes"] @ absorbed
         if held is not None:
             motions = (points - tare.offsets - held - self._search.positions)[:, 1]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics
 from finforce_ifea.errors import NotEnoughDataError, UnobservableError
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE, Jaw
-from finforce_ifea.observation import Contact
+from finforce_ifea.observation import Contact, Observation
 from finforce_ifea.paper_inverse import InverseResult, Problem, solve_inverse
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tare import Tare
@@ -134,25 +134,24 @@ class GivenContactTracker:
             energy_form=self.settings.energy_form,
         )
 
-    def update(
-        self, points: NDArray, tare: Tare, dt: float, stddev: NDArray | None = None, gravity: NDArray | None = None
-    ) -> ContactState | None:
+    def update(self, points: NDArray, tare: Tare, dt: float, observation: Observation) -> ContactState | None:
         """Take the key points of an image; return None when too few are left.
 
         Args:
             points: (K, 3) [m], NaN where unused.
             tare: offsets and noise.
             dt: time since the last image [s], of no use here.
-            stddev: stated standard deviations (K, 3) [m].
-            gravity: of no use here.
+            observation: that the points are of.
 
         Raises:
             UnobservableError: They do not tell the force.
         """
         targets = points - tare.offsets
         known = np.isfinite(targets[:, 0])
-        noise = tare.point_noise(stddev)
+        noise = tare.point_noise(observation.stddev)
         scatter = np.trace(noise.plane, axis1=1, axis2=2) / 2.0 / noise.trust
+        # the points are taken to err independently, and would average away what they share
+        scatter += np.count_nonzero(known) * observation.shared**2
         variance = scatter + noise.bias + tare.offset_variance()
         try:
             if self.paper:

@@ -26,7 +26,7 @@ from finforce_keypoints.geometry.depth import (
     sample_depths,
     weigh_depths,
 )
-from finforce_keypoints.geometry.jaw_pose import Origin, OriginEstimator, OriginTrack, ReferencePatch
+from finforce_keypoints.geometry.jaw_pose import COVERED_STDDEV, Origin, OriginEstimator, OriginTrack, ReferencePatch
 from finforce_keypoints.images import PixelDetection, RgbdImage, lie_inside
 from finforce_keypoints.parameters import DetectorSettings, JawMount
 
@@ -54,6 +54,7 @@ class JawKeypoints:
         T_camera_jaw: (4, 4) where the jaw is.
         reasons: (K,) str, "" for valid points, else what speaks against them, one of `REASONS`.
         scale: of the depth image, as this jaw shows it; None where nobody knows.
+        shared: standard deviation of a shift, beyond `stddev`, that all points share, see `Observation` [m].
     """
 
     stamp: float
@@ -65,6 +66,7 @@ class JawKeypoints:
     T_camera_jaw: NDArray
     reasons: NDArray
     scale: DepthScale | None = None
+    shared: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -223,10 +225,11 @@ class JawLocalizer:
         points = np.where(has_depth[:, None], sight.camera + depths[:, None] * sight.rays, np.nan)
         late = self._find_delays(seen, T_camera_jaw)
         points[:, 0] -= self._sign * self._track.speed * (late - late[-1])
-        stddev = compute_stddev(sight, depths, fit.stddev, seen.ray_stddev)
-        # whoever takes the points' errors for independent averages away what they share, unless it is stated as larger
-        points_alike = 1.0 if self._visible[-1] else max(float(seen.likely.sum()), 1.0)
-        stddev[:, 0] = np.hypot(stddev[:, 0], origin.stddev * np.sqrt(points_alike))
+        # where a holder covers what is rigid, the place was found by points that bend: it tells nothing of the bending
+        is_held = not self._visible[-1]
+        y_stddev = np.where(is_held, self._model.relief, fit.stddev)
+        stddev = compute_stddev(sight, depths, y_stddev, seen.ray_stddev)
+        stddev[:, 0] = np.hypot(stddev[:, 0], 0.0 if is_held else origin.stddev)
         reasons = self._judge(seen.image, seen.detection, has_depth, points)
         valid = reasons == ""
         count = len(valid)
@@ -240,6 +243,7 @@ class JawLocalizer:
             T_camera_jaw=self._origin.place(replace(origin, x=origin.x - self._track.speed * late[-1])),
             reasons=reasons,
             scale=fit.scale,
+            shared=COVERED_STDDEV if is_held else 0.0,
         )
 
     def _find_delays(self, seen: _Seen, T_camera_jaw: NDArray) -> NDArray:

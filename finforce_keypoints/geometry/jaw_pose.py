@@ -28,7 +28,7 @@ _LEAST_AGREEMENT = 0.6  # share of the points near the base that stand where the
 _SET_ASIDE = 3  # consecutive places off the course that are believed when they agree
 _RIGID_STDDEV = 0.3e-3  # [m] bending of the jaw at that height; more with the square of the height
 _ORIGIN_STDDEV = 0.6e-3  # [m] a jaw whose place is less well known is not found
-_COVERED_STDDEV = 3e-3  # [m] the same of a jaw whose rigid part is covered: how sure its place is goes into the force
+COVERED_STDDEV = 3e-3  # [m] the same of a jaw whose rigid part is covered: how sure its place is goes into the force
 _SLIP = 1.5e-3  # [m] standard deviation of how far holder and camera give under load, along the jaw
 _ROUNDS = 6  # of reweighting
 _LEAST_BENT = 5  # points that tell the place of a jaw that may be bent
@@ -92,7 +92,7 @@ class OriginEstimator:
             bends = np.insert(find_motions(jaw)[:BENDS], 1, 0.0, axis=2) @ self._T_camera_middle[:3, :3].T
             slip = np.broadcast_to(_SLIP * self._T_camera_middle[:3, 2], (1, *points.shape))
             self._motions = np.concatenate((slip, np.append(bends, np.zeros((BENDS, 1, 3)), axis=1)))
-            self.largest_stddev = _COVERED_STDDEV
+            self.largest_stddev = COVERED_STDDEV
 
     @property
     def middle(self) -> Origin:

@@ -108,10 +108,10 @@ def test_columns_of_different_length_or_unknown_type_are_refused():
 
 def test_key_points_without_likelihood_are_certain():
     cloud = packed({"x": np.float32([1, np.nan]), "y": np.float32([2, 2]), "z": np.float32([3, 3])})
-    points, likelihood, stddev = decode_keypoints(cloud)
+    points, likelihood, stddev, shared = decode_keypoints(cloud)
     np.testing.assert_array_equal(points, [[1, 2, 3], [np.nan, 2, 3]])
     np.testing.assert_array_equal(likelihood, [1, 1])
-    assert stddev is None
+    assert stddev is None and shared == 0.0
 
 
 def test_rows_that_the_detector_calls_invalid_are_not_used():

@@ -59,6 +59,19 @@ def test_reading_inverts_writing(tmp_path, storage, compressed, single_file):
     assert_same(read, written)
 
 
+def test_what_the_points_of_an_image_share_is_read_as_it_was_written(tmp_path):
+    written = make_recording("held")
+    jaws = dict(written.jaws)
+    for side, jaw in jaws.items():
+        shared = np.linspace(1e-3, 3e-3, len(jaw.keypoints.stamps)).astype(np.float32)
+        jaws[side] = replace(jaw, keypoints=replace(jaw.keypoints, shared=shared.astype(np.float64)))
+    written = replace(written, jaws=jaws)
+    read = read_recording(write_recording(written, tmp_path / "held"))
+    assert_same(read, written)
+    track = next(iter(read.jaws.values())).keypoints
+    assert track.observation(2).shared == track.shared[2] > track.shared[0]
+
+
 def test_recording_of_the_right_jaw_is_read(tmp_path):
     read = read_recording(write_recording(make_recording(side="right"), tmp_path / "bag"))
     assert list(read.jaws) == ["right"]

@@ -38,6 +38,7 @@ class FakeKeypoints:
     stddev: np.ndarray = field(default_factory=lambda: np.tile((1e-4, 2e-4, 3e-4), (COUNT, 1)))
     T_camera_jaw: np.ndarray = field(default_factory=lambda: jaw_in_camera(ROBOT_CAMERA, "left", -0.04))
     reasons: np.ndarray = field(default_factory=lambda: np.full(COUNT, "", dtype=object))
+    shared: float = 0.0
 
 
 class FakeDetector:

@@ -17,7 +17,7 @@ from finforce_keypoints.detectors.side_plane import AnyFinger, SidePlaneDetector
 from finforce_keypoints.errors import DetectorSettingsError, GeometryError, RigError
 from finforce_keypoints.geometry.depth import DepthScale
 from finforce_keypoints.geometry.jaw_localizer import JawLocalizer
-from finforce_keypoints.geometry.jaw_pose import OriginEstimator
+from finforce_keypoints.geometry.jaw_pose import COVERED_STDDEV, OriginEstimator
 from finforce_keypoints.geometry.side_picture import PlaneGrid, find_side, project_plane
 from finforce_keypoints.geometry.template import find_motions, find_shape
 from finforce_keypoints.images import PixelDetection, RgbdImage
@@ -232,6 +232,20 @@ def test_a_holder_that_gives_along_the_finger_moves_no_jaw_along_the_closing_axi
     found = estimator.measure(rays_from_pixels(pixels, CAMERA), np.full(len(pixels), 0.3 / CAMERA.fx))
     assert abs(found.x + 0.04) < min(0.4e-3, 3.0 * found.stddev) and abs(found.slip - slip) < 0.3 * abs(slip)
     np.testing.assert_allclose(estimator.place(found)[:3, 3], T[:3, 3] + slip * T[:3, 2], atol=1e-3)
+
+
+def test_the_place_of_a_jaw_in_a_holder_is_stated_apart_from_its_points():
+    jaw = load_jaw("bench", "left")
+    image = RgbdImage(stamp=1.0, color=np.zeros((480, 640, 3), np.uint8), depth=None, camera=CAMERA)
+    found = []
+    for mount in (JawMount(), JawMount(covered=LOW)):
+        localizer = JawLocalizer(jaw, ROBOT_CAMERA, DetectorSettings(plane_depth=True), mount)
+        found.append(localizer.locate(image, localizer.imagine(CAMERA), DepthScale(error=0.0, stddev=0.015)))
+    straight, held = found
+    used = held.valid & straight.valid
+    assert straight.shared == 0.0 and held.shared == COVERED_STDDEV and used.sum() >= 5
+    # what the camera is off the side, and the place along the closing axis, move all points together
+    assert (held.stddev[used][:, [0, 2]] < straight.stddev[used][:, [0, 2]]).all()
 
 
 def test_a_picture_without_jaws_is_refused(monkeypatch):

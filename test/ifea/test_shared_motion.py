@@ -1,0 +1,84 @@
+"""Claims about a motion that all key points of an image share, as of a jaw that slips in its holder."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from estimator_fakes import errors, make_estimator, ramp, record, run
+from mechanics_fakes import BENCH
+
+from finforce.errors import ObservationError
+from finforce_ifea.observation import Observation
+from finforce_ifea.tracking.contact_filter import take_shared_out
+from finforce_ifea.tracking.contact_state import KEYPOINT
+
+SHARED = 3e-3
+
+
+def test_residuals_count_as_their_whole_covariance_says():
+    random = np.random.default_rng(0)
+    points, places = np.zeros(9, KEYPOINT), random.uniform(0.0, 0.1, (9, 3))
+    points["r"], points["modes"] = 1e-3 * random.normal(size=(9, 2)), random.normal(size=(9, 2, 4))
+    points["tare_noise"], points["bias"] = 1e-8 * np.array([[9.0, 2.0], [2.0, 4.0]]), 3e-8
+    points["weight"] = random.uniform(0.1, 1.0, 9)
+    points["lateral"][4] = np.nan  # not seen
+    used = np.arange(9) != 4
+    own = np.zeros((16, 16))
+    for i, noise in enumerate((points["tare_noise"] + 3e-8 * np.eye(2))[used] / points["weight"][used, None, None]):
+        own[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = noise
+    x, z = places[used, 0], places[used, 2]
+    shared = np.zeros((8, 2, 4))
+    shared[:, 0, 0] = shared[:, 1, 1] = SHARED
+    shared[:, 0, 2], shared[:, 1, 2], shared[:, 1, 3] = 0.03 * z, -0.03 * x, 0.02 * z
+    shared = shared.reshape(16, 4)
+    before = np.column_stack((points["r"][used].ravel(), points["modes"][used].reshape(16, 4)))
+    take_shared_out(points, places, SHARED)
+    after = np.column_stack((points["r"][used].ravel(), points["modes"][used].reshape(16, 4)))
+    wanted = before.T @ np.linalg.solve(own + shared @ shared.T, before)
+    np.testing.assert_allclose(after.T @ np.linalg.solve(own, after), wanted, rtol=1e-9)
+
+
+def slip(observation, *, shift, turn):
+    """The image of a jaw that has moved along x [m] and turned [rad] in its holder."""
+    points = observation.points + np.array([shift, 0.0, 0.0])
+    points[:, 0] += turn * observation.points[:, 2]
+    points[:, 2] -= turn * observation.points[:, 0]
+    return replace(observation, points=points)
+
+
+@pytest.fixture(scope="module")
+def slipping():
+    """A press of 4 mm under which the jaw slips by 0.8 mm and turns by half a degree."""
+    pressed = record(ramp(4, hold=0.6), seed=2)
+    share = np.minimum(pressed.depths / 2e-3, 1.0)
+    seen = [slip(o, shift=8e-4 * s, turn=0.009 * s) for o, s in zip(pressed.observations, share, strict=True)]
+    return replace(pressed, observations=seen)
+
+
+def test_a_jaw_that_slips_in_its_holder_tells_the_force_within_what_is_stated(slipping):
+    allowed = replace(slipping, observations=[replace(o, shared=SHARED) for o in slipping.observations])
+    held = slice(len(slipping.depths) - 15, None)
+    solutions = run(allowed, solver="frame")
+    stated = np.array([s.magnitude_stddev for s in solutions[held]])
+    error = errors(slipping, solutions)[held]
+    assert np.isfinite(error).all() and (np.abs(error) < 3.0 * stated).all()
+    # who is not told does not answer, or is wrong by more than that
+    ignorant = run(slipping, solver="frame")
+    wrong = errors(slipping, ignorant)[held]
+    assert (~(np.abs(wrong) < 3.0 * np.array([s.magnitude_stddev for s in ignorant[held]]))).all()
+
+
+def test_what_is_shared_makes_no_force_surer(slipping):
+    estimators = [make_estimator(solver="frame") for _ in range(2)]
+    stated = []
+    for estimator, shared in zip(estimators, (0.0, SHARED), strict=True):
+        pressed = record(ramp(3, hold=0.3), seed=3)
+        last = [estimator.update(replace(o, shared=shared), pressed.contact) for o in pressed.observations][-1]
+        stated.append(last.magnitude_stddev)
+    assert 0.0 < stated[0] < stated[1]
+
+
+@pytest.mark.parametrize("shared", [-1e-3, np.nan, np.inf])
+def test_a_shared_deviation_that_is_none_is_refused(shared):
+    with pytest.raises(ObservationError, match="shared standard deviation"):
+        make_estimator(solver="frame").update(Observation(stamp=1.0, points=BENCH.keypoints, shared=shared), None)
