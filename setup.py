@@ -99,14 +99,15 @@ setup(
     entry_points={
         "console_scripts": [
             "finforce = finforce_eval.cli.main:main",
-            "contact_estimator = finforce.ros.start:contact_estimator",
-            "emulated_gripper = finforce.ros.start:emulated_gripper",
-            "gripper_driver = finforce.ros.start:gripper_driver",
-            "ifea_solver = finforce.ros.start:ifea_solver",
-            "keypoint_detector = finforce.ros.start:keypoint_detector",
-            "pipeline = finforce.ros.start:pipeline",
-            "recording_player = finforce.ros.start:recording_player",
-            "twin_camera = finforce.ros.start:twin_camera",
+            # run by the name that they are called by
+            "contact_estimator = finforce.ros.start:main",
+            "emulated_gripper = finforce.ros.start:main",
+            "gripper_driver = finforce.ros.start:main",
+            "ifea_solver = finforce.ros.start:main",
+            "keypoint_detector = finforce.ros.start:main",
+            "pipeline = finforce.ros.start:main",
+            "recording_player = finforce.ros.start:main",
+            "twin_camera = finforce.ros.start:main",
         ],
     },
 )

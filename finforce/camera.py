@@ -109,14 +109,9 @@ class CameraIntrinsics:
         object.__setattr__(self, "distortion", np.pad(distortion, (0, counts[-1] - len(distortion))))
 
     @cached_property
-    def is_distorted(self) -> bool:
-        """Whether the lens does anything that a pinhole does not."""
-        return self.model == EQUIDISTANT or bool(self.distortion.any())
-
-    @cached_property
     def lens(self) -> NDArray[np.float64]:
         """fx, fy, cx, cy, kind (0 pinhole, 1 distorted, 2 fisheye), eight coefficients and widest angle [rad] (14,)."""
-        kind = (2.0 if self.model == EQUIDISTANT else 1.0) if self.is_distorted else 0.0
+        kind = 2.0 if self.model == EQUIDISTANT else float(self.distortion.any())
         coefficients = np.pad(self.distortion, (0, 8 - len(self.distortion)))
         return np.array([self.fx, self.fy, self.cx, self.cy, kind, *coefficients, WIDEST])
 

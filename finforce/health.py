@@ -25,17 +25,18 @@ class StaleError(FinforceError, ValueError):
     """The data are older than what may be published."""
 
 
+_RESTART = 1 * NANOSECONDS  # by which stamps go back where a new recording begins; late images are nearer
+
+
 class StampGate:
     """Lets a sample through once, in order, and only while it is fresh.
 
     Args:
         max_age: greatest age of a sample [s]; a stamp may lie as far ahead of the clock.
-        restart_gap: a stamp that goes back by more than this begins a new recording [s].
     """
 
-    def __init__(self, *, max_age: float, restart_gap: float) -> None:
+    def __init__(self, max_age: float) -> None:
         self.limit(max_age)
-        self._restart_gap = round(restart_gap * NANOSECONDS)
         self._last: int | None = None
 
     def limit(self, max_age: float) -> None:
@@ -51,11 +52,11 @@ class StampGate:
 
         Raises:
             StaleError: the sample is too old.
-            StampError: the stamp repeats, goes back by less than `restart_gap` or lies ahead of the clock.
+            StampError: the stamp repeats, goes back by less than a second or lies ahead of the clock.
         """
         self.check_age(stamp, now)
         back = 0 if self._last is None else self._last - stamp
-        if self._last is not None and 0 <= back <= self._restart_gap:
+        if self._last is not None and 0 <= back <= _RESTART:
             verb = f"go back by {back / NANOSECONDS:.3f} s" if back else "stand still"
             raise StampError(f"the stamps {verb} at {stamp / NANOSECONDS:.3f} s")
         self._last = stamp
@@ -77,15 +78,13 @@ class StampGate:
             raise StampError(f"the stamp lies {-age:.3f} s ahead of the node's clock; {hint}")
 
 
+_PERIOD = NANOSECONDS // 10  # of the answers while nothing happens, counted from stamp 0
+
+
 class Idling:
-    """Passes images over while nothing happens: of every period one is answered, in every node the same.
+    """Passes images over while nothing happens: of every tenth of a second one is answered, in every node the same."""
 
-    Args:
-        period: of the answers [s]; an image is the first one of a period, counted from stamp 0.
-    """
-
-    def __init__(self, period: float = 0.1) -> None:
-        self._period = round(period * NANOSECONDS)
+    def __init__(self) -> None:
         self._answered: int | None = None
 
     @property
@@ -95,11 +94,11 @@ class Idling:
 
     def passes(self, stamp: int) -> bool:
         """Say whether an image [ns] may be passed over: one of its period was answered, and nothing happened then."""
-        return self._answered == stamp // self._period
+        return self._answered == stamp // _PERIOD
 
     def note(self, stamp: int, idle: bool) -> None:
         """Note that an image [ns] was answered, and whether nothing happened in it."""
-        self._answered = stamp // self._period if idle else None
+        self._answered = stamp // _PERIOD if idle else None
 
     def end(self) -> None:
         """Note that something happens."""
@@ -139,6 +138,9 @@ class Report:
     values: Mapping[str, str] = field(default_factory=dict)
 
 
+_WINDOW = 512  # messages that rates and latencies are taken over
+
+
 class Health:
     """Keeps the last outcomes of a node and says how it is.
 
@@ -149,17 +151,16 @@ class Health:
     Args:
         source: the same, as far as it is known at the start.
         stale_after: silence after which the node is stale [s].
-        window: number of messages that rates and latencies are taken over.
     """
 
     times = ("callback to published", "image to published")
 
-    def __init__(self, *, source: str, stale_after: float, window: int = 512) -> None:
+    def __init__(self, *, source: str, stale_after: float) -> None:
         self.source = source
         self._stale_after = stale_after
-        self._arrivals: deque[float] = deque(maxlen=window)
-        self._latency: deque[float] = deque(maxlen=window)
-        self._age: deque[float] = deque(maxlen=window)
+        self._arrivals: deque[float] = deque(maxlen=_WINDOW)
+        self._latency: deque[float] = deque(maxlen=_WINDOW)
+        self._age: deque[float] = deque(maxlen=_WINDOW)
         self._refused: Counter[str] = Counter()
         # the last of each kind: however many are refused between two reports
         self._recent: dict[tuple[Level, str], Outcome] = {}
@@ -227,18 +228,13 @@ class Health:
             f"{age} p95 [ms]": _percentile(self._age, 95),
             "arrived": str(self._arrived),
             "published": str(self._published),
-            "refused": _counts(self._refused),
+            "refused": ", ".join(f"{count} {reason}" for reason, count in self._refused.most_common()) or "none",
         }
 
 
 def _percentile(seconds: Sequence[float], percent: float) -> str:
     """Return a percentile of times [s] as text in milliseconds."""
     return f"{1e3 * float(np.percentile(seconds, percent)):.2f}" if len(seconds) else "-"
-
-
-def _counts(counter: Counter[str]) -> str:
-    """Return counts as text, the most frequent first."""
-    return ", ".join(f"{count} {reason}" for reason, count in counter.most_common() if count) or "none"
 
 
 class SkippingError(FinforceError):

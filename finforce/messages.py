@@ -107,20 +107,18 @@ def _wanted(
     return tuple(entries.values())
 
 
-def _rows(data: Any, width: int, height: int, point_step: int, row_step: int) -> NDArray[np.uint8]:
-    """Return the bytes of the points without the padding of the rows, (height, width * point_step)."""
-    used = width * point_step
+def _points(cloud: Any, layout: np.dtype) -> NDArray:
+    """Return the points of a cloud (width * height,), without the padding of its rows."""
+    width, height, row_step = int(cloud.width), int(cloud.height), int(cloud.row_step)
+    used = width * layout.itemsize
     step = used if height == 1 else row_step
     if step < used:
-        raise ObservationError(f"row_step is {row_step} bytes; {width} points of {point_step} need {used}")
-    buffer = np.frombuffer(data, dtype=np.uint8)
+        raise ObservationError(f"row_step is {row_step} bytes; {width} points of {layout.itemsize} need {used}")
+    buffer = np.frombuffer(cloud.data, dtype=np.uint8)
     needed = step * (height - 1) + used
     if buffer.size < needed:
         raise ObservationError(f"the cloud's buffer holds {buffer.size} bytes; {needed} were announced")
-    if height == 1:
-        return buffer[:used].reshape(1, used)
-    strided = np.lib.stride_tricks.as_strided(buffer, (height, used), (step, 1), writeable=False)
-    return np.ascontiguousarray(strided)
+    return np.ndarray((height, width), layout, buffer, strides=(step, layout.itemsize)).reshape(-1)
 
 
 def encode_cloud(columns: Mapping[str, ArrayLike]) -> EncodedCloud:
@@ -150,16 +148,15 @@ def encode_cloud(columns: Mapping[str, ArrayLike]) -> EncodedCloud:
 @lru_cache(maxsize=64)
 def _plan(columns: tuple[tuple[str, np.dtype, tuple[int, ...]], ...]) -> tuple[tuple[PointField, ...], np.dtype]:
     """Return fields and layout of a point with columns (name, type, shape without the first axis)."""
-    fields, point_step = [], 0
     for name, kind, shape in columns:
-        code = _CODES.get(kind.newbyteorder("="))
-        if code is None or len(shape) > 1:
+        if kind.newbyteorder("=") not in _CODES or len(shape) > 1:
             raise ObservationError(f"column '{name}' of type {kind}, shape (n, *{shape}) is not a field")
-        count = shape[0] if shape else 1
-        fields.append(PointField(name, point_step, code, count))
-        point_step += kind.itemsize * count
-    entries = tuple((field.name, field.offset, field.datatype, field.count) for field in fields)
-    return tuple(fields), _layout(entries, point_step, False)
+    layout = np.dtype([(name, kind.newbyteorder("<"), shape) for name, kind, shape in columns])
+    fields = (
+        PointField(name, layout.fields[name][1], _CODES[kind.newbyteorder("=")], *shape)
+        for name, kind, shape in columns
+    )
+    return tuple(fields), layout
 
 
 @dataclass(eq=False)
@@ -220,7 +217,7 @@ def decode_columns(cloud: Any, names: Sequence[str], optional: Sequence[str] = (
     for name in layout.names:
         if layout[name].shape:
             raise ObservationError(f"field '{name}' has {layout[name].shape[0]} numbers a point; expected count 1")
-    table = _rows(cloud.data, width, height, point_step, int(cloud.row_step)).view(layout).reshape(width * height)
+    table = _points(cloud, layout)
     return {name: np.ascontiguousarray(table[name], dtype=table[name].dtype.newbyteorder("=")) for name in layout.names}
 
 

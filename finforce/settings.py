@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
-from dataclasses import MISSING, Field, dataclass, field, fields, replace
+from dataclasses import MISSING, Field, dataclass, field, fields
 from typing import Any, TypeVar
 
 from finforce.errors import FinforceError
@@ -44,7 +43,6 @@ class TimeParameters:
     """What every node that answers images is told about time and frames; units stand in the metadata."""
 
     max_age: float = setting(0.2, "Maximum age of data when a result is published", "s", 0.001, 60.0, settable=True)
-    restart_gap: float = setting(1.0, "Backward jump of stamps that starts a new recording", "s", 0.001, 3600.0)
     diagnostics_period: float = setting(1.0, "Period of the diagnostics", "s", 0.05, 60.0)
     frame_prefix: str = setting("", "Prefix of the frames of gripper and jaws, such as robot1/")
 
@@ -130,17 +128,3 @@ def check_bounds(record: Any, error: type[Exception]) -> None:
     """Refuse a record with a value that `check_value` refuses, by raising `error`."""
     for entry in fields(record):
         check_value(entry, getattr(record, entry.name), error)
-
-
-def refresh_record(record: RecordT, read: Callable[[str], Any]) -> RecordT:
-    """Return a record whose settable fields have the values that `read` gives for their names.
-
-    Raises:
-        ParameterError: a value is out of bounds.
-    """
-    values = {}
-    for entry in fields(record):
-        if entry.metadata.get("settable"):
-            values[entry.name] = read(entry.name)
-            check_value(entry, values[entry.name])
-    return replace(record, **values)

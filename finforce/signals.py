@@ -11,7 +11,6 @@ import select
 import signal
 import socket
 from contextlib import suppress
-from types import FrameType
 from typing import Any
 
 STOPS = (signal.SIGINT, signal.SIGTERM)
@@ -30,7 +29,8 @@ class StopSignals:
 
     def __enter__(self) -> StopSignals:
         self._wakeup = signal.set_wakeup_fd(self._writer.fileno(), warn_on_full_buffer=False)
-        self._handlers = {number: signal.signal(number, _ignore) for number in STOPS}
+        # that there is a handler keeps the signal from ending the process
+        self._handlers = {number: signal.signal(number, lambda *_: None) for number in STOPS}
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -47,7 +47,3 @@ class StopSignals:
             with suppress(BlockingIOError):
                 self._stopped = any(number in STOPS for number in self._reader.recv(4096))
         return self._stopped
-
-
-def _ignore(number: int, frame: FrameType | None) -> None:
-    """Do nothing: that there is a handler keeps the signal from ending the process."""

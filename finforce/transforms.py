@@ -39,7 +39,7 @@ def check_pose(T: ArrayLike, what: str = "pose") -> NDArray:
             f"{what}: got NaN or infinite entries, expected a rigid pose; drop such samples at their source"
         )
     R = T[:3, :3]
-    scaling, turned = R.T @ R, _determinant(R)
+    scaling, turned = R.T @ R, float(np.linalg.det(R))
     error = float(np.abs(scaling - _UNIT).max())
     if not error <= _TOLERANCE or turned < 0.0 or np.abs(T[3] - _LAST).max() > 1e-9:
         raise PoseError(
@@ -131,11 +131,6 @@ def step_between(T_from: NDArray, T_to: NDArray) -> NDArray:
     factor = 2.0 * math.atan2(sine, w) / sine if sine else 2.0
     (a, b, c), (d, e, f) = T_from[:3, 3].tolist(), T_to[:3, 3].tolist()
     return np.array([d - a, e - b, f - c, factor * x, factor * y, factor * z])
-
-
-def _determinant(R: NDArray) -> float:
-    (a, b, c), (d, e, f), (g, h, i) = R.tolist()
-    return a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g)
 
 
 def _rotation(x: float, y: float, z: float, w: float) -> list[list[float]]:

@@ -17,7 +17,7 @@ from finforce.camera_topics import COMPRESSED_DEPTH
 from finforce.health import IDLE, Health, Idling, Level, Outcome, Report, Skips, StampGate
 from finforce.messages import SECOND, CameraStream, stamp_of
 from finforce.ros import node as ros
-from finforce.settings import refresh_record
+from finforce.settings import check_bounds
 from finforce.transforms import pose_numbers
 from finforce_contact.estimator import ContactEstimate
 from finforce_contact.localization.touch import Slip
@@ -109,9 +109,9 @@ class ContactEstimatorNode(ros.ImageNode):
         self.skips = Skips(parameters.skip_off)
         ros.warn_first_start()
         self.session = ContactSession(parameters, contact, tracker, self.skips)
-        self.gates = {side: StampGate(max_age=age, restart_gap=parameters.restart_gap) for side in self.sides}
+        self.gates = {side: StampGate(age) for side in self.sides}
         self.health = {side: Health(source=f"{side}/jaw_pose", stale_after=age) for side in self.sides}
-        ros.follow_settings(self, parameters, self._limit_age)
+        ros.follow_settings(self, parameters, self._take_changes)
         self.stage = ros.Stage(self, pipeline)
         self.out = _ContactOutputs(self.stage, parameters, self.session.stream, self.skips)
         with self.rejections():
@@ -125,8 +125,8 @@ class ContactEstimatorNode(ros.ImageNode):
         """Offer services, whose long work holds up nothing else, and diagnostics."""
         session, period = self.session, self.parameters.diagnostics_period
         one_by_one = MutuallyExclusiveCallbackGroup()
-        ros.serve_trigger(self.stage, "~/load_mesh", lambda: session.load_mesh(self._refreshed()), one_by_one)
-        ros.serve_trigger(self.stage, "~/reconstruct", lambda: session.reconstruct(self._refreshed()), one_by_one)
+        ros.serve_trigger(self.stage, "~/load_mesh", lambda: session.load_mesh(self._checked()), one_by_one)
+        ros.serve_trigger(self.stage, "~/reconstruct", lambda: session.reconstruct(self._checked()), one_by_one)
         ros.serve_trigger(self.stage, "~/reset", session.reset)
         for side in self.sides:
             report = partial(self._report, side)
@@ -165,14 +165,16 @@ class ContactEstimatorNode(ros.ImageNode):
         images("object_mask", partial(self._on_image, camera.take_mask))
         images(self.parameters.depth_topic, partial(self._on_image, camera.take_depth), end=COMPRESSED_DEPTH)
 
-    def _limit_age(self, changed: ContactParameters) -> None:
-        """Take another greatest age of data."""
+    def _take_changes(self, changed: ContactParameters) -> None:
+        """Take parameters that were set at run time."""
+        self.parameters = changed
         for gate in self.gates.values():
             gate.limit(changed.max_age)
 
-    def _refreshed(self) -> ContactParameters:
-        """Return the parameters with the present values of those that may be set at run time."""
-        return refresh_record(self.parameters, lambda name: self.get_parameter(name).value)
+    def _checked(self) -> ContactParameters:
+        """Return the parameters; raise ParameterError where one that was set at run time is out of its choices."""
+        check_bounds(self.parameters, ros.ParameterError)
+        return self.parameters
 
     def _on_jaw_pose(self, side: str, pose: ros.PoseStamped) -> None:
         """Find the contact of an image, unless it may be passed over."""

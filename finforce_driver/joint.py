@@ -15,14 +15,13 @@ from finforce_driver.errors import GripperStateError, TargetError
 from finforce_driver.gripper import Clock, StateCondition, StateSource
 from finforce_driver.machine.knowledge import History
 from finforce_driver.settings import GripperSettings, JointSettings, check_numbers, is_number
-from finforce_driver.state import GripperState, MoveOutcome, Phase, describe
+from finforce_driver.state import ABSENT, GripperState, MoveOutcome, Phase, describe
 
 NEAR = 1.5  # steps within which the target is reached
 STILL, STALL = 1e-3, 0.4  # [m/s], and [s] without motion after which the jaws are stalled
 SILENCE = 0.5  # [s] without a state after which the joint counts as disconnected
 EXTRA_TIME = 2.0  # [s] beyond the travel's own time
 TURN = 0.005  # [s] between two looks of one who waits
-ABSENT = (Phase.PROBING, Phase.DISCONNECTED)
 SendCommand = Callable[[float, float, float], None]
 
 

@@ -139,12 +139,11 @@ class MessageTimes:
         clock: the gripper's.
         sources: names of what sends messages, each in the order of its stamps.
         max_age: greatest age of a message, and greatest time that its stamp may lie ahead [s].
-        restart_gap: by which the stamps of a source may go back, because they begin anew [s].
     """
 
-    def __init__(self, clock: Clock, sources: tuple[str, ...], *, max_age: float, restart_gap: float) -> None:
+    def __init__(self, clock: Clock, sources: tuple[str, ...], max_age: float) -> None:
         self._clock = clock
-        self._gates = {name: StampGate(max_age=max_age, restart_gap=restart_gap) for name in sources}
+        self._gates = {name: StampGate(max_age) for name in sources}
 
     def enter(self, source: str, stamp: int, now: int) -> float:
         """Return the stamp [ns] of a fresh message of a source on the gripper's clock [s].

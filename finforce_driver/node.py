@@ -167,9 +167,8 @@ class GripperDriverNode(Node):
         first = {name: getattr(parameters, f"grasp_{name}") for name in ("force", "speed", "time_limit")}
         self.session = GraspSession(self.gripper, GraspGoal(**first), grasp, self.wake.trigger)
         self.tasks = GripperTasks(self.gripper, self.session, parameters)
-        gate = {"max_age": parameters.max_age, "restart_gap": parameters.restart_gap}
         told = [f"{side} {what}" for side in JAWS for what in ("stddev", "slip")]
-        self.times = MessageTimes(self.gripper.clock, ("force", *JAWS, *told), **gate)
+        self.times = MessageTimes(self.gripper.clock, ("force", *JAWS, *told), parameters.max_age)
         self.health = GripperHealth(source=parameters.port, stale_after=parameters.max_age)
         self.stage = ros.Stage(self)
         self.joints = None if self.is_other else self.stage.publisher(JointState, "joint_states", ros.RESULT)

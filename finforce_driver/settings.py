@@ -56,7 +56,7 @@ class GripperSettings(_Bounded):
     """
 
     node_id: int = setting(0, "CAN node of the gripper", "", 0, 15)
-    poll_rate: float = setting(50.0, "Rate of state requests", "Hz", 5.0, 200.0)
+    poll_rate: float = setting(50.0, "Rate of state requests", "Hz", 5.0, 200.0, parameter=False)
     reply_timeout: float = setting(0.05, "Maximum wait for a reply", "s", 0.005, 1.0)
     stroke: float = setting(0.048, "Stroke of the opening between the end stops", "m", 0.001, 0.5)
     closed_opening: float = setting(0.0, "Opening between the jaws' inner faces at the closed stop", "m", 0.0, 0.2)
@@ -151,19 +151,6 @@ class GripperSettings(_Bounded):
     def force_of(self, current: float) -> float:
         """Return the grip force [N] of a current [A]; both positive when driving closed."""
         return self.force_per_current * current
-
-    def force_for(self, current: float, force: float | None) -> float:
-        """Return the grip force [N] that stands for a current limit [A].
-
-        Raises:
-            TargetError: the current is no number or out of range, or a force is given in addition to it.
-        """
-        if force is not None:
-            raise TargetError(f"force {force!r} N and current {current!r} A: expected one of them")
-        low, high = LEAST_CURRENT, self.largest_current
-        if not (is_number(current) and low - ROUNDING <= current <= high + ROUNDING):
-            raise TargetError(f"current: got {current!r} A, expected {low:g} to {high:g} A")
-        return self.force_of(current)
 
     def current_of(self, force: float) -> int:
         """Return the current limit [mA] of a grip force [N].

@@ -47,6 +47,10 @@ class Phase(Enum):
     FAULT = "fault"  # the gripper's power stage is asleep until its errors are cleared
 
 
+USABLE = (Phase.READY, Phase.MOVING)  # a move may begin
+ABSENT = (Phase.DISCONNECTED, Phase.PROBING)  # nothing has answered
+
+
 class MoveOutcome(Enum):
     """What became of the last move."""
 

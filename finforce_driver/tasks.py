@@ -17,14 +17,13 @@ from finforce_driver.grasp.session import GraspSession
 from finforce_driver.gripper import Gripper
 from finforce_driver.messages import fill_outcome
 from finforce_driver.settings import DriverParameters
-from finforce_driver.state import GripperState, MoveOutcome, MoveRequest, Phase
+from finforce_driver.state import ABSENT, GripperState, MoveOutcome, MoveRequest, Phase
 
 CALIBRATION_TIMEOUT = 50.0  # s; the driver gives up after 35 s, and a reset may go before
 STOP_TIMEOUT = 0.2  # s in which a gripper says that it stands; usually 0.02 s
 CLEARING_TIMEOUT = 2.0  # s; it takes 0.2 s
 WATCH_PERIOD = 0.1  # s
 MOVE_MARGIN = 5.0  # s beyond the time that the way takes
-ABSENT = (Phase.DISCONNECTED, Phase.PROBING)
 LIMP = (*ABSENT, Phase.FAULT, Phase.UNCALIBRATED, Phase.LOST)
 
 

@@ -215,7 +215,7 @@ class IfeaSolverNode(ros.ImageNode):
         ros.warn_first_start()
         with self._announce_wait(jaw.name):
             self.estimator = build(jaw, parameters, settings)
-        self.gate = StampGate(max_age=parameters.max_age, restart_gap=parameters.restart_gap)
+        self.gate = StampGate(parameters.max_age)
         ros.follow_settings(self, parameters, lambda changed: self.gate.limit(changed.max_age))
         health = Health(source=f"{parameters.jaw_name}/keypoints", stale_after=parameters.max_age)
         self.health[parameters.jaw_name] = health

@@ -164,7 +164,7 @@ class KeypointDetectorNode(ros.ImageNode):
         self._build = partial(build, jaws, dots=dots, rests=self.skips.allows(STILL))
         self._mounting = not ros.is_given(self, "T_gripper_camera") and self.frames.listen()
         self._asked = float("inf")
-        self.gate = StampGate(max_age=parameters.max_age, restart_gap=parameters.restart_gap)
+        self.gate = StampGate(parameters.max_age)
         source, age = self.feed.source, parameters.max_age
         self.health = {side: Health(source=source, stale_after=age) for side in parameters.sides}
         self.found: Mapping[str, JawKeypoints] = {}

@@ -28,6 +28,10 @@ class JawState(JawShape):
 
     origin_x: float
 
+    def blend(self, other: JawState, share: float) -> JawState:
+        """Return the state at a share of the way to another: position, shape and wrench."""
+        return JawState(**{name: _blend(value, vars(other)[name], share) for name, value in vars(self).items()})
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TwinState:
@@ -55,7 +59,7 @@ class TwinState:
         return replace(
             self,
             stamp=_blend(self.stamp, other.stamp, share),
-            jaws={side: _blend_jaws(jaw, other.jaws[side], share) for side, jaw in self.jaws.items()},
+            jaws={side: jaw.blend(other.jaws[side], share) for side, jaw in self.jaws.items()},
             T_gripper_object=pose,
             gravity=_blend(self.gravity, other.gravity, share),
         )
@@ -63,11 +67,6 @@ class TwinState:
 
 def _blend(value: Any, other: Any, share: float) -> Any:
     return (1.0 - share) * value + share * other
-
-
-def _blend_jaws(jaw: JawState, other: JawState, share: float) -> JawState:
-    """Return a jaw between two states: position, shape and wrench."""
-    return replace(jaw, **{name: _blend(value, vars(other)[name], share) for name, value in vars(jaw).items()})
 
 
 def _blend_poses(pose: NDArray, other: NDArray, share: float) -> NDArray:
@@ -101,7 +100,7 @@ class TwinGripper(Assembly):
         # set down, the object rests on the table, which also takes what the creep left
         weights[~script.weight.any(axis=1)] = 0.0
         held = self.hold_object()
-        wrenches = {side: RelaxedWrench(self.material.terms) for side in self._jaws}
+        wrenches = {side: RelaxedWrench(self.material.terms) for side in self.jaws}
         posture, weight, shapes, slid = None, None, self.rest_shapes(), 0.0
         for index, stamp in enumerate(script.stamps):
             slid += held.creep / self.scenario.rate if held is not None else 0.0
@@ -115,7 +114,7 @@ class TwinGripper(Assembly):
             yield TwinState(
                 stamp=float(stamp),
                 phase=script.phases[index],
-                jaws={side: self._jaw_state(side, posture, shapes[side], wrenches[side]) for side in self._jaws},
+                jaws={side: self._jaw_state(side, posture, shapes[side], wrenches[side]) for side in self.jaws},
                 T_gripper_object=self.object_pose(posture, x),
                 gravity=script.gravity[index],
             )
@@ -154,7 +153,7 @@ class PressedGrasp(Assembly):
             BalanceError: The jaws cannot shut on the object at all.
         """
         super().__init__(scenario, seed, density)
-        self._reach = self.touch_origin - self.inner_face_x  # of each jaw, from touch to closed
+        self._reach = self.touch_origin - self.jaws["left"].inner_face_x  # of each jaw, from touch to closed
         self._solve(step)
         sizes = np.array([np.linalg.norm(table.force, axis=1) for table in self._tables.values()])
         self._forces = sizes.min(axis=0)
@@ -188,10 +187,7 @@ class PressedGrasp(Assembly):
 
     def elastic_force(self, opening: float) -> float:
         """Return the grasp force [N] at an opening [m] before anything relaxes: that of the jaw pressed less."""
-        if not opening < self.touch_opening:
-            return 0.0
-        jammed = JAMMED * max(self.least_opening - opening, 0.0)
-        return float(np.interp(self.closing_at(opening), self._closings, self._forces)) + jammed
+        return self._find_growth(opening) * float(np.interp(self.closing_at(opening), self._closings, self._forces))
 
     def find_closing(self, force: float) -> float:
         """Return how far beyond first touch [m] each jaw goes for an elastic grasp force [N].

@@ -395,6 +395,7 @@ class Assembly:
     Attributes:
         scenario: what is put together.
         material: of the jaws.
+        pressed: the jaws' mechanics and meshes, by side.
         object_mesh: in its own frame; None without an object.
         touch_origin: of the jaws' origins from the middle [m] where the object just fits.
     """
@@ -418,7 +419,7 @@ class Assembly:
         # always of both jaws: the bench's is the same left one
         self.material: PrintedMaterial = draw_material(material, ("left", "right"), np.random.default_rng(seed))
         lateral = bool(scenario.mass and (scenario.turn_angle or scenario.pitch))
-        self._jaws = {
+        self.pressed = {
             side: PressedJaw(jaw, self.material.elastic[side], density, lateral=lateral) for side, jaw in jaws.items()
         }
         self._object = place_object(scenario) if scenario.object else None
@@ -428,24 +429,11 @@ class Assembly:
     @property
     def jaws(self) -> Mapping[str, Jaw]:
         """The jaws by side."""
-        return {side: pressed.jaw for side, pressed in self._jaws.items()}
-
-    @property
-    def inner_face_x(self) -> float:
-        """Where the undeformed inner face is in the jaw frame [m]."""
-        return float(self._jaws["left"].jaw.inner_face_x)
-
-    def triangles(self, side: str) -> NDArray:
-        """Return the surface of a jaw as (m, 3) indices of its vertices, normals outwards."""
-        return self._jaws[side].mesh.surface
-
-    def rest_vertices(self, side: str) -> NDArray:
-        """Return the undeformed vertices (n, 3) [m] of a jaw in its own frame."""
-        return self._jaws[side].mesh.nodes
+        return {side: pressed.jaw for side, pressed in self.pressed.items()}
 
     def rest_shapes(self) -> Mapping[str, JawShape]:
         """Return the jaws as they are when nothing touches them."""
-        return {side: jaw.describe(np.zeros(jaw.model.size), None) for side, jaw in self._jaws.items()}
+        return {side: jaw.describe(np.zeros(jaw.model.size), None) for side, jaw in self.pressed.items()}
 
     def hold_object(self) -> HeldObject | None:
         """Return the object between jaws at rest; None without one."""
@@ -453,7 +441,7 @@ class Assembly:
             return None
         scenario = self.scenario
         told = {"guided": scenario.is_guided, "friction": scenario.friction, "drag": scenario.drag}
-        return HeldObject(self._jaws, scenario.offset, **told)
+        return HeldObject(self.pressed, scenario.offset, **told)
 
     def setting_of(self, posture: Posture, weight: NDArray | None = None) -> GraspSetting:
         """Return what a posture, and a weight (3,) [N] in `gripper_base`, mean to the jaws."""
@@ -486,11 +474,11 @@ class Assembly:
         Raises:
             ScenarioError: It does not fit, or the jaws would not touch it.
         """
-        face, scenario = self.inner_face_x, self.scenario
+        face, scenario = self.jaws["left"].inner_face_x, self.scenario
         if self._object is None:
             return face + _EMPTY_GAP
         touches = []
-        for side, pressed in self._jaws.items():
+        for side, pressed in self.pressed.items():
             R = R_GRIPPER_JAW[side].T
             polygons = cut_outline(self._object.centred, R, pressed.half_width, float(R[1, 1]) * scenario.shift)
             if not polygons:

@@ -76,7 +76,7 @@ class TwinCameraNode(Node):
             depth_step=parameters.depth_step,
         )
         if parameters.gripper_link:
-            self.gripper = EmulatedGripper(parameters.gripper_firmware, load=self.scene.grasp.elastic_force)
+            self.gripper = EmulatedGripper(load=self.scene.grasp.elastic_force)
             self.port = PtyPort(EmulatedAdapter(self.gripper), parameters.gripper_link)
         self.images: list[list[Output]] = []
         self.is_over = False
@@ -227,7 +227,6 @@ class TwinParameters:
     gripper_link: str = setting(
         "", "Port link of an emulated gripper that grasps the scene; empty: the scene as scripted"
     )
-    gripper_firmware: str = setting("new", "Firmware of the emulated gripper", choices=("new", "old"))
     detects: bool = setting(
         False, "Whether true key points and jaw poses are published, as by a detector without errors"
     )

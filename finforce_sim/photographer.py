@@ -224,13 +224,13 @@ class Photographer:
 
     def _dress_jaw(self, side: str, state: TwinState) -> list[Body]:
         """Return a deformed jaw, and its holder with the reference dot."""
-        wardrobe, T_camera_jaw, rest = self._wardrobe, self._place(side, state), self._assembly.rest_vertices(side)
-        centre, triangles = self._assembly.jaws[side].reference_point, self._assembly.triangles(side)
+        wardrobe, T_camera_jaw, mesh = self._wardrobe, self._place(side, state), self._assembly.pressed[side].mesh
+        centre, rest = self._assembly.jaws[side].reference_point, mesh.nodes
         dot = Decal(centre=centre, radius=wardrobe.dot_radius, color=wardrobe.dot_color)
         # a finger whose clamped part is in view carries the dot itself
         own = (dot,) if centre[2] > 0.0 else ()
         moved = _move(state.jaws[side].vertices, T_camera_jaw)
-        jaw = Body(vertices=moved, triangles=triangles, rest=rest, paint=wardrobe.jaw, decals=own)
+        jaw = Body(vertices=moved, triangles=mesh.surface, rest=rest, paint=wardrobe.jaw, decals=own)
         holder = HOLDER.copy()
         if own:
             # the holder is as wide as the finger that stands in it

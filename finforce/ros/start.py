@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from functools import partial
 from importlib import import_module
+from pathlib import Path
 
 NODES = {
     "ifea_solver": "finforce_ifea.node",
@@ -26,6 +26,8 @@ def start(name: str) -> int:
 
     Loading takes a second, in which nothing has to be cleaned up: a signal ends it at once.
     """
+    if name == "emulated_gripper" and "--ros-args" in sys.argv:  # no node: what `ros2 launch` adds is left out
+        del sys.argv[sys.argv.index("--ros-args") :]
     before = [signal.signal(number, lambda *_: os._exit(0)) for number in STOPS]
     try:
         module = import_module(NODES[name])
@@ -37,22 +39,11 @@ def start(name: str) -> int:
     return module.main()
 
 
-def emulated_gripper() -> int:
-    """Run the emulated gripper, which is no node; what `ros2 launch` adds for nodes is left out."""
-    if "--ros-args" in sys.argv:
-        del sys.argv[sys.argv.index("--ros-args") :]
-    return start("emulated_gripper")
-
-
-# the entry points of the others, see setup.py
-ifea_solver = partial(start, "ifea_solver")
-contact_estimator = partial(start, "contact_estimator")
-keypoint_detector = partial(start, "keypoint_detector")
-pipeline = partial(start, "pipeline")
-gripper_driver = partial(start, "gripper_driver")
-recording_player = partial(start, "recording_player")
-twin_camera = partial(start, "twin_camera")
+def main() -> int:
+    """Run the node that this executable is called after, else the one that the first word names."""
+    own = Path(sys.argv[0]).stem
+    return start(own if own in NODES else sys.argv.pop(1))
 
 
 if __name__ == "__main__":
-    sys.exit(start(sys.argv.pop(1)))
+    sys.exit(main())

@@ -6,6 +6,7 @@ import inspect
 import traceback
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 from statistics import median
 from time import perf_counter
 from typing import Any
@@ -85,7 +86,7 @@ class Pipeline:
     def outlet(self, topic: str, publisher: Publisher, qos: QoSProfile) -> Outlet:
         """Return what publishes a topic, inside and outside."""
         self._topics.add(topic)
-        return Outlet(self, topic, publisher, qos)
+        return Outlet(self, topic, publisher, qos.durability == DurabilityPolicy.TRANSIENT_LOCAL)
 
     def open(self) -> None:
         """Connect the stages, all of which are there."""
@@ -131,48 +132,41 @@ class Pipeline:
             self._left.popleft()()
 
 
+@dataclass(eq=False)
 class Port:
     """A subscription, to another stage of the process or to what comes from outside.
 
     Attributes:
-        topic: its full name.
-        outside: the subscription to what comes from outside; None while there is none.
-
-    Args:
         pipeline: of the process.
-        topic: the same.
+        topic: its full name.
         callback: takes messages, guarded.
         subscribe: makes the subscription to what comes from outside.
         can_wait: whether the process goes on without it where it takes too long.
+        outside: the subscription to what comes from outside; None while there is none.
     """
 
-    def __init__(
-        self,
-        pipeline: Pipeline,
-        topic: str,
-        callback: Callable,
-        subscribe: Callable[[], Subscription],
-        can_wait: bool = False,
-    ) -> None:
-        self.topic, self._pipeline, self._callback = topic, pipeline, callback
-        self._subscribe, self._can_wait = subscribe, can_wait
-        self._times: deque[float] = deque(maxlen=WATCHED)
-        self.outside: Subscription | None = None
+    pipeline: Pipeline
+    topic: str
+    callback: Callable
+    subscribe: Callable[[], Subscription]
+    can_wait: bool = False
+    outside: Subscription | None = field(default=None, init=False)
+    _times: deque[float] = field(default_factory=lambda: deque(maxlen=WATCHED), init=False)
 
     def connect(self) -> None:
         """Subscribe to what comes from outside, if no stage of this process publishes it."""
-        if not self._pipeline.publishes(self.topic):
-            self.outside = self._subscribe()
+        if not self.pipeline.publishes(self.topic):
+            self.outside = self.subscribe()
 
     @property
     def is_slow(self) -> bool:
         """Whether it takes more than its budget, and others need not wait for it."""
-        return self._can_wait and len(self._times) == WATCHED and median(self._times) > BUDGET
+        return self.can_wait and len(self._times) == WATCHED and median(self._times) > BUDGET
 
     def take(self, message: Any) -> None:
         """Take a message of another stage."""
         before = perf_counter()
-        self._callback(message)
+        self.callback(message)
         self._times.append(perf_counter() - before)
 
     def take_waiting(self) -> Iterator[Any]:
@@ -193,32 +187,31 @@ class Port:
                 yield taken[0]
 
 
+@dataclass(eq=False)
 class Outlet:
     """A publisher of a stage: to other stages as it is, to listeners outside serialised, where there are any.
 
     Attributes:
-        topic_name: the full name of the topic.
-
-    Args:
         pipeline: of the process.
-        topic: the same.
+        topic_name: the full name of the topic.
         publisher: to the outside.
-        qos: what it keeps for listeners that come later.
+        is_kept: whether messages are kept for listeners that come later.
     """
 
-    def __init__(self, pipeline: Pipeline, topic: str, publisher: Publisher, qos: QoSProfile) -> None:
-        self.topic_name, self._pipeline, self._publisher = topic, pipeline, publisher
-        self._is_kept = qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
+    pipeline: Pipeline
+    topic_name: str
+    publisher: Publisher
+    is_kept: bool
 
     def publish(self, message: Any) -> None:
         """Publish a message; of `CloudColumns` the cloud, packed only where it leaves the process."""
-        self._pipeline.hand_on(self.topic_name, message)
-        if self._is_kept or self._publisher.get_subscription_count():
-            self._publisher.publish(pack(message))
+        self.pipeline.hand_on(self.topic_name, message)
+        if self.is_kept or self.publisher.get_subscription_count():
+            self.publisher.publish(pack(message))
 
     def get_subscription_count(self) -> int:
         """Return how many listen, here and outside."""
-        return self._pipeline.count_ports(self.topic_name) + self._publisher.get_subscription_count()
+        return self.pipeline.count_ports(self.topic_name) + self.publisher.get_subscription_count()
 
 
 class Stage:
@@ -230,8 +223,8 @@ class Stage:
         fault: what has stopped this node while others of its process go on; empty while it works.
 
     Args:
-        node: the same.
-        pipeline: the same; None where the node is alone.
+        node: whose ends these are.
+        pipeline: of its process; None where the node is alone.
     """
 
     def __init__(self, node: Node, pipeline: Pipeline | None = None) -> None:

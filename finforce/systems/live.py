@@ -23,6 +23,7 @@ from finforce.systems.processes import (
     emulated_port,
     finish,
     given,
+    node_process,
     read_numbers,
     solver_process,
     viewer,
@@ -122,18 +123,13 @@ def twin_processes(scene: str, options: GripperOptions) -> list[Process]:
         "jaw_file": options.jaw_file,
         "gripper_link": options.gripper_port,
     }
-    return [_node("twin_camera", asked, options)]
+    return [node_process("twin_camera", asked, options)]
 
 
 def gripper_process(options: GripperOptions) -> Process:
     """Return the driver of the gripper."""
-    return _node("gripper_driver", {"port": options.gripper_port, "interface": options.gripper_interface}, options)
-
-
-def _node(name: str, asked: Mapping[str, Any], options: GripperOptions) -> Process:
-    """Return a node that is called as its executable."""
-    parameters = {**given(asked), "use_sim_time": options.use_sim_time}
-    return Process(executable=name, name=name, parameters=parameters, parameter_file=options.parameter_file)
+    asked = {"port": options.gripper_port, "interface": options.gripper_interface}
+    return node_process("gripper_driver", asked, options)
 
 
 def see_camera(process: Process, options: RobotOptions) -> Process:

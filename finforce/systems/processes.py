@@ -144,32 +144,25 @@ def executables_of(parts: Sequence[Process | Include]) -> list[str]:
     return found
 
 
+def node_process(name: str, asked: Mapping[str, Any], options: SolverOptions) -> Process:
+    """Return a node of ours that is called as its executable, with the parameters that were asked for."""
+    parameters = {**given(asked), "use_sim_time": options.use_sim_time}
+    return Process(executable=name, name=name, parameters=parameters, parameter_file=options.parameter_file)
+
+
 def solver_process(side: str, options: SolverOptions, **parameters: Any) -> Process:
     """Return the solver of one jaw; `parameters` are added to those that the options name."""
     height = None if math.isnan(options.contact_height) else options.contact_height
     asked = {
+        "jaw_name": side,
         "jaw_file": options.jaw_file,
         "calibration_file": options.calibration_file,
         # NaN overrules a height in the parameter file
         "contact_height": math.nan if options.object_mesh else height,
         "estimator.solver": options.solver,
+        **parameters,
     }
-    return Process(
-        executable="ifea_solver",
-        name=f"{side}_ifea_solver",
-        parameters={"jaw_name": side, **given(asked), **parameters, "use_sim_time": options.use_sim_time},
-        parameter_file=options.parameter_file,
-    )
-
-
-def _jaws_process(name: str, jaws: str, asked: Mapping[str, Any], options: SolverOptions) -> Process:
-    """Return a node that serves "left", "right" or "both" jaws, called as its executable."""
-    return Process(
-        executable=name,
-        name=name,
-        parameters={"jaws": jaws, **given(asked), "use_sim_time": options.use_sim_time},
-        parameter_file=options.parameter_file,
-    )
+    return replace(node_process("ifea_solver", asked, options), name=f"{side}_ifea_solver")
 
 
 def contact_processes(jaws: str, options: SolverOptions, *, waits: bool = False) -> list[Process]:
@@ -180,6 +173,7 @@ def contact_processes(jaws: str, options: SolverOptions, *, waits: bool = False)
     if not options.object_mesh and not (waits and math.isnan(options.contact_height)):
         return []
     asked = {
+        "jaws": jaws,
         "jaw_file": options.jaw_file,
         "calibration_file": options.calibration_file,
         "object_mesh": options.object_mesh,
@@ -188,7 +182,7 @@ def contact_processes(jaws: str, options: SolverOptions, *, waits: bool = False)
         "contact.mesh": "coarse" if options.solver == "paper" else "",
     }
     topics = dict.fromkeys(POSE_TOPICS, options.pose_topic) if options.pose_topic else {}
-    return [replace(_jaws_process("contact_estimator", jaws, asked, options), remappings=topics)]
+    return [replace(node_process("contact_estimator", asked, options), remappings=topics)]
 
 
 def detector_processes(jaws: str, options: SolverOptions) -> list[Process]:
@@ -200,13 +194,14 @@ def detector_processes(jaws: str, options: SolverOptions) -> list[Process]:
     if not options.images:
         return []
     asked = {
+        "jaws": jaws,
         "jaw_file": options.jaw_file,
         "detection_method": options.detection_method,
         "model": options.model,
         "depth": DEPTHS.get(options.depth, ""),
         "T_gripper_camera": read_numbers("T_gripper_camera", options.T_gripper_camera, 7),
     }
-    return [_jaws_process("keypoint_detector", jaws, asked, options)]
+    return [node_process("keypoint_detector", asked, options)]
 
 
 def read_numbers(name: str, text: str, count: int) -> list[float] | None:

@@ -12,7 +12,7 @@ from finforce_driver.errors import BackOffError, GraspError, UnseenForceError
 from finforce_driver.grasp.load_watch import NOISE, ForceFeed, ForceSample, JawPosition, LoadWatch, TouchSample
 from finforce_driver.grasp.plan import FRICTION, MOTOR_MARGIN, GraspPlan
 from finforce_driver.settings import GraspGoal, GraspSettings, GripperSettings
-from finforce_driver.state import GraspPhase, GraspStatus, GripperState, MoveRequest, Phase
+from finforce_driver.state import USABLE, GraspPhase, GraspStatus, GripperState, MoveRequest
 
 _ONSET_FORCE = 0.25  # [N] above what was seen without load, that says that something presses
 _MOTOR_ONSET = 0.8  # [N] of the motor's force above that of free motion, at which jaws wait for the next image
@@ -338,7 +338,6 @@ class ForceGrasp:
         )
 
 
-_USABLE = (Phase.READY, Phase.MOVING)
 _SILENT = 0.3  # [s] after which a gripper without a reply is not the one that is known
 
 
@@ -367,7 +366,7 @@ def check_gripper(state: GripperState, now: float) -> None:
     """
     if state.estopped:
         raise GraspError("emergency stop of the gripper")
-    if state.phase not in _USABLE or not math.isfinite(state.opening):
+    if state.phase not in USABLE or not math.isfinite(state.opening):
         raise GraspError(f"the gripper is {state.phase.value}{': ' if state.message else ''}{state.message}")
     if not now - state.stamp <= _SILENT:
         raise GraspError(f"no reply of the gripper for {now - state.stamp:.2f} s")

@@ -13,7 +13,7 @@ from finforce_driver.grasp.controller import ForceGrasp
 from finforce_driver.grasp.load_watch import ForceSample, TouchSample
 from finforce_driver.gripper import Gripper
 from finforce_driver.settings import GraspGoal, GraspSettings
-from finforce_driver.state import GraspPhase, GraspStatus, GripperState, Phase
+from finforce_driver.state import USABLE, GraspPhase, GraspStatus, GripperState
 
 _SLIDES = 0.003  # [m/s] of the object over a jaw, above which it slides
 _LIMIT = 1.5  # times the set force, to which it rises at most
@@ -65,7 +65,6 @@ class SlipGuard:
 CYCLE = 0.05  # [s] in which the silence of a gripper is noticed
 MARGIN = 2.0  # [s] beyond the time limit of a goal, after which nobody waits for its grasp any longer
 SETTLED = (GraspPhase.HOLDING, GraspPhase.STOPPED)
-USABLE = (Phase.READY, Phase.MOVING)
 
 
 class GraspSession:

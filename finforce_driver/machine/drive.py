@@ -21,7 +21,7 @@ from finforce_driver.machine.knowledge import Knowledge
 from finforce_driver.machine.move import CLEAR_CURRENT, CONTACT_TIME, GRACE, Arrival, MoveJob, Orders, push_direction
 from finforce_driver.machine.procedures import CalibrationRun, EmergencyStop, Recovery, Step
 from finforce_driver.settings import SLOWEST_BYTE, GripperSettings
-from finforce_driver.state import HALF_CALIBRATED, STOP_PENDING, GripperState, MoveOutcome, Phase, describe
+from finforce_driver.state import HALF_CALIBRATED, STOP_PENDING, USABLE, GripperState, MoveOutcome, Phase, describe
 
 LENGTHS = {
     Command.REPLY: 4,
@@ -143,7 +143,6 @@ class Exchange:
 
 MISSED_REPLIES = 25  # requests in a row without a reply after which the link is opened anew
 GO = Flag.ACTIVATE | Flag.GO
-USABLE = (Phase.READY, Phase.MOVING)
 DIRECTIONS = {1: "closing", -1: "opening", 0: ""}
 LATEST_REPLY = 0.5  # [s] after which no reply is expected any more
 SPACING = 0.001  # [s] before a reply is asked for again

@@ -14,7 +14,7 @@ from typing import Any
 
 from finforce_driver.can.protocol import CanMessage, Command, Flag, Reply, decode_move, decode_reply, encode_watchdog
 from finforce_driver.errors import GripperStateError
-from finforce_driver.machine.drive import GO, USABLE, Drive, Request
+from finforce_driver.machine.drive import GO, Drive, Request
 from finforce_driver.machine.knowledge import Telemetry
 from finforce_driver.machine.move import CLEAR_CURRENT, Arrival, Goal, MoveJob, OrderWatch
 from finforce_driver.machine.procedures import CalibrationRun, Recovery, Step, Travel
@@ -26,6 +26,7 @@ from finforce_driver.state import (
     OTHER_NODE,
     REBOOTED,
     SILENT,
+    USABLE,
     MoveOutcome,
     Phase,
 )
@@ -91,22 +92,19 @@ class GripperMachine(Drive):
     # Commands
 
     @_command
-    def move(
-        self, opening: float, speed: float | None = None, force: float | None = None, *, current: float | None = None
-    ) -> None:
+    def move(self, opening: float, speed: float | None = None, force: float | None = None) -> None:
         """Go to an opening, and stall with a force when something is in the way; the same goal again changes nothing.
 
         Args:
             opening: to be reached [m].
             speed: of the opening [m/s], both jaws together; the default of the settings where None.
             force: grip force by the maker's curve [N]; the default current of the settings where None.
-            current: the motor's limit [A], in place of a force.
 
         Raises:
-            TargetError: a value is no number or out of bounds, or force and current are both given.
+            TargetError: a value is no number or out of bounds.
             GripperStateError: the gripper could not move: absent, faulty, not calibrated, calibrating, switched off.
         """
-        goal = self._make_goal(opening, speed, force if current is None else self.settings.force_for(current, force))
+        goal = self._make_goal(opening, speed, force)
         self._require("move", USABLE)
         if not self._enabled:
             raise GripperStateError("move: the gripper was switched off: activate it first")

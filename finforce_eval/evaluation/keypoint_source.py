@@ -45,7 +45,7 @@ DECIDED = {
 }
 _CHOICES = {"color": "color", "depth": "depth", "info": "camera_info", "episode": "episode"}  # of images, by options
 _SWITCHES = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
-LIVE = ("max_age", "restart_gap", "diagnostics_period")  # without meaning where no clock runs
+LIVE = ("max_age", "diagnostics_period")  # without meaning where no clock runs
 
 
 class DetectorRecords(NamedTuple):

@@ -252,18 +252,15 @@ _LEAST_SUPPLY, _LARGEST_SUPPLY = 9.0, 29.0  # [V]
 
 
 class Fault(Enum):
-    """What can be latched."""
+    """What can be latched: its bits in a reply, and in the two bytes of the error state."""
 
-    TEMPERATURE = "temperature"
-    ENCODER = "encoder"
-    SUPPLY = "supply"
-    ESTOP_COMMAND = "estop command"
-    ESTOP_FLAG = "estop flag"
-    WATCHDOG = "watchdog"
-    MOTOR_UNCALIBRATED = "motor uncalibrated"
-
-
-_FIRST_BYTE = {Fault.TEMPERATURE: 0x40, Fault.ENCODER: 0x20, Fault.SUPPLY: 0x10, Fault.ESTOP_COMMAND: 0x01}
+    TEMPERATURE = (0x08, 0x40, 0x00)
+    ENCODER = (0x00, 0x20, 0x00)
+    SUPPLY = (0x00, 0x10, 0x00)
+    ESTOP_COMMAND = (0x00, 0x01, 0x00)
+    ESTOP_FLAG = (0x02, 0x00, 0x00)
+    WATCHDOG = (0x04, 0x00, 0x20)
+    MOTOR_UNCALIBRATED = (0x00, 0x00, 0x00)
 
 
 @dataclass
@@ -320,17 +317,10 @@ class _Protection:
     @property
     def reply_bits(self) -> int:
         """Return the fault bits of the gripper's reply."""
-        faults = self.faults
-        return (
-            0x08 * (Fault.TEMPERATURE in faults)
-            | 0x04 * (Fault.WATCHDOG in faults)
-            | 0x02 * (Fault.ESTOP_FLAG in faults)
-        )
+        return sum(fault.value[0] for fault in self.faults)
 
     @property
     def error_bytes(self) -> bytes:
         """Return the two bytes of the error state."""
-        first = 0x80 * bool(self.faults)
-        for fault in self.faults:
-            first |= _FIRST_BYTE.get(fault, 0)
-        return bytes([first, 0x80 * self.motor_calibrated | 0x20 * (Fault.WATCHDOG in self.faults)])
+        first, second = (sum(fault.value[number] for fault in self.faults) for number in (1, 2))
+        return bytes([0x80 * bool(self.faults) | first, 0x80 * self.motor_calibrated | second])

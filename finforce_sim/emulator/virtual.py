@@ -19,13 +19,8 @@ _LEAST = 1e-6  # [s] that a wait takes: a rest of rounding would not move the cl
 class VirtualClock(Clock):
     """A clock that passes only while somebody waits, and then steps all that is attached."""
 
-    def __init__(self, step: float = _STEP) -> None:
-        """Make a clock at zero.
-
-        Args:
-            step: largest time between two steps of what is attached [s].
-        """
-        self._step = step
+    def __init__(self) -> None:
+        """Make a clock at zero."""
         self._now = 0.0
         self._attached: list[Any] = []
 
@@ -41,7 +36,7 @@ class VirtualClock(Clock):
         """Let `seconds` [s] pass, or less when `wake` is set meanwhile."""
         left = max(seconds, _LEAST) if seconds > 0.0 else 0.0
         while left > 1e-9 and not (wake is not None and wake.is_set()):
-            dt = min(left, self._step)
+            dt = min(left, _STEP)
             self.tick(dt)
             left -= dt
 

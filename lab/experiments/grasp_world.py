@@ -184,7 +184,7 @@ class World:
         """Calibrate, open, and go to an opening [m] with a limit of the motor's current [A], whatever is there."""
         self._prepare()
         try:
-            self.gripper.move(opening, self._case.speed, current=current)
+            self.gripper.move(opening, self._case.speed, self.gripper.settings.force_of(current))
             end = self.clock.now() + BLIND
             self.gripper.wait(lambda state: self.clock.now() > end, BLIND + 1.0)
         except Exception as error:  # whatever ends a grasp is a result of the benchmark

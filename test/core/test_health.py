@@ -12,7 +12,7 @@ POOR = Outcome(level=Level.WARN, reason="not_enough_points", text="3 points")
 
 
 def gate():
-    return StampGate(max_age=0.2, restart_gap=1.0)
+    return StampGate(max_age=0.2)
 
 
 def test_fresh_samples_in_order_pass():

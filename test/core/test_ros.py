@@ -24,7 +24,6 @@ from finforce.errors import FinforceError, ObservationError
 from finforce.health import Level, Report
 from finforce.messages import decode_keypoints, stamp_of
 from finforce.ros import node as ros
-from finforce.settings import refresh_record
 from finforce_contact.parameters import ContactParameters, ContactSettings, TrackerSettings
 from finforce_driver.settings import DriverParameters, GraspSettings, GripperSettings
 from finforce_eval.replay.node import PlayerParameters
@@ -156,17 +155,6 @@ def test_a_parameter_is_read_under_its_former_name_and_its_own_wins(declare):
     assert declare(number=7, count=5).record.count == 5
     with pytest.raises(ros.ParameterError, match=r"group\.count"):
         declare(number="seven")
-
-
-def test_a_settable_field_has_its_present_value_and_the_others_theirs():
-    asked = []
-    refreshed = refresh_record(Example(limit=0.25), lambda name: asked.append(name) or 1.5)
-    assert refreshed == Example(limit=0.25, scale=1.5) and asked == ["scale"]
-
-
-def test_a_present_value_out_of_bounds_is_refused():
-    with pytest.raises(ros.ParameterError, match="scale"):
-        refresh_record(Example(), lambda name: 2.5)
 
 
 @pytest.mark.parametrize("record", RECORDS)

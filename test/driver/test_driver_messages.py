@@ -120,14 +120,14 @@ class SteppedClock:
 
 
 def test_a_stamp_keeps_its_age_on_the_grippers_clock():
-    times = MessageTimes(SteppedClock(), ("force",), max_age=0.2, restart_gap=1.0)
+    times = MessageTimes(SteppedClock(), ("force",), max_age=0.2)
     now = 1_700_000_000 * NANOSECONDS
     assert times.enter("force", now - 50_000_000, now) == pytest.approx(99.95, abs=1e-9)
     assert times.to_stamp(99.95, now) == now - 50_000_000
 
 
 def test_sources_do_not_disturb_each_other():
-    times = MessageTimes(SteppedClock(), ("left", "right"), max_age=0.2, restart_gap=1.0)
+    times = MessageTimes(SteppedClock(), ("left", "right"), max_age=0.2)
     for name in ("left", "right"):
         times.enter(name, 10 * NANOSECONDS, 10 * NANOSECONDS)
     with pytest.raises(StampError, match="stand still"):
@@ -135,7 +135,7 @@ def test_sources_do_not_disturb_each_other():
 
 
 def test_a_clock_that_does_not_go_yet_stamps_nothing():
-    times = MessageTimes(SteppedClock(), (), max_age=0.2, restart_gap=1.0)
+    times = MessageTimes(SteppedClock(), (), max_age=0.2)
     with pytest.raises(StampError, match="use_sim_time without /clock"):
         times.to_stamp(99.9, 0)
 

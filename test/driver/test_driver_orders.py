@@ -1,12 +1,9 @@
 """Claims about orders: when they leave, when they wait, and what hold sends."""
 
-import math
-
 import pytest
 from emulator_fakes import COUNT, VARIANTS, Rig
 
 from finforce_driver.can.protocol import Command, Flag
-from finforce_driver.errors import TargetError
 from finforce_driver.state import MoveOutcome, Phase
 from finforce_sim.emulator.faults import FaultKind
 
@@ -163,29 +160,3 @@ def test_an_order_does_not_leave_on_the_word_of_an_old_reply(rig):
     messages = rig.sent(begin)
     assert messages[0].data == b""
     assert len(rig.orders(begin)) == 1
-
-
-@both_variants
-def test_a_limit_may_be_given_as_a_current(rig):
-    begin = rig.clock.now()
-    rig.gripper.move(0.03, 0.02, current=0.7)
-    rig.wait_for(Phase.READY)
-    assert {order.current_mA for order in rig.orders(begin)} == {700}
-
-
-@both_variants
-@pytest.mark.parametrize(
-    ("limits", "text"),
-    [
-        ({"force": 10.0, "current": 0.5}, "expected one of them"),
-        ({"current": 0.1}, r"current: got 0.1 A, expected 0.15 to 1.3 A"),
-        ({"current": math.nan}, "current: got nan A"),
-        ({"current": "0.5"}, "current: got '0.5' A"),
-    ],
-)
-def test_a_current_that_cannot_be_a_limit_moves_nothing(rig, limits, text):
-    begin = rig.clock.now()
-    with pytest.raises(TargetError, match=text):
-        rig.gripper.move(0.03, 0.02, **limits)
-    rig.live(0.2)
-    assert rig.orders(begin) == []

@@ -248,7 +248,7 @@ def test_what_something_else_decides_is_refused_by_name(change):
         parse_source(options(detector=[change]))
 
 
-@pytest.mark.parametrize("name", ["max_age", "restart_gap", "diagnostics_period"])
+@pytest.mark.parametrize("name", ["max_age", "diagnostics_period"])
 def test_what_needs_a_clock_is_refused_offline_and_reaches_the_node_of_a_replay(recording, name):
     source = parse_source(options(source="images", detector=[f"{name}=0.5"]))
     with pytest.raises(OptionError, match=f"--detector {name}: means nothing offline"):

@@ -49,7 +49,7 @@ def test_a_signal_while_the_node_loads_ends_it_without_a_word():
 def test_without_ros_a_node_says_how_to_get_it():
     missing = "import sys; sys.modules['rclpy'] = None; import finforce.ros.start"
     done = subprocess.run(
-        [sys.executable, "-c", f"{missing}; sys.exit(finforce.ros.start.ifea_solver())"],
+        [sys.executable, "-c", f"{missing}; sys.exit(finforce.ros.start.start('ifea_solver'))"],
         capture_output=True,
         text=True,
         timeout=START_PATIENCE,

@@ -133,8 +133,8 @@ def test_key_points_move_outwards_where_the_jaw_is_pressed(cylinder):
         # of 6 mm beyond touch nearly all is the inner band's, pressed at this rib
         assert -6e-3 < motion[pressed, 0] < -4e-3
         np.testing.assert_allclose(states[0].jaws[side].keypoints, jaw.keypoints, atol=1e-9)
-        assert state.vertices.shape == gripper.rest_vertices(side).shape
-        assert gripper.triangles(side).max() < len(state.vertices)
+        assert state.vertices.shape == gripper.pressed[side].mesh.nodes.shape
+        assert gripper.pressed[side].mesh.surface.max() < len(state.vertices)
 
 
 def test_right_jaw_shows_its_key_points_on_the_same_side_of_the_gripper(cylinder):

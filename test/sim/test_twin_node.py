@@ -16,7 +16,6 @@ from std_msgs.msg import String
 
 from finforce.messages import decode_columns, stamp_of
 from finforce.ros import node as ros
-from finforce.settings import ParameterError
 from finforce_sim import node as twin_node
 from finforce_sim.footage import encode_depth, parse_size
 from finforce_sim.gripper import PressedGrasp
@@ -167,11 +166,6 @@ def test_rendering_ends_with_the_node(probe, grasp, tmp_path):
         node.render()
     assert lens.looks < 80  # of 169
     assert not (tmp_path / "gripper").exists()
-
-
-def test_a_gripper_s_firmware_that_there_is_not_is_a_start_up_error(probe, grasp, tmp_path):
-    with pytest.raises(ParameterError, match="gripper_firmware: got 'newest', expected one of"):
-        start_live(probe, grasp, tmp_path / "gripper", gripper_firmware="newest")
 
 
 def test_a_scene_begins_again(probe):
