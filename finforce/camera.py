@@ -166,28 +166,6 @@ def project(points: NDArray, camera: CameraIntrinsics) -> NDArray:
     return project_points(camera.lens, np.ascontiguousarray(points, dtype=float))
 
 
-def deproject(depth: NDArray, camera: CameraIntrinsics, mask: NDArray | None = None) -> NDArray:
-    """Return the points of a depth image, row by row, without the pixels that have no depth.
-
-    Args:
-        depth: (h, w) distance along the optical axis [m], NaN where nothing was measured.
-        camera: of the depth image.
-        mask: (h, w) bool, the pixels wanted; all when absent.
-
-    Returns:
-        (n, 3) points in the camera frame [m].
-
-    Raises:
-        ImageError: an image has another size than the camera.
-    """
-    _check_size(depth, camera)
-    wanted = np.isfinite(depth)
-    if mask is not None:
-        _check_size(mask, camera, "mask")
-        wanted &= np.asarray(mask, dtype=bool)
-    return compute_rays(camera)[wanted] * np.asarray(depth, dtype=float)[wanted, None]
-
-
 def decode_depth(
     data: NDArray | bytes, encoding: str, layout: ImageLayout | None = None, scale: float = MILLIMETRE
 ) -> NDArray:
@@ -246,7 +224,11 @@ def check_depth(depth: NDArray, camera: CameraIntrinsics) -> None:
     Raises:
         ImageError: it is one of these.
     """
-    _check_size(depth, camera)
+    if np.shape(depth) != (camera.height, camera.width):
+        raise ImageError(
+            f"depth image: shape {np.shape(depth)}; the intrinsics are of {camera.height} rows and {camera.width} "
+            "columns"
+        )
     if not (np.isfinite(depth) & (np.nan_to_num(depth) > 0.0)).any():
         raise ImageError("depth image: no pixel has a depth; is the camera covered, or nearer than it can see?")
 
@@ -267,14 +249,6 @@ def check_mask(mask: NDArray, depth: NDArray, least: int = 1) -> None:
         raise ImageError(
             f"mask: {known} of its {int(selected.sum())} pixels have a depth, at least {least} are needed; "
             "is the object nearer or farther than the camera can see?"
-        )
-
-
-def _check_size(image: NDArray, camera: CameraIntrinsics, what: str = "depth image") -> None:
-    """Refuse an image of another size than its camera."""
-    if np.shape(image) != (camera.height, camera.width):
-        raise ImageError(
-            f"{what}: shape {np.shape(image)}; the intrinsics are of {camera.height} rows and {camera.width} columns"
         )
 
 

@@ -87,10 +87,10 @@ def build_camera(named: Mapping[str, Any], shape: tuple[int, int] | None) -> Cam
     return CameraIntrinsics(**size, **values, distortion=distortion, model=_MODELS.get(model.lower(), model))
 
 
-def cut_camera(camera: CameraIntrinsics, shape: tuple[int, int]) -> CameraIntrinsics:
-    """Return the camera of the middle of its images, scaled until they are h x w pixels (`shape`)."""
+def cut_camera(camera: CameraIntrinsics, shape: tuple[int, int], scale: float | None = None) -> CameraIntrinsics:
+    """Return the camera of the middle of its images, scaled until they are h x w pixels (`shape`), or by `scale`."""
     height, width = shape
-    scale = max(height / camera.height, width / camera.width)
+    scale = scale or max(height / camera.height, width / camera.width)
     middle = 0.5 * np.array([width / scale - camera.width, height / scale - camera.height])
     cx, cy = (np.array([camera.cx, camera.cy]) + middle + 0.5) * scale - 0.5
     lens = {"fx": camera.fx * scale, "fy": camera.fy * scale, "cx": float(cx), "cy": float(cy)}

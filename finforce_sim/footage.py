@@ -7,7 +7,7 @@ import re
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from finforce.camera import CameraIntrinsics
+from finforce.camera_file import cut_camera
 from finforce.messages import NANOSECONDS
 from finforce.transforms import invert_pose
 from finforce_sim.gripper import FINGER, TwinGripper, TwinState
@@ -138,18 +139,7 @@ def parse_size(text: str, lens: str = D405) -> CameraIntrinsics:
     width, height = (int(number) for number in found.groups()) if found else (0, 0)
     if not (LEAST_SIZE <= width <= LARGEST_SIZE and LEAST_SIZE <= height <= LARGEST_SIZE):
         raise ScenarioError(f"size {text!r}: expected WIDTHxHEIGHT, each {LEAST_SIZE} to {LARGEST_SIZE} pixels")
-    plain = LENSES[lens]
-    scale = width / plain.width
-    shift = 0.5 * (height - scale * plain.height)
-    return replace(
-        plain,
-        width=width,
-        height=height,
-        fx=scale * plain.fx,
-        fy=scale * plain.fy,
-        cx=scale * (plain.cx + 0.5) - 0.5,
-        cy=scale * (plain.cy + 0.5) - 0.5 + shift,
-    )
+    return cut_camera(LENSES[lens], (height, width), width / LENSES[lens].width)
 
 
 def disturb_pose(T: NDArray, rng: np.random.Generator) -> NDArray:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from finforce.camera import deproject
+from finforce.camera import compute_rays
 from finforce.errors import PoseError
 from finforce.optional import import_open3d
 from finforce.surfaces import LARGEST
@@ -175,7 +175,8 @@ def align_as_paper(mesh: ObjectMesh, affine: NDArray, evidence: ImageEvidence) -
     Raises:
         ReconstructionError: the mesh is out of the camera's sight.
     """
-    cloud = deproject(evidence.depth, evidence.camera, evidence.mask)
+    wanted = evidence.mask & np.isfinite(evidence.depth)
+    cloud = compute_rays(evidence.camera)[wanted] * evidence.depth[wanted, None]
     affine = scale_coarsely(mesh, affine, cloud)
     for with_scale in (False, True):
         visible = MeshView(mesh).render(affine, evidence.camera).points

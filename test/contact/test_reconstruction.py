@@ -8,7 +8,7 @@ from contact_fakes import bare_mesh, distance_mm, make_case
 from guess_fakes import place_mesh
 from scipy.spatial.transform import Rotation
 
-from finforce.camera import ImageError, deproject
+from finforce.camera import ImageError, compute_rays
 from finforce.errors import PoseError
 from finforce_contact.errors import ReconstructionError
 from finforce_contact.mesh.views import MeshView
@@ -112,7 +112,8 @@ def test_result_is_the_same_every_time():
 def test_paper_way_gives_a_closed_mesh_nearer_than_its_coarse_scale(coarse_poisson):
     case = make_case("cylinder")
     mesh = bare_mesh(case.guess.vertices, case.guess.triangles)
-    cloud = deproject(case.scene.depth, case.scene.camera, case.scene.mask)
+    seen = case.scene.mask & np.isfinite(case.scene.depth)
+    cloud = compute_rays(case.scene.camera)[seen] * case.scene.depth[seen, None]
     coarse = scale_coarsely(mesh, case.guess.affine, cloud)
     assert np.ptp(place_mesh(mesh, coarse).vertices[:, 0]) == pytest.approx(np.ptp(cloud[:, 0]), rel=1e-9)
     result = reconstruct(case.evidence, case.guess, "paper")

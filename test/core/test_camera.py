@@ -12,7 +12,6 @@ from finforce.camera import (
     check_mask,
     compute_rays,
     decode_depth,
-    deproject,
     project,
     rays_from_pixels,
 )
@@ -115,16 +114,8 @@ def test_distortion_that_cannot_be_inverted_is_refused():
 
 
 def test_depth_is_along_the_axis_and_columns_are_x():
-    depth = np.full((48, 64), np.nan)
-    depth[40, 5] = 0.2
-    point = deproject(depth, make_camera())
-    np.testing.assert_allclose(point, [[(5 - 31.0) / 33.0 * 0.2, (40 - 24.5) / 32.0 * 0.2, 0.2]], rtol=1e-12)
-
-
-def test_only_masked_pixels_become_points():
-    mask = np.zeros((48, 64), dtype=bool)
-    mask[3, 4:9] = True
-    assert len(deproject(np.full((48, 64), 0.3), make_camera(), mask)) == 5
+    point = 0.2 * compute_rays(make_camera())[40, 5]
+    np.testing.assert_allclose(point, [(5 - 31.0) / 33.0 * 0.2, (40 - 24.5) / 32.0 * 0.2, 0.2], rtol=1e-12)
 
 
 def test_point_behind_the_camera_has_no_pixel():

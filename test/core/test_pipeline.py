@@ -104,7 +104,7 @@ def test_nothing_is_packed_for_nobody_and_everything_for_who_listens_outside(lin
     first.say(COLUMNS)
     assert not clouds()
     probe.hear("two", PointCloud2)
-    first.work(lambda: second.out._publisher.get_subscription_count() == 1)
+    first.work(lambda: second.out.publisher.get_subscription_count() == 1)
     first.say(COLUMNS)
     first.work(lambda: probe.got["two"])
     assert len(clouds()) == 1 and len(third.heard) == 2
@@ -161,7 +161,7 @@ def test_nobody_waits_for_a_stage_that_takes_longer_than_its_budget(probe, monke
     slow = Relay(pipeline, "slow", "one", context=probe.context, can_wait=True)
     quick = Relay(pipeline, "quick", "one", context=probe.context)
     for node in (slow, quick):
-        node.port._callback = partial(lambda name, message: order.append(name), node.get_name())
+        node.port.callback = partial(lambda name, message: order.append(name), node.get_name())
     pipeline.open()
     say = pipeline.turn(lambda _: source.say(COLUMNS))
     say(None)
