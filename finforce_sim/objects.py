@@ -35,16 +35,6 @@ def build_object(name: str) -> ObjectMesh:
     return ObjectMesh(vertices=vertices, triangles=triangles, watertight=True, name=name)
 
 
-def _build_cylinder(kernel):
-    """A cylinder of 50 mm diameter, 100 mm high."""
-    return kernel.Manifold.cylinder(100.0, 25.0, circular_segments=SEGMENTS, center=True)
-
-
-def _build_cube(kernel):
-    """A cube of 60 mm."""
-    return kernel.Manifold.cube((60.0, 60.0, 60.0), center=True)
-
-
 def _build_asymmetric(kernel):
     """A leaning block with a shoulder on one side and a round boss on top; no turn maps it onto itself."""
     corners = np.array([[-30, -20], [25, -20], [25, 8], [5, 22], [-30, 22]], dtype=float)
@@ -116,8 +106,8 @@ def _revolve(kernel, profile: NDArray):
 
 
 BUILDERS: dict[str, Callable] = {
-    "cylinder": _build_cylinder,
-    "cube": _build_cube,
+    "cylinder": lambda kernel: kernel.Manifold.cylinder(100.0, 25.0, circular_segments=SEGMENTS, center=True),
+    "cube": lambda kernel: kernel.Manifold.cube((60.0, 60.0, 60.0), center=True),
     "asymmetric": _build_asymmetric,
     "mug": _build_mug,
     "bottle": _build_bottle,

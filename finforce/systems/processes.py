@@ -74,7 +74,8 @@ class Process:
         if self.parameter_file:
             words += ["--params-file", self.parameter_file]
         for name, value in self.parameters.items():
-            words += ["-p", f"{name}:={_yaml(value)}"]
+            # as YAML with its type beyond doubt, which JSON is, but for NaN
+            words += ["-p", f"{name}:={'.nan' if value != value else json.dumps(value)}"]
         for name, other in self.remappings.items():
             words += ["-r", f"{name}:={other}"]
         return words
@@ -99,11 +100,6 @@ class Include:
     environment: Mapping[str, str] = field(default_factory=dict)
     programs: tuple[str, ...] = ()
     advice: str = ""
-
-
-def _yaml(value: Any) -> str:
-    """Return a value as YAML with its type beyond doubt, which JSON is, but for NaN."""
-    return ".nan" if value != value else json.dumps(value)
 
 
 def finish(parts: Sequence[Process | Include], options: SolverOptions) -> list[Process | Include]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from finforce.errors import FinforceError
 from finforce.signals import StopSignals
@@ -36,11 +36,6 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def build_load(width: float, stiffness: float) -> Callable[[float], float]:
-    """Return the grip force [N] by opening [m] of a spring of a free width [m] and a stiffness [N/m]."""
-    return lambda opening: stiffness * max(width - opening, 0.0)
-
-
 def build_adapter(options: argparse.Namespace) -> EmulatedAdapter:
     """Return the adapter with the gripper that a command line describes.
 
@@ -53,7 +48,7 @@ def build_adapter(options: argparse.Namespace) -> EmulatedAdapter:
         options.variant,
         options.node,
         object_opening=None if soft else width,
-        load=build_load(width, 1e3 * options.stiffness) if soft else None,
+        load=(lambda opening: 1e3 * options.stiffness * max(width - opening, 0.0)) if soft else None,
     )
     plan = draw_plan(options.seed, _FAULTS, 60.0 / options.faults) if options.faults > 0.0 else ()
     return FaultyAdapter(gripper, plan, options.seed, ack_mode=options.ack, latency=1e-3 * options.latency_ms)
