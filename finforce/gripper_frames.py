@@ -86,7 +86,7 @@ _BENCH_JAW = pose_from_quaternion(
     (0.0293674, 0.02565352, 0.11204665), (-0.21179348, -0.35564507, 0.90650751, 0.08309176)
 )
 BENCH_CAMERA = jaw_in_gripper("left", BENCH_ORIGIN_X) @ invert_pose(_BENCH_JAW)
-CAMERAS = {"robot": ROBOT_CAMERA, "bench": BENCH_CAMERA}
+CAMERAS = {"robot": ROBOT_CAMERA, "bench": BENCH_CAMERA, "turned": ROBOT_CAMERA @ HALF_TURN, "front": FRONT_CAMERA}
 
 
 def read_extrinsics(camera: str | ArrayLike) -> NDArray:
@@ -95,7 +95,7 @@ def read_extrinsics(camera: str | ArrayLike) -> NDArray:
     Raises:
         PoseError: it is none of these.
     """
-    forms = "robot, bench, x y z qx qy qz qw, or a (4, 4) matrix"
+    forms = f"{', '.join(CAMERAS)}, x y z qx qy qz qw, or a (4, 4) matrix"
     if isinstance(camera, str):
         if camera in CAMERAS:
             return CAMERAS[camera]

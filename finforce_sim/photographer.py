@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.camera import CameraIntrinsics, project
-from finforce.gripper_frames import BENCH_CAMERA, FRONT_CAMERA, HALF_TURN, ROBOT_CAMERA, jaw_in_camera
+from finforce.gripper_frames import CAMERAS, jaw_in_camera
 from finforce.transforms import invert_pose
 from finforce_sim.gripper import TwinState
 from finforce_sim.mechanics import Assembly
@@ -36,14 +36,6 @@ _BOX_TRIANGLES = np.array(
     [[0, 2, 1], [1, 2, 3], [4, 5, 6], [5, 7, 6], [0, 1, 4], [1, 5, 4], [2, 6, 3], [3, 6, 7], [0, 4, 2], [2, 4, 6]]
     + [[1, 3, 5], [3, 7, 5]]
 )
-
-
-CAMERAS = {
-    "robot": ROBOT_CAMERA,
-    "turned": ROBOT_CAMERA @ HALF_TURN,
-    "front": FRONT_CAMERA,
-    "bench": BENCH_CAMERA,
-}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from finforce.errors import FinforceError
+from finforce.gripper_frames import CAMERAS
 from finforce.settings import check_bounds, setting
 from finforce_ifea.jaw.jaw import load_jaw
 
@@ -23,7 +24,6 @@ class BalanceError(FinforceError, RuntimeError):
     """Jaws and object find no equilibrium: a jaw buckles, or the object slips or falls."""
 
 
-CAMERAS = ("robot", "turned", "front", "bench")
 RATE = 30.0  # [Hz] of the images, unless a scene says otherwise
 LIGHTS = ("bright", "dim", "any")
 HELD = 1e-6  # [kg] of mass from which on an object is lifted
@@ -50,8 +50,8 @@ class Scenario:
     shift: float = setting(0.0, "y of the object's middle", "m", -0.05, 0.05)
     camera: str = setting(
         "robot",
-        "Camera: on the wrist, the same upside down, beyond the tips, or of the bench before a single jaw",
-        choices=CAMERAS,
+        "Camera: on the wrist, of the bench before a single jaw, on the wrist upside down, or beyond the tips",
+        choices=tuple(CAMERAS),
     )
     light: str = setting("bright", "Light", choices=LIGHTS)
     rate: float = setting(RATE, "Image rate", "Hz", 1.0, 240.0)

@@ -144,6 +144,6 @@ def test_the_object_is_tracked_at_a_third_of_the_images_where_it_is_seen():
 
 
 def test_an_object_that_fills_the_gripper_is_refused():
-    grasp = PressedGrasp(build_scenario("grasp_cylinder", object="cylinder"), 3, "coarse", step=1e-3)
+    grasp = PressedGrasp(build_scenario("grasp_cylinder", object="cylinder"), 3, "coarse", step=5e-4)
     with pytest.raises(ScenarioError, match="50 mm wide.*expected at most 46 mm"):
         LiveScene(grasp, FakeLens(), 0)
