@@ -57,7 +57,6 @@ setup(
         "pillow",  # picture files
         "rosbags>=0.11,<0.12",  # recordings, without ROS
         "mcap",  # recordings that were cut off, record by record
-        "lz4",  # chunks of recordings
         "manifold3d",  # Boolean intersections and outlines of object meshes
         "trimesh",  # object mesh files, surfaces of fingers
         "networkx",  # 3MF files, of which trimesh builds a graph

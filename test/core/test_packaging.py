@@ -13,7 +13,6 @@ import yaml
 
 ROOT = Path(__file__).parents[2]
 KEYS = {
-    "lz4": "python3-lz4",
     "pandas": "python3-pandas",
     "numpy": "python3-numpy",
     "scipy": "python3-scipy",
