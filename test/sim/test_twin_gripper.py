@@ -237,7 +237,7 @@ def test_sliding_object_moves_the_place_of_the_force_along():
 
 def test_a_level_gripper_that_rolls_carries_its_weight_from_jaw_to_jaw():
     roll = {"pitch": 0.5 * np.pi, "turn_tilt": 0.5 * np.pi, "turn_angle": np.pi, "turn_rate": 3.0}
-    _, states = play("weight_turn", rate=15.0, **roll)
+    _, states = play("weight_turn", **roll)
     carried = [state for state in states if np.linalg.norm(net_of(state)) > 0.78]
     gravity = np.array([state.gravity for state in carried])
     np.testing.assert_allclose(gravity[0], (0.0, -1.0, 0.0), atol=0.06)
