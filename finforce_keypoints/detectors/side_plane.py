@@ -13,6 +13,7 @@ from finforce.camera import CameraIntrinsics
 from finforce.gripper_frames import HALF_TURN, OpeningRange
 from finforce.transforms import pose_numbers
 from finforce_keypoints.errors import GeometryError, ModelError
+from finforce_keypoints.geometry.jaw_pose import SLIP
 from finforce_keypoints.geometry.side_picture import PlaneGrid, find_side, map_picture, project_plane, take_picture
 from finforce_keypoints.geometry.template import draw_template, find_motions, find_shape, fit_grid, span_shapes
 from finforce_keypoints.images import PixelDetection
@@ -143,9 +144,20 @@ class SidePlaneDetector:
         return replace(places, likelihood=np.stack([self._mounts[view.side].believe(each) for view, each in pairs]))
 
     def _score(self, views: Sequence[_View], places: Places) -> list[float]:
-        """Return the mean likelihoods of the points that can be seen of the jaw of each picture."""
-        pairs = zip(views, places.likelihood, strict=True)
-        return [float(likelihood[self._seen[view.side]].mean()) for view, likelihood in pairs]
+        """Return the mean likelihoods of the points that can be seen of the jaw of each picture.
+
+        Ribs look alike, and a holder gives by little: a picture in which all points are one rib off is less likely. The
+        square of the slip in standard deviations counts half as much as one likely point.
+        """
+        scores = []
+        for view, likelihood, pixels in zip(views, places.likelihood, places.pixels, strict=True):
+            seen, jaw = self._seen[view.side], self._T_gripper_camera @ view.T_camera_jaw
+            scores.append(float(likelihood[seen].mean()))
+            if not seen[-1]:
+                along = (view.grid.places(pixels) - self._rest[view.side])[seen, 1] + jaw[2, 3] / jaw[2, 2]
+                slip = np.nan_to_num(np.average(along, weights=likelihood[seen] + 1e-9))
+                scores[-1] -= 0.5 * float(slip / SLIP) ** 2 / np.count_nonzero(seen)
+        return scores
 
     def _views_of(self, side: str, pose: NDArray | None) -> list[_View]:
         """Return where to look for one jaw: where it is expected, or all along the closing axis."""
@@ -188,10 +200,10 @@ class SidePlaneDetector:
         # pixels of the image per pixel of the picture, both ways
         across = [np.hypot(*(other - pixels).T) * grid.scale / 1e-3 for other in beside]
         stddev = places.stddev[number] * np.sqrt(0.5 * (across[0] ** 2 + across[1] ** 2))
-        known = np.isfinite(pixels).all(axis=1)
+        known, seen = np.isfinite(pixels).all(axis=1), self._seen[view.side]
         return PixelDetection(
             pixels=pixels,
-            likelihood=np.where(known & self._seen[view.side], places.likelihood[number], 0.0),
+            likelihood=np.where(known & seen & (seen[-1] or score >= LEAST_SCORE), places.likelihood[number], 0.0),
             stddev=np.where(known, stddev, np.inf),
         )
 

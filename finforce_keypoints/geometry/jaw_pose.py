@@ -29,7 +29,7 @@ _SET_ASIDE = 3  # consecutive places off the course that are believed when they 
 _RIGID_STDDEV = 0.3e-3  # [m] bending of the jaw at that height; more with the square of the height
 _ORIGIN_STDDEV = 0.6e-3  # [m] a jaw whose place is less well known is not found
 COVERED_STDDEV = 3e-3  # [m] the same of a jaw whose rigid part is covered: how sure its place is goes into the force
-_SLIP = 1.5e-3  # [m] standard deviation of how far holder and camera give under load, along the jaw
+SLIP = 1.5e-3  # [m] standard deviation of how far holder and camera give under load, along the jaw
 _ROUNDS = 6  # of reweighting
 _LEAST_BENT = 5  # points that tell the place of a jaw that may be bent
 _ORIGIN_GATE = 3.0  # standard deviations of an origin off the forecast, which mean that the speed has changed
@@ -90,7 +90,7 @@ class OriginEstimator:
         self.largest_stddev = _ORIGIN_STDDEV
         if not mount.seen_points(jaw)[-1]:
             bends = np.insert(find_motions(jaw)[:BENDS], 1, 0.0, axis=2) @ self._T_camera_middle[:3, :3].T
-            slip = np.broadcast_to(_SLIP * self._T_camera_middle[:3, 2], (1, *points.shape))
+            slip = np.broadcast_to(SLIP * self._T_camera_middle[:3, 2], (1, *points.shape))
             self._motions = np.concatenate((slip, np.append(bends, np.zeros((BENDS, 1, 3)), axis=1)))
             self.largest_stddev = COVERED_STDDEV
 
@@ -165,7 +165,7 @@ class OriginEstimator:
             doubt = 1.0 / (1.0 + 0.5 * ((away - columns @ found) ** 2).sum(axis=1) / variance)
         place, spread = middle + float(found[0]), float(np.sqrt(covariance[0, 0]))
         # what a finger differs from its shapes by is the same from image to image
-        origin = Origin(x=place, stddev=spread, shared=spread, slip=_SLIP * float(found[1]))
+        origin = Origin(x=place, stddev=spread, shared=spread, slip=SLIP * float(found[1]))
         return origin if self._low <= place <= self._high else None
 
     def _agrees(self, origin: Origin, x: NDArray, off: NDArray) -> bool:

@@ -13,7 +13,7 @@ from finforce_eval.cli.camera import describe_placement
 from finforce_eval.evaluation.keypoint_source import build_records
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints import placement
-from finforce_keypoints.detectors.side_plane import AnyFinger, SidePlaneDetector
+from finforce_keypoints.detectors.side_plane import AROUND, AnyFinger, SidePlaneDetector
 from finforce_keypoints.errors import DetectorSettingsError, GeometryError, RigError
 from finforce_keypoints.geometry.depth import DepthScale
 from finforce_keypoints.geometry.jaw_localizer import JawLocalizer
@@ -165,6 +165,26 @@ def test_a_jaw_in_a_holder_that_is_not_where_it_is_expected_is_looked_for_at_onc
         assert abs(found.pixels[0] - points_of(jaws["left"], there)[0]).max() < 30.0
         counts.append(locator.count)
     assert counts[0] == 1 < counts[1]  # where it is likely, one picture is enough
+
+
+@pytest.mark.parametrize("right", [0.8, 0.1])
+def test_a_jaw_in_a_holder_is_not_taken_one_rib_along(slope, right):
+    jaws, there = {"left": load_jaw("bench")}, jaw_in_camera(ROBOT_CAMERA, "left", -0.035)
+
+    class Ribbed(Sighted):
+        """Is a little surer of the place one rib on, 7 mm along, in one of the pictures beside the first."""
+
+        def locate(self, pictures, sides, starts=()):
+            places = super().locate(pictures, sides, starts)
+            if len(pictures) == len(AROUND):
+                places.likelihood[1], places.pixels[1, :, 1] = 0.9, places.pixels[1, :, 1] - 7e-3 / PlaneGrid().scale
+            return places
+
+    locator = Ribbed(jaws, lambda side, seen: right if locator.count > 1 else 0.1)
+    detector = SidePlaneDetector(locator, jaws, ROBOT_CAMERA, mounts={"left": JawMount(covered=LOW)})
+    found = detector.detect(slope[0], {"left": there})["left"]
+    assert found.likelihood.max() == pytest.approx(right if right > 0.5 else 0.0)
+    np.testing.assert_allclose(found.pixels[0], points_of(jaws["left"], there)[0], atol=30.0)
 
 
 def test_covered_points_lie_beyond_a_straight_edge():
