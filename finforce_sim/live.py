@@ -13,11 +13,10 @@ from finforce.camera import CameraIntrinsics
 from finforce.transforms import invert_pose
 from finforce_ifea.grasp_force import Wrench
 from finforce_sim.emulator.mechanism import STROKE
-from finforce_sim.footage import FINGER, WORKERS, disturb_pose
+from finforce_sim.footage import WORKERS, disturb_pose
 from finforce_sim.gripper import PressedGrasp
 from finforce_sim.photographer import Photographer, Shot
 from finforce_sim.scenarios import Scenario, ScenarioError
-from finforce_sim.sensor import build_d405_vga
 
 LEAST_CLEARANCE = 2e-3  # [m] of opening that the open gripper leaves around the object
 TRACKED_EVERY = 3  # images: the object is tracked at 10 Hz
@@ -113,12 +112,7 @@ class LiveScene:
 
 
 def build_live_scene(
-    scenario: Scenario,
-    seed: int,
-    camera: CameraIntrinsics | None = None,
-    *,
-    finger: int = FINGER,
-    depth_step: float = 1e-3,
+    scenario: Scenario, seed: int, camera: CameraIntrinsics, *, finger: int, depth_step: float
 ) -> LiveScene:
     """Return the scene of a scenario's jaws and object that waits for a gripper; see `build_footage`.
 
@@ -126,7 +120,7 @@ def build_live_scene(
         FinforceError: the scenario's object or jaw cannot be used, or a library is missing.
     """
     grasp = PressedGrasp(scenario, finger)
-    return LiveScene(grasp, Photographer(grasp, camera or build_d405_vga(), seed, depth_step), seed)
+    return LiveScene(grasp, Photographer(grasp, camera, seed, depth_step), seed)
 
 
 TAKES = 2  # of every opening: a camera that stands still never gives the same image twice

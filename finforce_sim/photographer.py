@@ -100,24 +100,16 @@ class TrueJaw:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Shot:
-    """One image.
+    """One image, developed or as it comes through the lens.
 
     Attributes:
-        color: (h, w, 3) uint8 red, green, blue.
-        depth: (h, w) float32 [m] as the camera measures it, NaN where it does not.
+        color: (h, w, 3) uint8 red, green, blue; linear light before it is developed.
+        depth: (h, w) float32 [m] as the camera measures it, NaN where it does not; true before.
         jaws: the truth by side.
     """
 
     color: NDArray
     depth: NDArray
-    jaws: Mapping[str, TrueJaw]
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class WristView:
-    """What comes through the lens: light and true depth, and the truth about the jaws by side."""
-
-    picture: Picture
     jaws: Mapping[str, TrueJaw]
 
 
@@ -148,14 +140,14 @@ class Photographer:
         """Return the image of a state, given that of the image before; the same seed and stamp give the same noise."""
         return self.develop(self.look(state, before), state.stamp, self._smear(state, before))
 
-    def look(self, state: TwinState, before: TwinState | None = None) -> WristView:
+    def look(self, state: TwinState, before: TwinState | None = None) -> Shot:
         """Return what a perfect sensor would see of a state; its upper rows are of a moment before."""
         stage = self._build_stage(state)
         jaws = {side: self._look_for(side, state, stage) for side in state.jaws}
         if before is not None and self._readout and before.stamp < state.stamp:
             jaws = {side: self._roll_truth(side, true, state, before) for side, true in jaws.items()}
-            return WristView(picture=self._roll(state, before), jaws=jaws)
-        return WristView(picture=stage.render(self.camera), jaws=jaws)
+            return Shot(**vars(self._roll(state, before)), jaws=jaws)
+        return Shot(**vars(stage.render(self.camera)), jaws=jaws)
 
     def _shares(self, rows: NDArray, state: TwinState, before: TwinState) -> NDArray:
         """Return how far back, of the way to the state before, rows (n,) [px] are exposed."""
@@ -189,7 +181,7 @@ class Photographer:
         """Return T_camera_jaw (4, 4)."""
         return jaw_in_camera(self.T_gripper_camera, side, state.jaws[side].origin_x)
 
-    def develop(self, view: WristView, stamp: float, smear: NDArray | None = None) -> Shot:
+    def develop(self, view: Shot, stamp: float, smear: NDArray | None = None) -> Shot:
         """Return a view as the sensor gives it.
 
         Args:
@@ -199,8 +191,8 @@ class Photographer:
         """
         rng = np.random.default_rng((self._seed, 8, round(stamp * 1e6)))
         noise = replace(D405_NOISE, quantum=self.depth_step)
-        color = expose(view.picture.color, self._look.exposure, rng, smear)
-        depth = measure_depth(view.picture.depth, color, self.camera, rng, noise)
+        color = expose(view.color, self._look.exposure, rng, smear)
+        depth = measure_depth(view.depth, color, self.camera, rng, noise)
         return Shot(color=color, depth=depth, jaws=view.jaws)
 
     def _build_stage(self, state: TwinState) -> RenderedScene:

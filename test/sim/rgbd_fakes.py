@@ -13,7 +13,7 @@ from finforce_keypoints.errors import DetectionError
 from finforce_keypoints.images import ImageWatch
 from finforce_sim.footage import Footage
 from finforce_sim.gripper import JawState, TwinState
-from finforce_sim.photographer import Shot, TrueJaw, WristView
+from finforce_sim.photographer import Shot, TrueJaw
 
 CAMERA = CameraIntrinsics(width=64, height=48, fx=43.0, fy=43.0, cx=31.5, cy=23.5, distortion=np.full(5, 0.01))
 KEYPOINTS = 4
@@ -165,7 +165,7 @@ class FakeLens:
     def look(self, state):
         with self._lock:
             self.looks += 1
-        return WristView(picture=None, jaws={side: true_jaw(state, side, CAMERA_POSE, 0) for side in state.jaws})
+        return Shot(color=None, depth=None, jaws={side: true_jaw(state, side, CAMERA_POSE, 0) for side in state.jaws})
 
     def develop(self, view, stamp):
         rng = np.random.default_rng(round(stamp * 1e6))

@@ -90,7 +90,7 @@ def test_rows_of_a_rolling_shutter_are_of_their_own_time(gripper):
         ago = readout * (1.0 - (rows.start + 0.5 * (band - 1)) / (height - 1))
         then = flat.look(state.blend(before, ago / (state.stamp - before.stamp)))
         inner = slice(rows.start + 1, rows.stop - 1)  # a band's edge has no neighbours that show an edge in its pixels
-        np.testing.assert_allclose(rolled.picture.color[inner], then.picture.color[inner], atol=1e-6)
+        np.testing.assert_allclose(rolled.color[inner], then.color[inner], atol=1e-6)
     # a point is where the jaw was when the point's own row was exposed
     now, past = (flat.look(some).jaws["left"].pixels for some in (state, before))
     seen = rolled.jaws["left"].pixels
