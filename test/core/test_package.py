@@ -12,6 +12,8 @@ from pathlib import Path
 import pytest
 import setuptools
 
+from finforce.ros import start
+
 ROOT = Path(__file__).resolve().parents[2]
 SOURCES = sorted(ROOT.glob("finforce*/**/*.py"))
 ROS = {"rclpy", "builtin_interfaces", "rcl_interfaces", "rosgraph_msgs", "std_srvs"}
@@ -116,6 +118,15 @@ def test_executables_land_where_ros_looks_and_point_at_functions(described):
     for script in described["entry_points"]["console_scripts"]:
         module, function = script.split(" = ")[1].split(":")
         assert callable(getattr(import_module(module), function))
+
+
+def test_an_executable_runs_the_node_of_its_name(monkeypatch):
+    started = []
+    monkeypatch.setattr(start, "start", lambda name: started.append((name, sys.argv[1:])) or 0)
+    for words in (["/opt/lib/finforce/ifea_solver", "-x"], [start.__file__, "twin_camera", "-x"]):
+        monkeypatch.setattr(sys, "argv", words)
+        assert start.main() == 0
+    assert started == [("ifea_solver", ["-x"]), ("twin_camera", ["-x"])]
 
 
 def test_launch_configuration_and_marker_files_are_installed(described):
