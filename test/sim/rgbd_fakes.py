@@ -113,6 +113,7 @@ class FakeKeypoints:
     stddev: np.ndarray
     T_camera_jaw: np.ndarray
     reasons: np.ndarray
+    shared: float = 0.0
 
 
 @dataclass
