@@ -21,12 +21,14 @@ from finforce.gripper_frames import SIDES
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.contact_source import ContactChoice
 from finforce_eval.evaluation.keypoint_source import KeypointSource
+from finforce_eval.evaluation.scoring import Evaluation
 from finforce_eval.evaluation.setup import EvaluationSetup, hash_files
 from finforce_eval.figures.figures import new_figure, style_axes
 from finforce_eval.machine import commit, version, write_figures
 from finforce_eval.recordings.bags import bag_source
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.tracks import Recording
+from finforce_eval.table import AXES
 from finforce_eval.tasks import OK, EngineOptions, Manifest, Task, choose_shard, hash_settings, run_tasks
 from finforce_ifea.jaw.calibration import load_calibration
 from finforce_ifea.jaw.jaw import load_jaw
@@ -156,6 +158,14 @@ def build_setup(settings: Mapping[str, Any], contact: ContactChoice | None = Non
         contacts=contact or ContactChoice(mode="estimate"),
         about={},
     )
+
+
+SHARP = {f"sharpness {axis}": f"sharp {axis}" for axis in AXES}  # headings by column of `tabulate`
+
+
+def axis_sharpness(evaluation: Evaluation) -> dict[str, float | None]:
+    """Return how sharp the stated deviations of all jaws' forces were along x, y and z, see `Stats.sharpness`."""
+    return dict(zip(AXES, evaluation.total.all.sharpness or (None,) * 3, strict=True))
 
 
 def keep_poses(recording: Recording, seen: NDArray) -> Recording:

@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 from finforce.gripper_frames import SIDES
 from finforce_eval.evaluate import evaluate_all
-from finforce_eval.evaluation.scoring import join_net, rms
+from finforce_eval.evaluation.scoring import join_net, measure_sharpness, rms
 from finforce_eval.evaluation.setup import EvaluationSetup
 from finforce_eval.recordings.tracks import Recording
 from finforce_eval.table import AXES, ForceSeries
 from finforce_ifea.grasp_force import R_GRIPPER_JAW
 from finforce_sim.footage import START
 from finforce_sim.scenarios import build_scenario, write_script
-from lab.experiments.experiment import Case, Experiment, RunOptions, average, build_setup, tabulate
+from lab.experiments.experiment import SHARP, Case, Experiment, RunOptions, average, build_setup, tabulate
 from lab.harness import Figures
 
 MASS, SPEED = 0.1, 1.2  # [kg], [rad/s]
@@ -67,9 +67,9 @@ def run(options: RunOptions, case: Case, folder: Path) -> dict[str, Any]:
 def find(options: RunOptions, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Figures:
     """Return errors along gravity by light."""
     errors = {"along_rmse_N": "along gravity/N", "told_along_rmse_N": "with gravity/N"}
-    turns = tabulate(figures).reindex(columns=["axis", "light", *errors])
+    turns = tabulate(figures).reindex(columns=["axis", "light", *errors, *SHARP])
     turns[["axis", "light"]] = turns[["axis", "light"]].fillna("")
-    lights = average(turns, ("axis", "light"), errors)
+    lights = average(turns, ("axis", "light"), errors | SHARP)
     lights["paper/N"] = [PAPER.get(key, "") for key in zip(lights.axis, lights.light, strict=True)]
     note = (
         "RMSE of the net force of both jaws (Eq. 3) along the true one, while that is above 0.5 N: mean and "
@@ -116,6 +116,7 @@ def score_weight(net: ForceSeries) -> dict[str, Any]:
         "across_rmse_N": rms(np.linalg.norm(error - along[:, None] * down, axis=1)),
         **{f"{axis}_rmse_N": rms(error[:, row]) for row, axis in enumerate(AXES)},
         "within_3_sigma_pct": 100.0 * float((np.abs(along) <= 3.0 * sigma).mean()) if known else float("nan"),
+        "sharpness": dict(zip(AXES, measure_sharpness(stated, error).tolist(), strict=True)),
         "answered_pct": answered,
     }
 

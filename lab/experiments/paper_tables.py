@@ -17,7 +17,7 @@ from finforce_eval.evaluation.scoring import ONSET_FORCE, Evaluation
 from finforce_eval.evaluation.setup import EvaluationSetup
 from finforce_eval.recordings.tracks import Recording
 from finforce_eval.table import AXES
-from lab.experiments.experiment import Case, Experiment, RunOptions, build_setup
+from lab.experiments.experiment import SHARP, Case, Experiment, RunOptions, axis_sharpness, build_setup
 from lab.harness import Figures
 
 # Ø [mm] and height of the axis [mm] of the twin's cylinders, whose finger the paper's heights do not fit
@@ -99,6 +99,7 @@ def score_contact(recording: Recording, setup: EvaluationSetup) -> dict[str, Any
         "nrmsd_pct": score.cycles["all"]["nrmsd_pct"]["mean"],
         "bias_N": score.all.bias_N,
         "within_3_sigma_pct": score.all.within_3_sigma_pct,
+        "sharpness": axis_sharpness(evaluation),
         "solved_pct": _share_solved(evaluation),
     }
 
@@ -173,12 +174,13 @@ def find_places(options: RunOptions, figures: Mapping[str, Mapping[str, Any]], f
 
 
 def tabulate_deviations(figures: Mapping[str, Mapping[str, Any]]) -> dict[str, pd.DataFrame]:
-    """Return how many errors of each case and contact are within three stated deviations."""
+    """Return how many errors of each case and contact are within three stated deviations, and how sharp these are."""
     rows = [
         {
             "case": name,
             "contact": contact,
             **{f"{axis} within 3σ/%": share for axis, share in zip(AXES, cell["within_3_sigma_pct"], strict=True)},
+            **{heading: cell["sharpness"][column[-1]] for column, heading in SHARP.items()},
         }
         for name, row in figures.items()
         for contact, cell in row["contacts"].items()

@@ -24,7 +24,7 @@ from finforce_eval.evaluation.contact_source import ContactChoice
 from finforce_eval.recordings.objects import require_mesh
 from finforce_eval.recordings.tracks import PoseTrack, Recording
 from finforce_keypoints.images import RgbdImage
-from lab.experiments.experiment import Case, Experiment, RunOptions, build_setup, keep_poses
+from lab.experiments.experiment import SHARP, Case, Experiment, RunOptions, axis_sharpness, build_setup, keep_poses
 from lab.experiments.grasp import join_jaws, score_grasp
 from lab.harness import Figures
 
@@ -91,6 +91,7 @@ def run(options: RunOptions, case: Case, folder: Path) -> dict[str, Any]:
             places = [score.solved_place["median_mm"] for score in evaluation.scores.values()]
             known = [place for place in places if place is not None]
             score = score_grasp(join_jaws(evaluation, recording.name))
+            score |= {f"sharpness {axis}": value for axis, value in axis_sharpness(evaluation).items()}
             found[way] = {**score, "place_median_mm": max(known) if known else float("nan")}
     return {"ways": found}
 
@@ -113,6 +114,7 @@ def find(options: RunOptions, figures: Mapping[str, Mapping[str, Any]], folder: 
         "place: worst median/mm": ways.place_median_mm.max(),
         "answered/%": ways.answered_pct.mean(),
         "within 3σ/%": ways.within_3_sigma_pct.mean(),
+        **{heading: ways[column].mean() for column, heading in SHARP.items()},
     }
     by_way = pd.DataFrame(summary).loc[errors.columns].reset_index()
     return Figures(tables={"By way": by_way, EACH: errors.reset_index()}, notes=[NOTE])

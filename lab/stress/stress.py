@@ -16,8 +16,10 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from finforce.errors import FinforceError
+from finforce_eval.evaluation.scoring import measure_sharpness
 from lab.harness import format_table
 
 TIME_LIMIT = 60.0
@@ -229,6 +231,7 @@ PRINTED = {
     "worst_sigmas": ("worst σ", 1),
     "within": ("in 3σ %", 100),
     "median_sigmas": ("median σ", 1),
+    **{f"sharpness_{axis}": (f"sharp {axis}", 1) for axis in AXES[:4]},
     "step_p50": ("p50 ms", 1000),
     "step_ratio": ("max/p50", 1),
     "nans": ("NaN", 1),
@@ -257,10 +260,20 @@ def summarise(name: str, trials: Sequence[Trial], *, least_sure: float = 0.0, ti
         "median_sigmas": judged.median(),
         "step_p50": table.step_time.median(),
         "step_ratio": measure_longest(trials),
+        **dict(zip((f"sharpness_{axis}" for axis in AXES), _measure_sharpness(trials), strict=True)),
     }
     counts = {"nans": int(table.nan.sum()), **{name: outcomes[name] for name in ("refused", "crashed", "hung")}}
     figures = {key: value if key == "n" else float(value) for key, value in figures.items()} | counts
     return {"name": name, **figures, "broken": list(_find_broken(figures, least_sure, timed))}
+
+
+def _measure_sharpness(trials: Sequence[Trial]) -> NDArray:
+    """Return the sharpness of the sure answers along `AXES`, see `measure_sharpness`."""
+    judged = [trial for trial in trials if trial.sure and trial.errors]
+    stated, errors = (
+        np.array([getattr(trial, name) for trial in judged]).reshape(-1, len(AXES)) for name in ("stated", "errors")
+    )
+    return measure_sharpness(stated, errors)
 
 
 def summarise_family(family: Family, trials: Sequence[Trial]) -> dict[str, Any]:

@@ -410,12 +410,14 @@ def test_what_each_way_of_poses_adds_is_counted_from_those_on_time(tmp_path):
     def grasp(*errors):
         ways = ("on time", "late")
         scores = {"answered_pct": 99.0, "place_median_mm": 1.0, "within_3_sigma_pct": 100.0}
+        scores |= {"sharpness x": 1.5, "sharpness y": 1.0, "sharpness z": 2.0}
         return {"ways": {way: {"rmse_N": {"all": error}, **scores} for way, error in zip(ways, errors, strict=True)}}
 
     found = POSE.find(RunOptions(), {"one": grasp(0.1, 0.1), "two": grasp(0.1, 0.4)}, tmp_path)
     rows = first_table(found).set_index("poses")
     assert rows["added/N"].to_dict() == pytest.approx({"on time": 0.0, "late": 0.15})
     assert rows["most added/N"]["late"] == pytest.approx(0.3)
+    assert rows["sharp x"]["late"] == pytest.approx(1.5)
 
 
 def test_grasps_and_turns_are_put_in_tables(tmp_path):
@@ -423,10 +425,12 @@ def test_grasps_and_turns_are_put_in_tables(tmp_path):
     series = {"seconds": [0.0, 1.0], "truth": [0.0, 2.0], "found": [0.0, 2.1]}
     score = {"rmse_N": phases, "nrmsd_pct": phases, "peak_N": 2.0, "bias_N": 0.0, "max_error_N": 0.1}
     score |= {"answered_pct": 100.0, "within_3_sigma_pct": 100.0, "delay_ms": [100.0, None]}
+    score |= {"sharpness": {"x": 1.5, "y": None, "z": 2.0}}
     row = {**score, "hidden": score, "drawn": series, "object": "cube", "place": "upper", "level": "low"}
     found = GRASP.find(RunOptions(), {"one": row}, tmp_path)
     assert first_table(found).force.tolist() == ["low", "all"]
     assert first_table(found)["shows after/ms"].tolist() == [100.0, 100.0]
+    assert first_table(found)["sharp z"].tolist() == [2.0, 2.0]
     one = np.eye(3)[:2]
     net = ForceSeries.build("one", "gripper", np.arange(2), force=one, true_force=one)
     turn = score_weight(net) | {"axis": "roll", "light": "dim"}

@@ -145,6 +145,12 @@ def test_figures_are_of_what_they_say():
     assert {key: summary[key] for key in expected} == expected
 
 
+def test_stated_deviations_as_large_as_the_errors_are_sharp():
+    summary = summarise("made", answers(3, error=0.01, stddev=0.02) + answers(3, error=0.03, stddev=0.02))
+    assert summary["sharpness_x"] == pytest.approx(0.02 / np.sqrt(5e-4))
+    assert np.isnan(summary["sharpness_y"])  # no error, nothing to be sharp about
+
+
 def test_levels_keep_their_order():
     trials = answers(2, level="b") + answers(1, level="a") + answers(1, level="b")
     assert [(level["name"], level["n"]) for level in summarise_levels(trials)] == [("b", 3), ("a", 1)]
