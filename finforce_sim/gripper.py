@@ -187,6 +187,8 @@ class PressedGrasp(Assembly):
 
     def elastic_force(self, opening: float) -> float:
         """Return the grasp force [N] at an opening [m] before anything relaxes: that of the jaw pressed less."""
+        if not opening < self.touch_opening:  # most of the time, and asked several times a millisecond
+            return 0.0
         return self._find_growth(opening) * float(np.interp(self.closing_at(opening), self._closings, self._forces))
 
     def find_closing(self, force: float) -> float:
