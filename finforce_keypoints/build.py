@@ -77,11 +77,12 @@ def build_pixel_detector(
         return _build_whole_image_detector(jaws, parameters)
 
     folder = Path(parameters.model) if parameters.model else choose_network(jaws)
+    mounts = mounts or find_mounts(parameters, jaws)
     if (folder / COARSE).is_file():
-        locator: AnyFinger | OneFinger = AnyFinger(SideNetwork(folder, threads=parameters.threads), jaws)
+        locator: AnyFinger | OneFinger = AnyFinger(SideNetwork(folder, threads=parameters.threads), jaws, mounts)
     else:
         locator = OneFinger(KeypointModel(folder, threads=parameters.threads), jaws)
-    return SidePlaneDetector(locator, jaws, parameters.camera_pose, opening, mounts or find_mounts(parameters, jaws))
+    return SidePlaneDetector(locator, jaws, parameters.camera_pose, opening, mounts)
 
 
 def choose_network(jaws: Mapping[str, Jaw]) -> Path:

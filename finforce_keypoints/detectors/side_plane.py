@@ -247,11 +247,14 @@ class AnyFinger:
     Args:
         network: that compares pictures with templates.
         jaws: by side.
+        mounts: by side, whose covered points are not looked for; without, all are.
     """
 
     shifts = STRAIGHT
 
-    def __init__(self, network: SideNetwork, jaws: Mapping[str, Jaw]) -> None:
+    def __init__(
+        self, network: SideNetwork, jaws: Mapping[str, Jaw], mounts: Mapping[str, JawMount] | None = None
+    ) -> None:
         self._network, self.name, self.sha256 = network, network.path.name, network.sha256
         shapes = {side: find_shape(jaw) for side, jaw in jaws.items()}
         self.grids = {side: fit_grid(shape, network.width, network.height) for side, shape in shapes.items()}
@@ -259,7 +262,8 @@ class AnyFinger:
         for side, grid in self.grids.items():
             points = grid.pixels(find_rest(jaws[side]))
             together = span_shapes(find_motions(jaws[side]), points, grid.scale)
-            self._templates[side] = network.prepare(draw_template(shapes[side], grid), points, together)
+            seen = mounts[side].seen_points(jaws[side]) if mounts else None
+            self._templates[side] = network.prepare(draw_template(shapes[side], grid), points, together, seen)
 
     def locate(self, pictures: NDArray, sides: Sequence[str], starts: Sequence[NDArray | None] = ()) -> Places:
         """Return where the points are: of each picture the jaw's key points, then its reference point.

@@ -44,12 +44,18 @@ class Template:
         points: (K, 2) float32 its points in the template at full size [px].
         pieces: (K, p, p, 3) uint8, the template around them.
         shapes: (2 K, m) how they can move together, see `span_shapes`; None where nobody knows.
+        wanted: (K,) bool, which are looked for; the others are covered.
     """
 
     half: NDArray
     points: NDArray
     pieces: NDArray
     shapes: NDArray | None = None
+    wanted: NDArray | None = None
+
+    def __post_init__(self) -> None:
+        if self.wanted is None:
+            object.__setattr__(self, "wanted", np.ones(len(self.points), dtype=bool))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -144,17 +150,20 @@ class SideNetwork:
         """The SHA-256 of both files, by which recordings tell what they were made with."""
         return hashlib.sha256(b"".join((self.path / name).read_bytes() for name in (COARSE, FINE))).hexdigest()
 
-    def prepare(self, template: NDArray, points: NDArray, shapes: NDArray | None = None) -> Template:
+    def prepare(
+        self, template: NDArray, points: NDArray, shapes: NDArray | None = None, wanted: NDArray | None = None
+    ) -> Template:
         """Return what is told of a finger.
 
         Args:
             template: (height, width, 3) uint8, see `draw_template`.
             points: (K, 2) column and row of its points there [px].
             shapes: (2 K, m) how they can move together [px]; without them each point is found for itself.
+            wanted: (K,) bool, which can be seen; None: all.
         """
         cv2, points = import_cv2(), np.asarray(points, dtype=np.float32)
         half = cv2.resize(template, (self.width // 2, self.height // 2), interpolation=cv2.INTER_AREA)
-        return Template(half=half, points=points, pieces=self._cut(template, points), shapes=shapes)
+        return Template(half=half, points=points, pieces=self._cut(template, points), shapes=shapes, wanted=wanted)
 
     def locate(self, pictures: NDArray, templates: Sequence[Template], starts: Sequence[NDArray | None] = ()) -> Places:
         """Find points in pictures, as many of these at a time as there are threads.
@@ -177,18 +186,18 @@ class SideNetwork:
 
     def _locate_one(self, picture: NDArray, template: Template, start: NDArray | None) -> Places:
         """Return where the points are in one picture, all without its axis."""
-        points, shapes = template.points, template.shapes
+        points, shapes, wanted = template.points, template.shapes, template.wanted
         seen = self._run(self._coarse, COARSE_LAYOUT[0], (picture[None], template.half[None], points[None]))
         guesses, *seen = (value[0] for value in seen)
-        everywhere = np.ones(len(points), dtype=bool)
         if shapes is None:
-            return self._compare(picture, template, seen, guesses, everywhere)
+            return self._compare(picture, template, seen, guesses, wanted)
+        everywhere = np.ones(len(points))
         moves = fit_motion(shapes, guesses - points, GUESS * everywhere, everywhere)
         if start is not None and np.linalg.norm(start - moves, axis=1).max() < ASTRAY:
             moves = start
-        places = self._compare(picture, template, seen, points + moves, everywhere)
+        places = self._compare(picture, template, seen, points + moves, wanted)
         better = _fit(template, places)
-        wrong = np.linalg.norm(better - moves, axis=1) > NEAR
+        wrong = wanted & (np.linalg.norm(better - moves, axis=1) > NEAR)
         if wrong.any():
             again = self._compare(picture, template, seen, points + better, wrong)
             places = Places(

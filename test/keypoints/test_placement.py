@@ -83,7 +83,7 @@ def test_points_that_cannot_be_seen_do_not_count_against_a_jaw():
         height, width, sha256 = 224, 176, ""
         path = type("Path", (), {"name": "half"})
 
-        def prepare(self, template, points, shapes):
+        def prepare(self, template, points, shapes, wanted=None):
             return Template(half=template, points=points, pieces=template[None])
 
         def locate(self, pictures, templates, starts=()):

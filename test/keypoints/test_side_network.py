@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -34,6 +35,17 @@ def test_every_point_of_every_picture_gets_a_place(network):
     assert places.pixels.shape == (3, 7, 2) and places.likelihood.shape == places.stddev.shape == (3, 7)
     assert np.isfinite(places.pixels).all() and (places.stddev > 0.0).all()
     assert ((places.likelihood >= 0.0) & (places.likelihood <= 1.0)).all()
+
+
+def test_covered_points_are_not_looked_for_and_the_others_are_found_as_before(network, monkeypatch):
+    picture, whole, wanted = draw(1, network), prepare(network, 8), np.arange(8) % 3 > 0
+    held = replace(whole, wanted=wanted)
+    every, seen = network.locate(picture, [whole]), []
+    cut = network._cut
+    monkeypatch.setattr(network, "_cut", lambda image, places: seen.append(len(places)) or cut(image, places))
+    some = network.locate(picture, [held])
+    assert sum(seen) == wanted.sum() and not some.likelihood[0, ~wanted].any()
+    np.testing.assert_allclose(some.pixels[0, wanted], every.pixels[0, wanted], atol=1e-3)
 
 
 def test_pictures_in_one_batch_do_not_disturb_each_other(network):

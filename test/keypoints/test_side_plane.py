@@ -33,7 +33,7 @@ class ShadeNetwork:
     def __init__(self, hidden=()):
         self.batches, self.hidden = [], hidden
 
-    def prepare(self, template, points, shapes):
+    def prepare(self, template, points, shapes, wanted=None):
         assert template.shape == (self.height, self.width, 3) and template[..., 0].any()
         return Template(half=template, points=points, pieces=template[None])
 
