@@ -242,7 +242,9 @@ class ContactTracker:
             self._follow_traction((asked, spread), noise.gain, dt, observation.gravity)
         self._complete(state)
         expected = self._search.expectation["mean"], prior
-        if not observation.shared:  # else common motion is expected
+        if observation.shared:  # common motion is expected
+            state["bumped"] = state["motion"] = 0.0
+        else:
             self._camera.update(self._search.points, self._search.positions, state, expected, tare)
         state["traction_leak"] = state["by_traction"] - state["force_modes"] @ absorbed
         if held is not None:

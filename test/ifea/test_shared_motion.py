@@ -68,6 +68,14 @@ def test_a_jaw_that_slips_in_its_holder_tells_the_force_within_what_is_stated(sl
     assert (~(np.abs(wrong) < 3.0 * np.array([s.magnitude_stddev for s in ignorant[held]]))).all()
 
 
+def test_a_motion_that_is_shared_is_no_bumped_camera(slipping):
+    estimator, seen = make_estimator(solver="frame"), slipping.observations
+    bumped = [slip(o, shift=2e-3, turn=0.0) for o in seen[60:80]]
+    before = [estimator.update(o, slipping.contact) for o in (*seen[:60], *bumped)]
+    after = [estimator.update(replace(o, shared=SHARED), slipping.contact) for o in seen[-15:]]
+    assert not before[-1].trusted and all(solution.trusted for solution in after[-5:])
+
+
 def test_what_is_shared_makes_no_force_surer(slipping):
     estimators = [make_estimator(solver="frame") for _ in range(2)]
     stated = []
