@@ -6,12 +6,13 @@ from dataclasses import replace
 from itertools import product
 
 import numpy as np
+from numpy.typing import NDArray
 
 from finforce_ifea.contact_mechanics.pressed_jaw import (
     Mechanics,
     RigidContact,
     build_contact_surface,
-    measure_stiffness,
+    measure_compliances,
 )
 from finforce_ifea.errors import ContactError, JawFileError
 from finforce_ifea.fem.model import JawModel
@@ -22,8 +23,9 @@ from finforce_ifea.jaw.mesh import VolumeMesh, shape_gradients, to_tet4, to_tet1
 from finforce_ifea.settings import EstimatorSettings
 
 _REDUCED = ("reduced", "linear")
-# How much softer the solid finger is than its section in plane strain, by shape, Poisson's ratio and size of elements.
-_WIDTH_SHARES: dict[tuple, float] = {}
+# Compliances (2, 3) of the solid finger and of its section in plane strain, by shape, Poisson's ratio and size of
+# elements.
+_COMPLIANCES: dict[tuple, NDArray] = {}
 
 
 def build_mechanics(jaw: Jaw, settings: EstimatorSettings) -> Mechanics:
@@ -76,18 +78,35 @@ def build_plane_model(jaw: Jaw, mesh: VolumeMesh, density: str | None = None) ->
         raise JawFileError(
             f"the jaw {jaw.name!r} is not a section, which solver plane needs; expected solver {jaw.model}"
         )
-    key = (jaw.digest, jaw.material.poisson_ratio, jaw.section.size)
-    if key not in _WIDTH_SHARES:
-        coarse = jaw.build_mesh("coarse")
-        solid = SolidModel(coarse, jaw.material)
-        held = PlaneModel(coarse, jaw.build_plane("coarse"), jaw.section, jaw.material)
-        stiffness = [
-            measure_stiffness(model, build_contact_surface(jaw, coarse, model, across=model.across))
-            for model in (solid, held)
-        ]
-        _WIDTH_SHARES[key] = stiffness[0] / stiffness[1]
-    material = jaw.material.model_copy(update={"young_modulus": jaw.material.young_modulus * _WIDTH_SHARES[key]})
+    solid, held = _compare_width(jaw).mean(axis=1)
+    material = jaw.material.model_copy(update={"young_modulus": jaw.material.young_modulus * held / solid})
     return PlaneModel(mesh, jaw.build_plane(density), jaw.section, material)
+
+
+def _compare_width(jaw: Jaw) -> NDArray:
+    """Return the compliances (2, 3) [m/N] of a section's coarse solid and of its plane model at three heights."""
+    from finforce_ifea.fem.plane import PlaneModel
+
+    key = (jaw.digest, jaw.material.poisson_ratio, jaw.section.size)
+    if key not in _COMPLIANCES:
+        coarse, unit = jaw.build_mesh("coarse"), jaw.material.model_copy(update={"young_modulus": 1e6})
+        models = SolidModel(coarse, unit), PlaneModel(coarse, jaw.build_plane("coarse"), jaw.section, unit)
+        _COMPLIANCES[key] = np.array(
+            [
+                measure_compliances(model, build_contact_surface(jaw, coarse, model, across=model.across))
+                for model in models
+            ]
+        )
+    return _COMPLIANCES[key]
+
+
+def measure_warping(jaw: Jaw) -> float:
+    """Return by how much the stiffness of a section's solid over that of its plane model changes along the finger.
+
+    As a share of the least. A finger of which one side is stiffer twists, which no plane model does.
+    """
+    solid, held = _compare_width(jaw)
+    return float(np.ptp(held / solid) / (held / solid).min())
 
 
 def choose_solver(settings: EstimatorSettings) -> EstimatorSettings:

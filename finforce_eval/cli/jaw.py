@@ -32,6 +32,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--flip", action=argparse.BooleanOptionalAction, help="the wider end is, or is not, the tip; if about as wide"
     )
     parser.add_argument("--other-face", action="store_true", help="take the other side as the inner face")
+    parser.add_argument(
+        "--solid", action="store_true", help="take a closed solid as it is, whatever its shape, in layers of its width"
+    )
     text = "picture to draw (next to the jaw file, .png)"
     parser.add_argument("--picture", type=lambda name: Path(picture_file(name)), help=text)
 
@@ -55,6 +58,7 @@ def run(options: argparse.Namespace) -> CommandResult:
             flip=options.flip, other_face=options.other_face, clamp_z=options.clamp, face_x=options.face_x
         ),
         picture=options.picture,
+        solid=options.solid,
     )
     for note in notes:
         print(f"  {note}")

@@ -26,7 +26,12 @@ _HEIGHTS = (0.25, 0.5, 0.75)
 
 
 def measure_stiffness(model: JawModel, surface: ContactSurface) -> float:
-    """Return one over the mean compliance against line loads along -x, one at a time [N/m].
+    """Return one over the mean of `measure_compliances` [N/m]."""
+    return float(1.0 / measure_compliances(model, surface).mean())
+
+
+def measure_compliances(model: JawModel, surface: ContactSurface) -> NDArray:
+    """Return the compliances (3,) [m/N] against line loads along -x, one at a time.
 
     The loads stand at a quarter, half and three quarters of the surface.
     """
@@ -38,7 +43,7 @@ def measure_stiffness(model: JawModel, surface: ContactSurface) -> float:
         loads.append(model.load(surface.probe, rest, forces))
     pushes = np.stack(loads, axis=1)
     motions = model.factorise(model.linearize(rest).tangent).solve(pushes)
-    return float(1.0 / np.einsum("ij,ij->j", pushes, motions).mean())
+    return np.einsum("ij,ij->j", pushes, motions)
 
 
 BISECTIONS = 10
@@ -258,6 +263,8 @@ def build_contact_surface(jaw: Jaw, mesh: VolumeMesh, model: JawModel, *, across
     points = np.stack([jaw.face.read(z.ravel()), y.ravel(), z.ravel()], axis=1)
     if jaw.section is not None and jaw.section.taper.any():
         points[:, 1] *= jaw.section.read_width(points[:, [0, 2]]) / (high[0] - low[0])
+    elif jaw.section is not None:
+        points[:, 1] = jaw.section.place_across(points)
     stiffness = np.full(len(points), _STIFFNESS * _SPACING / len(sides))
     probe = model.attach(points, 1e-3)
     return ContactSurface(

@@ -11,7 +11,7 @@ from finforce.typed_yaml import TAGS, Count, FileModel, Length, Number, Point, T
 from finforce_ifea.errors import JawFileError
 from finforce_ifea.jaw.drawing import Band, Drawing, Rib
 from finforce_ifea.jaw.mesh_file import MeshFile
-from finforce_ifea.jaw.section import FaceLine, Section, join_loops, order_rings, read_loops
+from finforce_ifea.jaw.section import FaceLine, Section, join_loops, order_rings, read_layers, read_loops
 
 LIST, MAPPING = TAGS
 
@@ -230,8 +230,9 @@ class SectionEntry(FileModel):
             clamp_slope=self.clamped.slope,
             clamped_circles=np.array(self.clamped.circles).reshape(-1, 3),
             size=self.size,
+            layers=read_layers(path),
         )
-        least = float(section.read_width(rings[0]).min())
+        least = np.inf if section.layers else float(section.read_width(rings[0]).min())
         if not least > 0.0:
             raise JawFileError(f"section.taper: leaves a width of {1e3 * least:.3g} mm somewhere, expected any")
         return section

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, reduce
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,24 @@ from finforce_ifea.errors import JawFileError
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "inch": 25.4e-3}
 _LARGEST_FILE, _MOST_VERTICES = 5_000_000, 100_000
+# Points this close [m] to a layer are of it; lines of layers meet on a grid of this size [m].
+_AT, _GRID = 1e-4, 1e-6
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Layer:
+    """A part of a finger's width, from `low` to `high` along y [m], with a section of its own, `area` [m]."""
+
+    low: float
+    high: float
+    area: shapely.Geometry
+
+    @cached_property
+    def reached(self) -> shapely.Geometry:
+        """The section, and what is close to it."""
+        grown = self.area.buffer(_AT)
+        shapely.prepare(grown)
+        return grown
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -29,6 +47,7 @@ class Section:
         clamp_slope: [-], rise of that height with x.
         clamped_circles: (c, 3), x, z and radius [m] about bolts: everything within is clamped.
         size: [m], of the elements in the section; None for what the thinnest parts ask for.
+        layers: of a finger that is no prism, lowest y first; its rings bound all of them together.
     """
 
     rings: tuple[NDArray, ...]
@@ -38,15 +57,41 @@ class Section:
     clamp_slope: float = 0.0
     size: float | None = None
     taper: NDArray = field(default_factory=lambda: np.zeros(2))
+    layers: tuple[Layer, ...] = ()
 
     def read_width(self, points: NDArray) -> NDArray:
-        """Return the width (...) [m] at points (..., 2) [m] of the section."""
-        return self.width + points @ self.taper
+        """Return the width (...) [m] at points (..., 2) [m] of the section, of all layers together."""
+        if not self.layers:
+            return self.width + points @ self.taper
+        there = [shapely.intersects_xy(layer.area, points[..., 0], points[..., 1]) for layer in self.layers]
+        return np.tensordot([layer.high - layer.low for layer in self.layers], np.array(there, float), 1)
+
+    def place_across(self, points: NDArray) -> NDArray:
+        """Return the y (n,) [m] that is nearest to that of points (n, 3) [m] and within the finger."""
+        half = 0.5 * (self.width + points[:, [0, 2]] @ self.taper)
+        y = np.clip(points[:, 1], -half, half)
+        nearest = np.full(len(points), np.inf)
+        for layer in self.layers:
+            inside = np.clip(points[:, 1], layer.low, layer.high)
+            away = np.abs(inside - points[:, 1])
+            better = shapely.intersects_xy(layer.reached, points[:, 0], points[:, 2]) & (away < nearest)
+            y, nearest = np.where(better, inside, y), np.where(better, away, nearest)
+        return y
 
     @cached_property
     def widest(self) -> float:
         """The largest width [m]."""
-        return float(self.read_width(self.rings[0]).max())
+        return self.width if self.layers else float(self.read_width(self.rings[0]).max())
+
+    @cached_property
+    def lines(self) -> list[tuple[NDArray, bool]]:
+        """What bounds the section and its layers: lines (n, 2) [m] that meet at their ends alone; whether closed."""
+        if not self.layers:
+            return [(ring, True) for ring in self.rings]
+        bounds = shapely.union_all([layer.area.boundary for layer in self.layers], grid_size=_GRID)
+        merged = shapely.line_merge(bounds)
+        lines = [np.array(line.coords) for line in getattr(merged, "geoms", [merged])]
+        return [(line[:-1], True) if (line[0] == line[-1]).all() else (line, False) for line in lines]
 
     @cached_property
     def polygon(self) -> shapely.Polygon:
@@ -60,6 +105,9 @@ class Section:
         numbers += self.taper.tolist() if self.taper.any() else []
         numbers += [self.clamp_slope] if self.clamp_slope else []
         rings = [np.round(1e6 * ring).astype(np.int64).tobytes() for ring in self.rings]
+        for layer in self.layers:
+            numbers += [layer.low, layer.high]
+            rings.append(np.round(1e6 * shapely.get_coordinates(layer.area)).astype(np.int64).tobytes())
         return b"|".join([np.round(1e6 * np.array(numbers)).tobytes(), *rings])
 
     @cached_property
@@ -91,7 +139,7 @@ class Section:
 
     def distance_to(self, points: NDArray) -> NDArray:
         """Compute the distances (n,) [m] of points (n, 3) [m, jaw frame] from the finger, 0 inside."""
-        lateral = np.maximum(np.abs(points[:, 1]) - 0.5 * self.read_width(points[:, [0, 2]]), 0.0)
+        lateral = np.abs(points[:, 1] - self.place_across(points))
         in_plane = shapely.distance(self.polygon, shapely.points(points[:, [0, 2]]))
         return np.hypot(lateral, in_plane)
 
@@ -166,6 +214,30 @@ def read_loops(path: Path) -> tuple[list[NDArray], float | None]:
         ) from error
     check_loops(loops, path.name)
     return loops, width
+
+
+def read_layers(path: Path) -> tuple[Layer, ...]:
+    """Return the layers of a section file that `read_loops` has read, none of a prism.
+
+    Raises:
+        JawFileError: They are not of that form: `y`, from and to, and `loops`.
+    """
+    content = parse_json(read_text(path, _LARGEST_FILE))
+    layers, scale = [], UNITS[content["unit"]]
+    try:
+        for entry in content.get("layers", ()):
+            loops = [np.array(loop, float) * scale for loop in entry["loops"]]
+            check_loops(loops, path.name)
+            low, high = (float(value) * scale for value in entry["y"])
+            # what lies within an odd number of loops
+            area = reduce(shapely.symmetric_difference, map(shapely.Polygon, loops))
+            layers.append(Layer(low=low, high=high, area=area))
+    except (KeyError, TypeError, ValueError, shapely.errors.GEOSException) as error:
+        raise JawFileError(f"{path.name}: layers: expected y: [from, to] and loops ({error})") from error
+    ends = np.array([(layer.low, layer.high) for layer in layers]).reshape(-1, 2)
+    if not (np.diff(ends, axis=1) > 0.0).all() or not np.allclose(ends[1:, 0], ends[:-1, 1], atol=1e-9):
+        raise JawFileError(f"{path.name}: layers: expected one upon another, lowest y first")
+    return tuple(layers)
 
 
 def check_loops(loops: list[NDArray], name: str) -> None:

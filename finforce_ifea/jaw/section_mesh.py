@@ -57,7 +57,7 @@ def mesh_section(section: Section, share: float = 1.0) -> PlaneMesh:
     """
     size = section.size or max(_SIZE, float(np.sqrt(section.free_area / (_EQUILATERAL * _MOST_TRIANGLES))))
     field = _SizeField(section, share * size)
-    rings = [_resample(ring, field) for ring in section.rings]
+    rings = [_resample(line, field, is_closed) for line, is_closed in section.lines]
     points = np.concatenate(rings)
     if len(points) > _MOST_POINTS:
         raise MeshError(
@@ -65,12 +65,19 @@ def mesh_section(section: Section, share: float = 1.0) -> PlaneMesh:
             "`size`, or leave out what is that thin"
         )
     first = np.cumsum([0, *map(len, rings)])
-    edges = np.concatenate([_close(start, len(ring)) for start, ring in zip(first, rings, strict=False)])
-    polygon = shapely.Polygon(rings[0], rings[1:])
+    edges = [_close(start, len(ring)) for start, ring in zip(first, rings, strict=False)]
+    edges = np.concatenate([e if closed else e[:-1] for e, (_, closed) in zip(edges, section.lines, strict=True)])
+    if section.layers:  # whose lines share their ends
+        points, number = np.unique(points, axis=0, return_inverse=True)
+        edges, polygon = number.ravel()[edges], section.polygon
+    else:
+        polygon = shapely.Polygon(rings[0], rings[1:])
     inside = _fill(polygon, points, field)
     points, triangles = _triangulate(points, edges, inside)
     centres = points[triangles].mean(axis=1)
-    triangles = triangles[shapely.contains_xy(polygon, centres) & (_measure_quality(points[triangles]) > _FLAT)]
+    areas = [layer.area for layer in section.layers] or [polygon]
+    there = np.any([shapely.contains_xy(area, centres) for area in areas], axis=0)
+    triangles = triangles[there & (_measure_quality(points[triangles]) > _FLAT)]
     used, triangles = np.unique(triangles, return_inverse=True)
     return _add_middles(points[used], _turn(points[used], triangles.reshape(-1, 3)))
 
@@ -82,9 +89,11 @@ class _SizeField:
         self.size = size
         self._section = section
         places, sizes = [], []
-        for ring in section.rings:
+        for ring, is_closed in section.lines:
             length = np.linalg.norm(np.roll(ring, -1, axis=0) - ring, axis=1)
             turn = _measure_turns(ring)
+            if not is_closed:
+                turn[[0, -1]] = 0.0
             curve = turn / (0.5 * (length + np.roll(length, 1)))
             curve[turn > _CORNER] = 0.0
             places.append(ring)
@@ -109,24 +118,27 @@ def _measure_turns(ring: NDArray) -> NDArray:
     return np.abs((angle - np.roll(angle, 1) + np.pi) % (2.0 * np.pi) - np.pi)
 
 
-def _resample(ring: NDArray, field: _SizeField) -> NDArray:
-    """Return points (m, 2) along a ring: its corners, and between them as many as the sizes ask for."""
+def _resample(ring: NDArray, field: _SizeField, is_closed: bool) -> NDArray:
+    """Return points (m, 2) along a ring, or a line: its corners, and between them as many as the sizes ask for."""
     length = np.linalg.norm(np.roll(ring, -1, axis=0) - ring, axis=1)
     ring = ring[length > 1e-7]
     length = length[length > 1e-7]
-    corners = np.flatnonzero(_measure_turns(ring) > _CORNER)
+    turns = _measure_turns(ring)
+    if not is_closed:
+        turns[[0, -1]] = np.pi
+    corners = np.flatnonzero(turns > _CORNER)
     corners = corners if len(corners) else np.array([0])
     arc = np.concatenate([[0.0], np.cumsum(length)])
     closed = np.vstack([ring, ring[:1]])
     pieces = []
-    for begin, end in zip(corners, np.roll(corners, -1), strict=True):
+    for begin, end in list(zip(corners, np.roll(corners, -1), strict=True))[: None if is_closed else -1]:
         start, stop = arc[begin], arc[end] + (arc[-1] if end <= begin else 0.0)
         fine = np.linspace(start, stop, max(int((stop - start) / _LEAST), 2) + 1)
         middles = 0.5 * (fine[1:] + fine[:-1])
         count = np.concatenate([[0.0], np.cumsum(np.diff(fine) / field.read(_walk(middles, arc, closed)))])
         number = max(int(np.ceil(count[-1] - 1e-6)), 1)
         pieces.append(_walk(np.interp(np.arange(number) * count[-1] / number, count, fine), arc, closed))
-    return np.concatenate(pieces)
+    return np.concatenate(pieces if is_closed else [*pieces, ring[-1:]])
 
 
 def _walk(distance: NDArray, arc: NDArray, closed: NDArray) -> NDArray:
@@ -210,7 +222,9 @@ def _add_middles(points: NDArray, triangles: NDArray) -> PlaneMesh:
 
 
 def extrude_section(section: Section, share: float = 1.0) -> VolumeMesh:
-    """Return the finger as 10-node tetrahedra, one layer of prisms on either side of y = 0, three to a prism.
+    """Return the finger as 10-node tetrahedra, three to a prism.
+
+    A prism or a tapered finger is one layer of prisms on either side of y = 0; others have as many as they have layers.
 
     Raises:
         MeshError: The section cannot be divided, or nothing of it is clamped.
@@ -218,14 +232,28 @@ def extrude_section(section: Section, share: float = 1.0) -> VolumeMesh:
     plane = mesh_section(section, share)
     corners, triangles = plane.points[: plane.corners], np.sort(plane.triangles[:, :3], axis=1)
     count = len(corners)
-    half = 0.5 * section.read_width(corners)
-    nodes = np.concatenate([np.insert(corners, 1, level * half, axis=1) for level in (-1.0, 0.0, 1.0)])
-    middle, tets = triangles + count, []
-    for end in (triangles, triangles + 2 * count):
-        # the diagonals of all sides start at the smallest number in the middle plane: both halves mirror each other
-        (a, b, c), (d, e, f) = middle.T, end.T
+    if section.layers:
+        ends = np.unique([0.0, *(end for layer in section.layers for end in (layer.low, layer.high))])
+        levels = np.repeat(ends[:, None], count, axis=1)
+        centres = corners[triangles].mean(axis=1)
+        there = [
+            shapely.contains_xy(layer.area, *centres.T)
+            for middle in 0.5 * (ends[1:] + ends[:-1])
+            for layer in section.layers
+            if layer.low < middle < layer.high
+        ]
+    else:
+        levels = np.array([-0.5, 0.0, 0.5])[:, None] * section.read_width(corners)
+        there = np.ones((2, len(triangles)), bool)
+    nodes, tets = np.concatenate([np.insert(corners, 1, y, axis=1) for y in levels]), []
+    for number, present in enumerate(there):
+        # the diagonals of all sides start at the smallest number of the end towards the middle: both halves mirror each
+        # other
+        near, far = (number, number + 1) if levels[number].max() >= 0.0 else (number + 1, number)
+        (a, b, c), (d, e, f) = (triangles[present].T + count * end for end in (near, far))
         tets += [np.stack(four, axis=1) for four in ((a, b, c, f), (a, b, f, e), (a, e, f, d))]
-    tets = np.concatenate(tets)
+    used, tets = np.unique(np.concatenate(tets), return_inverse=True)
+    nodes, tets = nodes[used], tets.reshape(-1, 4)
     edges = [nodes[tets[:, k]] - nodes[tets[:, 0]] for k in (1, 2, 3)]
     flipped = np.einsum("ij,ij->i", np.cross(edges[0], edges[1]), edges[2]) < 0.0
     tets = np.where(flipped[:, None], tets[:, [0, 2, 1, 3]], tets)

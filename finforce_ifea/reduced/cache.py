@@ -168,6 +168,7 @@ def name_manifold(full: Mechanics, jaw: Jaw) -> str:
     if isinstance(model, PlaneModel):  # one for both sides
         parts[:2] = [model.plane.points, model.plane.triangles, jaw.section.width]
         parts += [jaw.section.taper] if jaw.section.taper.any() else []
+        parts += [jaw.digest] if jaw.section.layers else []
     if isinstance(full.model, FrameModel):
         parts.append(repr(jaw.drawing))
     if not manifold_build.has_own_rows(full):

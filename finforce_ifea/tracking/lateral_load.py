@@ -94,6 +94,8 @@ def measure_torsion(jaw: Jaw, mesh: VolumeMesh) -> Torsion | None:
     heights = np.linspace(low + 0.1 * (high - low), high - 0.05 * (high - low), _HEIGHTS)
     arm, rest = _ARM * _find_narrowest(jaw, heights, half), np.zeros(model.size)
     places = np.array([[jaw.face.read(z), y, z] for z in heights for y in (-arm, 0.0, arm)])
+    if jaw.section is not None:
+        places[:, 1] = jaw.section.place_across(places)
     probes = [model.attach(places[3 * row : 3 * row + 3], 1e-3) for row in range(_HEIGHTS)]
     twist, across = np.zeros((3, 3)), np.zeros((3, 3))
     twist[0, 0], twist[2, 0], across[1, 1] = 0.5 / arm, -0.5 / arm, 1.0

@@ -10,17 +10,19 @@ import pytest
 import shapely
 import shapely.affinity
 import trimesh
+from mechanics_fakes import compute_volume
 from scipy.spatial.transform import Rotation
-from section_fakes import BASE, LENGTH, MILLIMETRE, WIDTH, draw_polygon, make_section
+from section_fakes import BASE, LENGTH, MILLIMETRE, TPU, WIDTH, draw_polygon, make_section
 
 from finforce_eval.cli.main import main
 from finforce_ifea.errors import JawFileError
-from finforce_ifea.jaw.cad.cad_file import read_section
+from finforce_ifea.fem.plane import PlaneModel
+from finforce_ifea.jaw.cad.cad_file import _GRID, _cut, _find_axis, read_section
 from finforce_ifea.jaw.cad.make_jaw import choose_keypoints, make_jaw
 from finforce_ifea.jaw.cad.recognition import Overrides, recognize
 from finforce_ifea.jaw.jaw import load_jaw
-from finforce_ifea.jaw.section import order_rings
-from finforce_ifea.jaw.section_mesh import extrude_section
+from finforce_ifea.jaw.section import Layer, order_rings
+from finforce_ifea.jaw.section_mesh import extrude_section, mesh_section
 
 RIBS = 4
 
@@ -97,6 +99,72 @@ def test_a_floor_and_a_slot_are_named_with_their_place(tmp_path, surface):
     with pytest.raises(JawFileError, match="its usual section is drawn in"):
         make_jaw(tmp_path / "finger.stl", tmp_path / "out" / "jaw.yaml", name="slotted", overrides=Overrides())
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["jaw.png"]
+
+
+@pytest.mark.parametrize("kind", ["floor", "slot"])
+def test_a_solid_that_is_no_prism_is_taken_in_layers(tmp_path, surface, kind):
+    low, high = surface.bounds
+    size, middle, side = high - low, 0.5 * (low + high), np.array([0.0, 0.5 * WIDTH, 0.0])
+    box = {
+        "floor": ((0.6 * size[0], 1.0, 0.6 * size[2]), middle - side + [0.0, 0.5, 0.0]),
+        "slot": ((1.0, 0.4 * WIDTH, 0.5 * size[2]), [high[0], middle[1], middle[2]]),
+    }[kind]
+    mesh = boxes_joined(surface, box, cut=kind == "slot")
+    mesh.export(tmp_path / "finger.stl")
+    _, notes = make_jaw(
+        tmp_path / "finger.stl", tmp_path / "jaw.yaml", name="layered", overrides=Overrides(), solid=True
+    )
+    jaw = load_jaw(tmp_path / "jaw.yaml")
+    depth = 0.4 * WIDTH * MILLIMETRE
+    heights = {"floor": [1.0, WIDTH], "slot": [0.3 * WIDTH, 0.7 * WIDTH, WIDTH]}[kind]
+    tops = [layer.high - jaw.section.layers[0].low for layer in jaw.section.layers]
+    if kind == "floor" and jaw.section.layers[0].high > 0.0:  # on either side, as the axis was found
+        heights[0] = WIDTH - heights[0]
+    assert tops == pytest.approx(np.array(heights) * MILLIMETRE, abs=1e-5)
+    assert compute_volume(jaw.build_mesh("coarse")) == pytest.approx(mesh.volume * MILLIMETRE**3, rel=5e-3)
+    # a finger of which one side alone is stiffer twists
+    assert jaw.model == ("solid" if kind == "floor" else "plane")
+    assert any("layers move apart" in note for note in notes) == (kind == "floor")
+    if kind == "slot":
+        face = np.array([[jaw.inner_face_x - 2e-4, 0.035], [jaw.inner_face_x - 2e-3, 0.035]])
+        assert jaw.section.read_width(face[:1]) == pytest.approx(WIDTH * MILLIMETRE - depth, abs=1e-5)
+
+
+def test_layers_that_are_alike_are_as_stiff_as_one():
+    prism = make_section(size=4e-3)
+    half = 0.5 * prism.width
+    layers = tuple(Layer(low=a, high=b, area=prism.polygon) for a, b in ((-half, 0.002), (0.002, half)))
+    found = []
+    for section in (prism, replace(prism, layers=layers)):
+        mesh, plane = extrude_section(section), mesh_section(section)
+        model = PlaneModel(mesh, plane, section, TPU)
+        probe = model.attach(np.array([[0.014, 0.0, 0.04]]))
+        load = model.load(probe, np.zeros(model.size), np.array([[-1.0, 0.0, 0.0]]))
+        found.append(float(load @ model.factorise(model.linearize(np.zeros(model.size)).tangent).solve(load)))
+        assert compute_volume(mesh) == pytest.approx(prism.polygon.area * prism.width, rel=5e-3)
+    assert found[1] == pytest.approx(found[0], rel=0.01)
+
+
+def test_a_finger_without_ribs_is_taken_as_a_solid(tmp_path):
+    wedge = shapely.Polygon([(14.0, 0.0), (14.0, 70.0), (10.0, 70.0), (-14.0, 0.0)])
+    trimesh.creation.extrude_polygon(wedge, WIDTH).export(tmp_path / "finger.stl")
+    with pytest.raises(JawFileError, match="0 cells"):
+        make_jaw(tmp_path / "finger.stl", tmp_path / "jaw.yaml", name="wedge", overrides=Overrides())
+    make_jaw(tmp_path / "finger.stl", tmp_path / "jaw.yaml", name="wedge", overrides=Overrides(), solid=True)
+    jaw = load_jaw(tmp_path / "jaw.yaml")
+    assert jaw.section.polygon.area == pytest.approx(wedge.area * MILLIMETRE**2, rel=1e-3)
+    assert len(jaw.keypoints) > 10
+
+
+def test_a_cut_is_closed_wherever_its_ends_are_rounded():
+    # corners half way between two lines of the grid: both triangles at an edge may round them to either side
+    corners = (np.array([[0, 0], [40001, 0], [40001, 20001], [20001, 30001], [0, 20001]]) + 0.5) * _GRID
+    mesh = trimesh.creation.extrude_polygon(shapely.Polygon(corners), 5e-3)
+    mesh.apply_transform(trimesh.transformations.rotation_matrix(0.3, [0.2, 0.5, 1.0]))
+    axis, _ = _find_axis(mesh)
+    low, high = np.sort(mesh.vertices @ axis)[[0, -1]]
+    areas = [_cut(mesh, axis, low + share * (high - low)).area for share in np.linspace(0.01, 0.99, 60)]
+    assert areas == pytest.approx([shapely.Polygon(corners).area] * 60, rel=1e-4)
 
 
 @pytest.mark.parametrize(("height", "clamp"), [(8.0, 10.5), (15.0, 15.0), (40.0, None)])

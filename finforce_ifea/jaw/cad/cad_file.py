@@ -7,6 +7,8 @@ import numpy as np
 import shapely
 import trimesh
 from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 from shapely.ops import polygonize, unary_union
 
 from finforce.files import FileError
@@ -14,7 +16,8 @@ from finforce.optional import import_library
 from finforce.sandbox import SandboxError, run_limited
 from finforce.surfaces import read_surface
 from finforce_ifea.errors import JawFileError
-from finforce_ifea.jaw.section import UNITS, check_loops, join_loops, read_loops
+from finforce_ifea.jaw.cad.layers import find_layers
+from finforce_ifea.jaw.section import UNITS, Layer, check_loops, join_loops, read_loops
 
 SURFACES = (".stl", ".obj", ".ply", ".off", ".3mf", ".glb")
 SUFFIXES = (*SURFACES, ".step", ".stp", ".dxf", ".svg", ".json")
@@ -54,6 +57,7 @@ class RawSection:
     notes: list[str] = field(default_factory=list)
     taper: NDArray = field(default_factory=lambda: np.zeros(2))
     base: shapely.Geometry | None = None
+    layers: tuple[Layer, ...] = ()
 
 
 class UnlikeSectionsError(JawFileError):
@@ -64,13 +68,14 @@ class UnlikeSectionsError(JawFileError):
         self.section = section
 
 
-def read_section(path: Path, *, unit: str | None = None, body: int | None = None) -> RawSection:
+def read_section(path: Path, *, unit: str | None = None, body: int | None = None, layered: bool = False) -> RawSection:
     """Read the section of a finger.
 
     Args:
         path: a surface (.stl and others), a solid (.step), a drawing (.dxf, .svg), or a section (.json).
         unit: one of `UNITS`; None for the only one in which it has a finger's size.
         body: which one of several bodies, from 1.
+        layered: take a solid as layers along its width, whatever its shape.
 
     Raises:
         JawFileError: The file cannot be read, or holds no finger; the message says what it holds and what to do.
@@ -96,7 +101,7 @@ def read_section(path: Path, *, unit: str | None = None, body: int | None = None
             extent = np.ptp(np.concatenate(loops), axis=0).max()
             scale, note = _choose_unit(float(extent), unit or named)
             return RawSection(polygon=_join_lines([scale * loop for loop in loops]), width=None, notes=[note])
-        return _cut_surface(_load_surface(path), unit, body)
+        return _cut_surface(_load_surface(path), unit, body, layered)
     except (JawFileError, FileError, SandboxError) as error:
         prefix = "" if str(error).startswith(path.name) else f"{path.name}: "
         raise JawFileError(f"{prefix}{error}") from error
@@ -137,8 +142,8 @@ def _load_surface(path: Path) -> trimesh.Trimesh:
     return mesh
 
 
-def _cut_surface(mesh: trimesh.Trimesh, unit: str | None, body: int | None) -> RawSection:
-    """Return the section of a closed surface across the direction in which it was extruded."""
+def _cut_surface(mesh: trimesh.Trimesh, unit: str | None, body: int | None, layered: bool) -> RawSection:
+    """Return the section of a closed surface across the direction in which it was extruded, or its layers."""
     scale, note = _choose_unit(float(mesh.extents.max()), unit)
     notes = [note]
     mesh = _choose_body(_drop_doubles(mesh, notes), body, scale, notes)
@@ -154,6 +159,8 @@ def _cut_surface(mesh: trimesh.Trimesh, unit: str | None, body: int | None) -> R
         mesh.invert()
         notes.append("its surface was inside out and has been turned")
     axis, share = _find_axis(mesh)
+    if layered:
+        return _cut_layers(mesh, axis, notes)
     cuts = _cut_often(mesh, axis)
     if share < _PRISMATIC and not cuts.is_one:
         return _cut_tapered(mesh, axis, notes)
@@ -171,6 +178,23 @@ def _cut_surface(mesh: trimesh.Trimesh, unit: str | None, body: int | None) -> R
     if pieces := int((cuts.pieces > 1).sum()):
         notes.append(f"a hole across it is left out: it parts {pieces} of {_CUTS} cuts")
     return RawSection(polygon=cuts.section, width=width, notes=notes, base=base)
+
+
+def _cut_layers(mesh: trimesh.Trimesh, axis: NDArray, notes: list[str]) -> RawSection:
+    """Return the layers of a closed surface along an axis, and of its cuts in one piece the one that is most usual."""
+    height = mesh.vertices @ axis
+    low, high = float(height.min()), float(height.max())
+    flat = np.abs(mesh.face_normals @ axis) > 1.0 - _UPRIGHT**2
+    steps = np.unique(np.round(height[mesh.faces[flat]].mean(axis=1), 5))
+    layers = find_layers(lambda at: _cut(mesh, axis, at), (low, high), steps[(steps > low) & (steps < high)].tolist())
+    whole = [layer for layer in layers if layer.area.geom_type == "Polygon"]
+    if not whole:
+        raise JawFileError("none of its layers is in one piece, expected one finger")
+    usual = max(whole, key=lambda layer: layer.high - layer.low)
+    _one_piece(shapely.union_all([layer.area for layer in layers]))
+    across = f"along {np.round(axis, 3).tolist()} of the file, {1e3 * (high - low):.4g} mm in all"
+    notes.append(f"{len(layers)} layer{'s' * (len(layers) > 1)} {across}")
+    return RawSection(polygon=usual.area, width=high - low, notes=notes, layers=tuple(layers))
 
 
 def _measure_blade(mesh: trimesh.Trimesh, axis: NDArray, base: shapely.Geometry) -> float:
@@ -236,7 +260,7 @@ class _Cuts:
             f"{other.mean():.0%} of its {width:.3g} mm, at {where[0]:.3g} to {where[-1]:.3g} mm, have another section "
             f"({areas.min():.4g} to {areas.max():.4g} mm^2) than the other {width * rest:.3g} mm "
             f"({1e6 * self.section.area:.4g} mm^2): a floor, a slot, or a base wider than the blade; expected one "
-            "section: export the blade alone, or use a volume mesh (`mesh:` in the jaw file)"
+            "section: export the blade alone, or take the solid as it is (--solid)"
         )
 
 
@@ -401,8 +425,11 @@ def _cut(mesh: trimesh.Trimesh, axis: NDArray, height: float) -> shapely.Geometr
     """Return the cut of a body across an axis at a height [m], a polygon or several."""
     lines = trimesh.intersections.mesh_plane(mesh, axis, height * axis)
     first, second = _span(axis)
-    flat = np.stack([lines @ first, lines @ second], axis=-1)
-    return _fill_lines([line for line in flat])
+    flat = np.stack([lines @ first, lines @ second], axis=-1).reshape(-1, 2)
+    # two triangles place the end that they share to rounding alike: on either side of a line of the grid, maybe
+    near = cKDTree(flat).sparse_distance_matrix(cKDTree(flat), _GRID, output_type="coo_matrix")
+    _, first, number = np.unique(connected_components(near)[1], return_index=True, return_inverse=True)
+    return _fill_lines(flat[first][number].reshape(-1, 2, 2))
 
 
 def _join_lines(lines: list[NDArray]) -> shapely.Polygon:
@@ -421,15 +448,18 @@ def _one_piece(area: shapely.Geometry) -> shapely.Polygon:
     return area
 
 
-def _fill_lines(lines: list[NDArray]) -> shapely.Geometry:
-    """Return what lines (n, 2) [m], open or closed, bound together: a polygon or several.
+def _fill_lines(lines: list[NDArray] | NDArray) -> shapely.Geometry:
+    """Return what lines (n, 2) [m], open or closed, bound together: a polygon or several; many at once as one array.
 
     Raises:
         JawFileError: They bound nothing.
     """
-    grid = [np.round(np.asarray(line, float) / _GRID) * _GRID for line in lines]
-    strings = [shapely.LineString(line) for line in grid if np.ptp(line, axis=0).max() > 0.0]
-    areas = sorted(polygonize(unary_union(strings)), key=lambda area: -area.area) if strings else []
+    if isinstance(lines, np.ndarray):
+        strings = shapely.linestrings(np.round(lines / _GRID) * _GRID)
+    else:
+        strings = np.array([shapely.LineString(np.round(line / _GRID) * _GRID) for line in lines])
+    strings = strings[shapely.length(strings) > 0.0]
+    areas = sorted(polygonize(unary_union(strings)), key=lambda area: -area.area) if len(strings) else []
     if not areas:
         raise JawFileError(f"{len(lines)} lines bound no area, expected closed loops: an outline and its holes")
     # a face within an odd number of others' outlines is a hole

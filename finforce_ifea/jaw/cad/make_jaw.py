@@ -1,21 +1,24 @@
 """A jaw file from the file of a finger: key points, contact candidates, reference point, its section and a picture."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import shapely
+import shapely.affinity
 from numpy.typing import NDArray
 
 from finforce_ifea.errors import JawFileError
 from finforce_ifea.jaw.cad.cad_file import RawSection, UnlikeSectionsError, read_section
 from finforce_ifea.jaw.cad.picture import draw_finger, draw_refused
-from finforce_ifea.jaw.cad.recognition import Overrides, RecognizedFinger, recognize
+from finforce_ifea.jaw.cad.recognition import Overrides, RecognizedFinger, has_cells, recognize
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.jaw.jaw_file import MATERIALS
-from finforce_ifea.jaw.section import cut_below
+from finforce_ifea.jaw.section import cut_below, find_reach, order_rings
+from finforce_ifea.mechanics import measure_warping
 
 # Key points [m] above the clamp at least; candidates so far from either end of the inner face, and from each other.
 _ABOVE, _AWAY, _STEP = 1e-3, 4e-3, 4e-3
@@ -24,6 +27,11 @@ _TIP = 2.5e-3
 # With fewer key points where ribs meet bands, those between them are taken, too: an object hides some.
 FEW = 12
 BANDS = ("inner", "outer")
+# A finger without ribs is given so many cells between these shares of its length, apart by twice this share, under a
+# skin of this share of its width.
+_CELLS, _CELLS_FROM, _GAP, _SKIN = 8, (0.08, 0.95), 0.008, 0.06
+# Layers that warp by more than this share need a solid, whose elements are of this size [m].
+_WARPING, _SIZE = 0.25, 0.002
 # A reference point [m] below a clamp that the section does not show.
 _BELOW = -6e-3
 
@@ -39,6 +47,7 @@ def make_jaw(
     width: float | None = None,
     overrides: Overrides,
     picture: Path | None = None,
+    solid: bool = False,
 ) -> tuple[list[Path], list[str]]:
     """Read a finger and write the jaw file that describes it; return what was written, and what was found and guessed.
 
@@ -52,6 +61,7 @@ def make_jaw(
         width: along y [m]; needed for drawings.
         overrides: what is stated in place of the guesses.
         picture: the PNG file; None for one next to the jaw file.
+        solid: take a closed solid as it is, as layers along its width, whatever its shape.
 
     Raises:
         JawFileError: The file shows no fin-ray finger; the message says what it shows and what to do.
@@ -59,12 +69,14 @@ def make_jaw(
     """
     picture = picture or output.with_suffix(".png")
     output.parent.mkdir(parents=True, exist_ok=True)
-    raw = _read_section(file, unit, body, picture)
+    raw = _read_section(file, unit, body, picture, solid)
+    if len(raw.layers) == 1 and has_cells(raw.polygon):  # a prism
+        raw = replace(raw, layers=())
     width = width or raw.width
     if width is None:
         raise JawFileError(f"{file.name}: a drawing has no width; give it in millimetres: --width 25")
     try:
-        finger = recognize(raw.polygon, width, overrides, raw.taper, raw.base)
+        finger = _recognize(raw, width, overrides)
     except JawFileError as error:
         draw_refused(raw.polygon, str(error), picture)
         raise JawFileError(f"{file.name}: {error} (its section is drawn in {picture})") from error
@@ -76,6 +88,12 @@ def make_jaw(
     lines.append(f"reference_point: {_list(_put_on_side(finger, *reference))}  # {place}")
     output.write_text("\n".join(lines) + "\n", encoding="utf-8")
     jaw = load_jaw(output)
+    if finger.layers and (warping := measure_warping(jaw)) > _WARPING:
+        raw.notes.append(f"its layers move apart (stiffness {warping:.0%} off), thus `model: solid`, which is slow")
+        lines = [*lines, "model: solid"]
+        lines[lines.index("section:")] += f"\n  size: {_SIZE}"
+        output.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        jaw = load_jaw(output)
     draw_finger(finger, jaw, picture)
     spread = f"{1e-6 * jaw.material.young_modulus:.3g} MPa +- {jaw.material.spread:.0%}"
     notes = [
@@ -88,15 +106,60 @@ def make_jaw(
     return [output, section, picture], notes
 
 
-def _read_section(file: Path, unit: str | None, body: int | None, picture: Path) -> RawSection:
+def _read_section(file: Path, unit: str | None, body: int | None, picture: Path, solid: bool) -> RawSection:
     """Read the section of a finger; draw the usual one of a solid that has others, too."""
     try:
-        return read_section(file, unit=unit, body=body)
+        return read_section(file, unit=unit, body=body, layered=solid)
     except JawFileError as error:
         if not isinstance(error.__cause__, UnlikeSectionsError):
             raise
         draw_refused(error.__cause__.section, str(error), picture)
         raise JawFileError(f"{error} (its usual section is drawn in {picture})") from error
+
+
+def _recognize(raw: RawSection, width: float, overrides: Overrides) -> RecognizedFinger:
+    """Return the finger in a section; of layers without ribs that could be found as if there were some, evenly.
+
+    Raises:
+        JawFileError: The section shows no fin-ray finger.
+    """
+    if not raw.layers:
+        return recognize(raw.polygon, width, overrides, raw.taper, raw.base)
+    try:
+        return _layer(recognize(raw.polygon, width, overrides), raw)
+    except JawFileError:
+        finger = _layer(recognize(_open_cells(raw.polygon), width, overrides), raw)
+    finger.notes[-1] = "no ribs found: key points stand at even heights, as if there were some"
+    return finger
+
+
+def _open_cells(polygon: shapely.Polygon) -> shapely.Polygon:
+    """Return what an outline bounds with cells, evenly along it."""
+    polygon = shapely.Polygon(polygon.exterior)
+    corners = np.array(polygon.minimum_rotated_rectangle.exterior.coords)[:4]
+    across, along = sorted((corners[1] - corners[0], corners[2] - corners[1]), key=lambda way: np.hypot(*way))
+    start, size = corners.mean(axis=0) - 0.5 * along, np.hypot(*along)
+    room = polygon.buffer(-_SKIN * np.hypot(*across))
+    cells = []
+    for low, high in pairwise(np.linspace(*_CELLS_FROM, _CELLS + 1)):
+        middle = shapely.LineString([start + (low + _GAP) * along, start + (high - _GAP) * along])
+        parts = shapely.get_parts(room.intersection(middle.buffer(size, cap_style="flat")))
+        cells.append(max(parts, key=lambda part: part.area, default=shapely.Polygon()))
+    return polygon.difference(shapely.union_all(cells))
+
+
+def _layer(finger: RecognizedFinger, raw: RawSection) -> RecognizedFinger:
+    """Return a finger that was recognized in one of its layers with all of them."""
+    a, b = finger.frame[:, :2], finger.frame[:, 2]
+    matrix = [*a.ravel(), *b]
+    areas = [shapely.affinity.affine_transform(layer.area, matrix) for layer in raw.layers]
+    areas = [shapely.set_precision(area, 1e-7) for area in areas]  # as they are written
+    layers = [replace(layer, area=area) for layer, area in zip(raw.layers, areas, strict=True)]
+    if np.linalg.det(a) > 0.0:  # x, z and the axis of the cuts make a left-handed frame
+        layers = [replace(layer, low=-layer.high, high=-layer.low) for layer in reversed(layers)]
+    whole = shapely.union_all([layer.area for layer in layers], grid_size=1e-6).buffer(0.0)
+    face_x = float(max(find_reach(whole, np.array([z for _, z in finger.inner.line])).max(), finger.face_x))
+    return replace(finger, rings=order_rings(whole), layers=tuple(layers), face_x=face_x)
 
 
 def choose_keypoints(finger: RecognizedFinger) -> dict[str, NDArray]:
@@ -140,7 +203,7 @@ def _find_middles(
 
 def _put_on_side(finger: RecognizedFinger, x: float, z: float) -> NDArray:
     """Return a place of the section on the side that the camera sees (3,) [m]."""
-    return np.array([x, 0.5 * float(finger.read_width(np.array([x, z]))), z])
+    return np.array([x, *finger.place_across(np.array([[x, 1.0, z]])), z])
 
 
 def _find_face_end(finger: RecognizedFinger) -> float:
@@ -162,9 +225,20 @@ def _choose_reference(finger: RecognizedFinger) -> tuple[NDArray, str]:
 
 def _describe_section(finger: RecognizedFinger, source: str) -> str:
     """Return the text of a section file; `source` is the name of the file that it comes from."""
-    loops = [np.round(1e3 * ring, 4).tolist() for ring in finger.rings]
     width = round(1e3 * finger.width, 4)
-    return json.dumps({"source": source, "unit": "mm", "axes": ["x", "z"], "width": width, "loops": loops}) + "\n"
+    content = {"source": source, "unit": "mm", "axes": ["x", "z"], "width": width, "loops": _list_rings(finger.rings)}
+    if finger.layers:
+        content["layers"] = [
+            {"y": np.round(1e3 * np.array([layer.low, layer.high]), 4).tolist(), "loops": _list_rings(rings)}
+            for layer in finger.layers
+            for rings in [[ring for part in shapely.get_parts(layer.area) for ring in order_rings(part)]]
+        ]
+    return json.dumps(content) + "\n"
+
+
+def _list_rings(rings: Sequence[NDArray]) -> list:
+    """Return rings (n, 2) [m] as lists in millimetres."""
+    return [np.round(1e3 * ring, 4).tolist() for ring in rings]
 
 
 def _describe_finger(finger: RecognizedFinger, section: str, name: str) -> list[str]:

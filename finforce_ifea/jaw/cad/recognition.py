@@ -98,6 +98,7 @@ class RecognizedFinger(Section):
         ribs: base to tip.
         face_x: plane of the inner face, x [m].
         face_deviation: how far the inner face leaves its plane [m].
+        frame: of the jaw in the section that was read: a rotation, perhaps mirrored, and a shift (2, 3) [m].
         notes: what was found and guessed, a line each.
     """
 
@@ -107,6 +108,7 @@ class RecognizedFinger(Section):
     ribs: list[RecognizedRib]
     face_x: float
     face_deviation: float
+    frame: NDArray
     notes: list[str] = field(default_factory=list)
 
 
@@ -187,6 +189,7 @@ def recognize(
         clamped_circles=circles + [shift, 0.0, 0.0],
         face_x=face_x + shift,
         face_deviation=deviation,
+        frame=frame + [[0.0, 0.0, shift], [0.0, 0.0, 0.0]],
         notes=notes,
     )
     notes.append(f"{len(cells)} cells, {_describe_walls(finger)}")
@@ -271,6 +274,11 @@ def _split_holes(polygon: shapely.Polygon) -> tuple[list[NDArray], list[NDArray]
     """Return the holes (n, 2) of a section: the round ones, and the others, which are cells."""
     holes = [np.array(ring.coords)[:-1] for ring in polygon.interiors]
     return [hole for hole in holes if _is_round(hole)], [hole for hole in holes if not _is_round(hole)]
+
+
+def has_cells(polygon: shapely.Polygon) -> bool:
+    """Whether a section has cells between ribs."""
+    return len(_split_holes(polygon)[1]) > 1
 
 
 def _is_round(hole: NDArray) -> bool:

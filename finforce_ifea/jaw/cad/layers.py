@@ -1,0 +1,90 @@
+"""A closed solid of any shape as layers: cuts across its width, of which each stands for all that are like it."""
+
+from collections.abc import Callable
+from itertools import pairwise
+
+import numpy as np
+import shapely
+
+from finforce_ifea.jaw.section import Layer
+
+# Cuts over the width beside the heights at which it steps; layers at most; and how far outlines of one layer may be
+# apart [m], tried in turn: so far where it is this share of the width, more where it is less, up to so many times.
+_CUTS, _MOST, _ALIKE = 64, 24, (0.1e-3, 0.2e-3, 0.4e-3, 0.8e-3)
+_EVEN = 16  # layers of a finger that changes everywhere
+_SHARE, _LARGEST = 0.1, 5.0
+# Areas are compared on a grid of this size [m], which keeps them valid.
+_GRID = 1e-8
+# Steps closer to each other than this [m] are one.
+_STEP = 2e-5
+
+
+def find_layers(cut: Callable[[float], shapely.Geometry], ends: tuple[float, float], steps: list[float]) -> list[Layer]:
+    """Return a solid's layers, lowest first, their places counted from the middle.
+
+    Args:
+        cut: returns the section at a height [m].
+        ends: lowest and highest point of the solid [m].
+        steps: heights [m] at which its section may change at once.
+    """
+    low, high = ends
+    grid = np.unique([*np.linspace(low, high, _CUTS + 1), *steps])
+    far = np.abs(grid[:, None] - np.array([low, high, *steps])).min(axis=1)
+    # of the even places those next to a step are left out
+    grid = grid[(far == 0.0) | (far > 0.25 * (high - low) / _CUTS)]
+    grid = grid[np.r_[True, np.diff(grid) > _STEP]]
+    grid[-1] = high
+    cuts = [cut(middle) for middle in 0.5 * (grid[1:] + grid[:-1])]
+    for apart in _ALIKE:
+        runs = _find_runs(cuts, apart)
+        if len(runs) <= _MOST:
+            break
+    else:  # everywhere, as that of a finger with slanted sides
+        ends_of = np.linspace(0, len(cuts), _EVEN + 1).astype(int).tolist()
+        runs = list(pairwise(ends_of))
+    areas: dict[int, shapely.Geometry] = {}
+    for number in np.argsort([grid[begin] - grid[end] for begin, end in runs], kind="stable").tolist():
+        begin, end = runs[number]
+        share = (grid[end] - grid[begin]) / (high - low)
+        cut = cuts[(begin + end - 1) // 2]
+        areas[number] = _share_lines(cut, list(areas.values()), apart * np.clip(_SHARE / share, 1.0, _LARGEST))
+    layers: list[Layer] = []
+    for number, (begin, end) in enumerate(runs):
+        bottom, area = float(grid[begin] - 0.5 * (low + high)), areas[number]
+        if layers and layers[-1].area is area:
+            bottom = layers.pop().low
+        layers.append(Layer(low=bottom, high=float(grid[end] - 0.5 * (low + high)), area=area))
+    return layers
+
+
+def _find_runs(cuts: list[shapely.Geometry], apart: float) -> list[tuple[int, int]]:
+    """Return first and last but one of neighbouring cuts that leave each other by no more than a distance [m]."""
+    starts = [0]
+    for number, cut in enumerate(cuts):
+        if not _thick(_compare(cut, cuts[starts[-1]]), apart).is_empty:
+            starts.append(number)
+    return list(zip(starts, [*starts[1:], len(cuts)], strict=True))
+
+
+def _thick(area: shapely.Geometry, apart: float) -> shapely.Geometry:
+    """Return the parts of an area that are thicker than a distance [m]."""
+    area = area.buffer(0.0)  # without lines
+    kept = area.buffer(-0.5 * apart, join_style="mitre").buffer(0.51 * apart, join_style="mitre")
+    return shapely.intersection(kept, area, grid_size=_GRID)
+
+
+def _share_lines(cut: shapely.Geometry, others: list[shapely.Geometry], apart: float) -> shapely.Geometry:
+    """Return a cut whose outline is that of another one wherever both are closer to each other than a distance [m]."""
+    if not others:
+        return cut.buffer(0.0)
+    like = min(others, key=lambda other: _compare(cut, other).area)
+    pairs = ((cut, like), (like, cut))
+    added, gone = (_thick(shapely.difference(one, two, grid_size=_GRID), apart) for one, two in pairs)
+    if added.is_empty and gone.is_empty:
+        return like
+    more = shapely.union(like, added, grid_size=_GRID)
+    return shapely.difference(more, gone, grid_size=_GRID).buffer(0.0)  # without what has no area
+
+
+def _compare(one: shapely.Geometry, two: shapely.Geometry) -> shapely.Geometry:
+    return shapely.symmetric_difference(one, two, grid_size=_GRID)
