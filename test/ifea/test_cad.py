@@ -17,14 +17,14 @@ from section_fakes import BASE, LENGTH, MILLIMETRE, TPU, WIDTH, draw_polygon, ma
 from finforce_eval.cli.main import main
 from finforce_ifea.errors import JawFileError
 from finforce_ifea.fem.plane import PlaneModel
-from finforce_ifea.jaw.cad.cad_file import _GRID, _cut, _find_axis, read_section
+from finforce_ifea.jaw.cad.cad_file import _GRID, _cut, _span, read_section
 from finforce_ifea.jaw.cad.make_jaw import choose_keypoints, make_jaw
 from finforce_ifea.jaw.cad.recognition import Overrides, recognize
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.jaw.section import Layer, order_rings
 from finforce_ifea.jaw.section_mesh import extrude_section, mesh_section
 
-RIBS = 4
+RIBS, UP = 4, np.array([0.0, 0.0, 1.0])
 
 
 def finger_surface(polygon=None, size=2e-3):
@@ -156,15 +156,13 @@ def test_a_finger_without_ribs_is_taken_as_a_solid(tmp_path):
     assert len(jaw.keypoints) > 10
 
 
-def test_a_cut_is_closed_wherever_its_ends_are_rounded():
-    # corners half way between two lines of the grid: both triangles at an edge may round them to either side
-    corners = (np.array([[0, 0], [40001, 0], [40001, 20001], [20001, 30001], [0, 20001]]) + 0.5) * _GRID
-    mesh = trimesh.creation.extrude_polygon(shapely.Polygon(corners), 5e-3)
-    mesh.apply_transform(trimesh.transformations.rotation_matrix(0.3, [0.2, 0.5, 1.0]))
-    axis, _ = _find_axis(mesh)
-    low, high = np.sort(mesh.vertices @ axis)[[0, -1]]
-    areas = [_cut(mesh, axis, low + share * (high - low)).area for share in np.linspace(0.01, 0.99, 60)]
-    assert areas == pytest.approx([shapely.Polygon(corners).area] * 60, rel=1e-4)
+def test_a_cut_is_closed_wherever_its_ends_are_rounded(monkeypatch):
+    # two triangles place the end that they share on either side of the middle between two lines of the grid
+    corners = (np.array([[0, 0], [40001, 0], [40001, 20001], [0, 20001]]) + 0.5) * _GRID
+    ends = np.stack([corners - 1e-12, np.roll(corners, -1, axis=0) + 1e-12], axis=1)
+    lines = np.insert(ends, 2, 0.0, axis=2)
+    monkeypatch.setattr(trimesh.intersections, "mesh_plane", lambda *_: lines @ np.stack([*_span(UP), UP]))
+    assert _cut(None, UP, 0.0).area == pytest.approx(shapely.Polygon(corners).area, rel=1e-3)
 
 
 @pytest.mark.parametrize(("height", "clamp"), [(8.0, 10.5), (15.0, 15.0), (40.0, None)])
