@@ -43,6 +43,7 @@ def run(options: argparse.Namespace) -> CommandResult:
     """Read a finger, say what was found, and write jaw file, section and picture."""
     from finforce_ifea.jaw.cad.make_jaw import make_jaw
     from finforce_ifea.jaw.cad.recognition import Overrides
+    from finforce_ifea.mechanics import measure_warping
 
     started = time.monotonic()
     output = options.output or Path(f"{options.file.stem}.yaml")
@@ -58,7 +59,7 @@ def run(options: argparse.Namespace) -> CommandResult:
             flip=options.flip, other_face=options.other_face, clamp_z=options.clamp, face_x=options.face_x
         ),
         picture=options.picture,
-        solid=options.solid,
+        solid=measure_warping if options.solid else None,
     )
     for note in notes:
         print(f"  {note}")

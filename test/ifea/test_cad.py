@@ -23,6 +23,7 @@ from finforce_ifea.jaw.cad.recognition import Overrides, recognize
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.jaw.section import Layer, order_rings
 from finforce_ifea.jaw.section_mesh import extrude_section, mesh_section
+from finforce_ifea.mechanics import measure_warping
 
 RIBS, UP = 4, np.array([0.0, 0.0, 1.0])
 
@@ -112,7 +113,7 @@ def test_a_solid_that_is_no_prism_is_taken_in_layers(tmp_path, surface, kind):
     mesh = boxes_joined(surface, box, cut=kind == "slot")
     mesh.export(tmp_path / "finger.stl")
     _, notes = make_jaw(
-        tmp_path / "finger.stl", tmp_path / "jaw.yaml", name="layered", overrides=Overrides(), solid=True
+        tmp_path / "finger.stl", tmp_path / "jaw.yaml", name="layered", overrides=Overrides(), solid=measure_warping
     )
     jaw = load_jaw(tmp_path / "jaw.yaml")
     depth = 0.4 * WIDTH * MILLIMETRE
@@ -150,7 +151,7 @@ def test_a_finger_without_ribs_is_taken_as_a_solid(tmp_path):
     trimesh.creation.extrude_polygon(wedge, WIDTH).export(tmp_path / "finger.stl")
     with pytest.raises(JawFileError, match="0 cells"):
         make_jaw(tmp_path / "finger.stl", tmp_path / "jaw.yaml", name="wedge", overrides=Overrides())
-    make_jaw(tmp_path / "finger.stl", tmp_path / "jaw.yaml", name="wedge", overrides=Overrides(), solid=True)
+    make_jaw(tmp_path / "finger.stl", tmp_path / "jaw.yaml", name="wedge", overrides=Overrides(), solid=measure_warping)
     jaw = load_jaw(tmp_path / "jaw.yaml")
     assert jaw.section.polygon.area == pytest.approx(wedge.area * MILLIMETRE**2, rel=1e-3)
     assert len(jaw.keypoints) > 10

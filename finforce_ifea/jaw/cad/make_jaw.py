@@ -1,7 +1,7 @@
 """A jaw file from the file of a finger: key points, contact candidates, reference point, its section and a picture."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -15,10 +15,9 @@ from finforce_ifea.errors import JawFileError
 from finforce_ifea.jaw.cad.cad_file import RawSection, UnlikeSectionsError, read_section
 from finforce_ifea.jaw.cad.picture import draw_finger, draw_refused
 from finforce_ifea.jaw.cad.recognition import Overrides, RecognizedFinger, has_cells, recognize
-from finforce_ifea.jaw.jaw import load_jaw
+from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_ifea.jaw.jaw_file import MATERIALS
 from finforce_ifea.jaw.section import cut_below, find_reach, order_rings
-from finforce_ifea.mechanics import measure_warping
 
 # Key points [m] above the clamp at least; candidates so far from either end of the inner face, and from each other.
 _ABOVE, _AWAY, _STEP = 1e-3, 4e-3, 4e-3
@@ -47,7 +46,7 @@ def make_jaw(
     width: float | None = None,
     overrides: Overrides,
     picture: Path | None = None,
-    solid: bool = False,
+    solid: Callable[[Jaw], float] | None = None,
 ) -> tuple[list[Path], list[str]]:
     """Read a finger and write the jaw file that describes it; return what was written, and what was found and guessed.
 
@@ -61,7 +60,8 @@ def make_jaw(
         width: along y [m]; needed for drawings.
         overrides: what is stated in place of the guesses.
         picture: the PNG file; None for one next to the jaw file.
-        solid: take a closed solid as it is, as layers along its width, whatever its shape.
+        solid: take a closed solid as it is, as layers along its width, whatever its shape; measures by what share the
+            stiffness of the layered jaw is off where it is taken as plane.
 
     Raises:
         JawFileError: The file shows no fin-ray finger; the message says what it shows and what to do.
@@ -69,7 +69,7 @@ def make_jaw(
     """
     picture = picture or output.with_suffix(".png")
     output.parent.mkdir(parents=True, exist_ok=True)
-    raw = _read_section(file, unit, body, picture, solid)
+    raw = _read_section(file, unit, body, picture, solid is not None)
     if len(raw.layers) == 1 and has_cells(raw.polygon):  # a prism
         raw = replace(raw, layers=())
     width = width or raw.width
@@ -88,7 +88,7 @@ def make_jaw(
     lines.append(f"reference_point: {_list(_put_on_side(finger, *reference))}  # {place}")
     output.write_text("\n".join(lines) + "\n", encoding="utf-8")
     jaw = load_jaw(output)
-    if finger.layers and (warping := measure_warping(jaw)) > _WARPING:
+    if solid and finger.layers and (warping := solid(jaw)) > _WARPING:
         raw.notes.append(f"its layers move apart (stiffness {warping:.0%} off), thus `model: solid`, which is slow")
         lines = [*lines, "model: solid"]
         lines[lines.index("section:")] += f"\n  size: {_SIZE}"
