@@ -218,6 +218,18 @@ def test_a_tilted_base_is_held_from_band_to_band(tmp_path, tilt):
     assert level.clamp_slope == 0.0
 
 
+@pytest.mark.parametrize("turn", [0.0, 0.3])
+def test_a_base_as_thin_as_a_band_is_held(turn):
+    whole = shapely.Polygon([(14.0, 0.0), (14.0, 70.0), (10.0, 70.0), (-14.0, 0.0)])
+    room = whole.buffer(-1.6, join_style="mitre").intersection(shapely.box(-50.0, 1.6, 50.0, 64.0))
+    for z in (20.0, 35.0, 50.0):
+        room = room.difference(shapely.box(-50.0, z, 50.0, z + 1.2))
+    section = shapely.affinity.rotate(whole.difference(room), turn, origin=(0.0, 0.0), use_radians=True)
+    finger = recognize(shapely.affinity.scale(section, *2 * [MILLIMETRE], origin=(0.0, 0.0)), 0.02, Overrides())
+    assert finger.find_clamped(np.array([[finger.face_x - 1e-4, 5e-4], [finger.face_x - 27.5e-3, 5e-4]])).all()
+    assert not finger.find_clamped(np.array([[finger.face_x - 1e-4, 1.7e-3]])).any()
+
+
 def test_a_rib_that_ends_on_the_base_is_a_rib_without_a_key_point_there():
     ribs = [((-20.0, 30.0), (4.0, -2.0)), ((-20.0, 48.0), (20.0, 10.0)), ((-20.0, 64.0), (20.0, 26.0))]
     finger = recognize(draw_triangle(0.0, ribs), 0.02, Overrides())

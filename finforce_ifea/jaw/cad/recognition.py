@@ -42,6 +42,8 @@ _EQUAL = 0.02
 # The clamp spans so much of the distance between the bands at least; the edge of a tilted base, which rises so much,
 # this.
 _HELD, _SPANNED, _TILTED = 0.5, 0.7, 0.02
+# Heights of clamps from here on [m] are given in half millimetres.
+_THIN = 2e-3
 # Share of the length up to which there may be a base.
 _LOW = 0.35
 
@@ -491,10 +493,10 @@ def _propose_clamp(
         height = float((height_of + _GRIP * bolts[:, 2])[is_base].max())
         reason = f"a radius of its {is_base.sum()} base bolts above their heads"
     else:
-        least = 0.5 * (floor + float(lows.min())) if slope or floor > _FLAT else 0.0
+        least = 0.5 * (floor + float(lows.min()))  # of a base as thin as a band half of it
         height = max(float(lows.min()) - inner.usual * np.hypot(1.0, slope), least)
         reason = "the solid base below its first cell"
-    height = height if slope or floor > _FLAT else round(2e3 * height) / 2e3
+    height = height if slope or floor > _FLAT or height < _THIN else round(2e3 * height) / 2e3
     around = "".join(f", and around the bolt at z = {1e3 * z:.4g} mm" for _, z, _ in circles)
     at = " at x = 0" if slope else ""
     notes.append(f"clamped below z = {1e3 * height:.4g} mm{at}{off}, {reason}{around} (--clamp)")
