@@ -15,9 +15,8 @@ ROS := $(if $(AMENT_PREFIX_PATH),ament,plain)
 demo: .venv/.$(ROS)-run
 	$(PYTHON) -m finforce_eval.cli.main demo --report report
 
-# Compiled once for all workers. What fails among others, beside real nodes in real time, has one more try alone.
+# What fails among others, beside real nodes in real time, has one more try alone.
 test: .venv/.$(ROS)-test
-	$(PYTHON) -m finforce_eval.cli.main prepare
 	$(PYTHON) -m pytest -n auto --dist worksteal || $(PYTHON) -m pytest --last-failed --last-failed-no-failures none
 
 lint: .venv/.$(ROS)-lint
