@@ -1,12 +1,19 @@
 """What tests of several packages are given."""
 
+import os
 import sys
 
 import pytest
 from hypothesis import settings
 
+from finforce.ros import transport
+
 settings.register_profile("finforce", deadline=None)  # a machine under load is not a counterexample
 settings.load_profile("finforce")
+
+# A process takes seconds to show that a domain is taken: workers draw from different ones.
+if worker := os.environ.get("PYTEST_XDIST_WORKER"):
+    transport.DOMAINS = transport.DOMAINS[int(worker[2:]) :: int(os.environ["PYTEST_XDIST_WORKER_COUNT"])]
 
 
 @pytest.fixture(autouse=True)

@@ -10,6 +10,7 @@ from pathlib import Path
 TRANSPORT = Path(__file__).with_name("fastdds.xml")
 PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"
 CHOICES = (PROFILES, "FASTDDS_DEFAULT_PROFILES_FILE", "FASTDDS_BUILTIN_TRANSPORTS")
+DOMAINS = range(1, 100)
 
 
 def provide_transport() -> None:
@@ -19,11 +20,11 @@ def provide_transport() -> None:
 
 
 def free_domain() -> int:
-    """Return a ROS_DOMAIN_ID from 1 to 99 on which no participant of this machine is, by chance.
+    """Return a ROS_DOMAIN_ID of `DOMAINS` on which no participant of this machine is, by chance.
 
     The first participant of a domain holds the UDP port 7410 + 250 times its number (DDSI-RTPS 2.3, 9.6.1.1).
     """
-    domains = random.sample(range(1, 100), 99)
+    domains = random.sample(DOMAINS, len(DOMAINS))
     return next((domain for domain in domains if _is_free(7410 + 250 * domain)), domains[0])
 
 
