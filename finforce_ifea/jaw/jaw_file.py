@@ -11,7 +11,7 @@ from finforce.typed_yaml import TAGS, Count, FileModel, Length, Number, Point, T
 from finforce_ifea.errors import JawFileError
 from finforce_ifea.jaw.drawing import Band, Drawing, Rib
 from finforce_ifea.jaw.mesh_file import MeshFile
-from finforce_ifea.jaw.section import FaceLine, Section, join_loops, order_rings, read_layers, read_loops
+from finforce_ifea.jaw.section import FaceLine, Section, join_loops, order_rings, read_section_file
 
 LIST, MAPPING = TAGS
 
@@ -214,12 +214,12 @@ class SectionEntry(FileModel):
             JawFileError: Its file is missing or describes none.
         """
         path = folder / self.file
-        loops, width = read_loops(path)
+        content = read_section_file(path)
         try:
-            rings = order_rings(join_loops(loops))
+            rings = order_rings(join_loops(content.loops))
         except JawFileError as error:
             raise JawFileError(f"{path.name}: {error}") from error
-        width = self.width or width
+        width = self.width or content.width
         if not (width and width > 0.0):
             raise JawFileError(f"section.width: got {width}, expected a positive length in metres")
         section = Section(
@@ -230,7 +230,7 @@ class SectionEntry(FileModel):
             clamp_slope=self.clamped.slope,
             clamped_circles=np.array(self.clamped.circles).reshape(-1, 3),
             size=self.size,
-            layers=read_layers(path),
+            layers=content.layers,
         )
         least = np.inf if section.layers else float(section.read_width(rings[0]).min())
         if not least > 0.0:

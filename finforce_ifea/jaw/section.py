@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property, reduce
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import shapely
@@ -89,8 +91,7 @@ class Section:
         if not self.layers:
             return [(ring, True) for ring in self.rings]
         bounds = shapely.union_all([layer.area.boundary for layer in self.layers], grid_size=_GRID)
-        merged = shapely.line_merge(bounds)
-        lines = [np.array(line.coords) for line in getattr(merged, "geoms", [merged])]
+        lines = [np.array(line.coords) for line in shapely.get_parts(shapely.line_merge(bounds))]
         return [(line[:-1], True) if (line[0] == line[-1]).all() else (line, False) for line in lines]
 
     @cached_property
@@ -191,10 +192,19 @@ def join_loops(loops: list[NDArray]) -> shapely.Polygon:
     return whole
 
 
-def read_loops(path: Path) -> tuple[list[NDArray], float | None]:
-    """Read the loops (n, 2) [m] of a section file, and its width [m] if it names one.
+class SectionFile(NamedTuple):
+    """A section file: its loops (n, 2) [m], the width [m] if it names one, and the layers of what is no prism."""
 
-    The file is JSON: `unit` ("m", "mm", "inch"), `loops`, a list of lists of [x, z], and perhaps `width` or `width_mm`.
+    loops: list[NDArray]
+    width: float | None
+    layers: tuple[Layer, ...]
+
+
+def read_section_file(path: Path) -> SectionFile:
+    """Read a section file.
+
+    It is JSON: `unit` ("m", "mm", "inch"), `loops`, a list of lists of [x, z], and perhaps `width` or `width_mm`, and
+    `layers`, each with `y`, from and to, and `loops`.
 
     Raises:
         JawFileError: The file is missing, too large, or not of that form.
@@ -213,30 +223,25 @@ def read_loops(path: Path) -> tuple[list[NDArray], float | None]:
             f"({type(error).__name__}: {error})"
         ) from error
     check_loops(loops, path.name)
-    return loops, width
+    return SectionFile(loops, width, _build_layers(content.get("layers", ()), unit, path.name))
 
 
-def read_layers(path: Path) -> tuple[Layer, ...]:
-    """Return the layers of a section file that `read_loops` has read, none of a prism.
-
-    Raises:
-        JawFileError: They are not of that form: `y`, from and to, and `loops`.
-    """
-    content = parse_json(read_text(path, _LARGEST_FILE))
-    layers, scale = [], UNITS[content["unit"]]
+def _build_layers(entries: Iterable[Any], unit: float, name: str) -> tuple[Layer, ...]:
+    """Return the layers of a section file; raises JawFileError where an entry has another form."""
+    layers = []
     try:
-        for entry in content.get("layers", ()):
-            loops = [np.array(loop, float) * scale for loop in entry["loops"]]
-            check_loops(loops, path.name)
-            low, high = (float(value) * scale for value in entry["y"])
+        for entry in entries:
+            loops = [np.array(loop, float) * unit for loop in entry["loops"]]
+            check_loops(loops, name)
+            low, high = (float(value) * unit for value in entry["y"])
             # what lies within an odd number of loops
             area = reduce(shapely.symmetric_difference, map(shapely.Polygon, loops))
             layers.append(Layer(low=low, high=high, area=area))
     except (KeyError, TypeError, ValueError, shapely.errors.GEOSException) as error:
-        raise JawFileError(f"{path.name}: layers: expected y: [from, to] and loops ({error})") from error
+        raise JawFileError(f"{name}: layers: expected y: [from, to] and loops ({error})") from error
     ends = np.array([(layer.low, layer.high) for layer in layers]).reshape(-1, 2)
     if not (np.diff(ends, axis=1) > 0.0).all() or not np.allclose(ends[1:, 0], ends[:-1, 1], atol=1e-9):
-        raise JawFileError(f"{path.name}: layers: expected one upon another, lowest y first")
+        raise JawFileError(f"{name}: layers: expected one upon another, lowest y first")
     return tuple(layers)
 
 

@@ -44,7 +44,7 @@ class Template:
         points: (K, 2) float32 its points in the template at full size [px].
         pieces: (K, p, p, 3) uint8, the template around them.
         shapes: (2 K, m) how they can move together, see `span_shapes`; None where nobody knows.
-        wanted: (K,) bool, which are looked for; the others are covered.
+        wanted: (K,) bool, which are looked for, the others being covered; None: all.
     """
 
     half: NDArray
@@ -52,10 +52,6 @@ class Template:
     pieces: NDArray
     shapes: NDArray | None = None
     wanted: NDArray | None = None
-
-    def __post_init__(self) -> None:
-        if self.wanted is None:
-            object.__setattr__(self, "wanted", np.ones(len(self.points), dtype=bool))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -186,12 +182,12 @@ class SideNetwork:
 
     def _locate_one(self, picture: NDArray, template: Template, start: NDArray | None) -> Places:
         """Return where the points are in one picture, all without its axis."""
-        points, shapes, wanted = template.points, template.shapes, template.wanted
+        points, shapes, everywhere = template.points, template.shapes, np.ones(len(template.points), dtype=bool)
+        wanted = everywhere if template.wanted is None else template.wanted
         seen = self._run(self._coarse, COARSE_LAYOUT[0], (picture[None], template.half[None], points[None]))
         guesses, *seen = (value[0] for value in seen)
         if shapes is None:
             return self._compare(picture, template, seen, guesses, wanted)
-        everywhere = np.ones(len(points))
         moves = fit_motion(shapes, guesses - points, GUESS * everywhere, everywhere)
         if start is not None and np.linalg.norm(start - moves, axis=1).max() < ASTRAY:
             moves = start

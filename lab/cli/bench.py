@@ -11,7 +11,6 @@ from finforce.errors import FinforceError
 from finforce_eval.cli.parser import CommandResult, picture_file
 from finforce_eval.errors import OptionError
 from finforce_eval.machine import describe_machine, write_figures
-from lab.bench.solvers import draw_tiers
 from lab.harness import PARTS, figures_json, format_figures, measure_part, select_parts
 
 
@@ -57,5 +56,7 @@ def _run_part(part: str, quick: bool, given: dict[str, Any], picture: str | None
         return {"not_measured": str(error)}
     print(format_figures(figures))
     if picture and part == "solvers":
+        from lab.bench.solvers import draw_tiers
+
         draw_tiers(figures.tables["tiers"], Path(picture))
     return {**figures_json(figures), "took_s": round(perf_counter() - begin, 1)}

@@ -17,7 +17,7 @@ from finforce.sandbox import SandboxError, run_limited
 from finforce.surfaces import read_surface
 from finforce_ifea.errors import JawFileError
 from finforce_ifea.jaw.cad.layers import find_layers
-from finforce_ifea.jaw.section import UNITS, Layer, check_loops, join_loops, read_loops
+from finforce_ifea.jaw.section import UNITS, Layer, check_loops, join_loops, read_section_file
 
 SURFACES = (".stl", ".obj", ".ply", ".off", ".3mf", ".glb")
 SUFFIXES = (*SURFACES, ".step", ".stp", ".dxf", ".svg", ".json")
@@ -93,8 +93,8 @@ def read_section(path: Path, *, unit: str | None = None, body: int | None = None
         )
     try:
         if suffix == ".json":
-            loops, width = read_loops(path)
-            return RawSection(polygon=join_loops(loops), width=width, notes=["a section file"])
+            content = read_section_file(path)
+            return RawSection(polygon=join_loops(content.loops), width=content.width, notes=["a section file"])
         if suffix in (".dxf", ".svg"):
             loops, named = run_limited(_read_dxf if suffix == ".dxf" else _read_svg, path)
             check_loops(loops, path.name)
