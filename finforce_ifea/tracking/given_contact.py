@@ -227,6 +227,7 @@ class GivenContactTracker:
 # No averaging makes the place that key points ask for surer than this share of the heights that the face has: their
 # answers are those of the unloaded jaw.
 _SUREST = 0.03
+_ACROSS_CONTACT = np.linspace(-1.0, 1.0, 41)
 
 
 class _LocationWatch:
@@ -238,7 +239,8 @@ class _LocationWatch:
         dz = (P U' . r) / (F P U' . P U'),      variance 1 / (F^2 P U' . P U'),
 
     is the way to the place that they ask for. A place off by dz changes the force by the factor U . V / (V . V),
-    V = U(z + dz). A round object that presses by d rolls along the face, which turns, by its radius times that angle.
+    V = U(z + dz). A round object that presses by d rolls along the face, which turns, by its radius times that angle,
+    and leans on where the jaw is stiffer than beside: its pressure is taken for the stiffness times the indentation.
     """
 
     def __init__(self, response: InfluenceCoefficients, settings: EstimatorSettings) -> None:
@@ -285,13 +287,20 @@ class _LocationWatch:
         self._average(asked, information)
         depth = force / self._response.stiffness_at(self._height)
         travel = self._radius * self._response.turn_at(self._height) * depth
-        given = self._prior_variance + self._spread + travel**2
+        given = self._prior_variance + self._spread + travel**2 + self._shift_pressure(depth) ** 2
         spread = 1.0 / max(self._information, 1e-9) + self._surest**2
         mistaken, beyond = question_location(self._offset, spread, given, 0.0)
         share = given / (given + spread)
         stddev = float(np.sqrt((share * self._offset) ** 2 + share * spread + beyond))
         state["offset"], state["mistaken"] = self._offset, mistaken
         state["height_stddev"], state["location_error"] = stddev, self._find_error(motion, used, weights, stddev)
+
+    def _shift_pressure(self, depth: float) -> float:
+        """Return how far from the height of first touch the pressure of a round object is centred, `depth` deep [m]."""
+        reach = np.sqrt(2.0 * self._radius * max(depth, 1e-9))
+        away = _ACROSS_CONTACT * reach
+        pressure = self._response.stiffness_at(self._height + away) * (1.0 - _ACROSS_CONTACT**2)
+        return float(pressure @ away / pressure.sum())
 
     def _find_error(self, motion: NDArray, used: NDArray, weights: NDArray, stddev: float) -> float:
         """Return the relative error of a force by a place that is off by a standard deviation [m], either way."""

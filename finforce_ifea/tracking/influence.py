@@ -50,9 +50,9 @@ class InfluenceCoefficients:
         """Return the derivative of the motions by the height (K, 2) [1/N]."""
         return self._interpolate(np.gradient(self.motions, self.heights, axis=0), height)
 
-    def stiffness_at(self, height: float) -> float:
-        """Return force over depth [N/m] at a height [m]; below and above, that of the nearest one."""
-        return float(np.interp(height, self.heights, self.stiffness))
+    def stiffness_at(self, height: float | NDArray) -> float | NDArray:
+        """Return force over depth [N/m] at heights [m]; below and above, that of the nearest one."""
+        return np.interp(height, self.heights, self.stiffness)
 
     def turn_at(self, height: float) -> float:
         """Return the turn of the inner face by the depth [rad/m] at a height [m]; beyond, that of the nearest one."""

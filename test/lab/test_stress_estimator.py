@@ -111,6 +111,16 @@ def test_a_load_held_in_place_may_have_rolled_along_the_face(height, radius):
     assert held[0].status == "ok" and held[1].sigmas < 2.5
 
 
+def test_a_load_held_in_place_leans_on_where_the_jaw_is_stiffer():
+    """Near the clamp of a stiff finger, what touches at 29 mm presses 3 mm below."""
+    stiff = Bench(Plan(solver="plane", jaw="ssg48_fin_ray_1"))
+    start = open_session(stiff, Plan(jaw="ssg48_fin_ray_1").random("right", 2))
+    assert start.history.forces(start.history.depth)[0] < -10.0
+    steps = [replace(step, contact=replace(start.contact, free=False)) for step in start.press(hold=5)]
+    trials = [judge(solution, step) for step in steps for solution in [update(stiff, step)] if solution.trusted]
+    assert len(trials) > 10 and max(trial.sigmas for trial in trials) < 3.0
+
+
 # --- contacts that are not where they were said to be
 
 
