@@ -2,7 +2,7 @@
 
 import hashlib
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from importlib import resources
 from pathlib import Path
 from typing import Literal
@@ -170,27 +170,29 @@ def load_jaw(name_or_path: str | Path | Jaw, side: Literal["left", "right"] = "l
         raise JawFileError(f"side: got {side!r}, expected 'left' or 'right'")
     if isinstance(name_or_path, Jaw):
         return name_or_path if name_or_path.side == side else name_or_path.mirrored()
-    path = _find_file(name_or_path)
-    try:
-        jaw = _build_jaw(read_model(path, JawEntry, JawFileError), path)
-    except (JawFileError, MeshError) as error:
-        raise type(error)(f"{path.name}: {error}") from error
+    if str(name_or_path) in list_shipped_jaws():
+        return _load_shipped(str(name_or_path), side)
+    jaw = _read_jaw(Path(name_or_path))
     return jaw if side == "left" else jaw.mirrored()
 
 
-def _find_file(name_or_path: str | Path) -> Path:
-    """Return the path of a shipped jaw's file, or the path as given."""
-    shipped = list_shipped_jaws()
-    if str(name_or_path) in shipped:
-        return Path(str(resources.files("finforce_ifea.jaw").joinpath("jaws", f"{name_or_path}.yaml")))
-    path = Path(name_or_path)
+@cache
+def _load_shipped(name: str, side: str) -> Jaw:
+    """Return a shipped jaw, whose files stay as they are."""
+    jaw = _read_jaw(Path(str(resources.files("finforce_ifea.jaw").joinpath("jaws", f"{name}.yaml"))))
+    return jaw if side == "left" else jaw.mirrored()
+
+
+def _read_jaw(path: Path) -> Jaw:
+    """Return the left jaw of a file."""
     if not path.is_file():
-        raise JawFileError(
-            f"there is no jaw file {str(name_or_path)!r}, {suggest(str(name_or_path), shipped)} (or give a path)"
-        )
+        raise JawFileError(f"there is no jaw file '{path}', {suggest(str(path), list_shipped_jaws())} (or give a path)")
     if path.suffix.lower() in _SHAPES:
         raise JawFileError(f"{path.name} is a shape, not a jaw file; make one: finforce jaw {path} -o {path.stem}.yaml")
-    return path
+    try:
+        return _build_jaw(read_model(path, JawEntry, JawFileError), path)
+    except (JawFileError, MeshError) as error:
+        raise type(error)(f"{path.name}: {error}") from error
 
 
 def _build_jaw(entry: JawEntry, path: Path) -> Jaw:

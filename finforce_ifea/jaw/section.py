@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from functools import cached_property, reduce
+from functools import cached_property, lru_cache, reduce
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -300,6 +300,7 @@ class FaceLine:
         return within & (np.abs(points[:, 0] - self.read(z)) < tolerance)
 
 
+@lru_cache(maxsize=16)  # of the fingers at hand, each loaded once for either side
 def find_face(section: Section, face_x: float) -> FaceLine:
     """Return the inner face of a section: the plane x = face_x [m] where most of it is on that, else what is in front.
 

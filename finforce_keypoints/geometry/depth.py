@@ -8,6 +8,7 @@ which is rigid; what is left over is each one's own.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numba import njit
@@ -70,6 +71,7 @@ class DepthEvidence:
     nearer: NDArray
 
 
+@lru_cache(maxsize=16)  # one for each jaw at hand
 def build_side_samples(jaw: Jaw, window: float = WINDOW, edge: float = EDGE) -> SideSamples:
     """Return places on the jaw's side, `edge` [m] inside its outline and at most `window` [m] from a key point.
 
@@ -97,9 +99,7 @@ def _select_places(raster: NDArray, point: NDArray, triangles: NDArray, window: 
     reach = np.abs(raster).max()
     corners = triangles[(np.abs(triangles[:, :, 1] - point[1]) < _ON_SIDE).all(axis=1)][:, :, ::2] - point[::2]
     corners = corners[(corners.min(axis=1) < reach).all(axis=1) & (corners.max(axis=1) > -reach).all(axis=1)]
-    inside = np.zeros(raster.shape[:2], dtype=bool)
-    for triangle in corners:
-        inside |= _covers(triangle, raster)
+    inside = _cover(np.ascontiguousarray(corners), raster)
     depth, near = distance_transform_edt(inside) * _SPACING, np.linalg.norm(raster, axis=-1) <= window
     for share in _EDGE_SHARES:
         places = _thin_out(raster, near & (depth > share * edge))
@@ -117,13 +117,19 @@ def _thin_out(raster: NDArray, chosen: NDArray) -> NDArray:
     return places
 
 
-def _covers(triangle: NDArray, raster: NDArray) -> NDArray:
-    """Return which points (a, a) of a raster (a, a, 2) a triangle (3, 2) covers."""
-    along = np.roll(triangle, -1, axis=0) - triangle
-    relative = raster[:, :, None, :] - triangle
-    turn = along[:, 0] * relative[..., 1] - along[:, 1] * relative[..., 0]
-    slack = 1e-9
-    return (turn >= -slack).all(axis=-1) | (turn <= slack).all(axis=-1)
+@njit(**_OPTIONS)
+def _cover(triangles, raster):
+    """Return which points (a, a) of a raster (a, a, 2) triangles (n, 3, 2) cover."""
+    inside, slack = np.zeros(raster.shape[:2], dtype=np.bool_), 1e-9
+    for corners in triangles:
+        for place in np.ndindex(inside.shape):
+            least, most = np.inf, -np.inf
+            for k in range(3):
+                along = corners[(k + 1) % 3] - corners[k]
+                turn = along[0] * (raster[place][1] - corners[k, 1]) - along[1] * (raster[place][0] - corners[k, 0])
+                least, most = min(least, turn), max(most, turn)
+            inside[place] |= least >= -slack or most <= slack
+    return inside
 
 
 def _disc(raster: NDArray, radius: float) -> NDArray:

@@ -180,7 +180,8 @@ def test_a_running_camera_is_checked_as_its_recording_is(still, capsys, tmp_path
     assert status == 0 and "everything fits" in said
 
 
-def test_topics_without_a_camera_are_said_to_be_so(still, tmp_path):
+def test_topics_without_a_camera_are_said_to_be_so(still, tmp_path, monkeypatch):
+    monkeypatch.setattr("finforce_eval.cli.check.TIMEOUT", 3.0)
     words = pytest.raises(RecordingError, match=r"0 camera_info on .*published on .*color/image_raw/compressed")
     with camera_of(still, left_out=("camera_info",)) as domain, words:
         record_camera(COLOR_ALONE, 3, tmp_path / "heard", domain)
