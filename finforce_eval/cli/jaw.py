@@ -59,7 +59,8 @@ def run(options: argparse.Namespace) -> CommandResult:
             flip=options.flip, other_face=options.other_face, clamp_z=options.clamp, face_x=options.face_x
         ),
         picture=options.picture,
-        solid=measure_warping if options.solid else None,
+        solid=options.solid,
+        measure_warping=measure_warping,
     )
     for note in notes:
         print(f"  {note}")

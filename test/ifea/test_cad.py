@@ -113,7 +113,12 @@ def test_a_solid_that_is_no_prism_is_taken_in_layers(tmp_path, surface, kind):
     mesh = boxes_joined(surface, box, cut=kind == "slot")
     mesh.export(tmp_path / "finger.stl")
     _, notes = make_jaw(
-        tmp_path / "finger.stl", tmp_path / "jaw.yaml", name="layered", overrides=Overrides(), solid=measure_warping
+        tmp_path / "finger.stl",
+        tmp_path / "jaw.yaml",
+        name="layered",
+        overrides=Overrides(),
+        solid=True,
+        measure_warping=measure_warping,
     )
     jaw = load_jaw(tmp_path / "jaw.yaml")
     depth = 0.4 * WIDTH * MILLIMETRE
@@ -126,6 +131,13 @@ def test_a_solid_that_is_no_prism_is_taken_in_layers(tmp_path, surface, kind):
     # a finger of which one side alone is stiffer twists
     assert jaw.model == ("solid" if kind == "floor" else "plane")
     assert any("layers move apart" in note for note in notes) == (kind == "floor")
+    make_jaw(tmp_path / "jaw.section.json", tmp_path / "again.yaml", name="again", overrides=Overrides())
+    again = load_jaw(tmp_path / "again.yaml").section
+    assert [layer.low for layer in again.layers] == pytest.approx([layer.low for layer in jaw.section.layers], abs=1e-6)
+    parted = [
+        one.area.symmetric_difference(two.area).area for one, two in zip(again.layers, jaw.section.layers, strict=True)
+    ]
+    assert max(parted) < 1e-3 * jaw.section.polygon.area
     if kind == "slot":
         face = np.array([[jaw.inner_face_x - 2e-4, 0.035], [jaw.inner_face_x - 2e-3, 0.035]])
         assert jaw.section.read_width(face[:1]) == pytest.approx(WIDTH * MILLIMETRE - depth, abs=1e-5)
@@ -151,7 +163,14 @@ def test_a_finger_without_ribs_is_taken_as_a_solid(tmp_path):
     trimesh.creation.extrude_polygon(wedge, WIDTH).export(tmp_path / "finger.stl")
     with pytest.raises(JawFileError, match="0 cells"):
         make_jaw(tmp_path / "finger.stl", tmp_path / "jaw.yaml", name="wedge", overrides=Overrides())
-    make_jaw(tmp_path / "finger.stl", tmp_path / "jaw.yaml", name="wedge", overrides=Overrides(), solid=measure_warping)
+    make_jaw(
+        tmp_path / "finger.stl",
+        tmp_path / "jaw.yaml",
+        name="wedge",
+        overrides=Overrides(),
+        solid=True,
+        measure_warping=measure_warping,
+    )
     jaw = load_jaw(tmp_path / "jaw.yaml")
     assert jaw.section.polygon.area == pytest.approx(wedge.area * MILLIMETRE**2, rel=1e-3)
     assert len(jaw.keypoints) > 10

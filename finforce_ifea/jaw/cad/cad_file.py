@@ -1,5 +1,6 @@
 """The section of a prismatic finger out of the files that people print: surfaces, STEP, DXF, SVG, JSON."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from finforce.sandbox import SandboxError, run_limited
 from finforce.surfaces import read_surface
 from finforce_ifea.errors import JawFileError
 from finforce_ifea.jaw.cad.layers import find_layers
-from finforce_ifea.jaw.section import UNITS, Layer, check_loops, join_loops, read_section_file
+from finforce_ifea.jaw.section import UNITS, Layer, SectionFile, check_loops, join_loops, read_section_file
 
 SURFACES = (".stl", ".obj", ".ply", ".off", ".3mf", ".glb")
 SUFFIXES = (*SURFACES, ".step", ".stp", ".dxf", ".svg", ".json")
@@ -93,8 +94,7 @@ def read_section(path: Path, *, unit: str | None = None, body: int | None = None
         )
     try:
         if suffix == ".json":
-            content = read_section_file(path)
-            return RawSection(polygon=join_loops(content.loops), width=content.width, notes=["a section file"])
+            return _take_section(read_section_file(path))
         if suffix in (".dxf", ".svg"):
             loops, named = run_limited(_read_dxf if suffix == ".dxf" else _read_svg, path)
             check_loops(loops, path.name)
@@ -105,6 +105,27 @@ def read_section(path: Path, *, unit: str | None = None, body: int | None = None
     except (JawFileError, FileError, SandboxError) as error:
         prefix = "" if str(error).startswith(path.name) else f"{path.name}: "
         raise JawFileError(f"{prefix}{error}") from error
+
+
+def _take_section(content: SectionFile) -> RawSection:
+    """Return what a section file holds, its layers along the axis of x and z rather than along y."""
+    notes = ["a section file"]
+    if not content.layers:
+        return RawSection(polygon=join_loops(content.loops), width=content.width, notes=notes)
+    layers = tuple(Layer(low=-layer.high, high=-layer.low, area=layer.area) for layer in reversed(content.layers))
+    return RawSection(polygon=_find_usual(layers), width=layers[-1].high - layers[0].low, notes=notes, layers=layers)
+
+
+def _find_usual(layers: Sequence[Layer]) -> shapely.Polygon:
+    """Return the area of the thickest layer in one piece.
+
+    Raises:
+        JawFileError: none is.
+    """
+    whole = [layer for layer in layers if layer.area.geom_type == "Polygon"]
+    if not whole:
+        raise JawFileError("none of its layers is in one piece, expected one finger")
+    return max(whole, key=lambda layer: layer.high - layer.low).area
 
 
 def _choose_unit(extent: float, unit: str | None) -> tuple[float, str]:
@@ -187,14 +208,11 @@ def _cut_layers(mesh: trimesh.Trimesh, axis: NDArray, notes: list[str]) -> RawSe
     flat = np.abs(mesh.face_normals @ axis) > 1.0 - _UPRIGHT**2
     steps = np.unique(np.round(height[mesh.faces[flat]].mean(axis=1), 5))
     layers = find_layers(lambda at: _cut(mesh, axis, at), (low, high), steps[(steps > low) & (steps < high)].tolist())
-    whole = [layer for layer in layers if layer.area.geom_type == "Polygon"]
-    if not whole:
-        raise JawFileError("none of its layers is in one piece, expected one finger")
-    usual = max(whole, key=lambda layer: layer.high - layer.low)
+    usual = _find_usual(layers)
     _one_piece(shapely.union_all([layer.area for layer in layers]))
     across = f"along {np.round(axis, 3).tolist()} of the file, {1e3 * (high - low):.4g} mm in all"
     notes.append(f"{len(layers)} layer{'s' * (len(layers) > 1)} {across}")
-    return RawSection(polygon=usual.area, width=high - low, notes=notes, layers=tuple(layers))
+    return RawSection(polygon=usual, width=high - low, notes=notes, layers=tuple(layers))
 
 
 def _measure_blade(mesh: trimesh.Trimesh, axis: NDArray, base: shapely.Geometry) -> float:

@@ -46,7 +46,8 @@ def make_jaw(
     width: float | None = None,
     overrides: Overrides,
     picture: Path | None = None,
-    solid: Callable[[Jaw], float] | None = None,
+    solid: bool = False,
+    measure_warping: Callable[[Jaw], float] | None = None,
 ) -> tuple[list[Path], list[str]]:
     """Read a finger and write the jaw file that describes it; return what was written, and what was found and guessed.
 
@@ -60,8 +61,8 @@ def make_jaw(
         width: along y [m]; needed for drawings.
         overrides: what is stated in place of the guesses.
         picture: the PNG file; None for one next to the jaw file.
-        solid: take a closed solid as it is, as layers along its width, whatever its shape; measures by what share the
-            stiffness of the layered jaw is off where it is taken as plane.
+        solid: take a closed solid as it is, as layers along its width, whatever its shape.
+        measure_warping: returns by what share the stiffness of a layered jaw is off where it is taken as plane.
 
     Raises:
         JawFileError: The file shows no fin-ray finger; the message says what it shows and what to do.
@@ -69,7 +70,7 @@ def make_jaw(
     """
     picture = picture or output.with_suffix(".png")
     output.parent.mkdir(parents=True, exist_ok=True)
-    raw = _read_section(file, unit, body, picture, solid is not None)
+    raw = _read_section(file, unit, body, picture, solid)
     if len(raw.layers) == 1 and has_cells(raw.polygon):  # a prism
         raw = replace(raw, layers=())
     width = width or raw.width
@@ -88,7 +89,7 @@ def make_jaw(
     lines.append(f"reference_point: {_list(_put_on_side(finger, *reference))}  # {place}")
     output.write_text("\n".join(lines) + "\n", encoding="utf-8")
     jaw = load_jaw(output)
-    if solid and finger.layers and (warping := solid(jaw)) > _WARPING:
+    if finger.layers and measure_warping and (warping := measure_warping(jaw)) > _WARPING:
         raw.notes.append(f"its layers move apart (stiffness {warping:.0%} off), thus `model: solid`, which is slow")
         lines = [*lines, "model: solid"]
         lines[lines.index("section:")] += f"\n  size: {_SIZE}"
