@@ -15,7 +15,7 @@ from finforce.ros.topics import Pipeline
 from finforce_contact.node import ContactEstimatorNode
 from finforce_ifea.node import IfeaSolverNode
 
-IMAGES = 150
+IMAGES = 116
 PATIENT = {"max_age": 60.0, "skip_off": ["idle image"]}
 
 

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from eval_fakes import cut
 
 from finforce.files import FileError, read_bytes, read_json, read_yaml
 
@@ -135,14 +136,17 @@ print(json.dumps(said))
 
 
 def test_commands_say_what_is_wrong_in_one_line(tmp_path):
-    from finforce_eval.recordings.recording import DEMO
+    from finforce_eval.recordings.recording import DEMO, read_recording
+    from finforce_eval.recordings.writer import write_recording
 
-    orders = {}
+    recording, orders = read_recording(DEMO), {}
+    begin = int(recording.jaw("left").keypoints.stamps[0])
+    bag = write_recording(cut(recording, begin, begin + 10**9), tmp_path / "bag")
     for name, bomb in BOMBS.items():
         file = tmp_path / name / "pytorch_config.yaml"
         file.parent.mkdir()
         file.write_text(bomb)
-        places = {"FILE": str(file), "BAG": str(DEMO)}
+        places = {"FILE": str(file), "BAG": str(bag)}
         for command, words in COMMANDS.items():
             orders[f"{command}, {name}"] = [places.get(w, w.replace("FOLDER", str(file.parent))) for w in words]
     process = subprocess.run(

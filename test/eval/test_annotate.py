@@ -22,7 +22,7 @@ from finforce_eval.recordings.writer import write_recording
 from finforce_eval.tasks import EngineOptions, Manifest, Task, choose_shard, run_tasks
 
 TYPES = get_typestore(Stores.ROS2_JAZZY)
-SECONDS = 6
+SECONDS = 4
 
 
 @pytest.fixture(scope="module")
@@ -263,7 +263,7 @@ def look_at(out, names, written):
 
 
 def test_a_run_that_is_killed_again_and_again_loses_nothing_and_does_nothing_twice(source, tmp_path):
-    names = [f"part{number}" for number in range(3)]
+    names = [f"part{number}" for number in range(2)]
     bags = [short_bag(tmp_path / name, begin=number * 10**9) for number, name in enumerate(names)]
     out, random = tmp_path / "out", np.random.default_rng(0)
     command = [sys.executable, "-m", "finforce_eval.cli.main", "annotate", *map(str, bags), "--out", str(out)]

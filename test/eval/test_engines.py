@@ -33,7 +33,7 @@ def bags(tmp_path_factory):
     begin = int(whole.jaws["left"].keypoints.stamps[0])
     made = []
     for number in range(3):
-        part = cut(whole, begin, begin + (8 + number) * 10**9)
+        part = cut(whole, begin, begin + (3 + number) * 10**9)
         made.append(str(write_recording(part, folder / f"part{number}")))
     return made
 

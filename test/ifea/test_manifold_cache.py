@@ -179,14 +179,19 @@ def test_both_jaws_of_a_gripper_share_their_equilibria(folder, monkeypatch):
     assert len(list(folder.glob("*.npz"))) == 1
 
 
+@pytest.fixture(scope="module")
+def two_processes():
+    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
+        yield pool
+
+
 @pytest.mark.parametrize(("name", "solver"), [("bench", "solid"), ("ssg48_fin_ray_1", "plane"), ("steel", "frame")])
-def test_equilibria_are_the_same_of_one_process_and_of_two(name, solver, monkeypatch):
-    monkeypatch.setattr(manifold_build, "HEIGHTS", 5)
+def test_equilibria_are_the_same_of_one_process_and_of_two(name, solver, two_processes, monkeypatch):
+    monkeypatch.setattr(manifold_build, "HEIGHTS", 3)
     jaw = load_jaw(name)
     full, modulus = build_mechanics(jaw, EstimatorSettings(mesh="coarse", solver=solver)), jaw.material.young_modulus
     alone, told = manifold_build.build_manifold(full, modulus, lambda done: None), []
-    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
-        shared = manifold_build.build_manifold(full, modulus, told.append, pool.map)
+    shared = manifold_build.build_manifold(full, modulus, told.append, two_processes.map)
     for name in ("heights", "rods", "depths", "loads", "moves", "compliance"):
         values = getattr(alone, name)  # to rounding: linear algebra's depends on where arrays lie
         np.testing.assert_allclose(getattr(shared, name), values, rtol=0, atol=1e-6 * np.abs(values).max())

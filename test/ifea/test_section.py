@@ -137,7 +137,7 @@ def jaw(tmp_path_factory):
 
 
 def press(mechanics, jaw, height=0.04, depth=2e-3):
-    depths = np.linspace(0.5e-3, depth, 4)
+    depths = np.linspace(0.5 * depth, depth, 2)
     model, surface = mechanics.model, mechanics.contact.surface
     return press_jaw(model, surface, jaw.inner_face_x, RigidCylinder(radius=12.5e-3), height, depths)[-1]
 
@@ -152,8 +152,8 @@ def test_plane_model_has_the_solid_finger_s_force(jaw):
         np.testing.assert_allclose(forces[0], forces[1], atol=0.02 * np.linalg.norm(forces[1]))
 
 
-@pytest.mark.parametrize("name", ["plane", "solid"])
-def test_no_load_is_lost_between_two_rows(tmp_path, name):
+@pytest.mark.parametrize(("name", "places"), [("plane", (0.0303, 0.0391, 0.0507)), ("solid", (0.0391,))])
+def test_no_load_is_lost_between_two_rows(tmp_path, name, places):
     """Rows are farther apart than nodes: what presses between two of them stands on both."""
     table = {"file": "finger.section.json", "width": 0.02, "size": 0.6e-3, "clamped": {"z_below": 0.012}}
     jaw = load_jaw(write_section_jaw(tmp_path, section=table))
@@ -161,7 +161,7 @@ def test_no_load_is_lost_between_two_rows(tmp_path, name):
     assert not has_own_rows(mechanics)
     heights = np.linspace(0.012, 0.068, 30)
     face = Face(mechanics, heights[1:])
-    for height in (0.0303, 0.0391, 0.0507):
+    for height in places:
         pressed = press(mechanics, jaw, height)
         load = face.describe(pressed.q)["loads"].reshape(-1, 2)
         np.testing.assert_allclose(load.sum(0), pressed.force[[0, 2]], atol=2e-3 * np.linalg.norm(pressed.force))

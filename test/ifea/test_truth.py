@@ -34,10 +34,10 @@ def test_truth_is_of_this_finger():
 
 
 @cache
-def compare(mesh, solver, diameter, place):
+def compare(mesh, solver, diameter, place, every=1):
     """Errors of the force's magnitude [%] and direction [deg], and of each key point [mm], by depth."""
-    results = bench_press(mesh, solver, diameter, round(1e3 * HEIGHTS[place]), DEPTHS)
-    true = TRUTH[f"{diameter}_{place}_force"]
+    results = bench_press(mesh, solver, diameter, round(1e3 * HEIGHTS[place]), DEPTHS[::every])
+    true = TRUTH[f"{diameter}_{place}_force"][::every]
     np.testing.assert_allclose(TRUTH[f"{diameter}_{place}_depth"], DEPTHS)
     force = np.array([result.force for result in results])
     magnitude = np.linalg.norm(force, axis=1) / np.linalg.norm(true, axis=1) - 1.0
@@ -46,7 +46,7 @@ def compare(mesh, solver, diameter, place):
     probe = model.attach(BENCH.keypoints, 1e-3)
     points = [model.positions(probe, result.q) for result in results]
     moved = 1e3 * (np.array(points) - model.positions(probe, np.zeros(model.size)))
-    true_moved = TRUTH[f"{diameter}_{place}_keypoints"] - TRUTH["keypoints0"]
+    true_moved = TRUTH[f"{diameter}_{place}_keypoints"][::every] - TRUTH["keypoints0"]
     return 100 * magnitude, lean[0] - lean[1], np.linalg.norm(moved - true_moved, axis=2)
 
 
@@ -72,7 +72,7 @@ def test_default_mesh_meets_the_force_within_3_percent_in_most_states():
 
 @pytest.mark.parametrize(("diameter", "place"), [(15, "upper"), (35, "middle"), (35, "lower")])
 def test_refined_mesh_meets_the_force_within_3_percent(diameter, place):
-    error, _, moved = compare("fine", "solid", diameter, place)
+    error, _, moved = compare("fine", "solid", diameter, place, every=3)
     assert np.abs(error).max() < 3.0
     assert moved.max() < (0.32 if place == "lower" else 0.10)
 
