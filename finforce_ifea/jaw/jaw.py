@@ -251,9 +251,8 @@ def _check_candidates(jaw: Jaw) -> None:
             half = 0.5 * shape.widest
             expected = f"y from {-half:g} to {half:g} m and z from 0 to {shape.length:g} m"
         if expected:
-            raise JawFileError(
-                f"candidates[{number}] at {_millimetres(point)} lies off the inner surface; expected {expected}"
-            )
+            place = ", ".join(f"{1e3 * value:.3f}" for value in point)
+            raise JawFileError(f"candidates[{number}] at ({place}) mm lies off the inner surface; expected {expected}")
 
 
 def _check_points(jaw: Jaw) -> None:
@@ -269,8 +268,3 @@ def _check_points(jaw: Jaw) -> None:
         attach_surface_points(mesh, jaw.candidates, _CANDIDATE_DISTANCE, candidates)
     except MeshError as error:
         raise JawFileError(str(error)) from error
-
-
-def _millimetres(point: NDArray) -> str:
-    """Return a point [m] as text in millimetres."""
-    return "(" + ", ".join(f"{1e3 * value:.3f}" for value in point) + ") mm"

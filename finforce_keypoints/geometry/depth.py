@@ -85,7 +85,7 @@ def build_side_samples(jaw: Jaw, window: float = WINDOW, edge: float = EDGE) -> 
     steps = np.arange(-window - edge, window + edge + 0.5 * _SPACING, _SPACING)
     raster = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1)
     places = [_select_places(raster, point, triangles, window, edge) for point in jaw.keypoints]
-    places.append(_disc(raster, _REFERENCE_RADIUS))
+    places.append(_thin_out(raster, np.linalg.norm(raster, axis=-1) <= _REFERENCE_RADIUS))
     offsets = np.zeros((len(places), max(map(len, places)), 3))
     used = np.zeros(offsets.shape[:2], dtype=bool)
     for row, place in enumerate(places):
@@ -100,12 +100,12 @@ def _select_places(raster: NDArray, point: NDArray, triangles: NDArray, window: 
     corners = triangles[(np.abs(triangles[:, :, 1] - point[1]) < _ON_SIDE).all(axis=1)][:, :, ::2] - point[::2]
     corners = corners[(corners.min(axis=1) < reach).all(axis=1) & (corners.max(axis=1) > -reach).all(axis=1)]
     inside = _cover(np.ascontiguousarray(corners), raster)
-    depth, near = distance_transform_edt(inside) * _SPACING, np.linalg.norm(raster, axis=-1) <= window
+    depth, away = distance_transform_edt(inside) * _SPACING, np.linalg.norm(raster, axis=-1)
     for share in _EDGE_SHARES:
-        places = _thin_out(raster, near & (depth > share * edge))
+        places = _thin_out(raster, (away <= window) & (depth > share * edge))
         if len(places) >= _ENOUGH:
             return places
-    return places if len(places) else _disc(raster, _SMALLEST_RADIUS)
+    return places if len(places) else _thin_out(raster, away <= _SMALLEST_RADIUS)
 
 
 def _thin_out(raster: NDArray, chosen: NDArray) -> NDArray:
@@ -130,11 +130,6 @@ def _cover(triangles, raster):
                 least, most = min(least, turn), max(most, turn)
             inside[place] |= least >= -slack or most <= slack
     return inside
-
-
-def _disc(raster: NDArray, radius: float) -> NDArray:
-    """Return the places (s, 2) of a raster (a, a, 2) within a radius [m] of its middle."""
-    return _thin_out(raster, np.linalg.norm(raster, axis=-1) <= radius)
 
 
 def sample_depths(

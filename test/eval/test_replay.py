@@ -177,7 +177,7 @@ def test_no_force_has_no_point_of_application():
 def two_jaws(tmp_path_factory):
     """A few seconds under load, seen on both jaws: the right one is the left one's mirror image."""
     folder = tmp_path_factory.mktemp("bags") / "both"
-    return write_recording(with_both_jaws(read_recording(SHIPPED), 6.0), folder)
+    return write_recording(with_both_jaws(read_recording(SHIPPED), 5.0), folder)
 
 
 def test_two_solvers_answer_alike_and_complete_the_grasp(two_jaws, tmp_path):
@@ -213,7 +213,7 @@ def matrices(track):
 
 
 def test_one_contact_estimator_serves_both_jaws(tmp_path):
-    recording = with_opposite_jaw(with_both_jaws(read_recording(SHIPPED), 6.0))
+    recording = with_opposite_jaw(with_both_jaws(read_recording(SHIPPED), 5.0))
     recording = read_recording(write_recording(recording, tmp_path / "both"))
     names = argparse.Namespace(
         jaw="bench", solver="default", mesh="default", contact=["estimate"], calibration=None, object=str(MESH)

@@ -13,10 +13,10 @@ from scipy.spatial import cKDTree
 from shapely.ops import polygonize, unary_union
 
 from finforce.files import FileError
-from finforce.optional import import_library
 from finforce.sandbox import SandboxError, run_limited
 from finforce.surfaces import read_surface
 from finforce_ifea.errors import JawFileError
+from finforce_ifea.jaw.cad.curves import read_dxf, read_svg
 from finforce_ifea.jaw.cad.layers import find_layers
 from finforce_ifea.jaw.section import UNITS, Layer, SectionFile, check_loops, join_loops, read_section_file
 
@@ -38,7 +38,6 @@ _SHORT = 0.6
 # Ends of cut triangles are joined on a grid of this size [m].
 _GRID = 2e-7
 _CHORD = 2e-5
-_DXF_UNITS = {1: "inch", 4: "mm", 6: "m"}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -96,7 +95,7 @@ def read_section(path: Path, *, unit: str | None = None, body: int | None = None
         if suffix == ".json":
             return _take_section(read_section_file(path))
         if suffix in (".dxf", ".svg"):
-            loops, named = run_limited(_read_dxf if suffix == ".dxf" else _read_svg, path)
+            loops, named = run_limited(read_dxf if suffix == ".dxf" else read_svg, path)
             check_loops(loops, path.name)
             extent = np.ptp(np.concatenate(loops), axis=0).max()
             scale, note = _choose_unit(float(extent), unit or named)
@@ -143,9 +142,8 @@ def _choose_unit(extent: float, unit: str | None) -> tuple[float, str]:
         choices = " or ".join(f"--unit {name} ({1e3 * sizes[name]:.4g} mm)" for name in likely or UNITS)
         raise JawFileError(f"its largest size is {extent:.4g} and its unit not sure, expected {choices}")
     (guess,) = likely
-    return UNITS[
-        guess
-    ], f"unit: {guess}, since the largest size is {extent:.4g}, thus {1e3 * sizes[guess]:.4g} mm (--unit)"
+    size = f"the largest size is {extent:.4g}, thus {1e3 * sizes[guess]:.4g} mm"
+    return UNITS[guess], f"unit: {guess}, since {size} (--unit)"
 
 
 def _load_surface(path: Path) -> trimesh.Trimesh:
@@ -488,52 +486,3 @@ def _fill_lines(lines: list[NDArray] | NDArray) -> shapely.Geometry:
         if sum(outline.contains(point) for outline in filled) % 2:
             whole = whole.union(area)
     return whole
-
-
-def _read_dxf(path: Path) -> tuple[list[NDArray], str | None]:
-    """Read the curves of a DXF drawing, and its unit."""
-    ezdxf = import_library("ezdxf", f"reading {path.name}")
-    make_path = import_library("ezdxf.path", f"reading {path.name}").make_path
-    document = ezdxf.readfile(path)
-    lines = []
-    for entity in document.modelspace():
-        try:
-            curve = make_path(entity)
-        except TypeError:
-            continue
-        points = np.array([(point.x, point.y) for point in curve.flattening(0.01)])
-        if len(points) > 1:
-            lines.append(points)
-    unit = _DXF_UNITS.get(document.header.get("$INSUNITS", 0))
-    return _keep_lines(lines), unit
-
-
-def _read_svg(path: Path) -> tuple[list[NDArray], str | None]:
-    """Read the curves of an SVG drawing; lengths without a unit are CSS pixels, as in browsers, unless one is named."""
-    svgelements = import_library("svgelements", f"reading {path.name}")
-    # a pixel is 1/96 inch: at 25.4 per inch everything comes out in millimetres where sizes have units
-    document = svgelements.SVG.parse(str(path), ppi=25.4, reify=True)
-    shapes = [element for element in document.elements() if isinstance(element, svgelements.Shape)]
-    parts = [part for shape in shapes for part in svgelements.Path(shape).as_subpaths()]
-    lines = [_sample_curve(svgelements.Path(part)) for part in parts]
-    return _keep_lines(lines), None
-
-
-def _sample_curve(curve) -> NDArray:
-    """Return points (n, 2) along the segments of an SVG path; y points up."""
-    points = []
-    for segment in curve:
-        kind = type(segment).__name__
-        if kind == "Move" or segment.start is None or segment.end is None:
-            continue
-        count = 1 if kind in ("Line", "Close") else 24
-        points += [segment.point(k / count) for k in range(count)] + [segment.end]
-    return np.array([(point.x, -point.y) for point in points]).reshape(-1, 2)
-
-
-def _keep_lines(lines: list[NDArray]) -> list[NDArray]:
-    """Return the curves that have a length, as closed loops need three points to be checked."""
-    kept = [line if len(line) > 2 else np.vstack([line[0], line.mean(axis=0), line[-1]]) for line in lines if len(line)]
-    if not kept:
-        raise JawFileError("holds no curves, expected the outline of a finger and its holes")
-    return kept
