@@ -14,7 +14,7 @@ KINDS = [("mcap", ""), ("mcap", "lz4"), ("mcap", "zstd"), ("sqlite3", "")]
 CHUNK = 0x06
 
 
-def write(folder, storage="mcap", compression="", frames=1500):
+def write(folder, storage="mcap", compression="", frames=900):
     """A recording of several chunks, and its one file."""
     recording = make_recording(frames=frames)
     if storage == "mcap":
@@ -135,7 +135,7 @@ def test_chunks_that_say_more_than_they_may_are_refused_and_names_the_way_out(tm
     with pytest.raises(OutOfBoundsError, match="FINFORCE_BUDGET=10"):
         read_recording(path)
     monkeypatch.setenv("FINFORCE_BUDGET", "1000")
-    assert len(read_recording(path).jaws["left"].keypoints.stamps) == 1500
+    assert len(read_recording(path).jaws["left"].keypoints.stamps) == 900
 
 
 def test_more_messages_than_a_file_can_hold_are_refused(tmp_path, monkeypatch):
