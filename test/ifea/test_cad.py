@@ -102,6 +102,13 @@ def test_a_floor_and_a_slot_are_named_with_their_place(tmp_path, surface):
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["jaw.png"]
 
 
+def make_layered(folder):
+    """The jaw of a folder's finger.stl, taken as a solid, and what was found."""
+    options = {"name": "layered", "overrides": Overrides(), "solid": True, "measure_warping": measure_warping}
+    _, notes = make_jaw(folder / "finger.stl", folder / "jaw.yaml", **options)
+    return load_jaw(folder / "jaw.yaml"), notes
+
+
 @pytest.mark.parametrize("kind", ["floor", "slot"])
 def test_a_solid_that_is_no_prism_is_taken_in_layers(tmp_path, surface, kind):
     low, high = surface.bounds
@@ -112,15 +119,7 @@ def test_a_solid_that_is_no_prism_is_taken_in_layers(tmp_path, surface, kind):
     }[kind]
     mesh = boxes_joined(surface, box, cut=kind == "slot")
     mesh.export(tmp_path / "finger.stl")
-    _, notes = make_jaw(
-        tmp_path / "finger.stl",
-        tmp_path / "jaw.yaml",
-        name="layered",
-        overrides=Overrides(),
-        solid=True,
-        measure_warping=measure_warping,
-    )
-    jaw = load_jaw(tmp_path / "jaw.yaml")
+    jaw, notes = make_layered(tmp_path)
     depth = 0.4 * WIDTH * MILLIMETRE
     heights = {"floor": [1.0, WIDTH], "slot": [0.3 * WIDTH, 0.7 * WIDTH, WIDTH]}[kind]
     tops = [layer.high - jaw.section.layers[0].low for layer in jaw.section.layers]
@@ -143,6 +142,15 @@ def test_a_solid_that_is_no_prism_is_taken_in_layers(tmp_path, surface, kind):
         assert jaw.section.read_width(face[:1]) == pytest.approx(WIDTH * MILLIMETRE - depth, abs=1e-5)
 
 
+def test_layers_of_a_section_file_that_are_apart_are_refused(tmp_path):
+    squares = [[[x, 0.0], [x + 10.0, 0.0], [x + 10.0, 60.0], [x, 60.0]] for x in (0.0, 30.0)]
+    layers = [{"y": [10.0 * number, 10.0 * number + 10.0], "loops": [square]} for number, square in enumerate(squares)]
+    file = tmp_path / "apart.json"
+    file.write_text(json.dumps({"unit": "mm", "loops": squares[:1], "layers": layers}))
+    with pytest.raises(JawFileError, match=r"apart\.json.*2 separate areas"):
+        make_jaw(file, tmp_path / "jaw.yaml", name="apart", overrides=Overrides())
+
+
 def test_layers_that_are_alike_are_as_stiff_as_one():
     prism = make_section(size=4e-3)
     half = 0.5 * prism.width
@@ -163,15 +171,7 @@ def test_a_finger_without_ribs_is_taken_as_a_solid(tmp_path):
     trimesh.creation.extrude_polygon(wedge, WIDTH).export(tmp_path / "finger.stl")
     with pytest.raises(JawFileError, match="0 cells"):
         make_jaw(tmp_path / "finger.stl", tmp_path / "jaw.yaml", name="wedge", overrides=Overrides())
-    make_jaw(
-        tmp_path / "finger.stl",
-        tmp_path / "jaw.yaml",
-        name="wedge",
-        overrides=Overrides(),
-        solid=True,
-        measure_warping=measure_warping,
-    )
-    jaw = load_jaw(tmp_path / "jaw.yaml")
+    jaw, _ = make_layered(tmp_path)
     assert jaw.section.polygon.area == pytest.approx(wedge.area * MILLIMETRE**2, rel=1e-3)
     assert len(jaw.keypoints) > 10
 

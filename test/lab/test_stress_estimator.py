@@ -43,7 +43,7 @@ def play(steps):
 @pytest.mark.parametrize("name", SHORT)
 def test_family_breaks_no_rule(name):
     family = replace(FAMILIES[name], timed=False)
-    summary = summarise_family(family, run_family(family, Plan(solver="frame", count=2, seed=1)))
+    summary = summarise_family(family, run_family(family, Plan(solver="frame", count=3, seed=1)))
     assert summary["broken"] == [] and summary["n"] > 0
 
 

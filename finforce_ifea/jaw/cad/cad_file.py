@@ -119,11 +119,12 @@ def _find_usual(layers: Sequence[Layer]) -> shapely.Polygon:
     """Return the area of the thickest layer in one piece.
 
     Raises:
-        JawFileError: none is.
+        JawFileError: none is, or all together are not.
     """
     whole = [layer for layer in layers if layer.area.geom_type == "Polygon"]
     if not whole:
         raise JawFileError("none of its layers is in one piece, expected one finger")
+    _one_piece(shapely.union_all([layer.area for layer in layers]))
     return max(whole, key=lambda layer: layer.high - layer.low).area
 
 
@@ -207,7 +208,6 @@ def _cut_layers(mesh: trimesh.Trimesh, axis: NDArray, notes: list[str]) -> RawSe
     steps = np.unique(np.round(height[mesh.faces[flat]].mean(axis=1), 5))
     layers = find_layers(lambda at: _cut(mesh, axis, at), (low, high), steps[(steps > low) & (steps < high)].tolist())
     usual = _find_usual(layers)
-    _one_piece(shapely.union_all([layer.area for layer in layers]))
     across = f"along {np.round(axis, 3).tolist()} of the file, {1e3 * (high - low):.4g} mm in all"
     notes.append(f"{len(layers)} layer{'s' * (len(layers) > 1)} {across}")
     return RawSection(polygon=usual, width=high - low, notes=notes, layers=tuple(layers))

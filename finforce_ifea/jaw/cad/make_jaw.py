@@ -62,7 +62,8 @@ def make_jaw(
         overrides: what is stated in place of the guesses.
         picture: the PNG file; None for one next to the jaw file.
         solid: take a closed solid as it is, as layers along its width, whatever its shape.
-        measure_warping: returns by what share the stiffness of a layered jaw is off where it is taken as plane.
+        measure_warping: returns by what share the stiffness of a layered jaw is off where it is taken as plane;
+            None: it is taken so unasked.
 
     Raises:
         JawFileError: The file shows no fin-ray finger; the message says what it shows and what to do.
