@@ -104,7 +104,7 @@ def _differentiate(corners: NDArray) -> tuple[NDArray, NDArray]:
     return np.ascontiguousarray(gradients), np.linalg.det(jacobian) / 6.0
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz", "arcp"})
 def _add_triangles(u, elements, gradients, volumes, lame, shear, with_tangent, force, K):
     """Add nodal forces (n, 3) and fill lower blocks of stiffnesses K (t, 18, 18).
 

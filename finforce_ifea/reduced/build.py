@@ -152,15 +152,15 @@ _HARDEST = 12.0
 # Longer steps [m] of a solid must agree with its motions at both ends, to this share; the longest of a frame, whose
 # hinged bars snap over.
 _SURE, _APART, _LONGEST = 0.1e-3, 0.1, 0.5e-3
-# Shortest step of a depth [m]; iterations to an equilibrium, and its tolerance [m].
-_SHORTEST, _ITERATIONS, _TOLERANCE = 0.02e-3, 30, 1e-9
+# Shortest step of a depth [m]; iterations to an equilibrium, and its tolerance [m]. What takes more is no near one.
+_SHORTEST, _ITERATIONS, _TOLERANCE = 0.02e-3, 9, 1e-9
 # Quarters of a path that are tried next where it cannot be divided.
 _KEPT = 3
 _FEWEST_ROWS, _MOST_ROWS = 12, 84
 # Rows of nodes nearer together than this share of their mean distance are those of an unstructured mesh.
 _CLOSEST = 0.1
 # What the outcome depends on beside the jaw.
-GRID = (DEPTHS, HEIGHTS, SHAPES, ROWS, _ROD, _DEEPEST, _LOWEST, _TOP, _DENSER, _EARLY, _HARDEST)
+GRID = (DEPTHS, HEIGHTS, SHAPES, ROWS, _ROD, _DEEPEST, _LOWEST, _TOP, _DENSER, _EARLY, _HARDEST, _ITERATIONS)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -315,6 +315,12 @@ def _are_joined(start: _Equilibrium, end: _Equilibrium) -> bool:
     return bool(np.linalg.norm(moved - along) < _APART * np.linalg.norm(moved))
 
 
+def _join(start: _Equilibrium, end: _Equilibrium) -> CubicHermiteSpline:
+    """Return the unknowns (size,) by depth [m] from one equilibrium to the next, as the jaw moves at both."""
+    ends = (start, end)
+    return CubicHermiteSpline(*zip(*((item.depth, item.q, item.state.modes[:, 0]) for item in ends), strict=True))
+
+
 class _Rod:
     """A rod at one height, pressed in deeper and deeper."""
 
@@ -344,7 +350,7 @@ class _Rod:
         step = depth - done if is_solid else min(depth - done, _LONGEST)
         while done < depth:
             last = way[-1] if way else start
-            found = self._settle(last, done + step if done + step < depth - 1e-9 else depth)
+            found = self._settle(done + step if done + step < depth - 1e-9 else depth, last)
             if found is None or (is_solid and step > _SURE and last and not _are_joined(last, found)):
                 step *= 0.5
                 if step < _SHORTEST:
@@ -363,21 +369,23 @@ class _Rod:
         states = [np.zeros(self._contact.model.size)]
         for depth in _divide(largest):
             below = int(np.searchsorted(depths, depth + 1e-12)) - 1
-            start = path[below] if below >= 0 else None
-            way = [start] if start and start.depth > depth - 1e-12 else self._advance(start, depth, np.inf)
+            start, end = (path[at] if 0 <= at < len(path) else None for at in (below, below + 1))
+            found = start if start and start.depth > depth - 1e-12 else self._settle(depth, start, end)
+            way = [found] if found else self._advance(start, depth, np.inf)
             if not way or way[-1].depth < depth - 1e-12:
                 return None
             states.append(way[-1].q)
         return states
 
-    def _settle(self, start: _Equilibrium | None, depth: float) -> _Equilibrium | None:
-        """Return the equilibrium at a depth [m] of the rod, or None."""
+    def _settle(self, depth: float, start: _Equilibrium | None, end: _Equilibrium | None = None) -> _Equilibrium | None:
+        """Return the equilibrium at a depth [m] of the rod, by one above it and one below it if known; or None."""
         contact, model = self._contact, self._contact.model
         place = np.array([self._touch + depth, np.log(self._radius), self._height])
-        q = np.zeros(model.size)
-        if start is not None:
+        q, before = np.zeros(model.size), _TOLERANCE
+        if start is not None and end is not None:
+            q = _join(start, end)(depth)
+        elif start is not None:
             q = start.q + start.state.modes[:, 0] * (depth - start.depth)
-        before = _TOLERANCE
         for _ in range(_ITERATIONS):
             state = contact.linearize(q, place)
             if not state.touches:
