@@ -5,12 +5,14 @@ import re
 import sys
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import shapely
 import shapely.affinity
 import trimesh
 from mechanics_fakes import compute_volume
+from PIL import Image
 from scipy.spatial.transform import Rotation
 from section_fakes import BASE, LENGTH, MILLIMETRE, TPU, WIDTH, draw_polygon, make_section
 
@@ -18,10 +20,11 @@ from finforce_eval.cli.main import main
 from finforce_ifea.errors import JawFileError
 from finforce_ifea.fem.plane import PlaneModel
 from finforce_ifea.jaw.cad.cad_file import _GRID, _cut, _span, read_section
-from finforce_ifea.jaw.cad.make_jaw import choose_keypoints, make_jaw
+from finforce_ifea.jaw.cad.make_jaw import _doubt_walls, choose_keypoints, make_jaw
+from finforce_ifea.jaw.cad.photo import Photo, read_photo
 from finforce_ifea.jaw.cad.recognition import Overrides, recognize
 from finforce_ifea.jaw.jaw import load_jaw
-from finforce_ifea.jaw.section import Layer, order_rings
+from finforce_ifea.jaw.section import Layer, join_loops, order_rings
 from finforce_ifea.jaw.section_mesh import extrude_section, mesh_section
 from finforce_ifea.mechanics import measure_warping
 
@@ -472,7 +475,91 @@ def test_a_drawing_is_read_and_needs_a_width(tmp_path, capsys, suffix, write):
     assert raw.width is None
     check_found(recognize(raw.polygon, WIDTH * MILLIMETRE, Overrides()))
     assert main(["jaw", str(path), "-o", str(tmp_path / "out.yaml")]) == 2
-    assert "a drawing has no width; give it in millimetres: --width" in capsys.readouterr().err
+    assert "a flat file has no width; give it in millimetres: --width" in capsys.readouterr().err
+
+
+PER_MM, TWO_MARKS = 8, "360,60,360,620=70"
+
+
+def photograph(path, light=(0.7, 0.6, 0.1), ground=(0.02, 0.02, 0.02), shown=None, orientation=1):
+    """Draws a finger and a longer ruler in linear light, blurs, adds noise, and writes that as sRGB and JPEG."""
+    fine, rng = 4 * PER_MM, np.random.default_rng(0)
+    mask, ruler = (np.zeros((fine * 85, fine * 60), np.uint8) for _ in range(2))
+    for number, ring in enumerate(order_rings(draw_polygon())):
+        # fillPoly draws the line around, too
+        ring = shapely.get_coordinates(shapely.Polygon(ring).buffer(-0.5 / fine, join_style="mitre"))
+        cv2.fillPoly(
+            mask, [np.round(256 * fine * (ring * [1, -1] + [22, 77])).astype(np.int32)], 255 * (not number), 8, 8
+        )
+    cv2.rectangle(ruler, (43 * fine, 2 * fine), (58 * fine, 82 * fine), 255, -1)
+    cover = [
+        cv2.resize(part, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)[..., None] for part in (mask, ruler)
+    ]
+    picture = np.array(ground) * (1 + 0.3 * np.linspace(-0.5, 0.5, 60 * PER_MM)[None, :, None])
+    for part, colour in zip(cover, (light, (0.9, 0.9, 0.9)), strict=True):
+        picture = picture + part / 255 * (np.array(colour) - picture)
+    picture = cv2.GaussianBlur(picture, (0, 0), 1.0)
+    picture = np.where(picture > 0.0031308, 1.055 * picture ** (1 / 2.4) - 0.055, 12.92 * picture)
+    picture = np.clip(255 * (picture + 0.01 * rng.standard_normal(picture.shape)), 0, 255).astype(np.uint8)
+    picture = Image.fromarray(picture if shown is None else picture[shown])
+    exif = picture.getexif()
+    exif[0x0112] = orientation
+    turned = picture.transpose(Image.Transpose.ROTATE_90) if orientation == 6 else picture
+    turned.save(path, quality=90, exif=exif)
+    return path
+
+
+BLACK_ON_WHITE = {"light": (0.03, 0.03, 0.03), "ground": (0.8, 0.8, 0.8)}
+
+
+@pytest.mark.parametrize("colours", [{}, BLACK_ON_WHITE, {"orientation": 6}])
+def test_a_photograph_gives_walls_to_a_fraction_of_a_pixel(tmp_path, colours):
+    photo = read_photo(photograph(tmp_path / "finger.jpg", **colours), TWO_MARKS)
+    assert photo.is_dark == (colours is BLACK_ON_WHITE)
+    finger = recognize(join_loops(photo.loops), WIDTH * MILLIMETRE, Overrides())
+    free = finger.inner.line[:, 1] > BASE * MILLIMETRE + 1e-3
+    walls = [np.median(finger.inner.thickness[free]), *(rib.wall.usual for rib in finger.ribs)]
+    # 3 % of a wall of 13 px is 0.4 px, and 9 % of its stiffness
+    assert walls == pytest.approx([1.6e-3, *[1.2e-3] * RIBS], rel=0.03)
+    assert len(finger.bolts) == 2 and finger.length == pytest.approx(LENGTH * MILLIMETRE, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("scale", "changes", "message"),
+    [
+        (None, {}, r"no scale; expected --scale X1,Y1,X2,Y2=50 .* or --scale MM_PER_PIXEL"),
+        ("360,60,360=70", {}, "scale '360,60,360=70' for 480 x 680 pixels; expected --scale"),
+        ("360,60,360,60=70", {}, "expected --scale"),
+        ("360,60,360,6200=70", {}, "expected --scale"),
+        ("0.125", {}, "two similar pieces at .* and the marks of --scale on the ruler"),
+        ("360,60,360,620=700", {}, "mm long at 0.8 pixels a millimetre, expected a finger of 20 to 300 mm"),
+        ("360,60,360,540=60", {"shown": np.s_[:600]}, "the edge of the picture cuts its largest piece"),
+        (TWO_MARKS, {"light": (0.025, 0.02, 0.02)}, "nothing stands out beside the ruler"),
+    ],
+)
+def test_a_photograph_that_shows_no_whole_finger_to_scale_is_refused(tmp_path, scale, changes, message):
+    with pytest.raises(JawFileError, match=message):
+        read_photo(photograph(tmp_path / "finger.jpg", **changes), scale)
+
+
+def test_a_photographed_finger_states_how_sure_its_stiffness_is(tmp_path, capsys):
+    path, output = photograph(tmp_path / "finger.jpg"), tmp_path / "out.yaml"
+    command = ["jaw", str(path), "-o", str(output), "--width", "20"]
+    assert main([*command, "--unit", "mm"]) == 2
+    assert "finger.jpg: expected --unit, or of a photograph --scale" in capsys.readouterr().err
+    assert main([*command, "--scale", TWO_MARKS]) == 0
+    found = re.search(r"walls (.*) pixels across: a stiffness \+- (.*)%\n", capsys.readouterr().out)
+    across, doubt = float(found[1]), 0.01 * float(found[2])
+    assert across == pytest.approx(
+        1.2 * PER_MM, rel=0.03
+    )  # blur over 1 px leaves 0.5 px of them, of stiffness thrice that
+    assert doubt == pytest.approx(1.5 / across, rel=0.2)
+    assert load_jaw(output).material.spread == pytest.approx(np.hypot(0.3, doubt), abs=0.01)
+    polygon = shapely.affinity.scale(draw_polygon(), MILLIMETRE, MILLIMETRE, origin=(0, 0))
+    finger = recognize(polygon, WIDTH * MILLIMETRE, Overrides())
+    assert _doubt_walls(finger, Photo([], 1e-4, 2e-4, True)) > 1.0  # a camera sees the sides of dark walls, too
+    with pytest.raises(JawFileError, match="walls are 4.0 pixels across, expected at least 5"):
+        _doubt_walls(finger, Photo([], 3e-4, 6e-4, False))
 
 
 def test_the_command_writes_a_jaw_that_loads(tmp_path, capsys, surface):

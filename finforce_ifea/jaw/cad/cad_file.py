@@ -12,16 +12,18 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from shapely.ops import polygonize, unary_union
 
+from finforce.camera import ImageError
 from finforce.files import FileError
 from finforce.sandbox import SandboxError, run_limited
 from finforce.surfaces import read_surface
 from finforce_ifea.errors import JawFileError
 from finforce_ifea.jaw.cad.curves import read_dxf, read_svg
 from finforce_ifea.jaw.cad.layers import find_layers
+from finforce_ifea.jaw.cad.photo import PHOTOS, SCALE, Photo, read_photo
 from finforce_ifea.jaw.section import UNITS, Layer, SectionFile, check_loops, join_loops, read_section_file
 
 SURFACES = (".stl", ".obj", ".ply", ".off", ".3mf", ".glb")
-SUFFIXES = (*SURFACES, ".step", ".stp", ".dxf", ".svg", ".json")
+SUFFIXES = (*SURFACES, ".step", ".stp", ".dxf", ".svg", ".json", *PHOTOS)
 # Largest size of a finger [m]; the second pair is for a unit that was stated.
 _PLAUSIBLE, _POSSIBLE = (0.015, 0.25), (0.005, 1.0)
 _MOST_TRIANGLES, _LARGEST_FILE = 2_000_000, 200_000_000
@@ -50,6 +52,7 @@ class RawSection:
         taper: (2,) [-], change of the width along the section's axes.
         base: where the body is wider than that, which the clamp has to hold; None for nowhere.
         notes: what was found and guessed, a line each.
+        photo: what it was traced from, if that is a photograph.
     """
 
     polygon: shapely.Polygon
@@ -58,6 +61,7 @@ class RawSection:
     taper: NDArray = field(default_factory=lambda: np.zeros(2))
     base: shapely.Geometry | None = None
     layers: tuple[Layer, ...] = ()
+    photo: Photo | None = None
 
 
 class UnlikeSectionsError(JawFileError):
@@ -72,8 +76,8 @@ def read_section(path: Path, *, unit: str | None = None, body: int | None = None
     """Read the section of a finger.
 
     Args:
-        path: a surface (.stl and others), a solid (.step), a drawing (.dxf, .svg), or a section (.json).
-        unit: one of `UNITS`; None for the only one in which it has a finger's size.
+        path: a surface (.stl and others), a solid (.step), a drawing (.dxf, .svg), a section (.json), or a photograph.
+        unit: one of `UNITS`; None for the only one in which it has a finger's size; of a photograph see `SCALE`.
         body: which one of several bodies, from 1.
         layered: take a solid as layers along its width, whatever its shape.
 
@@ -91,9 +95,15 @@ def read_section(path: Path, *, unit: str | None = None, body: int | None = None
             f"{path.name}: {path.stat().st_size // 1_000_000} MB, expected at most "
             f"{_LARGEST_FILE // 1_000_000} MB: export it with fewer triangles"
         )
+    if unit is not None and (unit in UNITS) == (suffix in PHOTOS):
+        raise JawFileError(f"{path.name}: expected --unit, or of a photograph {SCALE}")
     try:
         if suffix == ".json":
             return _take_section(read_section_file(path))
+        if suffix in PHOTOS:
+            photo = run_limited(read_photo, path, unit, memory=2 << 30, seconds=60)
+            notes = [f"traced at {1e-3 / photo.pixel:.3g} pixels a millimetre"]
+            return RawSection(polygon=join_loops(photo.loops), width=None, notes=notes, photo=photo)
         if suffix in (".dxf", ".svg"):
             loops, named = run_limited(read_dxf if suffix == ".dxf" else read_svg, path)
             check_loops(loops, path.name)
@@ -101,7 +111,7 @@ def read_section(path: Path, *, unit: str | None = None, body: int | None = None
             scale, note = _choose_unit(float(extent), unit or named)
             return RawSection(polygon=_join_lines([scale * loop for loop in loops]), width=None, notes=[note])
         return _cut_surface(_load_surface(path), unit, body, layered)
-    except (JawFileError, FileError, SandboxError) as error:
+    except (JawFileError, FileError, ImageError, SandboxError) as error:
         prefix = "" if str(error).startswith(path.name) else f"{path.name}: "
         raise JawFileError(f"{prefix}{error}") from error
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from finforce_ifea.errors import JawFileError
 from finforce_ifea.jaw.cad.cad_file import RawSection, UnlikeSectionsError, read_section
+from finforce_ifea.jaw.cad.photo import Photo
 from finforce_ifea.jaw.cad.picture import draw_finger, draw_refused
 from finforce_ifea.jaw.cad.recognition import Overrides, RecognizedFinger, has_cells, recognize
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
@@ -31,6 +32,9 @@ BANDS = ("inner", "outer")
 _CELLS, _CELLS_FROM, _GAP, _SKIN = 8, (0.08, 0.95), 0.008, 0.06
 # Layers that warp by more than this share need a solid, whose elements are of this size [m].
 _WARPING, _SIZE = 0.25, 0.002
+# Walls in a photograph are so many pixels across at least. They are uncertain by this share of the width of its edges
+# and, where a camera a metre away sees dark sides, of the finger's; bending goes with the cube.
+_ACROSS, _BLURRED, _SIDES = 5, 0.2, 0.025
 # A reference point [m] below a clamp that the section does not show.
 _BELOW = -6e-3
 
@@ -56,9 +60,9 @@ def make_jaw(
         output: the YAML file; its section goes next to it.
         name: of the finger.
         material: a name in `MATERIALS`.
-        unit: of the file; None to guess it.
+        unit: of the file; None to guess it; of a photograph its scale.
         body: which one of several bodies, from 1.
-        width: along y [m]; needed for drawings.
+        width: along y [m]; needed for drawings and photographs.
         overrides: what is stated in place of the guesses.
         picture: the PNG file; None for one next to the jaw file.
         solid: take a closed solid as it is, as layers along its width, whatever its shape.
@@ -76,9 +80,10 @@ def make_jaw(
         raw = replace(raw, layers=())
     width = width or raw.width
     if width is None:
-        raise JawFileError(f"{file.name}: a drawing has no width; give it in millimetres: --width 25")
+        raise JawFileError(f"{file.name}: a flat file has no width; give it in millimetres: --width 25")
     try:
         finger = _recognize(raw, width, overrides)
+        doubt = 0.0 if raw.photo is None else _doubt_walls(finger, raw.photo)
     except JawFileError as error:
         draw_refused(raw.polygon, str(error), picture)
         raise JawFileError(f"{file.name}: {error} (its section is drawn in {picture})") from error
@@ -86,7 +91,7 @@ def make_jaw(
     section = output.with_suffix(".section.json")
     section.write_text(_describe_section(finger, file.name), encoding="utf-8")
     heading = f"# {name}, from {file.name}. Lengths in metres, jaw frame (x closing, y width, z base to tip)."
-    lines = [heading, f"name: {name}", *_describe_finger(finger, section.name, material)]
+    lines = [heading, f"name: {name}", *_describe_finger(finger, section.name, material, doubt)]
     lines.append(f"reference_point: {_list(_put_on_side(finger, *reference))}  # {place}")
     output.write_text("\n".join(lines) + "\n", encoding="utf-8")
     jaw = load_jaw(output)
@@ -117,6 +122,18 @@ def _read_section(file: Path, unit: str | None, body: int | None, picture: Path,
             raise
         draw_refused(error.__cause__.section, str(error), picture)
         raise JawFileError(f"{error} (its usual section is drawn in {picture})") from error
+
+
+def _doubt_walls(finger: RecognizedFinger, photo: Photo) -> float:
+    """Return, and note, the relative deviation of a photographed stiffness; raises JawFileError for too few pixels."""
+    thinnest = min(finger.inner.usual, finger.outer.usual, float(np.median([rib.wall.usual for rib in finger.ribs])))
+    across = thinnest / photo.pixel
+    if across < _ACROSS:
+        raise JawFileError(f"its thinnest walls are {across:.1f} pixels across, expected at least {_ACROSS}: zoom in")
+    doubt = 3.0 * float(np.hypot(_BLURRED * photo.edge, _SIDES * finger.width * photo.is_dark)) / thinnest
+    advice = "; the sides of its walls, as dark, look like walls: chalk it and lay it on black" * photo.is_dark
+    finger.notes.append(f"thinnest walls {across:.1f} pixels across: a stiffness +- {doubt:.0%}{advice}")
+    return doubt
 
 
 def _recognize(raw: RawSection, width: float, overrides: Overrides) -> RecognizedFinger:
@@ -243,15 +260,20 @@ def _list_rings(rings: Sequence[NDArray]) -> list:
     return [np.round(1e3 * ring, 4).tolist() for ring in rings]
 
 
-def _describe_finger(finger: RecognizedFinger, section: str, name: str) -> list[str]:
+def _describe_finger(finger: RecognizedFinger, section: str, name: str, doubt: float) -> list[str]:
     """Return the lines of a jaw file on section, material, key points and candidates.
 
     Args:
         finger: what was recognized.
         section: name of its file.
         name: of its material.
+        doubt: relative standard deviation of the stiffness for another reason.
     """
     material, tapers = MATERIALS[name], bool(finger.taper.any())
+    if doubt:
+        spread = round(min(float(np.hypot(material.spread, doubt)), 1.0), 2)
+        material = material.model_copy(update={"name": name, "spread": spread})
+        name = json.dumps(material.model_dump())
     low, high = float(finger.clamp_height(finger.face_x)) + _AWAY, _find_face_end(finger) - _AWAY
     count = int(np.clip(round((high - low) / _STEP) + 1, _FEWEST, _MOST))
     circles = ", ".join(f"[{x:.5f}, {z:.5f}, {radius:.5f}]" for x, z, radius in finger.clamped_circles)
