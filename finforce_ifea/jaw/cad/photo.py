@@ -130,9 +130,9 @@ def _choose_piece(stands: NDArray[np.bool_], marks: NDArray) -> NDArray[np.bool_
         )
     if sizes[second] > _SIMILAR * sizes[largest]:
         places = " and ".join(f"({x:.0f}, {y:.0f})" for x, y in middles[[largest, second]])
-        raise JawFileError(f"two similar pieces at {places} [px], expected one, and the marks of --scale on the ruler")
+        raise JawFileError(f"two similar pieces at {places} [px], expected one on a plain ground, marks on the ruler")
     if piece[[0, -1]].any() or piece[:, [0, -1]].any():
-        raise JawFileError("the edge of the picture cuts its largest piece, expected a whole finger")
+        raise JawFileError("the edge of the picture cuts its largest piece, expected a whole finger on a plain ground")
     return piece
 
 

@@ -165,7 +165,7 @@ def recognize(
     inner, outer, ribs = _measure_walls(turned, cells)
     slope, floor = _find_floor(turned, (inner, outer))
     clamped_z, circles = _propose_clamp(cells, bolts, inner, (slope, floor), overrides, notes)
-    top = 0.0 if wider is None else _find_top(wider, frame, slope, turned)
+    top = -np.inf if wider is None else _find_top(wider, frame, slope, turned)
     if top > clamped_z:
         clamped_z = top
         notes.append(f"clamped up to z = {1e3 * top:.4g} mm, as far as it is wider than the blade")
