@@ -13,6 +13,7 @@ from finforce_keypoints.detectors.dots import DotDetector, DotSettings
 from finforce_keypoints.detectors.side_plane import AnyFinger, OneFinger, SidePlaneDetector
 from finforce_keypoints.detectors.whole_image import WholeImageDetector
 from finforce_keypoints.errors import ModelError
+from finforce_keypoints.geometry.tags import TagFinder
 from finforce_keypoints.images import ImageWatch, PixelDetector
 from finforce_keypoints.networks.metadata import build_name_map, parse_mapping
 from finforce_keypoints.networks.model import KeypointModel
@@ -51,6 +52,7 @@ def build_detector(
         settings = replace(settings, plane_depth=True)
     mounts = find_mounts(parameters, jaws)
     pixel_detector = build_pixel_detector(jaws, parameters, settings, dots, mounts)
+    ids = [mount.tag.id for mount in mounts.values() if mount.tag is not None]
     return KeypointDetector(
         pixel_detector,
         jaws,
@@ -59,6 +61,7 @@ def build_detector(
         ImageWatch() if watched else None,
         rests,
         mounts,
+        TagFinder(parameters.tag_family, ids) if ids else None,
     )
 
 

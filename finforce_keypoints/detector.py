@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from finforce_keypoints.geometry.depth import DepthScale
 from finforce_keypoints.geometry.jaw_localizer import JawKeypoints, JawLocalizer
 from finforce_keypoints.geometry.side_picture import find_side
 from finforce_keypoints.geometry.stillness import StillWatch
+from finforce_keypoints.geometry.tags import TagFinder
 from finforce_keypoints.images import ImageWatch, PixelDetection, PixelDetector, RgbdImage, check_image
 from finforce_keypoints.parameters import DetectorSettings, JawMount
 
@@ -37,12 +38,13 @@ _LEAST_SCALE_STDDEV = 5e-4  # images do not err independently: no average is bet
 class _Sight:
     """What the colours of an image show: key points by side where nothing has moved, else the pixels found.
 
-    `is_watched` says whether anybody looked for motion.
+    `is_watched` says whether anybody looked for motion; `tags` are the corners (4, 2) [px] of those seen, by number.
     """
 
     is_watched: bool
     still: Mapping[str, JawKeypoints] | None
     detections: Mapping[str, PixelDetection]
+    tags: Mapping[int, NDArray] = field(default_factory=dict)
 
 
 class KeypointDetector:
@@ -71,6 +73,7 @@ class KeypointDetector:
         watch: ImageWatch | None = None,
         rests: bool = False,
         mounts: Mapping[str, JawMount] | None = None,
+        tags: TagFinder | None = None,
     ) -> None:
         """Prepare to look at jaws.
 
@@ -82,6 +85,7 @@ class KeypointDetector:
             watch: notices a camera that fails; None: nobody does.
             rests: whether pixels and depth are left out where nothing has moved.
             mounts: by side; without, jaws stand straight and nothing covers them.
+            tags: finds those of the mounts; None: nobody looks for them.
         """
         self.settings = settings or DetectorSettings()
         wrong = [side for side, jaw in jaws.items() if jaw.side != side]
@@ -90,7 +94,7 @@ class KeypointDetector:
         for jaw in jaws.values():
             check_reference(jaw)
         T_gripper_camera = check_pose(T_gripper_camera, "T_gripper_camera")
-        self._pixel_detector, self._image_watch = pixel_detector, watch
+        self._pixel_detector, self._image_watch, self._tags = pixel_detector, watch, tags
         self._still_watch = StillWatch() if rests else None
         self._counts_of = {side: len(jaw.keypoints) + 1 for side, jaw in jaws.items()}
         self.mounts = mounts or {side: JawMount() for side in jaws}
@@ -102,7 +106,7 @@ class KeypointDetector:
 
     def reset(self) -> None:
         """Forget where the jaws were, the depth scale and the counts; for a new recording or another camera."""
-        for part in (*self._jaws.values(), self._image_watch, self._still_watch):
+        for part in (*self._jaws.values(), self._image_watch, self._still_watch, self._tags):
             if part is not None:
                 part.reset()
         self._stamp: float | None = None
@@ -150,7 +154,14 @@ class KeypointDetector:
                 "without camera_info, or has the camera moved?"
             )
             said = {side: [*texts, text] for side, texts in said.items()}
+        if self._is_mirrored:
+            said = {side: ["the image is mirrored: its tags decode only when it is flipped"] for side in said}
         return {side: "; ".join(texts) for side, texts in said.items() if texts}
+
+    @property
+    def _is_mirrored(self) -> bool:
+        """Whether the images show their tags mirrored."""
+        return self._tags is not None and self._tags.is_mirrored
 
     @property
     def _off_centre(self) -> float:
@@ -199,7 +210,7 @@ class KeypointDetector:
         self._sights = {stamp: later for stamp, later in self._sights.items() if stamp > image.stamp}
         self.was_still = sight.still is not None
         if sight.still is None:
-            found = self._find(image, sight.detections)
+            found = self._find(image, sight)
             if not sight.is_watched:
                 return found
             return self._still_watch.take(found if len(found) == len(self._jaws) else {}, image) or found
@@ -226,23 +237,30 @@ class KeypointDetector:
         still = watch.confirm(image) if is_watched else None
         if still is not None:
             return _Sight(is_watched=True, still=still, detections={})
-        detections = self._pixel_detector.detect(image, self._expect(image.stamp))
-        return _Sight(is_watched=is_watched, still=None, detections=detections)
+        tags = self._tags.find(image.color) if self._tags is not None else {}
+        detections = self._pixel_detector.detect(image, self._expect(image, tags))
+        return _Sight(is_watched=is_watched, still=None, detections=detections, tags=tags)
 
-    def _expect(self, stamp: float) -> dict[str, NDArray | None]:
-        """Return where the jaws should be at a time [s], None for a lost one; one not worth a search yet is absent."""
+    def _expect(self, image: RgbdImage, tags: Mapping[int, NDArray]) -> dict[str, NDArray | None]:
+        """Return where the jaws should be in an image, None for a lost one; one not worth a search yet is absent."""
         expected: dict[str, NDArray | None] = {}
+        stamp = image.stamp
         for side, jaw in self._jaws.items():
-            pose = jaw.expect(stamp)
+            pose = jaw.expect(image, self._corners(side, tags))
             if pose is None and self._searches[side] >= _SEARCHES and stamp < self._searched[side] + _SEARCH_PERIOD:
                 continue
             self._searches[side] = 0 if pose is not None else self._searches[side] + 1
             expected[side], self._searched[side] = pose, stamp
         return expected
 
-    def _find(self, image: RgbdImage, detections: Mapping[str, PixelDetection]) -> dict[str, JawKeypoints]:
+    def _corners(self, side: str, tags: Mapping[int, NDArray]) -> NDArray | None:
+        """Return the corners (4, 2) [px] of a jaw's tag; None where it is not seen."""
+        tag = self.mounts[side].tag
+        return None if tag is None else tags.get(tag.id)
+
+    def _find(self, image: RgbdImage, sight: _Sight) -> dict[str, JawKeypoints]:
         """Return the key points of the jaws in an image that has to be looked at."""
-        found = self._locate(image, detections)
+        found = {} if self._is_mirrored else self._locate(image, sight)
         self.counts["images"] += 1
         if self._off_centre > self.settings.largest_offset:  # intrinsics or place of a camera that bend every finger
             self.counts["off centre"] += 1
@@ -253,12 +271,12 @@ class KeypointDetector:
             self._shares[side] += (seen - self._shares[side]) / min(self._looks[side], _MEMORY)
         return found
 
-    def _locate(self, image: RgbdImage, detections: Mapping[str, PixelDetection]) -> dict[str, JawKeypoints]:
+    def _locate(self, image: RgbdImage, sight: _Sight) -> dict[str, JawKeypoints]:
         """Return the key points of the jaws that are found."""
         keypoints = {}
         for side, jaw in self._jaws.items():
-            detection = self._check(side, detections.get(side))
-            found = jaw.locate(image, detection, self._scale)
+            detection = self._check(side, sight.detections.get(side))
+            found = jaw.locate(image, detection, self._scale, self._corners(side, sight.tags))
             if found is not None:
                 stddev = max(found.scale.stddev, _LEAST_SCALE_STDDEV)
                 self._scale = replace(found.scale, stddev=min(stddev, self.settings.scale_stddev))

@@ -14,7 +14,8 @@ from finforce.camera_topics import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC, OLD_COL
 from finforce.gripper_frames import ROBOT_CAMERA
 from finforce.settings import GripperParameters, check_bounds, setting
 from finforce.transforms import pose_from_quaternion, pose_numbers
-from finforce_keypoints.errors import DetectorSettingsError
+from finforce_keypoints.errors import DetectorSettingsError, GeometryError
+from finforce_keypoints.geometry.tags import FAMILIES, Tag, read_tag
 
 if TYPE_CHECKING:
     from finforce_ifea.jaw.jaw import Jaw
@@ -42,6 +43,12 @@ class DetectorParameters(GripperParameters):
     covered: tuple[str, ...] = setting(
         ("",), "Key points hidden by the holder, each as SIDE/NAME, such as left/outer_1 or left/reference"
     )
+    left_tag: tuple[float, ...] = setting(
+        (math.nan,),
+        "Tag fixed to the left jaw: number, then x, y, z of its four corners in the jaw frame [m]; NaN: none",
+    )
+    right_tag: tuple[float, ...] = setting((math.nan,), "Tag fixed to the right jaw, likewise [m]")
+    tag_family: str = setting("4x4_50", "Family of the tags", choices=FAMILIES)
     likelihood_odds: float = setting(
         1.0, "Factor on the odds of likelihoods of small or unusual fingers, as a rig file has it", "1", 1.0, 20.0
     )
@@ -117,15 +124,22 @@ class JawMount:
         turn: rotation vector (3,) against the gripper's axes, jaw frame [rad].
         covered: names of the key points that are never seen, "reference" for the reference point.
         odds: factor on the odds of likelihoods: a network is less sure of small fingers than it could be.
+        tag: that is fixed to its holder; None without one.
     """
 
     turn: NDArray = field(default_factory=lambda: np.zeros(3))
     covered: frozenset[str] = frozenset()
     odds: float = 1.0
+    tag: Tag | None = None
 
     def seen_points(self, jaw: Jaw) -> NDArray[np.bool_]:
         """Return which of a jaw's key points, the reference point last, are not covered (K + 1,)."""
         return np.array([name not in self.covered for name in (*jaw.keypoint_names, REFERENCE)])
+
+    @property
+    def is_held(self) -> bool:
+        """Whether a jaw's place is told by its tag and all points that are seen, as its reference point is covered."""
+        return self.tag is not None or REFERENCE in self.covered
 
     def believe(self, likelihood: NDArray) -> NDArray:
         """Return likelihoods whose odds are multiplied."""
@@ -136,9 +150,11 @@ def find_mounts(parameters: DetectorParameters, jaws: Mapping[str, Jaw]) -> dict
     """Return how the jaws, by side, are mounted.
 
     Raises:
-        DetectorSettingsError: a turn is no three numbers, or `covered` names a point that the jaw does not have.
+        DetectorSettingsError: a turn is no three numbers, a tag none, or `covered` names a point that the jaw does not
+            have.
     """
     mounts, turns = {}, {"left": parameters.left_turn, "right": parameters.right_turn}
+    tags = {"left": parameters.left_tag, "right": parameters.right_tag}
     for side, jaw in jaws.items():
         turn = np.array(turns[side], dtype=float)
         if turn.shape != (3,) or not np.linalg.norm(turn) <= LARGEST_TURN:
@@ -153,7 +169,11 @@ def find_mounts(parameters: DetectorParameters, jaws: Mapping[str, Jaw]) -> dict
                 f"covered: got {', '.join(unknown)} of the {side} jaw, expected names of key points of the jaw "
                 f"'{jaw.name}' or {REFERENCE}"
             )
-        mounts[side] = JawMount(turn=turn, covered=covered, odds=parameters.likelihood_odds)
+        try:
+            tag = read_tag(tags[side])
+        except GeometryError as error:
+            raise DetectorSettingsError(f"{side}_tag: {error}") from error
+        mounts[side] = JawMount(turn=turn, covered=covered, odds=parameters.likelihood_odds, tag=tag)
     return mounts
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -38,11 +39,22 @@ class RigCamera(FileModel):
     model: Text = Field(description="Lens: plumb_bob, rational_polynomial or equidistant")
 
 
+Corner = tuple[Number, Number, Number]
+
+
+class RigTag(FileModel):
+    """A tag that is fixed to a jaw's holder."""
+
+    id: int = Field(ge=0, description="Its number")
+    corners: tuple[Corner, Corner, Corner, Corner] = Field(description="x, y, z in the jaw frame [m]")
+
+
 class RigJaw(FileModel):
     """How a jaw is mounted."""
 
     turn: tuple[Number, Number, Number] = Field((0.0, 0.0, 0.0), description="Rotation vector in its own frame [rad]")
     covered: tuple[Text, ...] = Field((), description="Names of key points that are never seen")
+    tag: RigTag | None = Field(None, description="What tells where its holder is")
 
 
 class Rig(FileModel):
@@ -57,6 +69,7 @@ class Rig(FileModel):
     likelihood_odds: Annotated[Number, Field(ge=1.0, le=20.0)] = Field(
         1.0, description="Factor on the odds of likelihoods, which are low on small or unusual fingers"
     )
+    tag_family: Text = Field("4x4_50", description="Family of the tags")
     left: RigJaw | None = Field(None, description="The left jaw")
     right: RigJaw | None = Field(None, description="The right jaw")
 
@@ -70,9 +83,12 @@ class Rig(FileModel):
         """Return the parameters of the detector that the rig sets, by their names."""
         jaws = {side: jaw for side in ("left", "right") if (jaw := getattr(self, side)) is not None}
         covered = [f"{side}/{name}" for side, jaw in jaws.items() for name in jaw.covered]
+        tags = {side: jaw.tag for side, jaw in jaws.items() if jaw.tag is not None}
         return {
             "T_gripper_camera": list(self.T_gripper_camera),
             **{f"{side}_turn": list(jaw.turn) for side, jaw in jaws.items()},
+            **{f"{side}_tag": [float(tag.id), *chain(*tag.corners)] for side, tag in tags.items()},
+            "tag_family": self.tag_family,
             "covered": covered or [""],
             "likelihood_odds": self.likelihood_odds,
             "detector.opening_max": self.half_opening + WIDER,
@@ -108,4 +124,5 @@ def write_rig(rig: Rig, path: Path) -> None:
 def describe_mount(mount: JawMount, names: tuple[str, ...]) -> RigJaw:
     """Return how a jaw with key points of some names is mounted."""
     covered = tuple(name for name in (*names, REFERENCE) if name in mount.covered)
-    return RigJaw(turn=tuple(round(float(number), 5) for number in mount.turn), covered=covered)
+    tag = mount.tag and RigTag(id=mount.tag.id, corners=mount.tag.corners.round(5).tolist())
+    return RigJaw(turn=tuple(round(float(number), 5) for number in mount.turn), covered=covered, tag=tag)

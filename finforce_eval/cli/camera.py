@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce.camera import CameraIntrinsics, project
 from finforce.gripper_frames import SIDES, read_extrinsics
 from finforce.transforms import pose_numbers
-from finforce_eval.cli.parser import BAG_HELP, CommandResult, add_rest_options
+from finforce_eval.cli.parser import BAG_HELP, CommandResult, add_rest_options, length_mm
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.check import FITTED, SEEN, draw_jaw, draw_points
 from finforce_eval.evaluation.keypoint_source import choose_images, parse_source
@@ -21,6 +22,7 @@ from finforce_eval.tasks import progress_bar
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints.build import ANY_FINGER
 from finforce_keypoints.detectors.side_plane import AnyFinger
+from finforce_keypoints.geometry.tags import FAMILIES, TagFinder, find_tag
 from finforce_keypoints.networks.side_network import SideNetwork
 from finforce_keypoints.parameters import NO_DEPTH
 from finforce_keypoints.placement import KEPT, POLISHED, ROUNDS, STARTS, STEPS, CameraPlacement, find_placement
@@ -38,6 +40,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", default="rig.yaml", metavar="FILE", help="rig file (rig.yaml)")
     text = "picture with the jaws drawn as found (the rig file's name with .png)"
     parser.add_argument("--overlay", metavar="PNG", help=text)
+    text = "numbers of the tags on the holders, which then tell where the jaws are under load"
+    parser.add_argument("--tags", nargs="+", type=int, default=[], metavar="ID", help=text)
+    text = "length of an edge of these tags' black square [mm] (16)"
+    parser.add_argument("--tag-size", type=length_mm, default=0.016, metavar="MM", help=text)
+    parser.add_argument("--tag-family", default=FAMILIES[0], choices=FAMILIES, help="family of the tags (4x4_50)")
     add_rest_options(parser, images=45)
 
 
@@ -56,8 +63,10 @@ def run(options: argparse.Namespace) -> CommandResult:
     guess = None if guess is None else read_extrinsics(guess)
     with progress_bar(STARTS + 2 * (KEPT * STEPS + POLISHED * ROUNDS * len(colors)), "step") as bar:
         found = find_placement(colors, recording.images.camera, jaws, locator, guess, progress=bar.update)
+    if options.tags:
+        found = add_tags(found, colors, recording.images.camera, options)
     output = Path(options.output)
-    rig = build_rig(found, recording, options.jaw)
+    rig = build_rig(found, recording, options.jaw, options.tag_family)
     write_rig(rig, output)
     picture = Path(options.overlay or output.with_suffix(".png"))
     import_cv2().imwrite(str(picture), draw_placement(found, colors[0], recording, jaws)[..., ::-1])
@@ -83,7 +92,33 @@ def choose_pictures(recording: Recording, count: int) -> list[NDArray]:
     return [image.color for _, image in images.at(first[chosen])]
 
 
-def build_rig(found: CameraPlacement, recording: Recording, jaw: str) -> Rig:
+def add_tags(
+    found: CameraPlacement, colors: list[NDArray], camera: CameraIntrinsics, options: argparse.Namespace
+) -> CameraPlacement:
+    """Return a placement with the tags that the options name, each on the jaw that it is nearer to.
+
+    Raises:
+        GeometryError: a tag is seen in no picture, or does not move with a jaw.
+        OptionError: the pictures are mirrored, or two tags are on one jaw.
+    """
+    finder = TagFinder(options.tag_family, options.tags)
+    seen = [finder.find(color) for color in colors]
+    if not any(seen) and any(finder.find(color[:, ::-1].copy()) for color in colors):
+        raise OptionError("the pictures are mirrored: their tags decode only when they are flipped")
+    mounts = dict(found.mounts)
+    for number in options.tags:
+        corners = {n: tags[number] for n, tags in enumerate(seen) if number in tags}
+        poses = {side: [found.pose(side, n) for n in corners] for side in mounts}
+        side, tag = find_tag(number, list(corners.values()), poses, options.tag_size, camera)
+        if mounts[side].tag is not None:
+            raise OptionError(
+                f"tags {mounts[side].tag.id} and {number} are both on the {side} jaw; expected one on each"
+            )
+        mounts[side] = replace(mounts[side], tag=tag)
+    return replace(found, mounts=mounts)
+
+
+def build_rig(found: CameraPlacement, recording: Recording, jaw: str, family: str) -> Rig:
     """Return the rig of what was found."""
     camera = recording.images.camera
     names = load_jaw(jaw).keypoint_names
@@ -94,6 +129,7 @@ def build_rig(found: CameraPlacement, recording: Recording, jaw: str) -> Rig:
         camera=RigCamera(**intrinsics, distortion=tuple(camera.distortion.tolist())),
         T_gripper_camera=tuple(round(float(number), 7) for number in pose_numbers(found.T_gripper_camera)),
         likelihood_odds=round(next(iter(found.mounts.values())).odds, 1),
+        tag_family=family,
         half_opening=round(float(np.mean(halves)), 5),
         **{side: describe_mount(mount, names) for side, mount in found.mounts.items()},
     )
@@ -110,7 +146,10 @@ def describe_placement(found: CameraPlacement, jaws) -> str:
         seen, count = int(mount.seen_points(jaws[side])[:-1].sum()), len(jaws[side].keypoints)
         turned = ", ".join(f"{angle:.1f}" for angle in np.degrees(mount.turn))
         places = ", ".join(f"{1e3 * origin:.1f}" for origin in found.origins[side])
-        lines.append(f"{side} jaw: {seen} of {count} key points to be seen, turned by {turned} degrees, at {places} mm")
+        tag = "" if mount.tag is None else f", tag {mount.tag.id}"
+        lines.append(
+            f"{side} jaw: {seen} of {count} key points to be seen, turned by {turned} degrees, at {places} mm{tag}"
+        )
     if found.rival > RIVAL:
         lines.append(
             f"WARNING: key points {found.rival:.1f} px beside explain the pictures nearly as well (one rib further?): "
@@ -125,4 +164,7 @@ def draw_placement(found: CameraPlacement, color: NDArray, recording: Recording,
     for side, jaw in jaws.items():
         draw_jaw(picture, jaw, found.pose(side, 0), recording.images.camera, FITTED)
         draw_points(picture, found.seen[side][0], SEEN)
+        if (tag := found.mounts[side].tag) is not None:
+            T = found.pose(side, 0)
+            draw_points(picture, project(tag.corners @ T[:3, :3].T + T[:3, 3], recording.images.camera), FITTED)
     return picture

@@ -27,6 +27,7 @@ from finforce_keypoints.geometry.depth import (
     weigh_depths,
 )
 from finforce_keypoints.geometry.jaw_pose import COVERED_STDDEV, Origin, OriginEstimator, OriginTrack, ReferencePatch
+from finforce_keypoints.geometry.tags import CORNER_STDDEV
 from finforce_keypoints.images import PixelDetection, RgbdImage, lie_inside
 from finforce_keypoints.parameters import DetectorSettings, JawMount
 
@@ -34,6 +35,7 @@ GATES = (5e-3, 2e-3)  # [m] off the known side plane, then off the one found, be
 LEAST_DEPTHS, LEAST_SHARE = 6, 0.4  # samples of the finger with depth that a key point needs, and their share of all
 DEPTH_NOISE = 0.06e-3  # [m] error of the depth that the samples of one point share
 MISFIT = 5.0  # standard deviations of its depth off the fit, above which a key point is not there
+TAGGED_STDDEV = 0.5e-3  # [m] of a shift that all points share beside a tag: holder and network give by so much
 MOST_SLIP = 6e-3  # [m] along its z that a jaw in a holder is off its place; more is another camera or rig
 _LEAST_SEEN = 3  # points, or all there are: fewer likely ones are no jaw
 _LEAST_FOUND = 1 / 3  # share of the points that have to be likely where no jaw was known before
@@ -71,13 +73,17 @@ class JawKeypoints:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Seen:
-    """One image, what was found in it, which points (K + 1,) are likely, their rays (K + 1, 3) and these' errors."""
+    """One image, what was found in it, which points (K + 1,) are likely, their rays (K + 1, 3) and these' errors.
+
+    `tag` are the rays (4, 3) to the corners of the jaw's tag, None where none is seen.
+    """
 
     image: RgbdImage
     detection: PixelDetection
     likely: NDArray
     rays: NDArray
     ray_stddev: NDArray
+    tag: NDArray | None
 
 
 class JawLocalizer:
@@ -93,7 +99,7 @@ class JawLocalizer:
         self._origin = OriginEstimator(jaw, T_gripper_camera, settings, self._mount)
         self._track = OriginTrack(settings, self._origin.largest_stddev)
         self._patch, self._rest_check = ReferencePatch(jaw), _RestCheck(jaw.keypoints)
-        self._unconfirmed, self._slip, self._astray = 0, 0.0, 0.0
+        self._unconfirmed, self._slip, self._astray, self._is_tag_elsewhere = 0, 0.0, 0.0, False
         self._samples = build_side_samples(jaw)
         self._rest = np.vstack((jaw.keypoints, jaw.reference_point))
         self._model = SideModel(places=self._rest[:, ::2])
@@ -108,11 +114,13 @@ class JawLocalizer:
         self._track.reset()
         self._patch.reset()
         self._rest_check.reset()
-        self._unconfirmed, self._slip, self._astray = 0, 0.0, 0.0
+        self._unconfirmed, self._slip, self._astray, self._is_tag_elsewhere = 0, 0.0, 0.0, False
 
     @property
     def warning(self) -> str:
         """What is suspicious about this jaw, in a sentence; "" for nothing."""
+        if self._is_tag_elsewhere:
+            return f"tag {self._mount.tag.id} is not where the rig has it: is it on the other side, or of another rig?"
         if abs(self._astray) > MOST_SLIP:
             return (
                 f"the jaw lies {1e3 * self._astray:+.0f} mm along its z from where the rig has it: is the image zoomed "
@@ -158,23 +166,39 @@ class JawLocalizer:
             stddev=np.full(count, 0.5),
         )
 
-    def expect(self, stamp: float) -> NDArray | None:
-        """Return T_camera_jaw (4, 4) where the jaw should be at a time [s]; None when it is lost."""
-        forecast = self._track.forecast(stamp)
-        return None if forecast is None else self._origin.place(replace(forecast, slip=self._slip))
+    def expect(self, image: RgbdImage, corners: NDArray | None) -> NDArray | None:
+        """Return T_camera_jaw (4, 4) where the jaw should be in an image; None when it is lost.
 
-    def locate(self, image: RgbdImage, detection: PixelDetection | None, scale: DepthScale) -> JawKeypoints | None:
+        Args:
+            image: the image.
+            corners: of its tag (4, 2) [px]; None where it is not seen.
+        """
+        forecast = self._track.forecast(image.stamp)
+        if forecast is not None:
+            return self._origin.place(replace(forecast, slip=self._slip))
+        if corners is None:
+            return None
+        nothing = np.full((len(self._rest), 3), np.nan)
+        found = self._origin.measure(
+            nothing, nothing[:, 0], rays_from_pixels(corners, image.camera), _tag_stddev(image)
+        )
+        return None if found is None else self._origin.place(found)
+
+    def locate(
+        self, image: RgbdImage, detection: PixelDetection | None, scale: DepthScale, corners: NDArray | None = None
+    ) -> JawKeypoints | None:
         """Return the jaw's key points, None when nobody knows where the jaw is.
 
         Args:
             image: the image, checked.
             detection: the pixels found; None when the pixel_detector saw nothing of the jaw.
             scale: what is known of the depth image's scale beforehand.
+            corners: of its tag (4, 2) [px]; None where it is not seen.
         """
         if detection is None:
             self._track.update(image.stamp, None)
             return None
-        seen = self._look(image, detection)
+        seen = self._look(image, detection, corners)
         measured = self._measure(seen)
         origin = self._track.update(image.stamp, measured)
         if measured is not None:
@@ -189,7 +213,7 @@ class JawLocalizer:
             return None
         return keypoints
 
-    def _look(self, image: RgbdImage, detection: PixelDetection) -> _Seen:
+    def _look(self, image: RgbdImage, detection: PixelDetection, corners: NDArray | None) -> _Seen:
         """Return the rays to the points that were found, and which of these the pixel detector believes in."""
         inside = lie_inside(image, detection.pixels)
         likely = detection.likelihood >= self._settings.likelihood
@@ -199,17 +223,20 @@ class JawLocalizer:
             likely=likely & inside & np.isfinite(detection.stddev) & self._visible,
             rays=rays_from_pixels(np.where(inside[:, None], detection.pixels, np.nan), image.camera),
             ray_stddev=detection.stddev / np.sqrt(image.camera.fx * image.camera.fy),
+            tag=None if corners is None else rays_from_pixels(corners, image.camera),
         )
 
     def _measure(self, seen: _Seen) -> Origin | None:
         """Return where one image shows the jaw; None where it does not."""
-        measured = self._origin.measure(np.where(seen.likely[:, None], seen.rays, np.nan), seen.ray_stddev)
-        if measured is None or not self._is_there(seen.likely):
+        self._is_tag_elsewhere = seen.tag is not None and self._origin.is_elsewhere(seen.tag)
+        rays = np.where(seen.likely[:, None], seen.rays, np.nan)
+        measured = self._origin.measure(rays, seen.ray_stddev, seen.tag, _tag_stddev(seen.image))
+        if measured is None or self._is_tag_elsewhere or not self._is_there(seen.likely):
             return None
         self._astray = measured.slip
         if abs(measured.slip) > MOST_SLIP:
             return None
-        if seen.likely[-1]:
+        if seen.likely[-1] and not self._mount.is_held:
             return self._patch.refine(seen.image.color, seen.image.camera, measured, self._origin.place)
         return measured
 
@@ -226,7 +253,8 @@ class JawLocalizer:
         late = self._find_delays(seen, T_camera_jaw)
         points[:, 0] -= self._sign * self._track.speed * (late - late[-1])
         # where a holder covers what is rigid, the place was found by points that bend: it tells nothing of the bending
-        is_held = not self._visible[-1]
+        is_held = self._mount.is_held
+        common = COVERED_STDDEV if seen.tag is None else np.hypot(origin.stddev, TAGGED_STDDEV)
         y_stddev = np.where(is_held, self._model.relief, fit.stddev)
         stddev = compute_stddev(sight, depths, y_stddev, seen.ray_stddev)
         stddev[:, 0] = np.hypot(stddev[:, 0], 0.0 if is_held else origin.stddev)
@@ -243,7 +271,7 @@ class JawLocalizer:
             T_camera_jaw=self._origin.place(replace(origin, x=origin.x - self._track.speed * late[-1])),
             reasons=reasons,
             scale=fit.scale,
-            shared=COVERED_STDDEV if is_held else 0.0,
+            shared=float(common) if is_held else 0.0,
         )
 
     def _find_delays(self, seen: _Seen, T_camera_jaw: NDArray) -> NDArray:
@@ -313,6 +341,11 @@ class JawLocalizer:
             outside,
         )
         return np.where(self._visible, np.select(against, REASONS[:-1], default=""), REASONS[-1])[:-1]
+
+
+def _tag_stddev(image: RgbdImage) -> float:
+    """Return the standard deviation of rays to a tag's corners [-]."""
+    return float(CORNER_STDDEV / np.sqrt(image.camera.fx * image.camera.fy))
 
 
 IMAGES = 15  # over which displacements are averaged

@@ -66,7 +66,7 @@ class Origin:
 
 
 class OriginEstimator:
-    """Finds the origin of one jaw, whose rotation is known, from rays to its points.
+    """Finds the origin of one jaw, whose rotation is known, from rays to its points and the corners of its tag.
 
     A point of the rigid jaw moves on a line q(x) = p + x a, a the closing axis; it is where it comes nearest to the
     ray r: the x for which r_xy q_z - q_xy, its distance from the ray [m], is least. All in the camera frame.
@@ -75,11 +75,13 @@ class OriginEstimator:
     def __init__(
         self, jaw: Jaw, T_gripper_camera: NDArray, settings: DetectorSettings, mount: JawMount | None = None
     ) -> None:
-        """Keep the lines on which the jaw's points move, the reference point last."""
+        """Keep the lines on which the jaw's points move, the reference point last, then the tag's corners."""
         mount = mount or JawMount()
         self._tolerance = settings.reference_tolerance
         self._T_camera_middle = jaw_in_camera(T_gripper_camera, jaw.side, 0.0, mount.turn)
-        points = np.vstack((jaw.keypoints, jaw.reference_point))
+        corners = np.zeros((0, 3)) if mount.tag is None else mount.tag.corners
+        self._count = len(jaw.keypoints) + 1
+        points = np.vstack((jaw.keypoints, jaw.reference_point, corners))
         self._starts = points @ self._T_camera_middle[:3, :3].T + self._T_camera_middle[:3, 3]
         self._axis = T_gripper_camera[0, :3].copy()
         bent = _RIGID_STDDEV * (jaw.keypoints[:, 2] / _BENT_AT) ** 2
@@ -88,10 +90,11 @@ class OriginEstimator:
         self._low, self._high = sorted((sign * settings.opening_min, sign * settings.opening_max))
         self._motions: NDArray | None = None
         self.largest_stddev = _ORIGIN_STDDEV
-        if not mount.seen_points(jaw)[-1]:
+        if mount.is_held:
             bends = np.insert(find_motions(jaw)[:BENDS], 1, 0.0, axis=2) @ self._T_camera_middle[:3, :3].T
             slip = np.broadcast_to(SLIP * self._T_camera_middle[:3, 2], (1, *points.shape))
-            self._motions = np.concatenate((slip, np.append(bends, np.zeros((BENDS, 1, 3)), axis=1)))
+            rigid = np.zeros((BENDS, 1 + len(corners), 3))
+            self._motions = np.concatenate((slip, np.append(bends, rigid, axis=1)))
             self.largest_stddev = COVERED_STDDEV
 
     @property
@@ -105,7 +108,15 @@ class OriginEstimator:
         T[:3, 3] += origin.x * self._axis + origin.slip * T[:3, 2]
         return T
 
-    def measure(self, rays: NDArray, stddev: NDArray) -> Origin | None:
+    def is_elsewhere(self, tag: NDArray) -> bool:
+        """Say whether rays (4, 3) to the tag's corners pass where no jaw of the opening range has them."""
+        rays = np.vstack((np.full((self._count, 3), np.nan), tag))
+        x, _, off = np.median(self._solve(rays, np.ones(len(rays)))[:, self._count :], axis=1)
+        return not (self._low <= x <= self._high and off <= 2.0 * self._tolerance)
+
+    def measure(
+        self, rays: NDArray, stddev: NDArray, tag: NDArray | None = None, tag_stddev: float = 0.0
+    ) -> Origin | None:
         """Return the origin that rays show, None when they show none within the opening range.
 
         The reference point decides; without it, the key points near the clamped base do, less exactly as they bend.
@@ -115,8 +126,16 @@ class OriginEstimator:
         Args:
             rays: (K + 1, 3) through the jaw's points, camera frame, z = 1; NaN: not seen.
             stddev: (K + 1,) of the rays' x and y [-]: that of the pixels by the focal length.
+            tag: rays (4, 3) to the corners of the jaw's tag; None where it is not seen.
+            tag_stddev: of these rays' x and y [-].
         """
         if self._motions is not None:
+            corners = len(self._starts) - self._count
+            unseen = np.full((corners, 3), np.nan)
+            rays, stddev = (
+                np.vstack((rays, unseen if tag is None else tag)),
+                np.append(stddev, np.full(corners, tag_stddev)),
+            )
             return self._measure_bent(rays, stddev)
         x, error, off = self._solve(rays, stddev)
         with np.errstate(invalid="ignore"):
@@ -144,7 +163,7 @@ class OriginEstimator:
         with np.errstate(invalid="ignore"):
             x, _, off = self._solve(rays, stddev)
             seen = off <= 2.0 * self._tolerance
-        if seen.sum() < _LEAST_BENT:
+        if seen.sum() < _LEAST_BENT and not seen[self._count :].any():
             return None
         middle = float(np.median(x[seen]))
         points = self._starts[seen] + middle * self._axis

@@ -30,7 +30,7 @@ from finforce_keypoints.placement import (
     find_placement,
     measure_rival,
 )
-from finforce_keypoints.rig import Rig, RigCamera, RigJaw, read_rig, write_rig
+from finforce_keypoints.rig import Rig, RigCamera, RigJaw, RigTag, read_rig, write_rig
 from finforce_sim.sensor import build_d405_vga
 
 CAMERA = build_d405_vga()
@@ -46,7 +46,11 @@ RIG = Rig(
     T_gripper_camera=tuple(pose_numbers(ROBOT_CAMERA)),
     half_opening=0.055,
     likelihood_odds=3.0,
-    left=RigJaw(turn=(0.0, 0.05, 0.0), covered=("reference",)),
+    left=RigJaw(
+        turn=(0.0, 0.05, 0.0),
+        covered=("reference",),
+        tag=RigTag(id=3, corners=((0.0, 0.01, 0.0), (0.01, 0.01, 0.0), (0.01, 0.01, -0.01), (0.0, 0.01, -0.01))),
+    ),
 )
 
 
