@@ -13,12 +13,12 @@ from finforce_keypoints.detectors.dots import DotDetector, DotSettings
 from finforce_keypoints.detectors.side_plane import AnyFinger, OneFinger, SidePlaneDetector
 from finforce_keypoints.detectors.whole_image import WholeImageDetector
 from finforce_keypoints.errors import ModelError
-from finforce_keypoints.geometry.tags import TagFinder
 from finforce_keypoints.images import ImageWatch, PixelDetector
 from finforce_keypoints.networks.metadata import build_name_map, parse_mapping
 from finforce_keypoints.networks.model import KeypointModel
 from finforce_keypoints.networks.side_network import COARSE, SideNetwork
 from finforce_keypoints.parameters import ALIGNED, DetectorParameters, DetectorSettings, JawMount, find_mounts
+from finforce_keypoints.tags import TagFinder
 
 MODELS = Path(__file__).parent / "models"
 ANY_FINGER, BENCH = MODELS / "side_plane", MODELS / "plane"

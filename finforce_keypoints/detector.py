@@ -18,9 +18,9 @@ from finforce_keypoints.geometry.depth import DepthScale
 from finforce_keypoints.geometry.jaw_localizer import JawKeypoints, JawLocalizer
 from finforce_keypoints.geometry.side_picture import find_side
 from finforce_keypoints.geometry.stillness import StillWatch
-from finforce_keypoints.geometry.tags import TagFinder
 from finforce_keypoints.images import ImageWatch, PixelDetection, PixelDetector, RgbdImage, check_image
 from finforce_keypoints.parameters import DetectorSettings, JawMount
+from finforce_keypoints.tags import TagFinder
 
 __all__ = ["JawKeypoints", "KeypointDetector"]
 

@@ -15,7 +15,7 @@ from finforce.gripper_frames import ROBOT_CAMERA
 from finforce.settings import GripperParameters, check_bounds, setting
 from finforce.transforms import pose_from_quaternion, pose_numbers
 from finforce_keypoints.errors import DetectorSettingsError, GeometryError
-from finforce_keypoints.geometry.tags import FAMILIES, Tag, read_tag
+from finforce_keypoints.tags import FAMILIES, Tag, read_tag
 
 if TYPE_CHECKING:
     from finforce_ifea.jaw.jaw import Jaw

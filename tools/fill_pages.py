@@ -149,7 +149,11 @@ def list_parameters() -> dict[str, str]:
 def _show(default: Any) -> str:
     """Return a default as a table shows it."""
     if isinstance(default, tuple):
-        return ", ".join(f"{part:.4g}" if isinstance(part, float) else f"`{part}`" for part in default if part != "")
+        return ", ".join(
+            f"{part:.4g}".replace("nan", "NaN") if isinstance(part, float) else f"`{part}`"
+            for part in default
+            if part != ""
+        )
     return "NaN" if default != default else f"`{default}`" if default != "" else ""
 
 

@@ -22,11 +22,11 @@ from finforce_eval.tasks import progress_bar
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints.build import ANY_FINGER
 from finforce_keypoints.detectors.side_plane import AnyFinger
-from finforce_keypoints.geometry.tags import FAMILIES, TagFinder, find_tag
 from finforce_keypoints.networks.side_network import SideNetwork
 from finforce_keypoints.parameters import NO_DEPTH
 from finforce_keypoints.placement import KEPT, POLISHED, ROUNDS, STARTS, STEPS, CameraPlacement, find_placement
 from finforce_keypoints.rig import Rig, RigCamera, describe_mount, write_rig
+from finforce_keypoints.tags import FAMILIES, TagFinder, find_tag
 
 PICTURES = 4  # of the images, which are compared
 RIVAL = 3.0  # [px] between two places of the key points, of which one has to be wrong

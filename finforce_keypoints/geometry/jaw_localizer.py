@@ -27,9 +27,9 @@ from finforce_keypoints.geometry.depth import (
     weigh_depths,
 )
 from finforce_keypoints.geometry.jaw_pose import COVERED_STDDEV, Origin, OriginEstimator, OriginTrack, ReferencePatch
-from finforce_keypoints.geometry.tags import CORNER_STDDEV
 from finforce_keypoints.images import PixelDetection, RgbdImage, lie_inside
 from finforce_keypoints.parameters import DetectorSettings, JawMount
+from finforce_keypoints.tags import CORNER_STDDEV
 
 GATES = (5e-3, 2e-3)  # [m] off the known side plane, then off the one found, beyond which depth is not the finger's
 LEAST_DEPTHS, LEAST_SHARE = 6, 0.4  # samples of the finger with depth that a key point needs, and their share of all

@@ -13,10 +13,10 @@ from finforce_keypoints.detector import KeypointDetector
 from finforce_keypoints.errors import DetectorSettingsError, GeometryError
 from finforce_keypoints.geometry.jaw_localizer import TAGGED_STDDEV
 from finforce_keypoints.geometry.jaw_pose import COVERED_STDDEV, OriginEstimator
-from finforce_keypoints.geometry.tags import Tag, TagFinder, find_tag, place_corners
 from finforce_keypoints.geometry.template import find_motions
 from finforce_keypoints.images import PixelDetection, RgbdImage
 from finforce_keypoints.parameters import DetectorParameters, DetectorSettings, JawMount, find_mounts
+from finforce_keypoints.tags import Tag, TagFinder, find_tag, place_corners
 from finforce_sim.sensor import build_d405_vga
 
 CAMERA, SIZE, FAMILY = build_d405_vga(), 0.016, "4x4_50"
