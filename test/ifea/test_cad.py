@@ -241,11 +241,20 @@ def test_a_tilted_base_is_held_from_band_to_band(tmp_path, tilt):
 
 
 def test_a_tilted_base_below_the_finger_is_no_wider_body():
-    drawn = draw_triangle(-1.2, LEVEL).buffer(-4e-4).buffer(4e-4)
+    drawn = draw_triangle(-0.95, LEVEL).buffer(-4e-4).buffer(4e-4)
     rounded = drawn.intersection(shapely.Polygon(drawn.exterior).buffer(-3e-3).buffer(3e-3))
     finger = recognize(rounded, 0.02, Overrides())
-    assert finger.clamp_slope == pytest.approx(-1.2, abs=0.01)
+    assert finger.clamp_slope == pytest.approx(-0.95, abs=0.01)
     assert "wider than the blade" not in " ".join(finger.notes)
+
+
+def test_the_long_steep_side_of_a_hull_is_not_its_base():
+    hull = shapely.Polygon([(14.0, 0.0), (14.0, 90.0), (-17.0, 23.0), (-1.0, 0.0)])
+    room = hull.buffer(-1.6, join_style="mitre").intersection(shapely.box(-50.0, 1.6, 50.0, 82.0))
+    for z in (24.0, 38.0, 52.0):
+        room = room.difference(shapely.box(-50.0, z, 50.0, z + 1.2))
+    section = shapely.affinity.scale(hull.difference(room), 1e-3, 1e-3, origin=(0, 0))
+    assert recognize(section, 0.02, Overrides()).clamp_slope == 0.0
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.3])

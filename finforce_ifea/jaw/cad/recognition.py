@@ -447,14 +447,17 @@ def _find_straight(points: NDArray) -> NDArray:
 
 
 def _find_base(polygon: shapely.Polygon, direction: NDArray) -> tuple[NDArray, NDArray]:
-    """Return the start of the longest straight edge at the base (2,) [m], and the way to its end."""
+    """Return the start of the longest straight edge at the base (2,) [m], and the way to its end.
+
+    One that rises by more than 45 degrees is a side, wherever there is another.
+    """
     ring = np.array(polygon.exterior.simplify(2e-5).coords)
     begin, end = ring[:-1], ring[1:]
     height = 0.5 * (begin + end) @ direction
     low = height < height.min() + 0.25 * np.ptp(height)
     along = end - begin
-    across = np.abs(along @ [-direction[1], direction[0]])
-    longest = np.where(low, across, -1.0).argmax()
+    across, rise = np.abs(along @ [-direction[1], direction[0]]), np.abs(along @ direction)
+    longest = max(np.flatnonzero(low), key=lambda edge: (across[edge] > rise[edge], across[edge]))
     return begin[longest], along[longest]
 
 
