@@ -115,7 +115,7 @@ class KeypointDetector:
         self._sights: dict[float, _Sight] = {}
         self._searches = dict.fromkeys(self._jaws, 0)
         self._searched = dict.fromkeys(self._jaws, -np.inf)
-        self.was_still = False
+        self.was_still = self._is_mirrored = False
         self.counts: Counter[str] = Counter()
 
     def adjust(self, settings: DetectorSettings) -> None:
@@ -157,11 +157,6 @@ class KeypointDetector:
         if self._is_mirrored:
             said = {side: ["the image is mirrored: its tags decode only when it is flipped"] for side in said}
         return {side: "; ".join(texts) for side, texts in said.items() if texts}
-
-    @property
-    def _is_mirrored(self) -> bool:
-        """Whether the images show their tags mirrored."""
-        return self._tags is not None and self._tags.is_mirrored
 
     @property
     def _off_centre(self) -> float:
@@ -237,9 +232,18 @@ class KeypointDetector:
         still = watch.confirm(image) if is_watched else None
         if still is not None:
             return _Sight(is_watched=True, still=still, detections={})
-        tags = self._tags.find(image.color) if self._tags is not None else {}
+        tags = self._find_tags(image) if self._tags is not None else {}
         detections = self._pixel_detector.detect(image, self._expect(image, tags))
         return _Sight(is_watched=is_watched, still=None, detections=detections, tags=tags)
+
+    def _find_tags(self, image: RgbdImage) -> Mapping[int, NDArray]:
+        """Return the tags seen; notice whether the mirrored image has them on the jaws, as no mirror in view does."""
+        tags = self._tags.find(image.color)
+        self._is_mirrored = any(
+            (corners := self._corners(side, self._tags.mirrored)) is not None and jaw.has_tag_at(image, corners)
+            for side, jaw in self._jaws.items()
+        )
+        return tags
 
     def _expect(self, image: RgbdImage, tags: Mapping[int, NDArray]) -> dict[str, NDArray | None]:
         """Return where the jaws should be in an image, None for a lost one; one not worth a search yet is absent."""

@@ -41,7 +41,7 @@ class TagFinder:
     """Finds tags of some numbers in the images of one camera.
 
     Attributes:
-        is_mirrored: whether they have been unseen for long and are there in the mirrored picture.
+        mirrored: corners (4, 2) [px] by number of those in the mirrored image, looked for while no tag is seen.
     """
 
     def __init__(self, family: str, ids: Sequence[int]) -> None:
@@ -55,7 +55,7 @@ class TagFinder:
     def reset(self) -> None:
         """Forget where they were."""
         self._last: dict[int, NDArray] = {}
-        self._unseen, self.is_mirrored = 0, False
+        self._unseen, self.mirrored = 0, {}
 
     def find(self, color: NDArray) -> dict[int, NDArray]:
         """Return the corners (4, 2) [px] by number of the tags seen in an image (h, w, 3); raise no error."""
@@ -66,9 +66,9 @@ class TagFinder:
             found = self._detect(grey)
         self._last, self._unseen = found, 0 if found else self._unseen + 1
         if found:
-            self.is_mirrored = False
+            self.mirrored = {}
         elif self._unseen % _UNSEEN == 1:
-            self.is_mirrored = bool(self._detect(cv2.flip(grey, 1)))
+            self.mirrored = self._detect(cv2.flip(grey, 1))
         return found
 
     def _detect_near(self, grey: NDArray) -> dict[int, NDArray]:

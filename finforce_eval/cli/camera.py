@@ -57,14 +57,14 @@ def run(options: argparse.Namespace) -> CommandResult:
     source = replace(source, choice=replace(source.choice, is_cut=True))
     (recording,) = read_recordings(options.bags, source.choice, sides, strict=source.strict)
     colors = choose_pictures(recording, options.images)
+    seen = find_tags(colors, options)
     jaws = {side: load_jaw(options.jaw, side) for side in SIDES if side in recording.jaws}
     locator = AnyFinger(SideNetwork(source.parameters.get("model") or ANY_FINGER), jaws)
     guess = source.node_parameters(recording).get("T_gripper_camera")
     guess = None if guess is None else read_extrinsics(guess)
     with progress_bar(STARTS + 2 * (KEPT * STEPS + POLISHED * ROUNDS * len(colors)), "step") as bar:
         found = find_placement(colors, recording.images.camera, jaws, locator, guess, progress=bar.update)
-    if options.tags:
-        found = add_tags(found, colors, recording.images.camera, options)
+    found = add_tags(found, seen, recording.images.camera, options)
     output = Path(options.output)
     rig = build_rig(found, recording, options.jaw, options.tag_family)
     write_rig(rig, output)
@@ -92,19 +92,30 @@ def choose_pictures(recording: Recording, count: int) -> list[NDArray]:
     return [image.color for _, image in images.at(first[chosen])]
 
 
+def find_tags(colors: list[NDArray], options: argparse.Namespace) -> list[dict[int, NDArray]]:
+    """Return the corners (4, 2) [px] by number of the tags that the options name, in each of some pictures.
+
+    Raises:
+        OptionError: the pictures are mirrored.
+    """
+    if not options.tags:
+        return []
+    finder = TagFinder(options.tag_family, options.tags)
+    seen = [finder.find(color) for color in colors]
+    if not any(seen) and any(finder.find(color[:, ::-1].copy()) for color in colors):
+        raise OptionError("the pictures are mirrored: their tags decode only when they are flipped")
+    return seen
+
+
 def add_tags(
-    found: CameraPlacement, colors: list[NDArray], camera: CameraIntrinsics, options: argparse.Namespace
+    found: CameraPlacement, seen: list[dict[int, NDArray]], camera: CameraIntrinsics, options: argparse.Namespace
 ) -> CameraPlacement:
     """Return a placement with the tags that the options name, each on the jaw that it is nearer to.
 
     Raises:
         GeometryError: a tag is seen in no picture, or does not move with a jaw.
-        OptionError: the pictures are mirrored, or two tags are on one jaw.
+        OptionError: two tags are on one jaw.
     """
-    finder = TagFinder(options.tag_family, options.tags)
-    seen = [finder.find(color) for color in colors]
-    if not any(seen) and any(finder.find(color[:, ::-1].copy()) for color in colors):
-        raise OptionError("the pictures are mirrored: their tags decode only when they are flipped")
     mounts = dict(found.mounts)
     for number in options.tags:
         corners = {n: tags[number] for n, tags in enumerate(seen) if number in tags}

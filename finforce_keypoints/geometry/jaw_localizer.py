@@ -184,6 +184,10 @@ class JawLocalizer:
         )
         return None if found is None else self._origin.place(found)
 
+    def has_tag_at(self, image: RgbdImage, corners: NDArray) -> bool:
+        """Whether a jaw of the opening range has its tag at corners (4, 2) [px] of an image."""
+        return not self._origin.is_elsewhere(rays_from_pixels(corners, image.camera))
+
     def locate(
         self, image: RgbdImage, detection: PixelDetection | None, scale: DepthScale, corners: NDArray | None = None
     ) -> JawKeypoints | None:

@@ -1,5 +1,6 @@
 """Claims about tags on the holders of jaws."""
 
+from argparse import Namespace
 from dataclasses import replace
 
 import cv2
@@ -8,6 +9,8 @@ import pytest
 
 from finforce.camera import project, rays_from_pixels
 from finforce.gripper_frames import ROBOT_CAMERA, jaw_in_camera
+from finforce_eval.cli.camera import add_tags, find_tags
+from finforce_eval.errors import OptionError
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints.detector import KeypointDetector
 from finforce_keypoints.errors import DetectorSettingsError, GeometryError
@@ -16,6 +19,8 @@ from finforce_keypoints.geometry.jaw_pose import COVERED_STDDEV, OriginEstimator
 from finforce_keypoints.geometry.template import find_motions
 from finforce_keypoints.images import PixelDetection, RgbdImage
 from finforce_keypoints.parameters import DetectorParameters, DetectorSettings, JawMount, find_mounts
+from finforce_keypoints.placement import CameraPlacement
+from finforce_keypoints.rig import describe_mount
 from finforce_keypoints.tags import Tag, TagFinder, find_tag, place_corners
 from finforce_sim.sensor import build_d405_vga
 
@@ -91,8 +96,8 @@ def test_tags_are_found_by_number_again_near_where_they_were_and_mirrored_ones_a
     assert list(TagFinder(FAMILY, (1,)).find(picture(*corners))) == [1]
     assert not TagFinder("5x5_50", (0, 1)).find(picture(*corners))
     mirrored = np.ascontiguousarray(picture(*corners)[:, ::-1])
-    assert not finder.find(mirrored) and finder.is_mirrored
-    assert finder.find(picture(*corners)) and not finder.is_mirrored
+    assert not finder.find(mirrored) and sorted(finder.mirrored) == [0, 1]
+    assert finder.find(picture(*corners)) and not finder.mirrored
 
 
 def test_a_tag_is_put_on_the_jaw_that_carries_it():
@@ -107,6 +112,23 @@ def test_a_tag_is_put_on_the_jaw_that_carries_it():
         find_tag(3, [], {"left": [], "right": []}, SIZE, CAMERA)
     with pytest.raises(GeometryError, match="expected those of a square tag"):
         place_corners(seen[0] * [1.0, 1.5], SIZE, CAMERA)
+
+
+def test_finforce_camera_writes_tags_into_the_rig():
+    mounts, origins = {side: JawMount() for side in PLACES}, {side: np.array([X[side]] * 2) for side in PLACES}
+    placement = CameraPlacement(
+        T_gripper_camera=ROBOT_CAMERA, mounts=mounts, origins=origins, contrast=1.0, residual=0.0, seen={}
+    )
+    options = Namespace(tags=[0, 1], tag_family=FAMILY, tag_size=SIZE)
+    color = picture(*(see(tag_of(side).corners, pose(side)) for side in PLACES))
+    placed = add_tags(placement, find_tags([color] * 2, options), CAMERA, options)
+    for side, number in PLACES.items():
+        tag = describe_mount(placed.mounts[side], NAMES).tag
+        assert tag.id == number and np.abs(np.array(tag.corners) - tag_of(side).corners).max() < 0.5e-3
+    with pytest.raises(OptionError, match="the pictures are mirrored"):
+        find_tags([np.ascontiguousarray(color[:, ::-1])], options)
+    with pytest.raises(OptionError, match="tags 0 and 0 are both on the left jaw"):
+        add_tags(placed, find_tags([color] * 2, options), CAMERA, options)
 
 
 @pytest.fixture
@@ -153,9 +175,12 @@ def test_tags_on_the_wrong_sides_and_mirrored_images_are_named_and_give_no_key_p
     corners = [see(tag_of(side).corners, pose(side)) for side in ("right", "left")]
     found, warnings, _ = look(picture(*corners))
     assert not found and all("is not where the rig has it" in warnings[side] for side in PLACES)
-    mirrored = np.ascontiguousarray(picture(*corners)[:, ::-1])
+    mirrored = np.ascontiguousarray(picture(*corners[::-1])[:, ::-1])
     found, warnings, _ = look(mirrored)
     assert not found and all("mirrored" in warnings[side] for side in PLACES)
+    beside = np.ascontiguousarray(picture(*(there + [0.0, 200.0] for there in corners[::-1]))[:, ::-1])
+    found, warnings, _ = look(beside)  # as in a mirror beside the jaws
+    assert len(found) == 2 and not warnings
 
 
 @pytest.mark.parametrize("numbers", [(), (1.0,), (0.5, *[0.0] * 12), (-1.0, *[0.0] * 12), (0.0, *[np.nan] * 12)])
