@@ -6,7 +6,7 @@ import os
 import re
 from collections import deque
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -85,12 +85,15 @@ class Footage:
             )
 
     def _shoot_ahead(self) -> Iterator[tuple[TwinState, Shot]]:
-        """Yield states and their images, of which a few are rendered at once."""
-        pool, coming, before = ThreadPoolExecutor(WORKERS), deque(), None
+        """Yield states and their images, of which a few are rendered at once; a view stays while nothing moves."""
+        pool, coming, before, stood, view = ThreadPoolExecutor(WORKERS), deque(), None, False, None
         try:
             for state in self._gripper.states():
-                coming.append((state, pool.submit(self._photographer.shoot, state, before)))
-                before = state
+                stands = state.looks_like(before)
+                if not (stands and stood):  # the upper rows of a rolling shutter show the state before
+                    view = pool.submit(self._photographer.look, state, before)
+                coming.append((state, pool.submit(self._shoot, state, before, view)))
+                before, stood = state, stands
                 if len(coming) > WORKERS:
                     taken, shot = coming.popleft()
                     yield taken, shot.result()
@@ -98,6 +101,9 @@ class Footage:
                 yield taken, shot.result()
         finally:
             pool.shutdown(cancel_futures=True)
+
+    def _shoot(self, state: TwinState, before: TwinState | None, view: Future[Shot]) -> Shot:
+        return self._photographer.shoot(state, before, view.result())
 
 
 def build_footage(

@@ -51,6 +51,13 @@ class TwinState:
     T_gripper_object: NDArray | None
     gravity: NDArray
 
+    def looks_like(self, other: TwinState | None) -> bool:
+        """Say whether jaws and object are where they are in another state; forces may differ."""
+        if other is None or not np.array_equal(self.T_gripper_object, other.T_gripper_object):
+            return False
+        pairs = [(jaw, other.jaws[side]) for side, jaw in self.jaws.items()]
+        return all(one.vertices is two.vertices and one.origin_x == two.origin_x for one, two in pairs)
+
     def blend(self, other: TwinState, share: float) -> TwinState:
         """Return the state at a share of the way to another: x = (1 - s) x + s x_other; turns the short way."""
         pose = self.T_gripper_object

@@ -136,9 +136,14 @@ class Photographer:
         self._look: Lighting = draw_look(rng, assembly.scenario.light)
         self._T_camera_gripper = invert_pose(self.T_gripper_camera)
 
-    def shoot(self, state: TwinState, before: TwinState | None = None) -> Shot:
-        """Return the image of a state, given that of the image before; the same seed and stamp give the same noise."""
-        return self.develop(self.look(state, before), state.stamp, self._smear(state, before))
+    def shoot(self, state: TwinState, before: TwinState | None = None, view: Shot | None = None) -> Shot:
+        """Return the image of a state, given that of the image before; the same seed and stamp give the same noise.
+
+        A view of both that `look` gave before, perhaps at other forces, saves rendering it.
+        """
+        view = view or self.look(state, before)
+        jaws = {side: replace(view.jaws[side], force=jaw.force, torque=jaw.torque) for side, jaw in state.jaws.items()}
+        return self.develop(replace(view, jaws=jaws), state.stamp, self._smear(state, before))
 
     def look(self, state: TwinState, before: TwinState | None = None) -> Shot:
         """Return what a perfect sensor would see of a state; its upper rows are of a moment before."""

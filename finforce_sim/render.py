@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
+import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from finforce.camera import CameraIntrinsics, compute_rays, rays_from_pixels
 from finforce.optional import import_open3d
 
+_OPTIONS = {"cache": True, "error_model": "numpy", "nogil": True}
 TEXTURE_SIZE = 384  # [px] of the square background picture
 TEXTURE_SPAN = 0.6  # [m] that it covers before it repeats
 EXPOSURE_TARGET = 0.28  # mean linear brightness that automatic exposure aims at ...
@@ -74,6 +77,12 @@ class Lighting:
     background_distance: float
     exposure: Exposure
 
+    @cached_property
+    def backdrop(self) -> NDArray:
+        """The background's light (s * s, 3), row by row."""
+        total = self.ambient + sum(0.5 * lamp.color for lamp in self.lights)
+        return (self.background * total).reshape(-1, 3)
+
 
 def draw_look(rng: np.random.Generator, light: str = "any") -> Lighting:
     """Return a look by chance.
@@ -135,7 +144,7 @@ def draw_background(rng: np.random.Generator) -> NDArray:
 
 
 PATTERNS = ("plain", "noise", "stripes", "checks", "speckles", "layers")
-VOLUME_SIZE = 64  # of the tileable noise volume, per axis
+VOLUME_SIZE = 64  # of the tileable noise volume, per axis; a power of two
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -165,9 +174,9 @@ class Paint:
     def colors_at(self, points: NDArray) -> NDArray:
         """Return the colours (n, 3) at points (n, 3) [m] of the body at rest."""
         points = points + self.offset
-        share = self._mix(points)[:, None]
-        color = self.color * (1.0 - share) + self.second * share
-        return color * (1.0 + self.grain * (_look_up(points, 0.4e-3) - 0.5))[:, None]
+        share = self._mix(points)
+        color = self.color[:, None] * (1.0 - share) + self.second[:, None] * share
+        return (color * (1.0 + self.grain * (_look_up(points, 0.4e-3) - 0.5))).T
 
     def _mix(self, points: NDArray) -> NDArray:
         """Return the share (n,) of the second colour."""
@@ -189,16 +198,15 @@ class Paint:
 def _noise_volume() -> NDArray:
     """Return tileable noise (s, s, s), spread evenly over [0, 1]."""
     rng = np.random.default_rng(20)
-    shape = (VOLUME_SIZE,) * 3
-    volume = smooth_field(shape, 1.2, rng)
+    volume = gaussian_filter(rng.standard_normal((VOLUME_SIZE,) * 3), 1.2, mode="wrap")
     ranks = np.empty(volume.size)
     ranks[np.argsort(volume, axis=None)] = np.linspace(0.0, 1.0, volume.size)
-    return ranks.reshape(shape)
+    return ranks.reshape(volume.shape)
 
 
 def _look_up(points: NDArray, cell: float) -> NDArray:
     """Return noise (n,) in [0, 1] at points (n, 3) [m], in cells of a size [m]."""
-    index = np.floor(points / cell).astype(np.int64) % VOLUME_SIZE
+    index = np.floor(points / cell).astype(np.int64) & VOLUME_SIZE - 1
     return _noise_volume()[index[:, 0], index[:, 1], index[:, 2]]
 
 
@@ -247,7 +255,9 @@ def smooth_field(shape: tuple[int, int], width: float, rng: np.random.Generator)
     field = rng.standard_normal(shape)
     if width <= 0.0:
         return field
-    field = gaussian_filter(field, width, mode="wrap")
+    radius = int(4.0 * width + 0.5)
+    kernel = cv2.getGaussianKernel(2 * radius + 1, width)
+    field = cv2.sepFilter2D(np.pad(field, radius, mode="wrap"), -1, kernel, kernel)[radius:-radius, radius:-radius]
     return field / field.std()
 
 
@@ -322,7 +332,8 @@ class RenderedScene:
         self._triangles = np.concatenate(
             [body.triangles + start for body, start in zip(bodies, starts[:-1], strict=True)]
         )
-        self._owners = np.repeat(np.arange(len(bodies)), [len(body.triangles) for body in bodies])
+        owners = np.repeat(np.arange(len(bodies)), [len(body.triangles) for body in bodies])
+        self._owners = np.append(owners, -1).astype(np.int16)  # the last of what meets no triangle
         vertices = np.concatenate([body.vertices for body in bodies])
         self._scene.add_triangles(
             self._tensor(vertices.astype(np.float32)), self._tensor(self._triangles.astype(np.uint32))
@@ -333,8 +344,9 @@ class RenderedScene:
         rays = compute_rays(camera)[rows]
         shape = rays.shape[:2]
         flat = rays.reshape(-1, 3)
-        blind = np.isnan(flat).any(axis=1)  # beyond what a fisheye can show
-        flat = np.where(blind[:, None], [0.0, 0.0, 1.0], flat)
+        blind = np.isnan(flat[:, 0])  # beyond what a fisheye can show
+        if blind.any():
+            flat = np.where(blind[:, None], [0.0, 0.0, 1.0], flat)
         hits = self._cast(flat)
         color = self._shade(flat, hits)
         rough = _find_edges(hits.depth.reshape(shape), hits.surface.reshape(shape), hits.owner.reshape(shape))
@@ -357,16 +369,15 @@ class RenderedScene:
         packed[:, 3:] = rays
         answer = self._scene.cast_rays(self._tensor(packed), nthreads=1)
         depth = answer["t_hit"].numpy().astype(float)
-        surface = answer["primitive_ids"].numpy().astype(np.int64)
-        hit = np.isfinite(depth)
-        owner = np.where(hit, self._owners[np.where(hit, surface, 0)], -1)
-        plane = self._background_depth(rays)
+        missed = np.flatnonzero(np.isinf(depth))
+        depth[missed] = self._background_depth(rays[missed])
+        surface = np.minimum(answer["primitive_ids"].numpy(), len(self._triangles))
         return _Hits(
-            depth=np.where(hit, depth, plane),
-            owner=owner,
-            surface=np.where(hit, surface, -1),
-            weights=answer["primitive_uvs"].numpy().astype(float),
-            normals=answer["primitive_normals"].numpy().astype(float),
+            depth=depth,
+            owner=self._owners[surface],
+            surface=surface,
+            weights=answer["primitive_uvs"].numpy(),
+            normals=answer["primitive_normals"].numpy(),
         )
 
     def _background_depth(self, rays: NDArray) -> NDArray:
@@ -378,60 +389,81 @@ class RenderedScene:
 
     def _shade(self, rays: NDArray, hits: _Hits) -> NDArray:
         """Return the linear colours (n, 3) that come along rays."""
-        color = np.empty((len(rays), 3))
-        outside = hits.owner < 0
-        color[outside] = self._look_at_background(rays[outside] * hits.depth[outside, None])
-        on = np.flatnonzero(~outside)
-        points = rays[on] * hits.depth[on, None]
-        normals = hits.normals[on]
-        normals = np.where((np.einsum("ij,ij->i", normals, rays[on]) > 0.0)[:, None], -normals, normals)
-        albedo, gloss, sharpness = self._paint(hits, on)
+        look, R, on = self._look, self._R, np.flatnonzero(hits.owner >= 0)
+        normals, starts, places = _meet(on, rays, *vars(hits).values(), self._triangles, self._rest)
+        lamps = np.array([(R @ lamp.direction, lamp.color) for lamp in look.lights]).reshape(-1, 2, 3)
+        lit = np.maximum(normals @ lamps[:, 0].T, 0.0)
+        for lamp, towards, share in zip(look.lights, lamps[:, 0], lit.T, strict=True):
+            if lamp.casts_shadow:
+                share[self._is_hidden(starts, towards, share)] = 0.0
         # light from everywhere comes least to what looks away from the open side, as the insides of the cells do
-        light = (SKY + (1.0 - SKY) * normals @ self._R[:, 1])[:, None] * self._look.ambient
-        shine = np.zeros_like(light)
-        view = -rays[on] / np.linalg.norm(rays[on], axis=1, keepdims=True)
-        for lamp in self._look.lights:
-            towards = self._R @ lamp.direction
-            lit = np.clip(normals @ towards, 0.0, None) * self._is_lit(points, normals, towards, lamp)
-            light += lit[:, None] * lamp.color
-            half = view + towards
-            half /= np.linalg.norm(half, axis=1, keepdims=True)
-            facing = np.clip(np.einsum("ij,ij->i", normals, half), 1e-6, None)
-            shine += ((lit > 0.0) * gloss * facing**sharpness)[:, None] * lamp.color
-        color[on] = albedo * light + shine
+        light = (SKY + (1.0 - SKY) * normals @ R[:, 1])[:, None] * look.ambient
+        gloss = np.array([(body.paint.gloss, body.paint.sharpness) for body in self._bodies])[hits.owner[on]]
+        color = np.empty((len(rays), 3))
+        _light_up(on, rays, normals, self._paint(hits.owner[on], places), gloss, light, lamps, lit, color)
+        off = np.flatnonzero(hits.owner < 0)
+        color[off] = self._look_at_background(rays[off] * hits.depth[off, None])
         return color
 
-    def _paint(self, hits: _Hits, on: NDArray) -> list[NDArray]:
-        """Return the colours (n, 3), gloss (n,) and sharpness (n,) of the bodies' surfaces at some hits."""
-        owner, corners = hits.owner[on], self._rest[self._triangles[hits.surface[on]]]
-        u, v = hits.weights[on].T[..., None]
-        points = (1.0 - u - v) * corners[:, 0] + u * corners[:, 1] + v * corners[:, 2]
-        color = np.empty((len(on), 3))
+    def _paint(self, owner: NDArray, places: NDArray) -> NDArray:
+        """Return the colours (n, 3) of bodies (n,) at places (n, 3) [m] on them at rest."""
+        color = np.empty((len(owner), 3))
         for index, body in enumerate(self._bodies):
-            mine = owner == index
-            color[mine] = body.paint.colors_at(points[mine])
+            mine = np.flatnonzero(owner == index)
+            points = places[mine]
+            color[mine] = body.paint.colors_at(points)
             for decal in body.decals:
-                near = mine & (((points - decal.centre) ** 2).sum(axis=1) < decal.radius**2)
-                color[near] = decal.color
-        gloss = np.array([body.paint.gloss for body in self._bodies])[owner]
-        sharpness = np.array([body.paint.sharpness for body in self._bodies])[owner]
-        return [color, gloss, sharpness]
+                color[mine[((points - decal.centre) ** 2).sum(axis=1) < decal.radius**2]] = decal.color
+        return color
 
-    def _is_lit(self, points: NDArray, normals: NDArray, towards: NDArray, lamp: Light) -> NDArray:
-        """Say which points (n, 3) a lamp reaches."""
-        if not lamp.casts_shadow:
-            return np.ones(len(points))
-        packed = np.empty((len(points), 6), dtype=np.float32)
-        packed[:, :3] = points + SHADOW_OFFSET * normals
-        packed[:, 3:] = towards
-        return ~self._scene.test_occlusions(self._tensor(packed), nthreads=1).numpy()
+    def _is_hidden(self, starts: NDArray, towards: NDArray, lit: NDArray) -> NDArray:
+        """Return the indices of the points (n, 3) from which bodies hide a lamp, of those where `lit` (n,) is not 0."""
+        facing = np.flatnonzero(lit)
+        packed = np.empty((len(facing), 6), dtype=np.float32)
+        packed[:, :3], packed[:, 3:] = starts[facing], towards
+        return facing[self._scene.test_occlusions(self._tensor(packed), nthreads=1).numpy()]
 
     def _look_at_background(self, points: NDArray) -> NDArray:
         """Return the light (n, 3) of the background at points (n, 3) [m], camera frame."""
-        across = (points - self._base) @ self._R[:, :2]
-        index = np.floor(across / TEXTURE_SPAN * TEXTURE_SIZE).astype(int) % TEXTURE_SIZE
-        total = self._look.ambient + sum(0.5 * lamp.color for lamp in self._look.lights)
-        return self._look.background[index[:, 1], index[:, 0]] * total
+        across = self._R[:, :2].T @ (points - self._base).T
+        column, row = np.floor(across / TEXTURE_SPAN * TEXTURE_SIZE).astype(np.int32) % TEXTURE_SIZE
+        return self._look.backdrop[row * TEXTURE_SIZE + column]
+
+
+@njit(**_OPTIONS)
+def _meet(on, rays, depth, owner, surface, weights, normals, triangles, rest):
+    """Return at the hits `on` normals towards the camera, points [m] just above, and places [m] at rest (3, n, 3)."""
+    met = np.empty((3, len(on), 3))
+    for i, hit in enumerate(on):
+        along = 0.0
+        for axis in range(3):
+            along += normals[hit, axis] * rays[hit, axis]
+        (a, b, c), (u, v) = triangles[surface[hit]], weights[hit]
+        for axis in range(3):
+            met[0, i, axis] = -normals[hit, axis] if along > 0.0 else normals[hit, axis]
+            met[1, i, axis] = rays[hit, axis] * depth[hit] + SHADOW_OFFSET * met[0, i, axis]
+            met[2, i, axis] = (1.0 - u - v) * rest[a, axis] + u * rest[b, axis] + v * rest[c, axis]
+    return met
+
+
+@njit(**_OPTIONS)
+def _light_up(on, rays, normals, albedo, gloss, light, lamps, lit, color):
+    """Write the light (n, 3) that the hits `on` send back: albedo times light, and highlights (Blinn-Phong)."""
+    for i, hit in enumerate(on):
+        length = np.sqrt(rays[hit, 0] ** 2 + rays[hit, 1] ** 2 + rays[hit, 2] ** 2)
+        color[hit] = 0.0
+        for lamp in range(len(lamps)):
+            if lit[i, lamp] > 0.0:
+                along, square = 0.0, 0.0
+                for axis in range(3):
+                    half = lamps[lamp, 0, axis] - rays[hit, axis] / length
+                    along, square = along + normals[i, axis] * half, square + half * half
+                shine = gloss[i, 0] * max(along / np.sqrt(square), 1e-6) ** gloss[i, 1]
+                for channel in range(3):
+                    light[i, channel] += lit[i, lamp] * lamps[lamp, 1, channel]
+                    color[hit, channel] += shine * lamps[lamp, 1, channel]
+        for channel in range(3):
+            color[hit, channel] += albedo[i, channel] * light[i, channel]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -448,14 +480,10 @@ class _Hits:
 def _find_edges(depth: NDArray, surface: NDArray, owner: NDArray) -> NDArray:
     """Return the pixels (h, w) next to which another body, or the same at another depth, begins."""
     rough = np.zeros(depth.shape, dtype=bool)
-    for axis in (0, 1):
-        other = np.diff(owner, axis=axis) != 0
-        step = np.abs(np.diff(depth, axis=axis)) > EDGE_STEP + 0.01 * np.minimum(
-            *(np.take(depth, range(low, depth.shape[axis] - 1 + low), axis=axis) for low in (0, 1))
-        )
-        changed = other | step & (np.diff(surface, axis=axis) != 0)
-        for low in (0, 1):
-            part = [slice(None), slice(None)]
-            part[axis] = slice(low, depth.shape[axis] - 1 + low)
-            rough[tuple(part)] |= changed
+    # views of the same pixels: neighbours in a column, then in a row
+    for d, s, o, r in ((depth, surface, owner, rough), (depth.T, surface.T, owner.T, rough.T)):
+        step = np.abs(d[1:] - d[:-1]) > EDGE_STEP + 0.01 * np.minimum(d[1:], d[:-1])
+        changed = (o[1:] != o[:-1]) | step & (s[1:] != s[:-1])
+        r[1:] |= changed
+        r[:-1] |= changed
     return rough

@@ -70,7 +70,10 @@ class FakePhotographer:
     T_gripper_camera = BENCH_CAMERA
     depth_step = 1e-3
 
-    def shoot(self, state, before=None):
+    def look(self, state, before=None):
+        return None
+
+    def shoot(self, state, before=None, view=None):
         number = round(30 * state.stamp)
         rng = np.random.default_rng(0 if number in self.frozen else round(1e6 * state.stamp) + 1)
         size = (CAMERA.height, CAMERA.width)

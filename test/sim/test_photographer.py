@@ -1,11 +1,12 @@
 from copy import copy
 from dataclasses import replace
-from itertools import pairwise
+from itertools import islice, pairwise
 
 import numpy as np
 import pytest
 
 from finforce.camera import project
+from finforce_sim.footage import Footage, parse_size
 from finforce_sim.gripper import TwinGripper
 from finforce_sim.photographer import BANDS, Photographer
 from finforce_sim.scenarios import build_scenario
@@ -97,3 +98,20 @@ def test_rows_of_a_rolling_shutter_are_of_their_own_time(gripper):
     ago = readout * (1.0 - seen[:, 1] / (height - 1)) / (state.stamp - before.stamp)
     np.testing.assert_allclose(seen[:, 0], now[:, 0] + ago * (past - now)[:, 0], atol=0.02)
     assert np.ptp((seen - now)[:, 0]) > 0.5
+
+
+def test_a_gripper_that_stands_is_looked_at_once_and_has_the_images_that_it_had(gripper):
+    photographer, looks = Photographer(gripper, parse_size("64x48"), 3), []
+    watched = copy(photographer)
+    watched.look = lambda *states: looks.append(states) or photographer.look(*states)
+    states, closing = list(islice(gripper.states(), 69, 82)), copy(gripper)  # it closes, and then stands
+    closing.states = lambda: iter(states)
+    for state, before, frame in zip(states, [None, *states], Footage(closing, watched, 3), strict=False):
+        alone = photographer.shoot(state, before)
+        np.testing.assert_array_equal(frame.color, alone.color)
+        np.testing.assert_array_equal(frame.depth, alone.depth)
+        for side, true in alone.jaws.items():
+            np.testing.assert_array_equal(frame.jaws[side].pixels, true.pixels)
+            np.testing.assert_array_equal(frame.jaws[side].force, true.force)
+    moves = sum(not state.looks_like(before) for before, state in pairwise(states))
+    assert moves > 2 and len(looks) < 0.5 * len(states)
