@@ -21,6 +21,7 @@ from finforce.sandbox import SandboxError, run_limited
 LARGEST = 1 << 30  # bytes, more than any format needs for millions of triangles
 # What these formats take goes with the size of the file.
 _PLAIN = (".stl", ".obj", ".ply", ".off")
+_STL = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])  # after 80 bytes and a number
 _LIBRARIES = {".step": ("cascadio",), ".stp": ("cascadio",), ".3mf": ("networkx", "lxml")}
 _MEMORY, _SECONDS = 2 << 30, 60
 
@@ -33,7 +34,6 @@ def read_surface(path: Path) -> tuple[NDArray, NDArray]:
         MissingDependencyError: The library that reads it is not installed.
     """
     suffix = path.suffix.lower()
-    import_trimesh()
     for library in _LIBRARIES.get(suffix, ()):
         import_library(library, f"reading {path.name}, which may be exported as STL instead,")
     try:
@@ -108,9 +108,14 @@ def _load_triangles(path: Path) -> tuple[NDArray, NDArray]:
     if not content:
         raise FileError(f"got 0 bytes, expected a whole .{kind} file: export it again")
     _refuse_other_kinds(content)
-    scene = import_trimesh().load_scene(io.BytesIO(content), file_type=kind, process=False, skip_materials=True)
-    mesh = scene.to_mesh()
-    vertices, triangles = np.array(mesh.vertices, dtype=float), np.array(mesh.faces, dtype=np.int64)
+    count = int.from_bytes(content[80:84], "little")
+    if kind == "stl" and count and len(content) == 84 + count * _STL.itemsize:  # trimesh takes a second to load
+        vertices = np.frombuffer(content, _STL, offset=84)["corners"].reshape(-1, 3).astype(float)
+        triangles = np.arange(len(vertices)).reshape(-1, 3)
+    else:
+        scene = import_trimesh().load_scene(io.BytesIO(content), file_type=kind, process=False, skip_materials=True)
+        mesh = scene.to_mesh()
+        vertices, triangles = np.array(mesh.vertices, dtype=float), np.array(mesh.faces, dtype=np.int64)
     if len(triangles) and not np.ptp(vertices, axis=0).any():
         raise FileError("has all its points in one place, as where they are compressed in a way that is not read")
     return vertices.reshape(-1, 3), triangles.reshape(-1, 3)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from contextlib import suppress
 from time import perf_counter
-from typing import NamedTuple, Protocol, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +14,10 @@ from finforce.errors import FinforceError
 from finforce.messages import SECOND
 from finforce_contact.estimator import ContactEstimate, ContactEstimator
 from finforce_contact.mesh.object_mesh import ObjectMesh
-from finforce_ifea.estimator import ForceEstimator
-from finforce_ifea.observation import Contact, Observation, Solution
-from finforce_ifea.tracking.influence import is_out_of_reach
+from finforce_ifea.observation import Contact, Observation, Solution, is_out_of_reach
+
+if TYPE_CHECKING:
+    from finforce_ifea.estimator import ForceEstimator
 
 ValueT = TypeVar("ValueT")
 

@@ -19,6 +19,8 @@ TRUSTED = ("ok", "unloaded")
 _UNIT = 1e-3  # by which the length of a unit vector may be off
 # Images are at least so long apart [s]; what comes sooner is the same one, stamped again.
 _SHORTEST_PERIOD = 0.5e-3
+# An object is away that stands in front of the undeformed surface by more than this and what its place may err [m].
+AWAY, _SIGMAS = 10e-3, 3.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -80,6 +82,15 @@ class Contact:
                 f"contact height {1e3 * z:g} mm, expected {1e3 * low:g} to {1e3 * high:g} mm on the jaw {jaw.name!r}"
             )
         return cls(points=np.array([[jaw.face.read(z), 0.0, z]]), weights=np.ones(1), free=True)
+
+
+def is_out_of_reach(contact: Contact, face_x: float) -> bool:
+    """Whether a contact's outline is in front of a surface x = face_x [m] by more than `AWAY` and its uncertainty."""
+    outline = contact.outline
+    if outline is None or contact.touching is not False:
+        return False
+    nearest = min(float(polygon[:, 0].min()) for polygon in outline.placed())
+    return nearest - face_x > AWAY + _SIGMAS * float(outline.stddev[0])
 
 
 class Solution(NamedTuple):

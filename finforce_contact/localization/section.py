@@ -7,7 +7,6 @@ from math import asin, atan2, sqrt
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.distance import cdist
 
 from finforce.errors import PoseError
 from finforce.optional import import_manifold3d
@@ -237,6 +236,7 @@ def _bridge(slab: _Slab, edges: NDArray) -> NDArray:
     if not len(stops):
         return np.empty((0, 2), dtype=int)
     from scipy.optimize import linear_sum_assignment  # half a second that a given contact need not wait
+    from scipy.spatial.distance import cdist
 
     rows, columns = linear_sum_assignment(cdist(slab.locate(stops), slab.locate(starts)))
     return np.stack([stops[rows], starts[columns]], axis=1)

@@ -10,8 +10,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from finforce.files import FileError
 from finforce.optional import import_manifold3d, import_open3d
@@ -474,6 +472,9 @@ def turn_outward(mesh: ObjectMesh) -> ObjectMesh:
 
 def label_bodies(mesh: ObjectMesh) -> NDArray:
     """Return for each triangle the number (m,) of its connected body; one body for mere fragments."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     ends, count = mesh.edges.ends, len(mesh.vertices)
     graph = coo_array((np.ones(len(ends), dtype=bool), (ends[:, 0], ends[:, 1])), shape=(count, count))
     bodies, label = connected_components(graph, directed=False)

@@ -5,7 +5,6 @@ from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from finforce.camera import CameraIntrinsics, check_depth, check_mask, compute_rays, project, rays_from_pixels
 from finforce.transforms import invert_pose
@@ -525,6 +524,8 @@ class MeshAligner:
         return step * min(1.0, _LONGEST_STEP / max(np.abs(step).max(), 1e-12))
 
     def _move(self, T: NDArray, step: NDArray) -> NDArray:
+        from scipy.spatial.transform import Rotation
+
         middle = self.middle_of(T)
         moved = T.copy()
         moved[:3, :3] = Rotation.from_rotvec(step[3:] / self.radius).as_matrix() @ T[:3, :3]

@@ -8,8 +8,6 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
 from finforce.transforms import rotation_between
 from finforce_contact.mesh.object_mesh import ObjectMesh
@@ -66,6 +64,8 @@ class Symmetry:
 
     def _unwind(self, T: NDArray, T_last: NDArray) -> NDArray:
         """Return the turn (3, 3) about the axis that brings a pose nearest to the last one."""
+        from scipy.spatial.transform import Rotation
+
         x, y, z, w = Rotation.from_matrix(T[:3, :3].T @ T_last[:3, :3]).as_quat()
         twist = 2.0 * np.arctan2(np.array([x, y, z]) @ self.axis, w)
         return Rotation.from_rotvec(twist * self.axis).as_matrix()
@@ -110,6 +110,9 @@ def parse_symmetry(text: str) -> tuple[str, ...] | None:
 @lru_cache(maxsize=1)  # both jaws hold the same object
 def find_symmetries(mesh: ObjectMesh) -> tuple[str, ...]:
     """Return the turns about the axes of a mesh's frame, through its middle, that map it onto itself."""
+    from scipy.spatial import cKDTree
+    from scipy.spatial.transform import Rotation
+
     points, normals = sample_with_normals(mesh, _SAMPLES, np.random.default_rng(0))
     points = points - mesh.middle
     tree, size = cKDTree(points), float(np.linalg.norm(np.ptp(points, axis=0)))
@@ -135,6 +138,8 @@ def find_symmetries(mesh: ObjectMesh) -> tuple[str, ...]:
 
 def _step(name: str) -> NDArray:
     """Return the turn (3, 3) of a word as `x_180`."""
+    from scipy.spatial.transform import Rotation
+
     letter, angle = name.split("_")
     return Rotation.from_rotvec(np.radians(float(angle)) * np.eye(3)[AXES[letter]]).as_matrix()
 

@@ -7,7 +7,6 @@ from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from finforce.camera import CameraIntrinsics, project
 from finforce.errors import PoseError
@@ -45,6 +44,8 @@ def spread_rotations() -> NDArray:
 
     Among them is one within 34 degrees of any rotation.
     """
+    from scipy.spatial.transform import Rotation
+
     rotations = []
     for direction in _icosphere():
         towards, _ = Rotation.align_vectors(direction[None], [[0.0, 0.0, 1.0]])

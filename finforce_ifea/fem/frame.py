@@ -10,7 +10,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from finforce_ifea.errors import MeshError
 from finforce_ifea.fem.model import (
@@ -527,6 +526,8 @@ def build_beams(
         width: of all [m].
         material: of all.
     """
+    from scipy.sparse.csgraph import reverse_cuthill_mckee
+
     count = int(dof.max()) + 1
     rows = dof.reshape(len(dof), -1)
     row, col = (index.ravel() for index in np.broadcast_arrays(rows[:, :, None], rows[:, None, :]))

@@ -10,7 +10,6 @@ Source: Bonet, Wood, Nonlinear Continuum Mechanics for Finite Element Analysis (
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from finforce_ifea.errors import MeshError
 from finforce_ifea.fem.model import LARGEST_MOVE, Across, Linearization
@@ -45,6 +44,8 @@ class PlaneModel(SolidModel):
         Raises:
             MeshError: The mesh is not made of that section.
         """
+        from scipy.spatial import cKDTree
+
         self.mesh, self.plane = mesh, plane
         self.rotations, self.reach, self.symmetric = None, LARGEST_MOVE, False
         self.sign = np.ones((len(mesh.nodes), 3))

@@ -5,9 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import sparse
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from finforce_ifea.errors import MeshError
 
@@ -271,6 +268,8 @@ def _check_elements(elements: NDArray, node_count: int) -> None:
 
 def _check_numbering(nodes: NDArray, elements: NDArray) -> None:
     """Refuse nodes that lie on each other and nodes that no element uses."""
+    from scipy.spatial import cKDTree  # half a second that a drawing, checked by itself, need not wait
+
     tolerance = 1e-7 * np.ptp(nodes, axis=0).max()
     pairs = cKDTree(nodes).query_pairs(tolerance, output_type="ndarray")
     if len(pairs):
@@ -381,6 +380,9 @@ def _check_hinges(nodes: NDArray, elements: NDArray, face: NDArray, clamped: NDA
 
 def _number_pieces(rows: NDArray, columns: NDArray, elements: NDArray) -> tuple[int, NDArray]:
     """Return how many pieces the elements make that are joined by common columns, and each one's piece (m,)."""
+    from scipy import sparse
+    from scipy.sparse.csgraph import connected_components
+
     count = int(columns.max()) + 1
     incidence = sparse.coo_matrix((np.ones(len(rows)), (rows, columns)), (len(elements), count)).tocsr()
     return connected_components(incidence @ incidence.T, directed=False)

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from scipy.spatial import Delaunay, cKDTree
 
 from finforce_ifea.errors import MeshError
 from finforce_ifea.jaw.mesh import VolumeMesh, build_volume_mesh, to_tet10
@@ -87,6 +86,8 @@ class _SizeField:
 
     def __init__(self, section: Section, size: float) -> None:
         self.size = size
+        from scipy.spatial import cKDTree
+
         self._section = section
         places, sizes = [], []
         for ring, is_closed in section.lines:
@@ -155,6 +156,8 @@ def _close(first: int, count: int) -> NDArray:
 
 def _fill(polygon: shapely.Polygon, points: NDArray, field: _SizeField) -> NDArray:
     """Return points (n, 2) on a lattice of triangles inside the section, away from those on its rings."""
+    from scipy.spatial import cKDTree
+
     low_x, low_z, high_x, high_z = polygon.bounds
     step = field.size
     x, z = np.arange(low_x, high_x, 0.95 * step), np.arange(low_z, high_z, 0.82 * step)
@@ -173,6 +176,8 @@ def _triangulate(points: NDArray, edges: NDArray, inside: NDArray) -> tuple[NDAr
     Raises:
         MeshError: An edge stays missing.
     """
+    from scipy.spatial import Delaunay
+
     for _ in range(_PASSES):
         everything = np.vstack([points, inside])
         triangles = Delaunay(everything).simplices

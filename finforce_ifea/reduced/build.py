@@ -6,12 +6,11 @@ Each equilibrium comes with what loads on the rows of the jaw's inner face do to
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.interpolate import CubicHermiteSpline
 from scipy.linalg import eigh
 from scipy.sparse.linalg import splu
 
@@ -20,6 +19,9 @@ from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics, PressedState,
 from finforce_ifea.errors import ContactError
 from finforce_ifea.fem.solid import SolidModel
 from finforce_ifea.reduced.equilibria import STENCIL, Manifold
+
+if TYPE_CHECKING:
+    from scipy.interpolate import CubicHermiteSpline
 
 # Loads below this share of the largest are rounding errors; rows that the mesh cannot tell apart share a load.
 _NOTHING, _RIDGE = 1e-7, 1e-9
@@ -258,6 +260,8 @@ def _find_depth(path: list[_Equilibrium], hardest: float) -> float:
 
     Depths that change smoothly with height make equilibria that do.
     """
+    from scipy.interpolate import CubicHermiteSpline  # a third of a second that stored equilibria need not wait
+
     if len(path) < 2:
         return path[-1].depth
     forces = np.array([item.state.force for item in path[-2:]])
@@ -315,8 +319,10 @@ def _are_joined(start: _Equilibrium, end: _Equilibrium) -> bool:
     return bool(np.linalg.norm(moved - along) < _APART * np.linalg.norm(moved))
 
 
-def _join(start: _Equilibrium, end: _Equilibrium) -> CubicHermiteSpline:
+def _join(start: _Equilibrium, end: _Equilibrium) -> "CubicHermiteSpline":
     """Return the unknowns (size,) by depth [m] from one equilibrium to the next, as the jaw moves at both."""
+    from scipy.interpolate import CubicHermiteSpline
+
     ends = (start, end)
     return CubicHermiteSpline(*zip(*((item.depth, item.q, item.state.modes[:, 0]) for item in ends), strict=True))
 

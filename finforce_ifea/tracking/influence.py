@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from finforce_ifea.contact_mechanics.indenter import DEPTH
 from finforce_ifea.contact_mechanics.pressed_jaw import PressedState, RigidContact
-from finforce_ifea.observation import Contact
+from finforce_ifea.observation import Contact, is_out_of_reach
 from finforce_ifea.tare import OFFSET_STDDEV, Tare
 
 _HEIGHTS = 13
@@ -154,9 +154,6 @@ def explain_offsets(modes: NDArray, tare: Tare, offset_stddev: float) -> float:
     return float(gain @ tare.offsets[seen][:, [0, 2]].ravel() / stddev)
 
 
-# An object is away that stands in front of the undeformed surface by more than this and what its place may err [m].
-AWAY = 10e-3
-_SIGMAS = 3.0
 # The jaw is at rest while it seems pressed by less than this [m], in one frame or in so many standard deviations of
 # it, and on average over the last ones.
 LARGEST_DEPTH, LARGEST_MEAN_DEPTH = 0.3e-3, 0.15e-3
@@ -218,12 +215,3 @@ class ReachWatch:
             and abs(depth) < max(LARGEST_DEPTH, _CHANCE * stddev)
             and abs(self._mean) < max(LARGEST_MEAN_DEPTH, _CHANCE * stddev / np.sqrt(self._count))
         )
-
-
-def is_out_of_reach(contact: Contact, face_x: float) -> bool:
-    """Whether a contact's outline is in front of a surface x = face_x [m] by more than `AWAY` and its uncertainty."""
-    outline = contact.outline
-    if outline is None or contact.touching is not False:
-        return False
-    nearest = min(float(polygon[:, 0].min()) for polygon in outline.placed())
-    return nearest - face_x > AWAY + _SIGMAS * float(outline.stddev[0])

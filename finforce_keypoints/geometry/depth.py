@@ -13,11 +13,11 @@ from functools import lru_cache
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
 
 from finforce.camera import CameraIntrinsics
 from finforce.elimination import eliminate
 from finforce.lens import project_point
+from finforce.optional import import_cv2
 from finforce_ifea.jaw.jaw import Jaw
 
 _OPTIONS = {"cache": True, "error_model": "numpy", "nogil": True}
@@ -100,7 +100,8 @@ def _select_places(raster: NDArray, point: NDArray, triangles: NDArray, window: 
     corners = triangles[(np.abs(triangles[:, :, 1] - point[1]) < _ON_SIDE).all(axis=1)][:, :, ::2] - point[::2]
     corners = corners[(corners.min(axis=1) < reach).all(axis=1) & (corners.max(axis=1) > -reach).all(axis=1)]
     inside = _cover(np.ascontiguousarray(corners), raster)
-    depth, away = distance_transform_edt(inside) * _SPACING, np.linalg.norm(raster, axis=-1)
+    cv2, away = import_cv2(), np.linalg.norm(raster, axis=-1)
+    depth = cv2.distanceTransform(inside.view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE) * _SPACING
     for share in _EDGE_SHARES:
         places = _thin_out(raster, (away <= window) & (depth > share * edge))
         if len(places) >= _ENOUGH:
@@ -383,15 +384,15 @@ def _fit_shape(places, relief, beforehand, measured, stddev, lever, error):
     covariance, theta = prior, beforehand
     for _ in range(_ROBUST_STEPS):
         covariance, theta = _solve_weighted(prior, rows, known, seen, own + noise)
-        left = known - rows @ theta
+        left = known - (rows * theta).sum(axis=1)  # @ would load SciPy, which takes half a second
         noise = variance * (1.0 + left**2 / (own + variance) / _OUTLIER_SIGMA**2)
     found, spread = np.full((3, count), np.nan), np.empty(5)
     for i in range(count):
         share = own[i] / (own[i] + noise[i]) if seen[i] else 0.0
         spread[:] = (1.0 - share) * rows[i]
         spread[4] = -share * rows[i, 4]
-        found[0, i] = rows[i, :4] @ theta[:4] + (share * left[i] if seen[i] else 0.0)
-        found[1, i] = np.sqrt(spread @ (covariance @ spread) + (1.0 - share) * own[i])
+        found[0, i] = (rows[i, :4] * theta[:4]).sum() + (share * left[i] if seen[i] else 0.0)
+        found[1, i] = np.sqrt((spread * (covariance * spread).sum(axis=1)).sum() + (1.0 - share) * own[i])
         if seen[i]:
             found[2, i] = left[i] / np.sqrt(own[i] + variance[i])
     return found, error + theta[4], np.sqrt(covariance[4, 4])
@@ -412,7 +413,7 @@ def _solve_weighted(prior, rows, known, seen, variance):
                 A[a, b] += w * rows[i, a] * rows[i, b]
     covariance = np.eye(size)
     eliminate(A, covariance)
-    return covariance, covariance @ g
+    return covariance, (covariance * g).sum(axis=1)
 
 
 def compute_stddev(sight: SideView, depths: NDArray, y_stddev: NDArray, ray_stddev: NDArray) -> NDArray:

@@ -37,7 +37,7 @@ def test_what_cannot_be_set_up_ends_with_two_and_one_reason(given, reason, capfd
 
 @pytest.mark.parametrize("name", ["ifea_solver", "contact_estimator"])
 def test_heavy_libraries_wait_until_they_are_needed(name):
-    heavy = "{'open3d', 'trimesh', 'manifold3d', 'small_gicp'}"
+    heavy = "{'open3d', 'trimesh', 'manifold3d', 'small_gicp', 'scipy.linalg', 'scipy.sparse', 'scipy.spatial'}"
     load = f"from finforce.ros import start; __import__(start.NODES['{name}'])"
     check = f"import sys; {load}; print({heavy} & set(sys.modules))"
     done = subprocess.run(

@@ -12,9 +12,8 @@ from estimator_fakes import BENCH, CALIBRATION, PERIOD, magnitudes, ramp, record
 from finforce.health import ALL, IDLE, RULES, STILL, Idling, SkippingError, Skips
 from finforce_contact.estimator import ContactEstimator
 from finforce_ifea.estimator import ForceEstimator
-from finforce_ifea.observation import Contact, ObjectOutline
+from finforce_ifea.observation import AWAY, Contact, ObjectOutline, is_out_of_reach
 from finforce_ifea.settings import EstimatorSettings
-from finforce_ifea.tracking.influence import AWAY, is_out_of_reach
 
 RADIUS, HEIGHT = 0.0125, 0.040
 DEPTHS = ramp(2, 0)

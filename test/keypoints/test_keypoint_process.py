@@ -46,7 +46,7 @@ def test_what_cannot_be_set_up_ends_with_two_and_one_reason(given, reason, capfd
 
 
 def test_heavy_libraries_wait_until_they_are_needed():
-    heavy = "{'cv2', 'onnxruntime', 'torch', 'open3d', 'trimesh'}"
+    heavy = "{'cv2', 'onnxruntime', 'torch', 'open3d', 'trimesh', 'scipy.linalg', 'scipy.spatial'}"
     check = f"import finforce.ros.start, sys, finforce_keypoints.node; print({heavy} & set(sys.modules))"
     done = subprocess.run(
         [sys.executable, "-c", check], capture_output=True, text=True, timeout=START_PATIENCE, check=True

@@ -29,9 +29,9 @@ def draw_finger(finger: RecognizedFinger, jaw: Jaw, path: Path) -> None:
     from matplotlib.figure import Figure
 
     size = np.array([np.ptp(finger.rings[0][:, 0]), finger.length])
-    figure = Figure(figsize=(13.0, 9.0), layout="constrained")
-    flat = figure.add_subplot(1, 2, 1)
-    solid = figure.add_subplot(1, 2, 2, projection="3d", proj_type="ortho")
+    figure = Figure(figsize=(13.0, 9.0))
+    flat = figure.add_axes((0.06, 0.07, 0.43, 0.87))
+    solid = figure.add_axes((0.5, 0.07, 0.49, 0.87), projection="3d", proj_type="ortho")
     _draw_section(flat, finger)
     _draw_walls(flat, finger)
     _draw_points(flat, finger, jaw)
