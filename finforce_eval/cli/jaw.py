@@ -5,12 +5,8 @@ from __future__ import annotations
 import argparse
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from finforce_eval.cli.parser import CommandResult, length_mm, picture_file
-
-if TYPE_CHECKING:
-    from finforce_ifea.jaw.jaw import Jaw
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -49,6 +45,12 @@ def run(options: argparse.Namespace) -> CommandResult:
     """Read a finger, say what was found, and write jaw file, section and picture."""
     from finforce_ifea.jaw.cad.make_jaw import make_jaw
     from finforce_ifea.jaw.cad.recognition import Overrides
+    from finforce_ifea.jaw.jaw import Jaw
+
+    def measure_warping(jaw: Jaw) -> float:
+        from finforce_ifea import mechanics  # half a second, asked of layers only
+
+        return mechanics.measure_warping(jaw)
 
     started = time.monotonic()
     output = options.output or Path(f"{options.file.stem}.yaml")
@@ -65,16 +67,9 @@ def run(options: argparse.Namespace) -> CommandResult:
         ),
         picture=options.picture,
         solid=options.solid,
-        measure_warping=_measure_warping,
+        measure_warping=measure_warping,
     )
     for note in notes:
         print(f"  {note}")
     print(f"{', '.join(str(path) for path in files)}, {time.monotonic() - started:.1f} s")
     return CommandResult({"files": [str(path) for path in files], "notes": notes})
-
-
-def _measure_warping(jaw: Jaw) -> float:
-    """See `measure_warping`, which takes half a second to load and is asked of layers only."""
-    from finforce_ifea.mechanics import measure_warping
-
-    return measure_warping(jaw)
