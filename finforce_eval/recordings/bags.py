@@ -288,7 +288,7 @@ def bag_source(path: Path) -> Path:
     files = sorted([*path.glob("*.mcap"), *path.glob("*.db3")])
     if len(files) != 1:
         found = f"no metadata.yaml and {len(files)} bag files: run `ros2 bag reindex` on it; expected one or metadata"
-        found = found if files else "no metadata.yaml, .mcap or .db3"
+        found = found if files else "no metadata.yaml, .mcap, .db3 or pictures"
         raise RecordingError(f"{path.name}: the folder is not a recording: {found} in it")
     return _check_bag(files[0])
 
