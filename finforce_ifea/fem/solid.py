@@ -34,10 +34,11 @@ _ON_PLANE = 1e-9
 
 
 class _Probe(NamedTuple):
-    """Material points of a solid: undeformed (p, 3) [m], and what each unknown moves them (3 p, size)."""
+    """Material points of a solid: undeformed (p, 3) [m], and how unknowns move them (3 p, size), also transposed."""
 
     points: NDArray
     matrix: sparse.csr_matrix
+    transposed: sparse.csc_matrix
 
 
 class SolidModel:
@@ -158,7 +159,7 @@ class SolidModel:
         row = np.broadcast_to(np.arange(3 * len(points)).reshape(-1, 1, 3), column.shape)
         free = column < self.size
         matrix = sparse.csr_matrix((weights[free], (row[free], column[free])), (3 * len(points), self.size))
-        return _Probe(np.array(points, float), matrix)
+        return _Probe(np.array(points, float), matrix, matrix.T)
 
     def positions(self, probe: _Probe, q: NDArray) -> NDArray:
         """Return the deformed positions (p, 3) [m] of a probe."""
@@ -170,7 +171,7 @@ class SolidModel:
 
     def load(self, probe: _Probe, q: NDArray, forces: NDArray) -> NDArray:
         """Return the generalised load (size,) [N] of forces (p, 3) [N] at a probe's points."""
-        return forces.ravel() @ probe.matrix
+        return probe.transposed @ forces.ravel()
 
     def stiffen(self, tangent: NDArray, probe: _Probe, q: NDArray, blocks: NDArray) -> None:
         """Add springs blocks (p, 3, 3) [N/m] at a probe's points to a stored tangent, in place."""

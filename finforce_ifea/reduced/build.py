@@ -154,8 +154,9 @@ _HARDEST = 12.0
 # Longer steps [m] of a solid must agree with its motions at both ends, to this share; the longest of a frame, whose
 # hinged bars snap over.
 _SURE, _APART, _LONGEST = 0.1e-3, 0.1, 0.5e-3
-# Shortest step of a depth [m]; iterations to an equilibrium, and its tolerance [m]. What takes more is no near one.
-_SHORTEST, _ITERATIONS, _TOLERANCE = 0.02e-3, 9, 1e-9
+# Shortest step of a depth [m]; iterations to an equilibrium, and its tolerance [m]. What takes more is no near one, nor
+# what corrects as much as at first after so many.
+_SHORTEST, _ITERATIONS, _TOLERANCE, _TRIED = 0.02e-3, 9, 1e-9, 5
 # Quarters of a path that are tried next where it cannot be divided.
 _KEPT = 3
 _FEWEST_ROWS, _MOST_ROWS = 12, 84
@@ -387,12 +388,12 @@ class _Rod:
         """Return the equilibrium at a depth [m] of the rod, by one above it and one below it if known; or None."""
         contact, model = self._contact, self._contact.model
         place = np.array([self._touch + depth, np.log(self._radius), self._height])
-        q, before = np.zeros(model.size), _TOLERANCE
+        q, before, first = np.zeros(model.size), _TOLERANCE, np.inf
         if start is not None and end is not None:
             q = _join(start, end)(depth)
         elif start is not None:
             q = start.q + start.state.modes[:, 0] * (depth - start.depth)
-        for _ in range(_ITERATIONS):
+        for count in range(_ITERATIONS):
             state = contact.linearize(q, place)
             if not state.touches:
                 q = q + contact.approach(q, state.correction, place)
@@ -404,6 +405,9 @@ class _Rod:
             size = float(np.abs(step).max())
             if size * min(size / before, 1.0) < _TOLERANCE:  # the next step is smaller still
                 return _Equilibrium(depth=depth, q=q, state=state)
+            first = size if count == 0 else first
+            if count >= _TRIED and size > first:
+                return None
             before = size
         return None
 
