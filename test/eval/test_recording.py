@@ -123,7 +123,7 @@ def test_garbage_is_refused(tmp_path):
 def test_absent_and_empty_places_are_refused(tmp_path):
     with pytest.raises(RecordingError, match="no such recording"):
         read_recording(tmp_path / "nowhere")
-    with pytest.raises(RecordingError, match="no metadata.yaml, .mcap or .db3 in it"):
+    with pytest.raises(RecordingError, match="no metadata.yaml, .mcap, .db3 or pictures in it"):
         read_recording(tmp_path)
     (tmp_path / "notes.txt").write_text("x")
     with pytest.raises(RecordingError, match="not a recording"):

@@ -113,7 +113,9 @@ def test_no_surface_point_is_closer_than_the_closest(x, y, z, seed):
     samples = np.einsum("ts,tsi->ti", rng.dirichlet(np.ones(3), len(corners)), corners)
     assert distances[0] <= np.linalg.norm(samples - point, axis=1).min() + 1e-12
     assert distances[0] == pytest.approx(np.linalg.norm(closest[0] - point[0]), abs=1e-12)
-    assert find_closest(HEXES, closest)[1][0] < 1e-9
+    assert (
+        find_closest(HEXES, closest)[1][0] < 1e-8
+    )  # trimesh takes points within its tolerance, 1e-8, for the surface's
 
 
 def test_far_points_are_refused_by_number_place_and_distance():
