@@ -58,11 +58,11 @@ class TagFinder:
         self._unseen, self.mirrored = 0, {}
 
     def find(self, color: NDArray) -> dict[int, NDArray]:
-        """Return the corners (4, 2) [px] by number of the tags seen in an image (h, w, 3); raise no error."""
+        """Return the corners (4, 2) [px] by number of the tags seen in an image (h, w, 3)."""
         cv2 = import_cv2()
         grey = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)
-        found = self._detect_near(grey) if self._last else {}
-        if len(found) < max(len(self._last), 1):
+        found = self._detect_near(grey) if len(self._last) == len(self._ids) else {}
+        if len(found) < len(self._ids):
             found = self._detect(grey)
         self._last, self._unseen = found, 0 if found else self._unseen + 1
         if found:
