@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.camera import CameraIntrinsics, check_depth, check_mask, compute_rays, project, rays_from_pixels
-from finforce.transforms import invert_pose
+from finforce.transforms import invert_pose, move_pose
 from finforce_contact.mesh.object_mesh import ObjectMesh
 from finforce_contact.mesh.views import MeshView
 from finforce_contact.parameters import TrackerSettings
@@ -524,11 +524,8 @@ class MeshAligner:
         return step * min(1.0, _LONGEST_STEP / max(np.abs(step).max(), 1e-12))
 
     def _move(self, T: NDArray, step: NDArray) -> NDArray:
-        from scipy.spatial.transform import Rotation
-
         middle = self.middle_of(T)
-        moved = T.copy()
-        moved[:3, :3] = Rotation.from_rotvec(step[3:] / self.radius).as_matrix() @ T[:3, :3]
+        moved = move_pose(T, np.r_[step[:3], step[3:] / self.radius])
         moved[:3, 3] = middle + step[:3] - moved[:3, :3] @ self.middle
         return moved
 

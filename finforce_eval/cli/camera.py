@@ -100,9 +100,12 @@ def find_tags(colors: list[NDArray], options: argparse.Namespace) -> list[dict[i
     """
     if not options.tags:
         return []
-    finder = TagFinder(options.tag_family, options.tags)
-    seen = [finder.find(color) for color in colors]
-    if not any(seen) and any(finder.find(color[:, ::-1].copy()) for color in colors):
+    finder, seen, mirrored = TagFinder(options.tag_family, options.tags), [], False
+    for color in colors:
+        finder.reset()
+        seen.append(finder.find(color))
+        mirrored |= bool(finder.mirrored)
+    if mirrored and not any(seen):
         raise OptionError("the pictures are mirrored: their tags decode only when they are flipped")
     return seen
 

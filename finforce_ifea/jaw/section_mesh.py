@@ -85,9 +85,9 @@ class _SizeField:
     """The wanted size of elements at any place."""
 
     def __init__(self, section: Section, size: float) -> None:
-        self.size = size
         from scipy.spatial import cKDTree
 
+        self.size = size
         self._section = section
         places, sizes = [], []
         for ring, is_closed in section.lines:

@@ -163,7 +163,7 @@ _FEWEST_ROWS, _MOST_ROWS = 12, 84
 # Rows of nodes nearer together than this share of their mean distance are those of an unstructured mesh.
 _CLOSEST = 0.1
 # What the outcome depends on beside the jaw.
-GRID = (DEPTHS, HEIGHTS, SHAPES, ROWS, _ROD, _DEEPEST, _LOWEST, _TOP, _DENSER, _EARLY, _HARDEST, _ITERATIONS)
+GRID = (DEPTHS, HEIGHTS, SHAPES, ROWS, _ROD, _DEEPEST, _LOWEST, _TOP, _DENSER, _EARLY, _HARDEST, _ITERATIONS, _TRIED)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -405,8 +405,9 @@ class _Rod:
             size = float(np.abs(step).max())
             if size * min(size / before, 1.0) < _TOLERANCE:  # the next step is smaller still
                 return _Equilibrium(depth=depth, q=q, state=state)
-            first = size if count == 0 else first
-            if count >= _TRIED and size > first:
+            if count == 0:
+                first = size
+            elif count >= _TRIED and size > first:
                 return None
             before = size
         return None

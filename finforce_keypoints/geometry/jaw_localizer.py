@@ -258,7 +258,7 @@ class JawLocalizer:
         points[:, 0] -= self._sign * self._track.speed * (late - late[-1])
         # where a holder covers what is rigid, the place was found by points that bend: it tells nothing of the bending
         is_held = self._mount.is_held
-        common = COVERED_STDDEV if seen.tag is None else np.hypot(origin.stddev, TAGGED_STDDEV)
+        shared = COVERED_STDDEV if seen.tag is None else float(np.hypot(origin.stddev, TAGGED_STDDEV))
         y_stddev = np.where(is_held, self._model.relief, fit.stddev)
         stddev = compute_stddev(sight, depths, y_stddev, seen.ray_stddev)
         stddev[:, 0] = np.hypot(stddev[:, 0], 0.0 if is_held else origin.stddev)
@@ -275,7 +275,7 @@ class JawLocalizer:
             T_camera_jaw=self._origin.place(replace(origin, x=origin.x - self._track.speed * late[-1])),
             reasons=reasons,
             scale=fit.scale,
-            shared=float(common) if is_held else 0.0,
+            shared=shared if is_held else 0.0,
         )
 
     def _find_delays(self, seen: _Seen, T_camera_jaw: NDArray) -> NDArray:

@@ -131,12 +131,8 @@ class OriginEstimator:
         """
         if self._motions is not None:
             corners = len(self._starts) - self._count
-            unseen = np.full((corners, 3), np.nan)
-            rays, stddev = (
-                np.vstack((rays, unseen if tag is None else tag)),
-                np.append(stddev, np.full(corners, tag_stddev)),
-            )
-            return self._measure_bent(rays, stddev)
+            tag = np.full((corners, 3), np.nan) if tag is None else tag
+            return self._measure_bent(np.vstack((rays, tag)), np.append(stddev, np.full(corners, tag_stddev)))
         x, error, off = self._solve(rays, stddev)
         with np.errstate(invalid="ignore"):
             fits = (off <= self._tolerance) & (x >= self._low) & (x <= self._high) & np.isfinite(self._bent)
