@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib import import_module
-from inspect import signature
 from time import perf_counter
 from typing import Any
 
@@ -41,23 +39,8 @@ PARTS = {
     "solvers": "Run time against force error of the solver tiers",
     "chain": "Latency against force error of the whole chain",
     "start": "From a node's start until it is ready, and its memory",
-    "images": "From images to forces on unseen scenes, beside true key points",
 }
 USUAL = ("solvers", "chain")  # measured when none is named
-
-
-def measure_part(name: str, quick: bool, **options: Any) -> Figures:
-    """Return the figures of a part.
-
-    Raises:
-        OptionError: the part does not take one of the options.
-        FinforceError: it cannot be measured here.
-    """
-    taken = {part: signature(import_module(f"lab.bench.{part}").measure).parameters for part in PARTS}
-    for option in options.keys() - taken[name].keys():
-        able = ", ".join(part for part in PARTS if option in taken[part]) or "none"
-        raise OptionError(f"the part {name} takes no {option}; {able} do")
-    return import_module(f"lab.bench.{name}").measure(quick, **options)
 
 
 def select_parts(names: str | None) -> tuple[str, ...]:

@@ -3,26 +3,19 @@
 from __future__ import annotations
 
 import argparse
+from importlib import import_module
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 from finforce.errors import FinforceError
 from finforce_eval.cli.parser import CommandResult, picture_file
-from finforce_eval.errors import OptionError
 from finforce_eval.machine import describe_machine, write_figures
-from lab.harness import PARTS, figures_json, format_figures, measure_part, select_parts
+from lab.harness import PARTS, figures_json, format_figures, select_parts
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
-    text = "folder for recordings of the part images (a cache)"
-    parser.add_argument("folder", nargs="?", metavar="FOLDER", help=text)
-    text = "jaw files or included jaws for the part images, comma-separated"
-    parser.add_argument("--jaw", metavar="NAME", help=text)
-    text = "number of seeds per scene of the part images"
-    parser.add_argument("--count", type=int, metavar="N", help=text)
-    parser.add_argument("--model", metavar="FOLDER", help="network for the part images (the included one)")
     text = f"parts to measure: {', '.join(PARTS)} (those of `make bench`)"
     parser.add_argument("--parts", metavar="A,B", help=text)
     text = "picture of time against error, of the part solvers"
@@ -32,25 +25,21 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> CommandResult:
     """Measure the parts and print each one's tables."""
-    given = {name: getattr(options, name) for name in ("folder", "jaw", "count", "model")}
-    given = {name: value for name, value in given.items() if value is not None}
     machine, content = describe_machine(), {}
     for part in select_parts(options.parts):
-        content[part] = _run_part(part, options.quick, given, options.figure)
+        content[part] = _run_part(part, options.quick, options.figure)
         if options.json:  # what comes next may fail
             write_figures(options.json, content)
     print(f"\n{machine['processor']}, {machine['cores']} cores, Python {machine['python']}, {machine['commit']}")
     return CommandResult(content)
 
 
-def _run_part(part: str, quick: bool, given: dict[str, Any], picture: str | None) -> dict[str, Any]:
+def _run_part(part: str, quick: bool, picture: str | None) -> dict[str, Any]:
     """Measure one part, print it and draw the solvers; return it as plain values."""
     print(f"\n{PARTS[part]}\n")
     begin = perf_counter()
     try:
-        figures = measure_part(part, quick, **given)
-    except OptionError:
-        raise
+        figures = import_module(f"lab.bench.{part}").measure(quick)
     except FinforceError as error:
         print(f"not measured: {error}")
         return {"not_measured": str(error)}

@@ -43,20 +43,15 @@ def two_parts(monkeypatch):
     """Replace the parts by some that measure nothing; return what they were asked for."""
     asked = []
 
-    def make(name, takes_folder=False):
+    def make(name):
         def measure(quick):
-            asked.append((name, quick, None))
+            asked.append((name, quick))
             return figures_of(name)
 
-        def measure_folder(quick, folder=None):
-            asked.append((name, quick, folder))
-            return figures_of(name)
-
-        module = SimpleNamespace(measure=measure_folder if takes_folder else measure)
-        monkeypatch.setitem(sys.modules, f"lab.bench.{name}", module)
+        monkeypatch.setitem(sys.modules, f"lab.bench.{name}", SimpleNamespace(measure=measure))
         return f"Title of {name}"
 
-    parts = {"first": make("first", takes_folder=True), "second": make("second"), "third": make("third")}
+    parts = {name: make(name) for name in ("first", "second", "third")}
     monkeypatch.setattr(harness, "USUAL", ("first", "second"))
     monkeypatch.setattr(harness, "PARTS", parts)
     monkeypatch.setattr(bench, "PARTS", parts)
@@ -119,7 +114,7 @@ def test_every_listed_part_can_be_measured():
 def test_command_prints_tables_and_writes_json(two_parts, tmp_path, capsys):
     out = tmp_path / "new" / "bench.json"
     assert main(["bench", "--quick", "--json", str(out)]) == 0
-    assert two_parts == [("first", True, None), ("second", True, None)]
+    assert two_parts == [("first", True), ("second", True)]
     content = json.loads(out.read_text())
     assert {"processor", "python", "commit"} <= content["machine"].keys()
     assert [content[name]["rows"]["rows"][0]["way"] for name in ("first", "second")] == ["first", "second"]
@@ -127,13 +122,8 @@ def test_command_prints_tables_and_writes_json(two_parts, tmp_path, capsys):
     assert "Title of first" in printed and "note of second" in printed
 
 
-def test_an_option_reaches_the_part_that_takes_it(two_parts, tmp_path):
-    assert main(["bench", str(tmp_path), "--parts", "first"]) == 0
-    assert two_parts == [("first", False, str(tmp_path))]
-
-
 def test_part_that_cannot_be_measured_is_said_and_the_others_are_measured(two_parts, tmp_path, monkeypatch, capsys):
-    def refuse(quick, folder=None):
+    def refuse(quick):
         raise MissingDependencyError("needs ROS 2")
 
     monkeypatch.setattr(sys.modules["lab.bench.first"], "measure", refuse)
@@ -144,7 +134,7 @@ def test_part_that_cannot_be_measured_is_said_and_the_others_are_measured(two_pa
     assert "not measured: needs ROS 2" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("words", [["--parts", "none"], ["FOLDER", "--parts", "second"], ["--frames", "9"]])
+@pytest.mark.parametrize("words", [["--parts", "none"], ["FOLDER"], ["--frames", "9"]])
 def test_options_that_mean_nothing_are_refused_with_one_line(two_parts, words, capsys):
     try:
         code = main(["bench", *words])
