@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
-from geometry_msgs.msg import TwistStamped, WrenchStamped
+from geometry_msgs.msg import WrenchStamped
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
@@ -167,7 +167,7 @@ class GripperDriverNode(Node):
         first = {name: getattr(parameters, f"grasp_{name}") for name in ("force", "speed", "time_limit")}
         self.session = GraspSession(self.gripper, GraspGoal(**first), grasp, self.wake.trigger)
         self.tasks = GripperTasks(self.gripper, self.session, parameters)
-        told = [f"{side} {what}" for side in JAWS for what in ("stddev", "slip")]
+        told = [f"{side} stddev" for side in JAWS]
         self.times = MessageTimes(self.gripper.clock, ("force", *JAWS, *told), parameters.max_age)
         self.health = GripperHealth(source=parameters.port, stale_after=parameters.max_age)
         self.stage = ros.Stage(self)
@@ -231,7 +231,6 @@ class GripperDriverNode(Node):
         self.stage.subscription(WrenchStamped, "grasp_wrench", self._on_wrench, ros.SENSOR)
         for side in JAWS:
             self.stage.subscription(PointCloud2, f"{side}/contact", partial(self._on_contact, side), ros.SENSOR)
-            self.stage.subscription(TwistStamped, f"{side}/slip", partial(self._on_slip, side), ros.RESULT)
             stddev = f"{side}/wrench_stddev"
             self.stage.subscription(WrenchStamped, stddev, partial(self._on_stddev, side), ros.RESULT)
 
@@ -332,16 +331,6 @@ class GripperDriverNode(Node):
         with self._rejections("standard deviation"):
             stddev = ros.force_stddev(message, self.parameters.jaw_frame(side))
             self.session.take_stddev(side, stddev, self._enter(f"{side} stddev", message))
-
-    def _on_slip(self, side: str, message: TwistStamped) -> None:
-        """Hand to the grasp how fast the object slides over a jaw."""
-        with self._rejections("slip"):
-            speed = ros.twist_speed(message, self.parameters.jaw_frame(side))
-            force = self.session.take_slip(side, speed, self._enter(f"{side} slip", message))
-            if force is not None:
-                self.get_logger().warning(
-                    f"the object slides over the {side} jaw at {1e3 * speed:.1f} mm/s: force raised to {force:.2f} N"
-                )
 
     def _on_contact(self, side: str, cloud: PointCloud2) -> None:
         """Hand to the grasp whether a jaw touches the object."""

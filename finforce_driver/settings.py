@@ -230,7 +230,6 @@ class GraspSettings(_Bounded):
         10.0,
         alias="touch_timeout",
     )
-    slip_raise: float = setting(0.0, "Share of the set force added while the object slides", "", 0.0, 1.0)
     motor_force: float = setting(
         7.5, "Motor limit as grip force by the vendor's curve, at least 1.5 times the set force", "N", 7.0, 62.0
     )

@@ -113,17 +113,6 @@ def _vector(xyz: Sequence[float]) -> Vector3:
     return Vector3(x=xyz[0], y=xyz[1], z=xyz[2])
 
 
-def twist_speed(message: TwistStamped, frame: str) -> float:
-    """Return the linear speed [m/s] of a velocity.
-
-    Raises:
-        ObservationError: the frame is not `frame`, or a component is not finite.
-    """
-    check_frame(message, frame, "the velocity")
-    linear = message.twist.linear
-    return math.hypot(*_finite("the velocity", linear.x, linear.y, linear.z))
-
-
 def grasp_force(message: WrenchStamped, frame: str) -> float:
     """Return the grasp force [N] of a grasp_wrench, as it came: it may be no number.
 

@@ -52,7 +52,6 @@ from finforce.ros.messages import (  # noqa: F401 - for those who publish
     stamp_message,
     status_message,
     twist_message,
-    twist_speed,
     wrench_message,
     xyz_columns,
 )

@@ -15,53 +15,6 @@ from finforce_driver.gripper import Gripper
 from finforce_driver.settings import GraspGoal, GraspSettings
 from finforce_driver.state import USABLE, GraspPhase, GraspStatus, GripperState
 
-_SLIDES = 0.003  # [m/s] of the object over a jaw, above which it slides
-_LIMIT = 1.5  # times the set force, to which it rises at most
-_IN_A_ROW = 3  # velocities above the limit that are no chance
-_APART = 0.4  # [s] between two rises: the gripper and the camera need that to show what the last one did
-_LONGEST_GAP = 0.5  # [s] after which velocities are no longer in a row
-
-
-class SlipGuard:
-    """Watches how the object moves over the jaws, and raises the set force in bounded steps; off unless asked for.
-
-    Args:
-        settings: of the grasp, which say by how much the force rises, and its limit.
-    """
-
-    def __init__(self, settings: GraspSettings) -> None:
-        self._settings = settings
-        self.begin(math.nan)
-
-    def begin(self, force: float) -> None:
-        """Take the set force [N] that somebody asked for; rises count from there."""
-        self._asked, self._raised = force, -math.inf
-        self._sliding: dict[str, tuple[float, int]] = {}  # of each jaw: stamp, and fast images in a row
-
-    def take(self, jaw: str, speed: float, stamp: float, force: float) -> float | None:
-        """Take a speed of the object over a jaw; return the force to be set now [N], None to leave it.
-
-        Args:
-            jaw: whose.
-            speed: [m/s].
-            stamp: of its image [s].
-            force: that is set [N].
-        """
-        settings = self._settings
-        last, count = self._sliding.get(jaw, (-math.inf, 0))
-        count = (count if 0.0 < stamp - last < _LONGEST_GAP else 0) + 1 if speed > _SLIDES else 0
-        self._sliding[jaw] = (stamp, count)
-        if count < _IN_A_ROW or settings.slip_raise == 0.0 or stamp - self._raised < _APART:
-            return None
-        limit = min(_LIMIT * self._asked, settings.force_limit)
-        wanted = min(force + settings.slip_raise * self._asked, limit)
-        if not wanted > force:
-            return None
-        self._raised = stamp
-        self._sliding[jaw] = (stamp, 0)
-        return wanted
-
-
 CYCLE = 0.05  # [s] in which the silence of a gripper is noticed
 MARGIN = 2.0  # [s] beyond the time limit of a goal, after which nobody waits for its grasp any longer
 SETTLED = (GraspPhase.HOLDING, GraspPhase.STOPPED)
@@ -98,7 +51,6 @@ class GraspSession:
         self._touches: dict[str, TouchSample] = {}
         self._touch_told = -math.inf
         self._stddevs: dict[str, tuple[float, float]] = {}
-        self._slips = SlipGuard(settings)
         self._ratios: list[float] = []
         self._changed = Condition()
 
@@ -119,7 +71,6 @@ class GraspSession:
             self.goal = goal
             if self._grasp is not None:
                 self._grasp.change_force(goal.force)
-                self._slips.begin(goal.force)
 
     def begin(self) -> None:
         """Begin a grasp, which looks at the gripper at once and may end by that."""
@@ -132,7 +83,6 @@ class GraspSession:
                 resolution=gripper.resolution,
                 ratios=self._ratios,
             )
-            self._slips.begin(self.goal.force)
             self.status = None
             self.update(gripper.state)
 
@@ -194,21 +144,6 @@ class GraspSession:
             if self._grasp is not None and stamp > self._touch_told and (touching or complete):
                 self._touch_told = stamp
                 self._grasp.take_touch(any(touch.touching for touch in fresh), stamp)
-
-    def take_slip(self, jaw: str, speed: float, stamp: float) -> float | None:
-        """Take the speed [m/s] of the object over a jaw in the image at `stamp` [s].
-
-        Returns:
-            The force [N] to which the grasp goes because the object slides; None where it stays as it is.
-        """
-        with self._changed:
-            grasp = self._grasp
-            if grasp is None or grasp.phase is not GraspPhase.HOLDING:
-                return None
-            force = self._slips.take(jaw, speed, stamp, grasp.set_force)
-            if force is not None:
-                grasp.change_force(force)
-            return force
 
     def take_stddev(self, jaw: str, stddev: float, stamp: float) -> None:
         """Keep the standard deviation of a jaw's force [N] in the image at `stamp` [s], for the forces to come."""

@@ -10,11 +10,8 @@ from finforce.errors import FinforceError
 from finforce.signals import StopSignals
 from finforce_sim.emulator.adapter import ACK_MODES, EmulatedAdapter
 from finforce_sim.emulator.control import VARIANTS
-from finforce_sim.emulator.faults import FaultyAdapter, draw_plan
 from finforce_sim.emulator.firmware import EmulatedGripper
 from finforce_sim.emulator.pty_port import PtyPort
-
-_FAULTS = 10_000  # planned ahead
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -31,8 +28,6 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--ack", choices=ACK_MODES, default="none", help="acknowledgements of the adapter (none)")
     parser.add_argument("--baud", type=int, help="baud rate that the host must set (any)")
     parser.add_argument("--latency-ms", type=float, default=0.0, help="latency from the bus to the host [ms] (0)")
-    parser.add_argument("--faults", type=float, default=0.0, help="random faults per minute, of all kinds (0)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the random faults (0)")
     return parser
 
 
@@ -50,8 +45,7 @@ def build_adapter(options: argparse.Namespace) -> EmulatedAdapter:
         object_opening=None if soft else width,
         load=(lambda opening: 1e3 * options.stiffness * max(width - opening, 0.0)) if soft else None,
     )
-    plan = draw_plan(options.seed, _FAULTS, 60.0 / options.faults) if options.faults > 0.0 else ()
-    return FaultyAdapter(gripper, plan, options.seed, ack_mode=options.ack, latency=1e-3 * options.latency_ms)
+    return EmulatedAdapter(gripper, ack_mode=options.ack, latency=1e-3 * options.latency_ms)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

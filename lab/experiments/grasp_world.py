@@ -35,7 +35,7 @@ from finforce_keypoints.detectors.dots import DotSettings
 from finforce_keypoints.geometry.jaw_localizer import JawKeypoints
 from finforce_keypoints.images import RgbdImage
 from finforce_keypoints.parameters import DetectorParameters, DetectorSettings, load_jaws
-from finforce_sim.emulator.faults import FaultyAdapter, PlannedFault
+from finforce_sim.emulator.adapter import EmulatedAdapter
 from finforce_sim.emulator.firmware import EmulatedGripper
 from finforce_sim.emulator.virtual import VirtualBus, VirtualClock
 from finforce_sim.footage import disturb_pose, parse_size
@@ -129,14 +129,14 @@ class World:
         case: GraspCase,
         sensor: Sensor,
         settings: GraspSettings | None = None,
-        plan: Sequence[PlannedFault] = (),
         holding: float = HOLDING,
+        connect: Callable[[EmulatedGripper], EmulatedAdapter] = EmulatedAdapter,
     ) -> None:
         self._holding = holding
         self._case, self._sensor, self._settings = case, sensor, settings
         self.emulated = EmulatedGripper(case.variant, load=case.plant.force_at)
         self.clock = VirtualClock()
-        self.adapter = FaultyAdapter(self.emulated, plan, case.seed)
+        self.adapter = connect(self.emulated)
         self.bus = VirtualBus(self.adapter, self.clock)
         self.gripper = Gripper(self.bus, clock=self.clock)
         self._relaxation = Relaxation(case.plant.terms)

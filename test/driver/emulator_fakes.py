@@ -8,6 +8,7 @@ from pathlib import Path
 from time import monotonic
 
 from driver_node_fakes import call, start_driver, wrench
+from emulator_faults import FaultyAdapter
 from geometry_msgs.msg import WrenchStamped
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
@@ -18,7 +19,6 @@ from finforce_driver.gripper import Gripper
 from finforce_driver.settings import GripperSettings
 from finforce_driver.state import Phase
 from finforce_sim.emulator.adapter import EmulatedAdapter
-from finforce_sim.emulator.faults import FaultyAdapter
 from finforce_sim.emulator.firmware import EmulatedGripper
 from finforce_sim.emulator.pty_port import PtyPort
 from finforce_sim.emulator.virtual import VirtualBus, VirtualClock

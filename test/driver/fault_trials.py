@@ -17,6 +17,8 @@ from dataclasses import dataclass, field, replace
 from random import Random
 from typing import Any
 
+from emulator_faults import LINE_FAULTS, FaultKind, FaultyAdapter, PlannedFault, draw_plan
+
 from finforce_driver.can.protocol import CanMessage, Command, Move, decode_move
 from finforce_driver.errors import DriverError
 from finforce_driver.gripper import Gripper
@@ -24,7 +26,6 @@ from finforce_driver.machine.machine import INHERITED
 from finforce_driver.settings import GripperSettings
 from finforce_driver.state import GripperState, MoveOutcome, Phase
 from finforce_sim.emulator.control import Mode
-from finforce_sim.emulator.faults import LINE_FAULTS, FaultKind, FaultyAdapter, PlannedFault, draw_plan
 from finforce_sim.emulator.firmware import EmulatedGripper, Fault
 from finforce_sim.emulator.mechanism import Jaws
 from finforce_sim.emulator.virtual import VirtualBus, VirtualClock

@@ -19,10 +19,12 @@ import math
 from collections import Counter
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from random import Random
 from typing import Any
 
 import numpy as np
+from emulator_faults import FaultKind, FaultyAdapter, PlannedFault
 from fault_trials import Tally
 from grasp_fakes import build_spring
 
@@ -32,7 +34,6 @@ from finforce_driver.grasp.session import hold_force
 from finforce_driver.settings import GraspGoal, GraspSettings
 from finforce_driver.state import GraspPhase, GraspStatus, GripperState, MoveOutcome, Phase
 from finforce_sim.emulator.control import Mode
-from finforce_sim.emulator.faults import FaultKind, PlannedFault
 from lab.experiments.grasp_world import GraspCase, NoisySensor, Plant, World
 
 LIMIT = GraspSettings().force_limit  # [N]
@@ -138,7 +139,8 @@ class FaultyGrasp(World):
         case = GraspCase(plant=plant, force=goal, speed=speed, latency=latency, seed=seed, variant=variant)
         start = draw.uniform(0.0, 3.0)
         camera = FaultyCamera(draw.choice(CAMERA), (start, start + draw.uniform(0.1, 3.0)), seed)
-        super().__init__(case, camera, None, self._plan(draw))
+        connect = partial(FaultyAdapter, plan=self._plan(draw), seed=seed)
+        super().__init__(case, camera, connect=connect)
         self.tally = GraspTally(cases=1)
         self._camera, self._seed = camera, seed
         self._act = draw.choice(("stop", "stop", "estop", "none", "none", "none"))

@@ -4,11 +4,11 @@ import math
 
 import pytest
 from emulator_fakes import VARIANTS, Rig
+from emulator_faults import FaultKind
 
 from finforce_driver.can.protocol import Command
 from finforce_driver.errors import GripperStateError
 from finforce_driver.state import MoveOutcome, Phase
-from finforce_sim.emulator.faults import FaultKind
 
 both_variants = pytest.mark.parametrize("variant", VARIANTS)
 LIMP = (Phase.UNCALIBRATED, Phase.FAULT)

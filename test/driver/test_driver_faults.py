@@ -6,12 +6,12 @@ FINFORCE_FAULTS is the number of faults and of grasps, 120 and 6 without it.
 import os
 
 import pytest
+from emulator_faults import FaultKind
 from fault_trials import FaultRun, choose_kinds
 from faulty_grasp_trials import play_all
 
 from finforce_driver.machine.drive import Exchange
 from finforce_driver.machine.knowledge import ReplyFilter
-from finforce_sim.emulator.faults import FaultKind
 
 
 def total(tally):

@@ -6,6 +6,7 @@ import time
 
 import pytest
 from emulator_fakes import COUNT, VARIANTS, Rig
+from emulator_faults import FaultKind
 
 from finforce_driver.can.protocol import Flag
 from finforce_driver.can.slcan import SerialBus
@@ -14,7 +15,6 @@ from finforce_driver.gripper import Gripper
 from finforce_driver.settings import GripperSettings
 from finforce_driver.state import MoveOutcome, Phase
 from finforce_sim.emulator.adapter import EmulatedAdapter
-from finforce_sim.emulator.faults import FaultKind
 from finforce_sim.emulator.firmware import EmulatedGripper
 from finforce_sim.emulator.pty_port import PtyPort
 

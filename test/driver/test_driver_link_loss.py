@@ -4,13 +4,13 @@ import math
 
 import pytest
 from emulator_fakes import VARIANTS, Rig
+from emulator_faults import FaultKind
 
 from finforce_driver.can.protocol import Command
 from finforce_driver.errors import GripperStateError, LinkError
 from finforce_driver.gripper import Gripper
 from finforce_driver.settings import GripperSettings
 from finforce_driver.state import MoveOutcome, Phase
-from finforce_sim.emulator.faults import FaultKind
 from finforce_sim.emulator.virtual import VirtualBus
 
 both_variants = pytest.mark.parametrize("variant", VARIANTS)

@@ -2,10 +2,10 @@
 
 import pytest
 from emulator_fakes import COUNT, VARIANTS, Rig
+from emulator_faults import FaultKind
 
 from finforce_driver.can.protocol import Command, Flag
 from finforce_driver.state import MoveOutcome, Phase
-from finforce_sim.emulator.faults import FaultKind
 
 GO = Flag.ACTIVATE | Flag.GO
 both_variants = pytest.mark.parametrize("variant", VARIANTS)

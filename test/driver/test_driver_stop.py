@@ -2,11 +2,11 @@
 
 import pytest
 from emulator_fakes import VARIANTS
+from emulator_faults import FaultKind
 
 from finforce_driver.can.protocol import Command, Flag
 from finforce_driver.errors import GripperStateError
 from finforce_driver.state import MoveOutcome, Phase
-from finforce_sim.emulator.faults import FaultKind
 from finforce_sim.emulator.firmware import Fault
 
 both_variants = pytest.mark.parametrize("variant", VARIANTS)

@@ -1,8 +1,8 @@
 import pytest
 from emulator_fakes import VARIANTS
+from emulator_faults import FaultKind, FaultyAdapter, PlannedFault, draw_plan
 
 from finforce_driver.can.protocol import CanMessage
-from finforce_sim.emulator.faults import FaultKind, FaultyAdapter, PlannedFault, draw_plan
 from finforce_sim.emulator.firmware import EmulatedGripper, Fault
 
 REPLY = b"t078400000030\r"

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 import serial
+from emulator_faults import FaultKind, FaultyAdapter
 from process_fakes import running
 
 from finforce_driver.errors import LinkError, TargetError
 from finforce_sim.emulator.__main__ import build_adapter, build_parser, main
 from finforce_sim.emulator.adapter import EmulatedAdapter
-from finforce_sim.emulator.faults import FaultKind, FaultyAdapter
 from finforce_sim.emulator.firmware import EmulatedGripper
 from finforce_sim.emulator.pty_port import PtyPort
 
@@ -152,8 +152,6 @@ def test_command_line_describes_the_gripper():
             "0.8",
             "--ack",
             "lawicel",
-            "--faults",
-            "60",
         ]
     )
     adapter = build_adapter(options)

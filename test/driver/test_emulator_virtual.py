@@ -2,10 +2,10 @@ from threading import Event
 
 import pytest
 from emulator_fakes import VARIANTS
+from emulator_faults import FaultKind, FaultyAdapter
 
 from finforce_driver.can.protocol import CanMessage
 from finforce_driver.errors import LinkError
-from finforce_sim.emulator.faults import FaultKind, FaultyAdapter
 from finforce_sim.emulator.firmware import EmulatedGripper
 from finforce_sim.emulator.virtual import VirtualBus, VirtualClock
 
