@@ -6,9 +6,8 @@ units, so that one function prints them and one writes them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -63,16 +62,6 @@ def percentiles(seconds: Sequence[float] | NDArray, label: str = "") -> dict[str
     prefix = f"{label} " if label else ""
     columns = zip(("p50", "p95", "p99", "max"), values, strict=True)
     return {f"{prefix}n": times.size, **{f"{prefix}{name}/ms": float(value) for name, value in columns}}
-
-
-def time_calls(call: Callable[[], Any], count: int, clock: Callable[[], float] = perf_counter) -> list[float]:
-    """Return the durations of `count` calls [s] by a clock."""
-    times = []
-    for _ in range(count):
-        begin = clock()
-        call()
-        times.append(clock() - begin)
-    return times
 
 
 def format_figures(figures: Figures) -> str:

@@ -131,17 +131,13 @@ def fingerprint(scene: TwinScene) -> str:
 
 def _render(scene: TwinScene, path: Path) -> None:
     """Render a scene into a new folder."""
-    from tqdm import tqdm
-
-    from finforce_eval.cli.twin import RecordingForm, write_footage
+    from finforce_eval.cli.twin import RecordingForm, record_footage
     from finforce_sim.footage import FINGER, Footage, parse_size
     from finforce_sim.gripper import TwinGripper
     from finforce_sim.photographer import Photographer
 
-    gripper = TwinGripper(scene.build(), FINGER)
+    scenario = scene.build()
+    gripper = TwinGripper(scenario, FINGER)
     smooth = SmoothGripper(gripper, scene.slots)
     footage = Footage(smooth, Photographer(gripper, parse_size(scene.size), scene.seed), scene.seed)
-    case = {"scene": scene.scenario, "seed": scene.seed, "finger": FINGER, "object": {"kind": scene.build().object}}
-    with tqdm(total=len(footage), unit="image", desc=scene.scenario, disable=None, leave=False) as bar:
-        form = RecordingForm(farthest=scene.farthest)
-        write_footage(footage, path, form=form, case=case, seen=lambda _: bar.update())
+    record_footage(footage, scenario, scene.seed, path, form=RecordingForm(farthest=scene.farthest))

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce.camera import ImageError, decode_picture
 from finforce.transforms import pose_numbers, rotation_between
 from finforce_eval.cli.parser import BAG_HELP, CommandResult, add_rest_options, length_mm
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.at_rest import ROUNDS, approach, first_images
 from finforce_eval.evaluation.keypoint_source import KeypointSource, build_records, choose_images, parse_source
 from finforce_eval.evaluation.setup import read_recordings, sides_of
+from finforce_eval.recordings.frames import read_picture
 from finforce_eval.recordings.tracks import Recording
 from finforce_eval.tasks import progress_bar
 from finforce_ifea.jaw.jaw import load_jaw
@@ -65,20 +65,6 @@ def read_at_rest(options: argparse.Namespace) -> tuple[KeypointSource, Recording
     (recording,) = read_recordings(options.bags, source.choice, sides, strict=source.strict)
     recording = first_images(recording, options.images)
     return source, replace(recording, jaws={side: recording.jaws[side] for side in sides})
-
-
-def read_picture(path: Path) -> NDArray[np.uint8]:
-    """Return a jpeg or png file as (h, w, 3) red green blue.
-
-    Raises:
-        OptionError: it is no regular file, or no picture.
-    """
-    if not path.is_file():
-        raise OptionError(f"{path}: expected a picture, jpeg or png, of a table with holes")
-    try:
-        return decode_picture(path.read_bytes(), path.name)
-    except ImageError as error:
-        raise OptionError(str(error)) from error
 
 
 def format_grid_camera(found: GridCamera) -> str:

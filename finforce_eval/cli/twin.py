@@ -38,6 +38,7 @@ from finforce_eval.recordings.writer import (
     wrench_message,
     write_entries,
 )
+from finforce_eval.tasks import progress_bar
 from finforce_sim.footage import (
     FINGER,
     Footage,
@@ -275,9 +276,14 @@ def record_scene(
     scenario: Scenario, seed: int, folder: Path, *, camera: Any, form: RecordingForm, finger: int = FINGER
 ) -> None:
     """Render a scene of a finger into a new folder, under a progress bar."""
-    from tqdm import tqdm
-
     footage = build_footage(scenario, seed, camera, finger=finger, depth_step=form.depth_step)
+    record_footage(footage, scenario, seed, folder, form=form, finger=finger)
+
+
+def record_footage(
+    footage: Footage, scenario: Scenario, seed: int, folder: Path, *, form: RecordingForm, finger: int = FINGER
+) -> None:
+    """Render the footage of a scene into a new folder, under a progress bar."""
     case = {
         "scene": scenario.name,
         "seed": seed,
@@ -285,5 +291,5 @@ def record_scene(
         "light": scenario.light,
         "object": {"kind": scenario.object},
     }
-    with tqdm(total=len(footage), unit="image", desc=scenario.name, disable=None, leave=False) as bar:
+    with progress_bar(len(footage), "image", scenario.name) as bar:
         write_footage(footage, folder, form=form, case=case, seen=lambda _: bar.update())

@@ -19,6 +19,7 @@ from finforce.transforms import invert_pose, move_pose, pose_numbers, rotation_b
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.at_rest import JawsAtRest, approach
 from finforce_eval.evaluation.keypoint_source import KeypointSource, build_records, choose_images
+from finforce_eval.recordings.frames import STILL_RATE, FrameImages
 from finforce_eval.recordings.tracks import Recording
 from finforce_ifea.jaw.jaw import Jaw, list_shipped_jaws, load_jaw
 from finforce_keypoints.errors import KeypointError
@@ -206,22 +207,13 @@ def _find_reasons(mean: RgbdImage, source: KeypointSource, recording: Recording,
     ]
 
 
-class _OneImage(list):
-    """One image in place of the images of a recording."""
-
-    has_depth, is_video = False, True
-
-    def __init__(self, image: RgbdImage, frame_id: str) -> None:
-        super().__init__([(0, image)])
-        self.camera, self.frame_id = image.camera, frame_id
-
-
 def _misfit(recording: Recording, source: KeypointSource, image: RgbdImage, pose: NDArray, jaw_file: str) -> float:
     """Return what is left over [px] once the jaws are laid on their key points; infinite where few are seen."""
     jaws = {side: load_jaw(jaw_file, side) for side in recording.jaws}
     here = replace(source, jaw_file=jaw_file, parameters={**source.parameters, "depth": NO_DEPTH})
+    one = FrameImages(name=recording.name, fps=STILL_RATE, camera=image.camera, count=1, read=lambda: [image.color])
     try:
-        found, look = approach(replace(recording, images=_OneImage(image, recording.images.frame_id)), here, jaws, pose)
+        found, look = approach(replace(recording, images=one), here, jaws, pose)
     except FinforceError:
         return np.inf
     seen = min(np.isfinite(jaw.pixels).all(axis=1).mean() for jaw in look.jaws.values())

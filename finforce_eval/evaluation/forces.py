@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -29,7 +29,7 @@ _NUMBERS = ("magnitude_stddev", "residual", "step_ms", "contact_ms", "contact_he
 _POINTS = ("points_x", "points_y", "points_z", "points_weight", "points_touching")
 
 
-NOT_FOUND = "not found"  # status of a jaw that is in none of the images
+NOT_FOUND, REFUSED = "not found", "refused"  # status of a jaw that is in none of the images, and of a bad image
 STILL_UPDATES, STILL_PERIOD = 30, 0.03  # as often, and so far apart [s], is a still seen, for its contact to settle
 PICKED_STDDEV = 1e-3  # [m] of key points that say nothing of it: picked by hand, they scatter by a millimetre or two
 LEAST_ANSWERED = 0.1  # share of the images with a force, below which there is no such finger in them
@@ -90,22 +90,11 @@ def estimate_forces(
     for side in sides:
         check_keypoint_count(recording, side, setup.jaw)
     both, found = len(sides) == len(JAWS), {}
+    how = {"strict": strict, "as_live": setup.as_live, "stills": setup.stills, "progress": progress, "watch": watch}
     for side in sides:
         own = setup.side(side)
         source = GivenContact(None) if _is_unseen(recording, side) else own.source(recording)
-        estimator = own.estimator(both)
-        found[side] = find_forces(
-            recording,
-            own.jaw,
-            source,
-            estimator,
-            side,
-            strict=strict,
-            as_live=setup.as_live,
-            stills=setup.stills,
-            progress=progress,
-            watch=watch,
-        )
+        found[side] = find_forces(recording, own.jaw, source, own.estimator(both), side, **how)
     return with_distances(found, recording) if both else found
 
 
@@ -197,32 +186,34 @@ def find_forces(
         RecordingError: a pose or an image is refused.
         ObservationError: the estimator refuses an image.
     """
-    track = recording.jaw(side).keypoints
-    stamps = track.stamps
+    stamps = recording.jaw(side).keypoints.stamps
     run, rows = _JawRun(recording, side, jaw, ForceLoop(source, estimator), stills), []
-    idling, answered = Idling(), np.ones(len(stamps), dtype=bool)
+    idling, passed = Idling(), np.zeros(len(stamps), dtype=bool)
     unseen = _is_unseen(recording, side)
     for index, stamp in enumerate(stamps.tolist()):
         progress(1)
         if unseen:
             rows.append(run.row(NOT_FOUND, f"the {side} jaw is in none of the images"))
             continue
-        if idling.passes(stamp):
+        passed[index] = idling.passes(stamp)
+        if passed[index]:
             source.contact_at(stamp)  # its node has rules of its own
-            answered[index] = False
             rows.append(run.row("", ""))
             continue
-        try:
-            rows.append(run.step(index))
-        except (ObservationError, RecordingError) as error:
-            if strict:
-                frame = f"frame {index}: " if isinstance(error, ObservationError) else ""
-                raise type(error)(f"{recording.name}: {frame}{error}") from error
-            rows.append(run.row("refused", str(error)))
-        else:
-            idling.note(stamp, as_live and estimator.is_idle)
+        rows.append(run.answer(index, strict))
+        idling.note(stamp, as_live and rows[-1]["status"] != REFUSED and estimator.is_idle)
         if watch is not None:
             watch(side, stamp, estimator)
+    columns = _stack_rows(rows, source)
+    columns |= recording.phases_at(stamps) | truth_columns(recording, side) | sight_columns(recording, side)
+    if "detector_ms" in columns:
+        columns["latency_ms"] = columns["step_ms"] + columns["detector_ms"]
+    series = ForceSeries.build(recording.name, side, stamps, **columns).with_snapshot(run.snapshot)
+    return series.at(~passed) if as_live else series
+
+
+def _stack_rows(rows: Sequence[Mapping[str, Any]], source: ContactSource) -> dict[str, Any]:
+    """Return the rows of a run as columns, with where its contacts came from."""
     columns = {name: np.array([row[name] for row in rows]) for name in (*_VECTORS, *_NUMBERS)}
     columns |= {name: [row[name] for row in rows] for name in (*_POINTS, "used")}
     columns |= {name: np.array([row[name] for row in rows], str) for name in ("status", "message", "contact_status")}
@@ -230,12 +221,7 @@ def find_forces(
         columns["touching"] = np.array([row["touching"] for row in rows], dtype=bool)
     else:
         del columns["contact_ms"]
-    columns |= recording.phases_at(stamps) | truth_columns(recording, side) | sight_columns(recording, side)
-    columns["contact_source"] = source.name
-    if "detector_ms" in columns:
-        columns["latency_ms"] = columns["step_ms"] + columns["detector_ms"]
-    series = ForceSeries.build(recording.name, side, stamps, **columns).with_snapshot(run.snapshot)
-    return series.at(answered) if as_live else series
+    return columns | {"contact_source": source.name}
 
 
 class _JawRun:
@@ -253,7 +239,7 @@ class _JawRun:
     """
 
     def __init__(self, recording: Recording, side: str, jaw: Any, loop: ForceLoop, stills: bool = False) -> None:
-        self._updates = STILL_UPDATES if stills else 1
+        self._name, self._updates = recording.name, STILL_UPDATES if stills else 1
         self._jaw, self._loop, self._track = jaw, loop, recording.jaw(side).keypoints
         self._scored = recording.phases_at(self._track.stamps)["scored"]
         self._surface0 = np.array(loop.force.surface())
@@ -262,6 +248,16 @@ class _JawRun:
             self._face = InnerSurface(self._surface0, jaw.face)
             self._lines = true_lines(recording, side, self._track.stamps, self._face.face_x)
         self.snapshot: Snapshot | None = None
+
+    def answer(self, index: int, strict: bool) -> dict[str, Any]:
+        """Return what the loop makes of image `index`; one that is refused ends the run if `strict`; see `step`."""
+        try:
+            return self.step(index)
+        except (ObservationError, RecordingError) as error:
+            if strict:
+                frame = f"frame {index}: " if isinstance(error, ObservationError) else ""
+                raise type(error)(f"{self._name}: {frame}{error}") from error
+            return self.row(REFUSED, str(error))
 
     def step(self, index: int) -> dict[str, Any]:
         """Return what the loop makes of image `index`.

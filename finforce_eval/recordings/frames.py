@@ -143,7 +143,7 @@ def read_picture(path: Path) -> NDArray[np.uint8]:
     try:
         return decode_picture(read_bytes(path, LARGEST_PICTURE), path.name)
     except (FileError, ImageError) as error:
-        raise RecordingError(f"{path.name}: {error}") from error
+        raise RecordingError(f"{path.name}: {error}; expected a picture, jpeg or png") from error
 
 
 def read_frames(path: Path, choice: ImageChoice, sides: Sequence[str] = ()) -> Recording:

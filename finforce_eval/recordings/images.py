@@ -36,6 +36,7 @@ from finforce.messages import (
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.bags import BagReader, check_types, open_bag
 from finforce_eval.recordings.image_files import read_intrinsics
+from finforce_eval.recordings.tracks import check_stamps
 from finforce_keypoints.images import RgbdImage, check_image
 
 # the ends of topics by which the images are found first, whatever the camera is called; the first that is there counts
@@ -203,7 +204,7 @@ def find_images(bag: BagReader, source: Path, choice: ImageChoice | None = None)
     found: dict[str, list[int]] = {topic: [] for topic in topics}
     for raw in bag.raw(topics):
         found[raw.topic].append(read_stamp(raw.data))
-    stamps = {topic: _rising(times, topic, bag.name) for topic, times in found.items()}
+    stamps = {topic: check_stamps(times, topic, bag.name) for topic, times in found.items()}
     depth_stamps = np.full(len(stamps[color]), ALONE)
     paired = np.ones(len(depth_stamps), dtype=bool)
     if depth:
@@ -338,15 +339,6 @@ def _read_camera(bag: BagReader, topic: str) -> tuple[CameraIntrinsics, str]:
             raise RecordingError(f"{bag.name}: the camera on {topic} changes; expected one in a recording")
         camera, frame = seen, info.header.frame_id
     return camera, frame
-
-
-def _rising(stamps: Sequence[int], topic: str, name: str) -> NDArray[np.int64]:
-    """Return stamps (n,) [ns] that were made sure to rise."""
-    times = np.array(stamps, dtype=np.int64)
-    wrong = np.flatnonzero(np.diff(times) <= 0)
-    if wrong.size:
-        raise RecordingError(f"{name}: the stamps of {topic} do not rise at message {wrong[0] + 1}")
-    return times
 
 
 IMAGES = IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"

@@ -10,7 +10,7 @@ import numpy as np
 
 from finforce.errors import ObservationError
 from finforce.files import FileError, read_json
-from finforce.messages import NANOSECONDS, Keypoints, decode_columns, decode_keypoints, stamp_of
+from finforce.messages import Keypoints, decode_columns, decode_keypoints, stamp_of
 from finforce_eval.errors import DamagedError, RecordingError
 from finforce_eval.recordings.bags import bag_source, check_messages, check_types, is_buffer, is_frames, open_bag
 from finforce_eval.recordings.dataset import is_dataset, read_episode
@@ -25,6 +25,7 @@ from finforce_eval.recordings.tracks import (
     PoseTrack,
     Recording,
     WrenchTrack,
+    check_stamps,
     parse_phases,
 )
 from finforce_eval.recordings.umi import read_buffer
@@ -152,19 +153,6 @@ def _read_samples(source: Path, name: str, choice: ImageChoice) -> _Content:
         return _Content(samples, phases, images, notes)
 
 
-def _stamps(samples: Sequence[Any], topic: str, name: str, *, strict: bool) -> np.ndarray:
-    """Return the header stamps (n,) [ns] and check their order."""
-    stamps = np.array([stamp_of(sample) for sample in samples], dtype=np.int64)
-    steps = np.diff(stamps)
-    wrong = np.flatnonzero(steps <= 0 if strict else steps < 0)
-    if wrong.size:
-        what = "go back" if steps[wrong[0]] < 0 else "stand still"
-        seconds = stamps[wrong[0] + 1] / NANOSECONDS
-        where = f"message {wrong[0] + 1}, {seconds:.3f} s"
-        raise RecordingError(f"{name}: the stamps of {topic} {what} at {where}")
-    return stamps
-
-
 def _jaw_track(samples: Mapping[str, list[Any]], side: str, name: str) -> JawTrack:
     """Gather what was recorded of one jaw."""
     truth = samples.get(f"/{side}/ground_truth_wrench")
@@ -192,7 +180,7 @@ def _keypoint_track(samples: Sequence[Any], side: str, name: str) -> KeypointTra
     """Stack the key point clouds of one jaw."""
     topic = f"/{side}/keypoints"
     _check_frame(samples, topic, side, name)
-    stamps = _stamps(samples, topic, name, strict=True)
+    stamps = check_stamps(map(stamp_of, samples), topic, name)
     clouds = [_cloud(sample, index, topic, name) for index, sample in enumerate(samples)]
     counts = [len(cloud.points) for cloud in clouds]
     odd = next((index for index, count in enumerate(counts) if count != counts[0] or count == 0), None)
@@ -217,7 +205,7 @@ def _detection_truth(samples: Sequence[Any], side: str, name: str) -> DetectionT
     """Stack the true key points of one jaw."""
     topic = f"/{side}/{TRUE_KEYPOINTS}"
     _check_frame(samples, topic, side, name)
-    stamps = _stamps(samples, topic, name, strict=True)
+    stamps = check_stamps(map(stamp_of, samples), topic, name)
     try:
         clouds = [decode_columns(sample, TRUTH_COLUMNS) for sample in samples]
         columns = ([cloud[name] for cloud in clouds] for name in TRUTH_COLUMNS)
@@ -240,7 +228,7 @@ def _wrench_track(samples: Sequence[Any], side: str, name: str) -> WrenchTrack:
     """Stack the ground truth of one jaw."""
     topic = f"/{side}/ground_truth_wrench"
     _check_frame(samples, topic, side, name)
-    stamps = _stamps(samples, topic, name, strict=False)
+    stamps = check_stamps(map(stamp_of, samples), topic, name, strict=False)
     wrenches = [sample.wrench for sample in samples]
     force = np.array([[w.force.x, w.force.y, w.force.z] for w in wrenches])
     torque = np.array([[w.torque.x, w.torque.y, w.torque.z] for w in wrenches])

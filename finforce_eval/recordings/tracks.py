@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce.messages import NANOSECONDS
 from finforce_eval.errors import RecordingError
 from finforce_ifea.observation import Observation
 
@@ -221,6 +222,18 @@ class Recording:
             "direction": np.where(row >= 0, phases.direction[row], ""),
             "scored": (row >= 0) & (phases.stage[row] == "record"),
         }
+
+
+def check_stamps(stamps: Iterable[int], topic: str, name: str, *, strict: bool = True) -> NDArray[np.int64]:
+    """Return the stamps of a topic (n,) [ns]; raises RecordingError where they go back or, if `strict`, stand still."""
+    times = np.array(list(stamps), dtype=np.int64)
+    steps = np.diff(times)
+    wrong = np.flatnonzero(steps <= 0 if strict else steps < 0)
+    if wrong.size:
+        what, message = "go back" if steps[wrong[0]] < 0 else "stand still", wrong[0] + 1
+        where = f"message {message}, {times[message] / NANOSECONDS:.3f} s"
+        raise RecordingError(f"{name}: the stamps of {topic} {what} at {where}")
+    return times
 
 
 def parse_phases(stamps: Sequence[int], texts: Sequence[str], name: str) -> PhaseTrack:

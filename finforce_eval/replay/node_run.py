@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from os import getpid
 from time import monotonic, time_ns
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import psutil
 
@@ -50,14 +50,12 @@ class NodeRun:
         cpu: of each process while the stream was played, all its threads [% of a core].
         memory: resident at the stream's end [bytes].
         others: CPU use of everything else on the machine meanwhile [% of a core]; it should be small.
-        seconds: for which it was played.
     """
 
     log: ReplayLog
     cpu: Mapping[str, float]
     memory: Mapping[str, int]
     others: float
-    seconds: float
 
 
 def awaited_topics(processes: Sequence[Process], sides: Sequence[str]) -> list[str]:
@@ -94,7 +92,6 @@ def run_nodes(
     *,
     heard: Sequence[str] | None = None,
     detector: bool = False,
-    watch: Callable[[Mapping[str, int], RawMessage], Any] = lambda pids, message: None,
     rate: float = 1.0,
     has_clock: bool = False,
     environment: Mapping[str, str] | None = None,
@@ -108,7 +105,6 @@ def run_nodes(
         awaited: topics that somebody has to listen to before it begins; without any those of our own nodes.
         heard: jaws whose own results are heard in addition to the grasp force, at a cost to the nodes; all without.
         detector: whether the results of a key point detector are heard, too.
-        watch: called with the process ids, by label, before each message leaves.
         rate: speed.
         has_clock: keep the stamps, and give the time on /clock; else stamps are shifted to now.
         environment: variables of the processes; without ROS_DOMAIN_ID they have a domain by chance.
@@ -129,31 +125,34 @@ def run_nodes(
         nodes = stack.enter_context(ProcessGroup(processes, environment))
         player.offer(messages)
         player.listen(sides if heard is None else heard, log, detector=detector)
-
         _await_listeners(player, nodes, awaited or awaited_topics(processes, sides))
         player.spin_until(monotonic() + LINGER)
-        bar = stack.enter_context(progress_bar(len(messages), "msg", "replay"))
-        offset = None if has_clock else time_ns() - messages.begin
-        log.offset, pids = offset or 0, nodes.pids
-        began, meters = monotonic(), begin_shares({**pids, PLAYER: getpid()})
+        log.offset = 0 if has_clock else time_ns() - messages.begin
+        meters = begin_shares({**nodes.pids, PLAYER: getpid()})
         psutil.cpu_percent()
-
-        def note(message: RawMessage) -> None:
-            nodes.check()
-            watch(pids, message)
-            log.take_sent(message.topic, message.stamp, monotonic())
-            bar.update()
-
-        player.play(messages, rate=rate, offset=offset, sent=note)
-        busy, shares, seconds = psutil.cpu_percent() * psutil.cpu_count(), end_shares(meters), monotonic() - began
-        memory = {name: resident_bytes(pid) for name, pid in pids.items()}
+        _play(player, nodes, messages, log, rate, has_clock=has_clock)
+        busy, shares = psutil.cpu_percent() * psutil.cpu_count(), end_shares(meters)
+        memory = {name: resident_bytes(pid) for name, pid in nodes.pids.items()}
         log.end()
         player.spin_until(monotonic() + LINGER)
         nodes.check()
     return NodeRun(
         log=log,
-        cpu={name: shares[name] for name in pids},
+        cpu={name: shares[name] for name in memory},
         memory=memory,
         others=max(0.0, busy - sum(shares.values())),
-        seconds=seconds,
     )
+
+
+def _play(
+    player: PlayerNode, nodes: ProcessGroup, messages: Playback, log: ReplayLog, rate: float, *, has_clock: bool
+) -> None:
+    """Play messages as long as all processes run, and log when each left."""
+    with progress_bar(len(messages), "msg", "replay") as bar:
+
+        def note(message: RawMessage) -> None:
+            nodes.check()
+            log.take_sent(message.topic, message.stamp, monotonic())
+            bar.update()
+
+        player.play(messages, rate=rate, offset=None if has_clock else log.offset, sent=note)

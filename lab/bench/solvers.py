@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from gc import collect, disable, enable
 from pathlib import Path
 from time import perf_counter, thread_time
+from timeit import repeat
 from typing import Any
 
 import numpy as np
@@ -20,13 +21,14 @@ from numpy.typing import NDArray
 
 from finforce.errors import FinforceError
 from finforce_eval.evaluation.scoring import rms
+from finforce_eval.tasks import progress_bar
 from finforce_ifea.estimator import ForceEstimator
 from finforce_ifea.fem.solid import SolidModel
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_ifea.jaw.jaw_file import Material
 from finforce_ifea.observation import Contact, ObjectOutline, Observation
 from finforce_ifea.settings import SOLVERS, EstimatorSettings
-from lab.harness import Figures, percentiles, time_calls
+from lab.harness import Figures, percentiles
 
 TRUTH = Path(__file__).parents[1] / "data" / "pressed_bench.npz"
 YOUNG_MODULUS, POISSON_RATIO = 30e6, 0.45
@@ -326,8 +328,6 @@ def measure(quick: bool) -> Figures:
     Args:
         quick: three cases instead of nine, and no slow tier.
     """
-    from tqdm import tqdm
-
     finger, tiers = bench_finger(), list_tiers(slow=not quick)
     cases = [case for case in load_cases() if case.name.startswith("Ø25") or not quick]
     presses = {
@@ -335,7 +335,7 @@ def measure(quick: bool) -> Figures:
         "noisy": [record_press(case, finger, NoisyCamera(), SEED) for case in cases],
     }
     rows, shapes, notes = [], [], []
-    with tqdm(total=len(tiers) * 2 * len(cases), unit="press", disable=None, leave=False) as bar:
+    with progress_bar(len(tiers) * 2 * len(cases), "press") as bar:
         for tier in tiers:
             bar.set_description(tier.name)
             try:
@@ -474,7 +474,7 @@ def time_factorisation() -> list[float]:
     model = SolidModel(jaw.build_mesh("coarse"), jaw.material, symmetric=False)
     stiffness = model.sparse_tangent(model.linearize(np.zeros(model.size)).tangent).tocsc()
     options = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
-    return time_calls(lambda: splu(stiffness, **options), FACTORISATIONS, clock=thread_time)
+    return repeat(lambda: splu(stiffness, **options), timer=thread_time, repeat=FACTORISATIONS, number=1)
 
 
 def compare_with_sofa(row: dict[str, Any]) -> dict[str, float]:

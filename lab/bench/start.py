@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from tqdm import tqdm
 
 from finforce.ros.transport import free_domain
 from finforce.systems.processes import (
@@ -29,6 +28,7 @@ from finforce.systems.processes import (
 from finforce_eval.recordings.objects import find_mesh
 from finforce_eval.recordings.recording import DEMO, read_recording
 from finforce_eval.replay.processes import ProcessError, ProcessGroup, resident_bytes
+from finforce_eval.tasks import progress_bar
 from lab.harness import Figures
 
 READY = b" ready"  # every node says so once, when it takes messages
@@ -50,7 +50,7 @@ def measure(quick: bool) -> Figures:
     rows = []
     with (
         tempfile.TemporaryDirectory() as folder,
-        tqdm(total=1 + times * (1 + len(seen)), unit="start", disable=None, leave=False) as bar,
+        progress_bar(1 + times * (1 + len(seen)), "start") as bar,
     ):
         rows.append(_start(pipeline, 1, folder, bar.update, compiled=False))
         rows += [_start(node, times, folder, bar.update) for node in (pipeline, *seen.values())]

@@ -19,7 +19,7 @@ from tqdm import tqdm
 from finforce.camera import CameraIntrinsics
 from finforce.camera_file import read_camera
 from finforce.gripper_frames import SIDES, jaw_in_camera, jaw_in_gripper, read_extrinsics
-from finforce.optional import import_cv2
+from finforce_eval.recordings.frames import read_picture
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_keypoints.geometry.side_picture import find_side, intersect_plane, map_picture, take_picture
 from finforce_keypoints.geometry.template import draw_template, find_shape, fit_grid
@@ -273,7 +273,8 @@ def load_project(
         mapping: names of the jaw's points by body part, where they differ.
 
     Raises:
-        TrainingError: an image is missing or of another size, or hardly any picture shows a labelled jaw.
+        RecordingError: an image is missing or damaged.
+        TrainingError: an image is of another size, or hardly any picture shows a labelled jaw.
         NamingError: the body parts are not the jaws' key points.
     """
     left = load_jaw(jaw)
@@ -281,7 +282,7 @@ def load_project(
     rows = build_name_map(labels.names, jaws, mapping).rows
     found = []
     for number, name in enumerate(tqdm(labels.images, desc="images", leave=False)):
-        image = read_image(folder / name)
+        image = read_picture(folder / name)
         for side, own in jaws.items():
             found.append(rectify(image, labels.points[number, rows[side]], own, side, view))
     usable = [picture for picture in found if picture is not None]
@@ -291,19 +292,6 @@ def load_project(
             f"expected at least {FEWEST}, better 50 to 300"
         )
     return FingerPictures.join(usable)
-
-
-def read_image(path: Path) -> NDArray:
-    """Return an image file as (h, w, 3) uint8 RGB.
-
-    Raises:
-        TrainingError: the file is missing, or no image.
-    """
-    cv2 = import_cv2()
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR) if path.is_file() else None
-    if image is None:
-        raise TrainingError(f"{path}: no image there; expected it below the project's folder (--project)")
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
 if __name__ == "__main__":

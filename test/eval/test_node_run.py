@@ -61,7 +61,6 @@ def test_a_busy_machine_is_said_and_a_quiet_one_too():
 def test_a_listener_is_played_to_measured_and_ended():
     pytest.importorskip("rclpy")
     run = run_nodes([Listener()], make_film(30), ("left",), [TOPIC])
-    assert run.seconds == pytest.approx(29 / 30, abs=0.5)  # a busy machine is late
     assert 0.0 <= run.cpu["listener"] < 200.0
     assert 20e6 < run.memory["listener"] < 400e6  # a Python with rclpy
     assert run.others >= 0.0

@@ -23,7 +23,7 @@ from finforce_eval.replay.processes import resident_bytes
 from finforce_ifea.jaw.jaw import load_jaw
 from lab import harness
 from lab.cli import bench
-from lab.harness import PARTS, Figures, percentiles, select_parts, time_calls
+from lab.harness import PARTS, Figures, percentiles, select_parts
 
 ROOT = Path(__file__).parents[2]
 
@@ -83,13 +83,6 @@ def test_a_table_has_words_first_and_nothing_where_nothing_was_measured():
     text = harness.format_table(pd.DataFrame({"x/N": [0.12345, np.nan], "name": ["a", "b"], "n": [1, 20]}))
     assert [cell.strip() for cell in text.splitlines()[2].split("|")[1:-1]] == ["a", "0.1235", "1"]
     assert [cell.strip() for cell in text.splitlines()[3].split("|")[1:-1]] == ["b", "", "20"]
-
-
-def test_every_call_is_timed_once():
-    calls = []
-    times = time_calls(lambda: calls.append(1), 4)
-    assert len(times) == len(calls) == 4
-    assert min(times) >= 0
 
 
 def test_a_process_takes_memory_until_it_has_gone():
