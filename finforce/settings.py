@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import MISSING, Field, dataclass, field, fields
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 from finforce.errors import FinforceError
 
@@ -128,3 +128,14 @@ def check_bounds(record: Any, error: type[Exception]) -> None:
     """Refuse a record with a value that `check_value` refuses, by raising `error`."""
     for entry in fields(record):
         check_value(entry, getattr(record, entry.name), error)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bounded:
+    """A record of settings that refuses, by raising its `error`, a value that `check_value` refuses."""
+
+    error: ClassVar[type[Exception]] = ParameterError
+
+    def __post_init__(self) -> None:
+        """Refuse what is not among its choices, or outside its bounds; NaN is, unless it is the default."""
+        check_bounds(self, self.error)

@@ -1,9 +1,6 @@
 """Errors of objects, poses, images and reconstructions."""
 
-from finforce.camera import ImageError
-from finforce.errors import FinforceError, PoseError
-
-__all__ = ["ImageError", "ObjectMeshError", "PoseError", "PoseLostError", "ReconstructionError"]
+from finforce.errors import FinforceError
 
 
 class ObjectMeshError(FinforceError, ValueError):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from finforce.camera_topics import AUTO, DEPTH_TOPIC, INFO_TOPIC, TRANSPORTS
 from finforce.errors import PoseError
-from finforce.settings import TimeParameters, check_bounds, setting
+from finforce.settings import Bounded, TimeParameters, setting
 from finforce_ifea.errors import ContactError
 
 if TYPE_CHECKING:
@@ -24,9 +24,14 @@ ORIGINS = {"mesh": 0.0, "middle": 1.0, "added": 2.0}
 
 
 @dataclass(frozen=True, kw_only=True)
-class ContactSettings:
-    """Settings of `ContactEstimator`; each field's metadata says unit, bounds and meaning."""
+class ContactSettings(Bounded):
+    """Settings of `ContactEstimator`; each field's metadata says unit, bounds and meaning.
 
+    Raises:
+        ContactError: a setting is not among its choices or outside its bounds.
+    """
+
+    error = ContactError
     mode: str = setting(
         "estimate",
         "Method of finding the contact: estimate, paper (Algorithm 1) or closest (nearest point)",
@@ -43,33 +48,22 @@ class ContactSettings:
     )
     pose_timeout: float = setting(1.0, "Maximum object pose age, unless the grasp is at rest", "s", 0.01, 60.0)
 
-    def __post_init__(self) -> None:
-        """Refuse values out of bounds.
-
-        Raises:
-            ContactError: a setting is not among its choices or outside its bounds.
-        """
-        check_bounds(self, ContactError)
-
 
 @dataclass(frozen=True, kw_only=True)
-class TrackerSettings:
-    """Settings of `PoseTracker`; each field's metadata says unit, bounds and meaning."""
+class TrackerSettings(Bounded):
+    """Settings of `PoseTracker`; each field's metadata says unit, bounds and meaning.
 
+    Raises:
+        PoseError: a setting is outside its bounds.
+    """
+
+    error = PoseError
     points: int = setting(1000, "Object pixels compared per image", "1", 100, 20000)
     noise: float = setting(0.3e-3, "Minimum standard deviation of the depth", "m", 1e-5, 0.01)
     least_fitness: float = setting(0.6, "Minimum share of the visible object that agrees with the depth", "1", 0.1, 1.0)
     least_visible: float = setting(0.1, "Minimum share of the object in view that is not occluded", "1", 0.01, 1.0)
     speed: float = setting(0.2, "Expected object speed (1 sigma)", "m/s", 0.001, 5.0)
     turn_rate: float = setting(1.0, "Expected object turn rate (1 sigma)", "rad/s", 0.01, 20.0)
-
-    def __post_init__(self) -> None:
-        """Refuse values out of bounds.
-
-        Raises:
-            PoseError: a setting is outside its bounds.
-        """
-        check_bounds(self, PoseError)
 
 
 IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from finforce.settings import GripperParameters, ParameterError, check_bounds, setting
+from finforce.settings import Bounded, GripperParameters, ParameterError, setting
 from finforce_driver.can.protocol import LARGEST_BYTE
 from finforce_driver.errors import TargetError
 
@@ -38,13 +38,10 @@ def check_numbers(**values: object) -> None:
             raise TargetError(f"{name}: got {value!r}, expected a number; the gripper stays as it was")
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Bounded:
-    """Settings whose values have bounds."""
+class _Bounded(Bounded):
+    """Settings that raise TargetError for a value out of bounds."""
 
-    def __post_init__(self) -> None:
-        """Reject values out of bounds by raising TargetError; NaN is out of all."""
-        check_bounds(self, TargetError)
+    error = TargetError
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from finforce.camera import CameraIntrinsics, project
 from finforce.gripper_frames import ROBOT_CAMERA, OpeningRange
 from finforce.optional import import_cv2
-from finforce.settings import check_bounds, setting
+from finforce.settings import Bounded, setting
 from finforce_keypoints.errors import DetectorSettingsError
 from finforce_keypoints.images import PixelDetection
 
@@ -24,9 +24,14 @@ Weigh = Callable[[tuple[slice, slice]], NDArray]  # how much the pixels of a par
 
 
 @dataclass(frozen=True, kw_only=True)
-class DotSettings:
-    """How the dots look; one dot on every key point and on the reference point, on the side that the camera sees."""
+class DotSettings(Bounded):
+    """How the dots look; one dot on every key point and on the reference point, on the side that the camera sees.
 
+    Raises:
+        DetectorSettingsError: a setting is out of its bounds.
+    """
+
+    error = DetectorSettingsError
     kind: str = setting(
         "colored",
         "Kind of dots: of one colour on any jaw, light on a dark jaw, or dark on a light jaw",
@@ -43,14 +48,6 @@ class DotSettings:
         0.25, "Minimum contrast of light or dark dots, relative to their surroundings", "1", 0.01, 1.0
     )
     diameter: float = setting(0.003, "Diameter of a dot", "m", 5e-4, 0.02)
-
-    def __post_init__(self) -> None:
-        """Refuse values out of bounds.
-
-        Raises:
-            DetectorSettingsError: a setting is out of its bounds.
-        """
-        check_bounds(self, DetectorSettingsError)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -60,7 +60,6 @@ class DepthEvidence:
         known: (n,) samples with depth.
         count: (n,) samples that are the finger's.
         share: (n,) of the samples with depth that are the finger's; 0 where none has depth.
-        nearer: (n,) share of the samples with depth that are before the finger.
     """
 
     excess: NDArray
@@ -68,7 +67,6 @@ class DepthEvidence:
     known: NDArray
     count: NDArray
     share: NDArray
-    nearer: NDArray
 
 
 @lru_cache(maxsize=16)  # one for each jaw at hand
@@ -200,7 +198,7 @@ def weigh_depths(excess: NDArray, centre: NDArray, gate: float, quantum: float) 
 
 @njit(**_OPTIONS)
 def _weigh_samples(excess, centre, gate, quantum):
-    """Return excess, stddev, known, count, share and nearer (6, n) of `DepthEvidence`.
+    """Return excess, stddev, known, count and share (5, n) of `DepthEvidence`.
 
     Args:
         excess: (n, S) measured less expected depths [m], NaN where nothing was measured.
@@ -209,23 +207,19 @@ def _weigh_samples(excess, centre, gate, quantum):
         quantum: [m].
     """
     n, size = excess.shape
-    found, chosen, apart = np.zeros((6, n)), np.empty(size), np.empty(size)
+    found, chosen, apart = np.zeros((5, n)), np.empty(size), np.empty(size)
     for i in range(n):
-        known, near, count = 0, 0, 0
+        known, count = 0, 0
         for s in range(size):
             away = excess[i, s] - centre[i]
-            if not np.isfinite(away):
-                continue
-            known += 1
-            if away < -gate:
-                near += 1
-            elif not away > gate:
+            known += np.isfinite(away)
+            if abs(away) <= gate:
                 chosen[count] = away
                 count += 1
-        middle = _median_of(chosen, count)
+        middle = np.median(chosen[:count]) if count else np.nan
         for s in range(count):
             apart[s] = abs(chosen[s] - middle)
-        spread = _MAD_TO_STDDEV * _median_of(apart, count)
+        spread = _MAD_TO_STDDEV * np.median(apart[:count]) if count else np.nan
         widest, total, kept = _INLIER_SIGMA * max(spread, 0.5 * quantum), 0.0, 0
         for s in range(count):
             if abs(chosen[s] - middle) <= widest:
@@ -235,31 +229,8 @@ def _weigh_samples(excess, centre, gate, quantum):
         rounded = max(spread, quantum / np.sqrt(12.0)) if count else np.nan
         found[1, i] = rounded / np.sqrt(max(kept / _CORRELATED, 1.0))
         found[2, i], found[3, i] = known, kept
-        found[4, i], found[5, i] = kept / max(known, 1), near / max(known, 1)
+        found[4, i] = kept / max(known, 1)
     return found
-
-
-@njit(**_OPTIONS)
-def _median_of(values, count):
-    """Return the median of the first values (count,), NaN of none."""
-    if count == 0:
-        return np.nan
-    part, middle = values[:count].copy(), count // 2
-    low, high = 0, count - 1
-    while low < high:  # values are only sorted as far as it takes to have the middle one in its place
-        pivot, i, j = part[(low + high) // 2], low, high
-        while i <= j:
-            while part[i] < pivot:
-                i += 1
-            while part[j] > pivot:
-                j -= 1
-            if i <= j:
-                part[i], part[j] = part[j], part[i]
-                i, j = i + 1, j - 1
-        if j < middle < i:
-            break
-        low, high = (low, j) if middle <= j else (i, high)
-    return part[middle] if count % 2 else 0.5 * (part[:middle].max() + part[middle])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

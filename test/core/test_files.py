@@ -5,6 +5,7 @@ import os
 import resource
 import subprocess
 import sys
+from itertools import cycle
 from pathlib import Path
 
 import pytest
@@ -139,7 +140,7 @@ def test_commands_say_what_is_wrong_in_one_line(tmp_path):
     from finforce_eval.recordings.recording import DEMO, read_recording
     from finforce_eval.recordings.writer import write_recording
 
-    recording, orders = read_recording(DEMO), {}
+    recording, orders, chosen = read_recording(DEMO), {}, cycle(COMMANDS.items())
     begin = int(recording.jaw("left").keypoints.stamps[0])
     bag = write_recording(cut(recording, begin, begin + 10**9), tmp_path / "bag")
     for name, bomb in BOMBS.items():
@@ -147,7 +148,8 @@ def test_commands_say_what_is_wrong_in_one_line(tmp_path):
         file.parent.mkdir()
         file.write_text(bomb)
         places = {"FILE": str(file), "BAG": str(bag)}
-        for command, words in COMMANDS.items():
+        # what no file may hold is refused before a command looks at it: there one command tells as much as all
+        for command, words in [next(chosen)] if name in ("lists", "digits", "values") else COMMANDS.items():
             orders[f"{command}, {name}"] = [places.get(w, w.replace("FOLDER", str(file.parent))) for w in words]
     process = subprocess.run(
         [sys.executable, "-c", SAY_ALL, json.dumps(orders)],
