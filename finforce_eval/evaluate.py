@@ -13,9 +13,8 @@ from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.forces import evaluate_jaws, truth_sides
 from finforce_eval.evaluation.keypoint_source import parse_source
 from finforce_eval.evaluation.scoring import Evaluation, score_results, score_series, true_range
-from finforce_eval.evaluation.setup import EvaluationSetup, describe_options, print_notes, share_setup, sides_of
+from finforce_eval.evaluation.setup import EvaluationSetup, describe_options, print_notes, share_setup
 from finforce_eval.recordings.bags import list_files, name_recordings
-from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.tracks import Recording
 from finforce_eval.table import ForceSeries, read_table, write_table
 from finforce_eval.tasks import OK, EngineOptions, Manifest, Task, choose_shard, hash_settings, run_tasks
@@ -93,7 +92,7 @@ def evaluate_task(name: str, path: str, target: str, options: argparse.Namespace
     """
     setup, source = share_setup(settings, options), parse_source(options)
     try:
-        read = replace(read_recording(path, source.choice, sides_of(options), strict=source.strict), name=name)
+        read = replace(source.read(path), name=name)
         truth_sides(read)
         setup.contacts.check(read)
         recording = source.apply(read)

@@ -23,10 +23,9 @@ from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.forces import estimate_forces, no_force_reasons, why_unanswered
 from finforce_eval.evaluation.gripper import combine_jaws
 from finforce_eval.evaluation.keypoint_source import parse_source
-from finforce_eval.evaluation.setup import share_setup, sides_of
+from finforce_eval.evaluation.setup import share_setup
 from finforce_eval.machine import version, without_nan
 from finforce_eval.recordings.bags import NO_DIGEST, BagReader, bag_source, is_frames, list_files, open_bag
-from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.tracks import Recording
 from finforce_eval.recordings.writer import (
     Entry,
@@ -73,7 +72,7 @@ def annotate_bag(source: Path, target: Path, options: argparse.Namespace, settin
         if note["key"] == key:
             return note["figures"]
     setup, keypoints = share_setup(settings, options), parse_source(options)
-    recording = read_recording(source, keypoints.choice, sides_of(options), strict=keypoints.strict)
+    recording = keypoints.read(source)
     setup.contacts.check(recording)
     recording = keypoints.apply(replace(recording, name=target.name))
     jaws = estimate_forces(recording, setup)

@@ -20,8 +20,8 @@ from finforce.files import FileError, check_inside, check_plain, parse_json, rea
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.forces import NOT_FOUND, estimate_forces, no_force_reasons, why_unanswered
 from finforce_eval.evaluation.gripper import combine_jaws
-from finforce_eval.evaluation.keypoint_source import parse_source
-from finforce_eval.evaluation.setup import describe_options, read_contacts, share_setup, sides_of
+from finforce_eval.evaluation.keypoint_source import parse_source, sides_of
+from finforce_eval.evaluation.setup import describe_options, read_contacts, share_setup
 from finforce_eval.recordings.dataset import (
     EPISODE_STATS_V2,
     EPISODES_V3,

@@ -16,7 +16,7 @@ from finforce_eval.cli.parser import BAG_HELP, CommandResult, add_rest_options, 
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.check import FITTED, SEEN, draw_jaw, draw_points
 from finforce_eval.evaluation.keypoint_source import choose_images, parse_source
-from finforce_eval.evaluation.setup import read_recordings, sides_of
+from finforce_eval.evaluation.setup import read_recordings
 from finforce_eval.recordings.tracks import Recording
 from finforce_eval.tasks import progress_bar
 from finforce_ifea.jaw.jaw import load_jaw
@@ -53,9 +53,9 @@ def run(options: argparse.Namespace) -> CommandResult:
     from finforce.optional import import_cv2
 
     options.source = "images"
-    source, sides = parse_source(options), sides_of(options)
+    source = parse_source(options)
     source = replace(source, choice=replace(source.choice, is_cut=True))
-    (recording,) = read_recordings(options.bags, source.choice, sides, strict=source.strict)
+    (recording,) = read_recordings(options.bags, source)
     colors = choose_pictures(recording, options.images)
     seen = find_tags(colors, options)
     jaws = {side: load_jaw(options.jaw, side) for side in SIDES if side in recording.jaws}

@@ -14,7 +14,7 @@ from finforce_eval.cli.parser import BAG_HELP, CommandResult, add_rest_options, 
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.at_rest import ROUNDS, approach, first_images
 from finforce_eval.evaluation.keypoint_source import KeypointSource, build_records, choose_images, parse_source
-from finforce_eval.evaluation.setup import read_recordings, sides_of
+from finforce_eval.evaluation.setup import read_recordings
 from finforce_eval.recordings.frames import read_picture
 from finforce_eval.recordings.tracks import Recording
 from finforce_eval.tasks import progress_bar
@@ -61,10 +61,9 @@ def read_at_rest(options: argparse.Namespace) -> tuple[KeypointSource, Recording
     if options.images < 5:
         raise OptionError(f"--images {options.images}: expected at least 5, which are averaged")
     source = parse_source(options)
-    sides = sides_of(options)
-    (recording,) = read_recordings(options.bags, source.choice, sides, strict=source.strict)
+    (recording,) = read_recordings(options.bags, source)
     recording = first_images(recording, options.images)
-    return source, replace(recording, jaws={side: recording.jaws[side] for side in sides})
+    return source, replace(recording, jaws={side: recording.jaws[side] for side in source.sides})
 
 
 def format_grid_camera(found: GridCamera) -> str:

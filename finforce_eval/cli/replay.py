@@ -5,13 +5,13 @@ from __future__ import annotations
 import argparse
 import math
 from dataclasses import asdict
+from pathlib import Path
 
 from finforce_eval.cli.parser import BAG_HELP, CommandResult, add_run_options
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.keypoint_source import parse_source
-from finforce_eval.evaluation.setup import make_setup, sides_of
+from finforce_eval.evaluation.setup import make_setup
 from finforce_eval.evaluation.tables import evaluation_json, format_tables
-from finforce_eval.recordings.recording import read_recording
 from finforce_eval.replay.replay import Playing, Replay, replay
 
 
@@ -78,20 +78,15 @@ def run(options: argparse.Namespace) -> CommandResult:
         rate=options.rate, sim_time=options.sim_time, domain=options.domain, parameter_file=options.params
     )
     keypoints, calibration = parse_source(options), options.calibration or ""
-    recording = read_recording(options.bag, keypoints.choice, sides_of(options), strict=keypoints.strict)
+    recording = keypoints.read(options.bag)
     result = replay(recording, setup, calibration_file=calibration, playing=playing, keypoints=keypoints)
     print(format_replay(result))
     if options.report:
-        from finforce_eval.figures.report import write_report
+        from finforce_eval.figures.report import draw_results, write_overview
 
-        page = write_report(
-            result.evaluation,
-            options.report,
-            keypoint_names=setup.jaw.keypoint_names,
-            about=setup.about,
-            recordings=[result.recording],
-        )
-        print(f"Report: {page}")
+        series, names = list(result.evaluation.results.values()), setup.jaw.keypoint_names
+        draw_results(series, Path(options.report), keypoint_names=names, recordings=[result.recording])
+        print(f"Report: {write_overview(result.evaluation, options.report, about=setup.about)}")
     score = result.grasp_score
     grasp = {"grasp": asdict(score.error), "grasp_delay": score.delay}
     return CommandResult(evaluation_json(result.evaluation, **grasp, **setup.about))

@@ -15,8 +15,7 @@ import pandas as pd
 from finforce_eval.cli.parser import BAG_HELP, CommandResult, add_run_options
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.keypoint_source import parse_source
-from finforce_eval.evaluation.setup import make_setup, sides_of
-from finforce_eval.recordings.recording import read_recording
+from finforce_eval.evaluation.setup import make_setup
 from finforce_eval.replay.replay import Playing, play_to_nodes
 
 
@@ -34,7 +33,7 @@ def run(options: argparse.Namespace) -> CommandResult:
         FinforceError: an option, the recording or a node fails.
     """
     keypoints = parse_source(options)
-    recording = read_recording(options.bag, keypoints.choice, sides_of(options), strict=keypoints.strict)
+    recording = keypoints.read(options.bag)
     with TemporaryDirectory() as folder:
         playing = Playing(composed=not options.apart, trace=folder)
         log = play_to_nodes(

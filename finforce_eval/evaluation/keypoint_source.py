@@ -7,6 +7,7 @@ import math
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -21,7 +22,8 @@ from finforce.messages import NANOSECONDS
 from finforce.transforms import pose_from_quaternion, pose_numbers, quaternion_from_pose
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.recordings.images import DEPTH_ENDS, ImageChoice, ImageTrack
-from finforce_eval.recordings.tracks import DetectionTrack, JawTrack, KeypointTrack, PoseTrack, Recording
+from finforce_eval.recordings.recording import read_recording
+from finforce_eval.recordings.tracks import JAWS, DetectionTrack, JawTrack, KeypointTrack, PoseTrack, Recording
 from finforce_eval.tasks import progress_bar
 from finforce_keypoints.errors import KeypointError
 from finforce_keypoints.rig import read_rig
@@ -68,6 +70,7 @@ class KeypointSource:
         as_live: leave out the images that the detector's node leaves out.
         stills: whether nothing of one image is known in the next.
         choice: which images are read.
+        sides: jaws that are in the images, whether or not a topic tells of them.
     """
 
     source: str = ""
@@ -77,6 +80,11 @@ class KeypointSource:
     as_live: bool = False
     stills: bool = False
     choice: ImageChoice = field(default_factory=ImageChoice)
+    sides: tuple[str, ...] = ()
+
+    def read(self, path: str | Path) -> Recording:
+        """Return a recording as it lies there; see `read_recording`."""
+        return read_recording(path, self.choice, self.sides, strict=self.strict)
 
     def source_of(self, recording: Recording) -> str:
         """Return "images", "keypoints" or "truth" for a recording.
@@ -203,6 +211,12 @@ def _true_track(track: JawTrack) -> JawTrack:
     return replace(track, keypoints=keypoints, pose=track.true_pose or track.pose)
 
 
+def sides_of(options: argparse.Namespace) -> tuple[str, ...]:
+    """Return the jaws that images show, none where the option does not say."""
+    jaws = getattr(options, "jaws", None)
+    return {None: (), "both": JAWS}.get(jaws, (jaws,))
+
+
 def parse_source(options: argparse.Namespace) -> KeypointSource:
     """Return where the key points come from.
 
@@ -233,7 +247,10 @@ def parse_source(options: argparse.Namespace) -> KeypointSource:
         T_gripper_camera=None if pose is None else pose_from_quaternion(pose[:3], pose[3:]),
         pairing=None if seconds is None or math.isnan(seconds) else round(seconds * NANOSECONDS),
     )
-    return KeypointSource(source=source, jaw_file=options.jaw, parameters=parameters, choice=choice, **switches)
+    sides = sides_of(options)
+    return KeypointSource(
+        source=source, jaw_file=options.jaw, parameters=parameters, choice=choice, sides=sides, **switches
+    )
 
 
 def _parse_parameters(texts: Sequence[str]) -> dict[str, Any]:

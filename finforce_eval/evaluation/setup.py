@@ -14,12 +14,10 @@ from finforce.errors import FinforceError
 from finforce_contact.loop import ContactSource
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.contact_source import ContactChoice, build_source, parse_contacts
-from finforce_eval.evaluation.keypoint_source import parse_changes, parse_source
+from finforce_eval.evaluation.keypoint_source import KeypointSource, parse_changes, parse_source
 from finforce_eval.machine import commit, version
 from finforce_eval.recordings.bags import name_recordings
-from finforce_eval.recordings.images import ImageChoice
-from finforce_eval.recordings.recording import read_recording
-from finforce_eval.recordings.tracks import JAWS, Recording
+from finforce_eval.recordings.tracks import Recording
 from finforce_ifea.estimator import ForceEstimator
 from finforce_ifea.jaw.calibration import Calibration, load_calibration
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
@@ -177,22 +175,8 @@ def _is_file(word: str) -> bool:
         return False
 
 
-def sides_of(options: argparse.Namespace) -> tuple[str, ...]:
-    """Return the jaws that images show, none where the option does not say."""
-    jaws = getattr(options, "jaws", None)
-    return {None: (), "both": JAWS}.get(jaws, (jaws,))
-
-
-def read_recordings(
-    paths: Sequence[str], choice: ImageChoice | None = None, sides: Sequence[str] = (), *, strict: bool = False
-) -> list[Recording]:
-    """Read recordings and give each a name of its own.
-
-    Args:
-        paths: of the recordings.
-        choice: which images are read.
-        sides: jaws that are in the images, whether or not a topic tells of them.
-        strict: refuse recordings that are damaged.
+def read_recordings(paths: Sequence[str], source: KeypointSource) -> list[Recording]:
+    """Read recordings as a source asks for, and give each a name of its own.
 
     Raises:
         RecordingError: one of them cannot be read.
@@ -200,7 +184,7 @@ def read_recordings(
     """
     recordings = []
     for name, path in name_recordings(paths, "/"):
-        recording = replace(read_recording(path, choice, sides, strict=strict), name=name)
+        recording = replace(source.read(path), name=name)
         print_notes(recording.name, recording.notes)
         recordings.append(recording)
     return recordings
@@ -217,14 +201,15 @@ def read_keypoints(options: argparse.Namespace, sides: Sequence[str] = ()) -> li
 
     Args:
         options: of the command line.
-        sides: jaws that are in the images, whether or not a topic tells of them.
+        sides: jaws that are in the images; those that the options name without.
 
     Raises:
         FinforceError: one of them cannot be read, or has no such key points.
     """
-    source, sides = parse_source(options), sides or sides_of(options)
-    recordings = []
-    for read in read_recordings(options.bags, source.choice, sides, strict=source.strict):
+    source, recordings = parse_source(options), []
+    if sides:
+        source = replace(source, sides=tuple(sides))
+    for read in read_recordings(options.bags, source):
         recording = source.apply(read)
         print_notes(recording.name, recording.notes[len(read.notes) :])
         recordings.append(recording)

@@ -25,35 +25,6 @@ PICTURES = {
 }
 
 
-def write_report(
-    evaluation: Evaluation,
-    folder: str | Path,
-    *,
-    keypoint_names: Sequence[str],
-    about: Mapping[str, str],
-    recordings: Sequence[Recording] = (),
-) -> Path:
-    """Write the pictures and the page of an evaluation.
-
-    Args:
-        evaluation: scores and time series.
-        folder: where to; made when missing, files of the same name are replaced.
-        keypoint_names: K names of the key points of the jaw.
-        about: what was run: solver, jaw, contact, ...
-        recordings: of the evaluation; where key points were found in images, some of these are shown.
-
-    Returns:
-        The page.
-
-    Raises:
-        MissingDependencyError: matplotlib is not installed.
-        RecordingError: an image is damaged.
-    """
-    results = list(evaluation.results.values())
-    draw_results(results, Path(folder), keypoint_names=keypoint_names, recordings=recordings)
-    return write_overview(evaluation, folder, about=about)
-
-
 def draw_results(
     results: Sequence[ForceSeries],
     folder: Path,
@@ -61,7 +32,18 @@ def draw_results(
     keypoint_names: Sequence[str],
     recordings: Sequence[Recording] = (),
 ) -> None:
-    """Draw recordings and the series of their jaws, in the folder of a report; see `write_report`."""
+    """Draw recordings and the series of their jaws.
+
+    Args:
+        results: of the jaws.
+        folder: of the report; made when missing, pictures of the same recordings are replaced.
+        keypoint_names: K names of the key points of the jaw.
+        recordings: where key points were found in their images, some of these are shown.
+
+    Raises:
+        MissingDependencyError: matplotlib is not installed.
+        RecordingError: an image is damaged.
+    """
     from finforce_eval.figures.figures import draw_jaw
 
     folder.mkdir(parents=True, exist_ok=True)

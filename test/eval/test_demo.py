@@ -3,7 +3,6 @@
 import json
 from argparse import Namespace
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -150,12 +149,11 @@ def test_the_demo_plays_its_recording_and_ends_with_figures_and_report(rendered,
         asked.update(recording=recording, calibration=calibration_file, source=keypoints.source, about=setup.about)
         return replay_of(played)
 
-    def report(evaluation, folder, **given):
+    def draw(results, folder, **given):
         asked.update(given)
-        return Path(folder) / "report.html"
 
     monkeypatch.setattr(replay, "replay", play)
-    monkeypatch.setattr("finforce_eval.figures.report.write_report", report)
+    monkeypatch.setattr("finforce_eval.figures.report.draw_results", draw)
     demo.run(Namespace(source="images", contact=[], rate="1", report=str(tmp_path / "report")))
     assert asked["recording"].path == tmp_path / "report" / demo.SCENE
     assert (asked["calibration"], asked["source"], asked["about"]["contact"]) == ("twin", "images", "estimate")

@@ -4,14 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from eval_fakes import FakeEstimator, FakeJaw, evaluate_recording, make_recording
+from eval_fakes import FakeEstimator, FakeJaw, evaluate_recording, make_recording, write_report
 from rgbd_fakes import FakeDetector, FakeGripper, make_footage
 
 from finforce_contact.loop import GivenContact
 from finforce_eval.cli.twin import write_footage
 from finforce_eval.evaluation.keypoint_source import detect_keypoints
 from finforce_eval.evaluation.scoring import score_results
-from finforce_eval.figures.report import write_report
 from finforce_eval.recordings.images import ImageTrack
 from finforce_eval.recordings.recording import read_recording
 from finforce_keypoints.diagnostics import COLORS

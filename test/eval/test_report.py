@@ -8,11 +8,19 @@ from base64 import b64decode
 
 import numpy as np
 import pytest
-from eval_fakes import BOX, BOX_TRIANGLES, FakeEstimator, FakeJaw, drawn_hues, evaluate_recording, make_recording
+from eval_fakes import (
+    BOX,
+    BOX_TRIANGLES,
+    FakeEstimator,
+    FakeJaw,
+    drawn_hues,
+    evaluate_recording,
+    make_recording,
+    write_report,
+)
 
 from finforce_contact.loop import GivenContact
 from finforce_eval.evaluation.scoring import score_results
-from finforce_eval.figures.report import write_report
 
 pytest.importorskip("matplotlib")
 
