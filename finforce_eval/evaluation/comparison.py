@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+import pandas as pd
 
 from finforce.files import FileError, read_json
 from finforce_eval.errors import OptionError
@@ -57,13 +57,9 @@ class Change:
 
 def error_blocks(result: ForceSeries) -> list[list[float]]:
     """Return second, mean squared error [N^2] and number of its frames, of every second with counted frames."""
-    counted = result.counted
-    seconds = (result.stamps[counted] - result.stamps[0]) // _SECOND if len(result) else np.zeros(0, np.int64)
-    squares = result.error[counted] ** 2
-    return [
-        [int(second), float(squares[seconds == second].mean()), int((seconds == second).sum())]
-        for second in np.unique(seconds)
-    ]
+    seconds = (result.stamps - result.stamps[:1]) // _SECOND
+    squares = pd.Series(result.error[result.counted] ** 2).groupby(seconds[result.counted])
+    return [list(row) for row in squares.agg(["mean", "size"]).itertuples()]
 
 
 def read_evaluation(path: str | Path) -> dict[str, Any]:
@@ -153,20 +149,16 @@ def _find_stddev(before: Mapping[str, Any], after: Mapping[str, Any], first: flo
 
     With d the difference of the mean squares, the errors differ by d / (first + second).
     """
-    blocks = [{row[0]: row[1:] for row in case.get("seconds", ())} for case in (before, after)]
-    common = sorted(blocks[0].keys() & blocks[1].keys())
     if not first + second > 0.0:
         return 0.0 if first == second == 0.0 else inf
-    means = _block_means([(blocks[1][key][0] - blocks[0][key][0], blocks[0][key][1]) for key in common])
-    if len(means) < _FEWEST:
+    seconds, other = (
+        pd.DataFrame(case.get("seconds", ()), columns=["second", "square", "frames"]).set_index("second")
+        for case in (before, after)
+    )
+    common = seconds.join(other.square.rename("after"), how="inner").astype(float).sort_index()
+    weighted = pd.DataFrame({"sum": common.frames * (common.after - common.square), "frames": common.frames})
+    blocks = weighted.groupby(np.arange(len(weighted)) // _BLOCK).sum()
+    if len(blocks) < _FEWEST:
         return inf
-    return float(np.std(means, ddof=1) / sqrt(len(means)) / (first + second))
-
-
-def _block_means(rows: Sequence[tuple[float, int]]) -> NDArray[np.float64]:
-    """Return the means of values with weights over blocks of neighbours."""
-    if not rows:
-        return np.zeros(0)
-    values, weights = np.array(rows, dtype=np.float64).T
-    starts = np.arange(0, len(values), _BLOCK)
-    return np.add.reduceat(values * weights, starts) / np.maximum(np.add.reduceat(weights, starts), 1.0)
+    means = blocks["sum"] / blocks.frames.clip(lower=1.0)
+    return float(means.std() / sqrt(len(means)) / (first + second))

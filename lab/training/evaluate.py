@@ -6,7 +6,6 @@ Knows no PyTorch: it runs the network as the product does.
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -27,23 +26,17 @@ LIGHT_LEVELS = {"dark (below 15)": (0.0, 15.0), "dim (15 to 50)": (15.0, 50.0), 
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Print the scores of a network as a table, and write them as JSON."""
+    """Print the scores of a network as a table."""
     parser = argparse.ArgumentParser(prog="python -m lab.training.evaluate", description=__doc__)
     parser.add_argument("network", type=Path, help="folder of an exported network")
-    parser.add_argument("dataset", type=Path, help="folder of shards")
-    parser.add_argument("--part", default=VALIDATION, help=f"which shards ({VALIDATION})")
-    parser.add_argument("--limit", type=int, help="judge on the first so many pictures only")
-    parser.add_argument("--threshold", type=float, default=THRESHOLD, help=f"likelihood to accept ({THRESHOLD})")
-    parser.add_argument("--json", type=Path, help="file for the scores")
+    parser.add_argument("dataset", type=Path, help=f"folder of shards {VALIDATION}_*.npz")
     options = parser.parse_args(arguments)
     with one_line_errors():
-        pictures = load_pictures(options.dataset, options.part, options.limit)
+        pictures = load_pictures(options.dataset, VALIDATION)
         detections = detect(SideNetwork(options.network, threads=1), pictures)
-    scores = score_groups(detections, pictures, options.threshold)
+    scores = score_groups(detections, pictures)
     scores |= {f"likelihood from {limit:g}": score_detections(detections, limit) for limit in THRESHOLDS}
     print(format_scores(scores))
-    if options.json:
-        options.json.write_text(json.dumps({name: score.as_row() for name, score in scores.items()}, indent=1))
 
 
 def detect(network: SideNetwork, pictures: FingerPictures) -> Detections:
@@ -61,12 +54,12 @@ def detect(network: SideNetwork, pictures: FingerPictures) -> Detections:
     return gather_detections(pictures, *columns)
 
 
-def score_groups(detections: Detections, pictures: FingerPictures, threshold: float) -> dict[str, Score]:
+def score_groups(detections: Detections, pictures: FingerPictures) -> dict[str, Score]:
     """Return the scores of all pictures and of each level of light."""
     level = pictures.middle.mean(axis=(1, 2, 3))
     groups = {"all": np.ones(len(pictures), dtype=bool)}
     groups |= {name: (level >= low) & (level < high) for name, (low, high) in LIGHT_LEVELS.items()}
-    return {name: score_detections(detections.take(mask), threshold) for name, mask in groups.items() if mask.any()}
+    return {name: score_detections(detections.take(mask)) for name, mask in groups.items() if mask.any()}
 
 
 def format_scores(scores: Mapping[str, Score]) -> str:

@@ -44,7 +44,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("-o", "--output", type=Path, required=True, help="folder of the two files")
     parser.add_argument("--dataset", type=Path, required=True, help="folder of shards val_*.npz")
-    parser.add_argument("--floats", action="store_true", help="do not turn the convolutions into bytes")
     text = "share of the visible points that the threshold is to lose; without it likelihoods stay as they were learnt"
     parser.add_argument("--lost", type=read_share, help=text)
     options = parser.parse_args(arguments)
@@ -54,8 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         write_network(network, options.output, 1.0)
         factor = fit_factor(detect(SideNetwork(options.output, threads=1), pictures))
         write_network(network, options.output, factor)
-        if not options.floats:
-            quantize_network(options.output, pictures)
+        quantize_network(options.output, pictures)
         if options.lost is not None:
             found = detect(SideNetwork(options.output, threads=1), pictures)
             shift_likelihoods(options.output, fit_shift(found, options.lost))

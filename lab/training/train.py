@@ -334,14 +334,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m lab.training.train", description=__doc__)
     parser.add_argument("dataset", type=Path, help="folder of shards train_*.npz and val_*.npz")
     parser.add_argument("-o", "--output", type=Path, required=True, help="folder of the run")
-    parser.add_argument("--limit", type=int, help="train on the first so many pictures only")
     parser.add_argument("--network", type=Path, help="begin with the weights of an exported network")
     parser.add_argument("--resume", action="store_true", help="resume from the checkpoint in the run folder")
     add_settings(parser, Recipe)
     options = parser.parse_args(arguments)
     with one_line_errors():
         recipe = settings_from(options, Recipe)
-        pictures = load_pictures(options.dataset, TRAIN, options.limit)
+        pictures = load_pictures(options.dataset, TRAIN)
         judging = load_pictures(options.dataset, VALIDATION, recipe.validation)
         if options.resume:
             checkpoint = load_checkpoint(options.output / CHECKPOINT)

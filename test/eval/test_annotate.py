@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from eval_fakes import cut, evaluate_recording
+from process_fakes import running
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
@@ -262,29 +263,22 @@ def look_at(out, names, written):
     return now
 
 
-def test_a_run_that_is_killed_again_and_again_loses_nothing_and_does_nothing_twice(source, tmp_path):
-    names = [f"part{number}" for number in range(2)]
+def test_a_run_that_is_killed_loses_nothing_and_its_successor_does_nothing_twice(tmp_path):
+    names, out = ["part0", "part1"], tmp_path / "out"
     bags = [short_bag(tmp_path / name, begin=number * 10**9) for number, name in enumerate(names)]
-    out, random = tmp_path / "out", np.random.default_rng(0)
     command = [sys.executable, "-m", "finforce_eval.cli.main", "annotate", *map(str, bags), "--out", str(out)]
-    written, kills, status = {}, 0, None
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parents[2])}
-    while status is None:
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment)
-        before = len(written)
-        while len(written) == before and process.poll() is None:  # at least one more, then by chance
+    with running(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment) as process:
+        while not (out / names[0]).exists():
+            assert process.poll() is None
             time.sleep(0.01)
-            written = look_at(out, names, written)
-        try:
-            status = process.wait(timeout=random.uniform(0.0, 0.5))
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-            kills += 1
-        written = look_at(out, names, written)
-    assert status == 0 and kills > 0
+        process.kill()
+        assert process.wait() == -signal.SIGKILL
+    written = look_at(out, names, {})
+    assert annotate(out, *bags) == 0
+    look_at(out, names, written)
     done = [line["name"] for line in lines_of(out) if line["status"] == "ok"]
-    assert sorted(done) == sorted(names)
+    assert sorted(done) == names
     for bag, name in zip(bags, names, strict=True):
         topics = {topic for topic, *_ in messages(bag)}
         assert [entry for entry in messages(out / name) if entry[0] in topics] == messages(bag)

@@ -77,7 +77,7 @@ def test_recordings_of_one_name_are_told_apart_by_their_folders(tmp_path, exact,
 
 def test_note_about_unknown_types_goes_to_stderr(tmp_path, exact, capsys, monkeypatch):
     noted = replace(bench_recording(), notes=("/odd skipped: unknown type own_msgs/msg/Odd",))
-    monkeypatch.setattr("finforce_eval.evaluate.read_recording", lambda *_, **__: noted)
+    monkeypatch.setattr("finforce_eval.evaluation.keypoint_source.read_recording", lambda *_, **__: noted)
     assert main(["evaluate", "pressed"]) == 0
     assert capsys.readouterr().err == "note: pressed: /odd skipped: unknown type own_msgs/msg/Odd\n"
 

@@ -32,7 +32,7 @@ def bags(tmp_path_factory):
     folder, whole = tmp_path_factory.mktemp("bags"), read_recording(DEMO)
     begin = int(whole.jaws["left"].keypoints.stamps[0])
     made = []
-    for number in range(3):
+    for number in range(2):
         part = cut(whole, begin, begin + (3 + number) * 10**9)
         made.append(str(write_recording(part, folder / f"part{number}")))
     return made
@@ -47,7 +47,7 @@ def test_evaluations_agree(bags, tmp_path, capsys):
     here = evaluate(bags, tmp_path / "here.json")
     there = evaluate(bags, tmp_path / "there.json", "--workers", "2")
     assert there == here
-    assert list(here["cases"]) == ["part0", "part1", "part2"]
+    assert list(here["cases"]) == ["part0", "part1"]
 
 
 def test_an_experiment_goes_to_processes(tmp_path):

@@ -63,7 +63,7 @@ def solvers_of(domain):
 
 def test_every_image_comes_back_as_a_wrench_with_its_stamp_its_contact_estimated_on_the_way(short, tmp_path):
     out = tmp_path / "scores.json"
-    done = run(short, "--contact", "estimate", "--object", MESH, "--json", out, "--rate", "2")
+    done = run(short, "--contact", "estimate", "--object", MESH, "--json", out)
     assert done.returncode == 0, done.stderr
     case = json.loads(out.read_text())["cases"]["short"]
     # the first images are silent until the offsets of the key points are known

@@ -385,7 +385,7 @@ def test_the_bench_runs_on_the_recording_in_the_package(tmp_path, capsys):
     whole = read_recording(DATA / "bench_cyl25_middle")
     begin = int(whole.jaw("left").keypoints.stamps[0])
     (tmp_path / "objects").symlink_to(DATA / "objects")
-    bag = str(write_recording(cut(whole, begin, begin + 15 * 10**9), tmp_path / "bench_cyl25_middle"))
+    bag = str(write_recording(cut(whole, begin, begin + 11 * 10**9), tmp_path / "bench_cyl25_middle"))
     command = ["experiment", "bench", "--on", bag, "--calibration", "bench", "--report", str(tmp_path)]
     assert main(command) == 0
     figures = json.loads((tmp_path / "bench" / "bench.json").read_text())["bench"]
