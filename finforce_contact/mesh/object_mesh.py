@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from finforce.files import FileError
@@ -188,23 +187,15 @@ def surrounds(mesh: ObjectMesh, point: NDArray) -> bool:
     low, high = mesh.bounds
     if ((point <= low) | (point >= high)).any():
         return False
-    corners = np.ascontiguousarray(mesh.vertices[mesh.triangles] - point, dtype=float)
-    return abs(_sum_solid_angles(corners)) / (4.0 * np.pi) > _INSIDE
+    return abs(_sum_solid_angles(mesh.vertices[mesh.triangles] - point)) / (4.0 * np.pi) > _INSIDE
 
 
-@njit(cache=True, error_model="numpy")
-def _sum_solid_angles(corners):
+def _sum_solid_angles(corners: NDArray) -> float:
     """Return the sum of the solid angles of triangles (m, 3, 3) seen from the origin (Van Oosterom, Strackee 1983)."""
-    total = 0.0
-    for m in range(len(corners)):
-        a, b, c = corners[m, 0], corners[m, 1], corners[m, 2]
-        la, lb, lc = np.sqrt((a * a).sum()), np.sqrt((b * b).sum()), np.sqrt((c * c).sum())
-        volume = (
-            a[0] * (b[1] * c[2] - b[2] * c[1]) + a[1] * (b[2] * c[0] - b[0] * c[2]) + a[2] * (b[0] * c[1] - b[1] * c[0])
-        )
-        below = la * lb * lc + (a * b).sum() * lc + (b * c).sum() * la + (c * a).sum() * lb
-        total += 2.0 * np.arctan2(volume, below)
-    return total
+    (a, b, c), (la, lb, lc) = corners.transpose(1, 0, 2), np.linalg.norm(corners, axis=2).T
+    volume = (a * np.cross(b, c)).sum(axis=1)
+    below = la * lb * lc + (a * b).sum(axis=1) * lc + (b * c).sum(axis=1) * la + (c * a).sum(axis=1) * lb
+    return float(2.0 * np.arctan2(volume, below).sum())
 
 
 def load_object_mesh(path: Path | str | ObjectMesh, *, unit: str = "m", triangle_limit: int = 20000) -> ObjectMesh:

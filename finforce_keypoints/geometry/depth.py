@@ -97,7 +97,7 @@ def _select_places(raster: NDArray, point: NDArray, triangles: NDArray, window: 
     reach = np.abs(raster).max()
     corners = triangles[(np.abs(triangles[:, :, 1] - point[1]) < _ON_SIDE).all(axis=1)][:, :, ::2] - point[::2]
     corners = corners[(corners.min(axis=1) < reach).all(axis=1) & (corners.max(axis=1) > -reach).all(axis=1)]
-    inside = _cover(np.ascontiguousarray(corners), raster)
+    inside = _cover(corners, raster)
     cv2, away = import_cv2(), np.linalg.norm(raster, axis=-1)
     depth = cv2.distanceTransform(inside.view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE) * _SPACING
     for share in _EDGE_SHARES:
@@ -116,18 +116,13 @@ def _thin_out(raster: NDArray, chosen: NDArray) -> NDArray:
     return places
 
 
-@njit(**_OPTIONS)
-def _cover(triangles, raster):
+def _cover(triangles: NDArray, raster: NDArray) -> NDArray[np.bool_]:
     """Return which points (a, a) of a raster (a, a, 2) triangles (n, 3, 2) cover."""
-    inside, slack = np.zeros(raster.shape[:2], dtype=np.bool_), 1e-9
+    inside, slack = np.zeros(raster.shape[:2], dtype=bool), 1e-9
     for corners in triangles:
-        for place in np.ndindex(inside.shape):
-            least, most = np.inf, -np.inf
-            for k in range(3):
-                along = corners[(k + 1) % 3] - corners[k]
-                turn = along[0] * (raster[place][1] - corners[k, 1]) - along[1] * (raster[place][0] - corners[k, 0])
-                least, most = min(least, turn), max(most, turn)
-            inside[place] |= least >= -slack or most <= slack
+        along, away = np.roll(corners, -1, axis=0) - corners, raster[..., None, :] - corners
+        turn = along[:, 0] * away[..., 1] - along[:, 1] * away[..., 0]
+        inside |= (turn >= -slack).all(axis=2) | (turn <= slack).all(axis=2)
     return inside
 
 
