@@ -14,17 +14,24 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from finforce.camera import MILLIMETRE
+from finforce.errors import PoseError
+from finforce.files import read_json
 from finforce.optional import import_trimesh
 from finforce_contact.mesh.views import MeshView, RenderedMesh
 from finforce_contact.reconstruction.evidence import GeneratedMesh, ImageEvidence, Reconstruction, collect_evidence
+from finforce_contact.reconstruction.generated import affine_from_generator
 from finforce_contact.reconstruction.generated import read_generated as read_mesh
 from finforce_contact.reconstruction.reconstruction import FROM_GENERATED, reconstruct
 from finforce_eval.cli.parser import CommandResult, picture_file
 from finforce_eval.errors import OptionError
 from finforce_eval.figures.figures import BLUE, ORANGE, new_figure
-from finforce_eval.recordings.image_files import read_depth, read_generated_pose, read_image, read_intrinsics, read_mask
+from finforce_eval.recordings.image_files import read_depth, read_image, read_intrinsics, read_mask
 
 OUTPUTS = (".stl", ".ply", ".glb")
+POSE_FORMS = (
+    '{"rotation": [w, x, y, z], "translation": [x, y, z], "scale": s, "axes": "glb" or "canonical"}, '
+    '{"matrix": 4x4}, {"T_camera_object": 4x4} as reconstruct writes it, or a bare 4x4 list'
+)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -115,6 +122,36 @@ def read_generated(options: argparse.Namespace) -> GeneratedMesh:
     vertices, triangles = read_mesh(options.mesh)
     affine = read_generated_pose(options.pose)
     return GeneratedMesh(vertices=vertices, triangles=triangles, affine=affine, name=Path(options.mesh).stem)
+
+
+def read_generated_pose(path: Path | str) -> NDArray:
+    """Return the map (4, 4) of a generated mesh into the camera frame.
+
+    Raises:
+        OptionError: the file is no JSON of one of `POSE_FORMS`.
+        PoseError: its numbers are no pose.
+    """
+    path = Path(path)
+    try:
+        content = read_json(path)
+        if isinstance(content, list):
+            content = {"matrix": content}
+        for key in ("matrix", "T_camera_object"):
+            if key in content:
+                return _check_matrix(np.array(content[key], dtype=float), path.name)
+        parts = [content[name] for name in ("rotation", "translation", "scale")]
+        return affine_from_generator(*parts, mesh_axes=content.get("axes", "glb"))
+    except PoseError:
+        raise
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        raise OptionError(f"{path.name}: {error!r}; expected {POSE_FORMS}") from None
+
+
+def _check_matrix(matrix: NDArray, name: str) -> NDArray:
+    """Refuse what is no map (4, 4)."""
+    if matrix.shape != (4, 4):
+        raise OptionError(f"{name}: a matrix of shape {matrix.shape}; expected {POSE_FORMS}")
+    return matrix
 
 
 def write_result(result: Reconstruction, output: Path) -> None:

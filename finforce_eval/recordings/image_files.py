@@ -1,4 +1,4 @@
-"""Images, intrinsics and generated poses from files, checked."""
+"""Images and intrinsics from files, checked."""
 
 from __future__ import annotations
 
@@ -11,17 +11,12 @@ from numpy.typing import NDArray
 
 from finforce.camera import MILLIMETRE, CameraIntrinsics, ImageError, IntrinsicsError, decode_depth, open_picture
 from finforce.camera_file import build_camera, camera_numbers, cut_camera, read_camera
-from finforce.errors import PoseError, one_line
-from finforce.files import FileError, read_bytes, read_json
-from finforce_contact.reconstruction.generated import affine_from_generator
+from finforce.errors import one_line
+from finforce.files import FileError, read_bytes
 from finforce_eval.errors import OptionError
 
 _LARGEST_FILE = 1 << 28  # bytes
 FARTHEST = 10.0  # [m] of the median depth; more means that the numbers are no metres
-POSE_FORMS = (
-    '{"rotation": [w, x, y, z], "translation": [x, y, z], "scale": s, "axes": "glb" or "canonical"}, '
-    '{"matrix": 4x4}, {"T_camera_object": 4x4} as reconstruct writes it, or a bare 4x4 list'
-)
 
 
 def read_image(path: Path | str) -> NDArray:
@@ -128,33 +123,3 @@ def read_intrinsics(words: Sequence[str], shape: tuple[int, int], *, is_cut: boo
         return cut_camera(read_camera(words[0], None, *words[1:]), shape)
     except IntrinsicsError as error:
         raise OptionError(f"--intrinsics {' '.join(words)[:80]}: {error}") from error
-
-
-def read_generated_pose(path: Path | str) -> NDArray:
-    """Return the map (4, 4) of a generated mesh into the camera frame.
-
-    Raises:
-        OptionError: the file is no JSON of one of `POSE_FORMS`.
-        PoseError: its numbers are no pose.
-    """
-    path = Path(path)
-    try:
-        content = read_json(path)
-        if isinstance(content, list):
-            content = {"matrix": content}
-        for key in ("matrix", "T_camera_object"):
-            if key in content:
-                return _check_matrix(np.array(content[key], dtype=float), path.name)
-        parts = [content[name] for name in ("rotation", "translation", "scale")]
-        return affine_from_generator(*parts, mesh_axes=content.get("axes", "glb"))
-    except PoseError:
-        raise
-    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        raise OptionError(f"{path.name}: {error!r}; expected {POSE_FORMS}") from None
-
-
-def _check_matrix(matrix: NDArray, name: str) -> NDArray:
-    """Refuse what is no map (4, 4)."""
-    if matrix.shape != (4, 4):
-        raise OptionError(f"{name}: a matrix of shape {matrix.shape}; expected {POSE_FORMS}")
-    return matrix

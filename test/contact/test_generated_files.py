@@ -16,7 +16,7 @@ from finforce_contact.mesh.object_mesh import ObjectMesh
 from finforce_contact.mesh.views import sample_surface
 from finforce_contact.reconstruction.evidence import GeneratedMesh
 from finforce_contact.reconstruction.generated import CAMERA_FROM_PYTORCH3D, CANONICAL_FROM_GLB, read_generated
-from finforce_eval.recordings.image_files import read_generated_pose
+from finforce_eval.cli.reconstruct import read_generated_pose
 from finforce_sim.objects import build_object
 
 SPLATS, SPREAD, STRAYS = 20000, 3e-3, 300  # count, of the mesh's size, count of faint ones

@@ -1,32 +1,30 @@
 """The notebook of the examples, from the finger's STL to its force, cell by cell."""
 
 import json
-import os
 import re
-import sys
 from pathlib import Path
 
 import pytest
 from matplotlib import pyplot
+
+from finforce_eval.cli.main import main
 
 ROOT = Path(__file__).parents[2]
 NOTEBOOK = ROOT / "examples" / "own_finger.ipynb"
 
 
 def run_cells(path):
-    """Run the cells of a notebook in this folder, `!finforce` by this interpreter, and return their names."""
-    names, cells = {"run": os.system}, json.loads(path.read_text(encoding="utf-8"))["cells"]
+    """Run the cells of a notebook in this folder, `!finforce` in this process, and return their names."""
+    names, cells = {"finforce": main}, json.loads(path.read_text(encoding="utf-8"))["cells"]
     for cell in cells:
         if cell["cell_type"] == "code":
             text = "".join(cell["source"]).replace("\\\n", " ")
-            command = f"{sys.executable} -m finforce_eval.cli.main"
-            exec(re.sub(r"^!finforce (.*)$", rf"assert run('{command} \1') == 0", text, flags=re.M), names)
+            exec(re.sub(r"^!finforce (.*)$", r"assert finforce('\1'.split()) == 0", text, flags=re.M), names)
     return names
 
 
 def test_notebook_goes_from_an_stl_to_a_force(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("PYTHONPATH", str(ROOT))
     pyplot.switch_backend("agg")
     left = run_cells(NOTEBOOK)["left"]
     pressed = left[left.true_force_x < -1.0]

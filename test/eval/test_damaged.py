@@ -4,7 +4,7 @@ import struct
 
 import numpy as np
 import pytest
-from eval_fakes import make_recording, pack_mcap
+from eval_fakes import cut, make_recording, pack_mcap
 
 from finforce_eval.errors import DamagedError, OutOfBoundsError, RecordingError
 from finforce_eval.recordings.recording import read_recording
@@ -112,10 +112,12 @@ def test_damaged_recordings_are_annotated_and_evaluated_with_a_word(tmp_path, ca
     from finforce_eval.cli.main import main
     from finforce_eval.recordings.recording import DEMO
 
-    path = tmp_path / "cut.mcap"
-    content = next(DEMO.glob("*.mcap")).read_bytes()
-    begin, length = chunk_places(content)[-1]
-    path.write_bytes(content[: begin + length])
+    whole = read_recording(DEMO)
+    begin = int(whole.jaw("left").keypoints.stamps[0])
+    short = write_recording(cut(whole, begin, begin + 8 * 10**9), tmp_path / "plain")
+    path = pack_mcap(short, tmp_path / "cut.mcap", "zstd")
+    begin, length = chunk_places(path.read_bytes())[-1]
+    path.write_bytes(path.read_bytes()[: begin + length])
     options = [str(path), "--contact", "fixed:42", "--calibration", "bench"]
     assert main(["evaluate", *options]) == 0
     assert "read as far as it is good" in capsys.readouterr().err

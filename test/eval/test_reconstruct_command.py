@@ -12,8 +12,9 @@ from finforce.errors import FinforceError
 from finforce.optional import import_trimesh
 from finforce_contact.mesh.object_mesh import load_object_mesh, read_triangles
 from finforce_eval.cli.main import main
+from finforce_eval.cli.reconstruct import read_generated_pose
 from finforce_eval.errors import OptionError
-from finforce_eval.recordings.image_files import read_depth, read_generated_pose, read_intrinsics, read_mask
+from finforce_eval.recordings.image_files import read_depth, read_intrinsics, read_mask
 
 SHAPE = (240, 424)
 

@@ -5,11 +5,13 @@ from importlib import resources
 
 import numpy as np
 import pytest
+from eval_fakes import cut
 
 from finforce_eval.calibration.weighing import GRAVITY, Hold, calibrate_with_scale, find_holds, weigh
 from finforce_eval.cli.main import main
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.recording import read_recording
+from finforce_eval.recordings.writer import write_recording
 from finforce_ifea.errors import CalibrationError
 from finforce_ifea.jaw.calibration import load_calibration, save_calibration
 from finforce_ifea.jaw.jaw import load_jaw
@@ -81,10 +83,13 @@ def test_a_wrong_modulus_is_mended_by_weights(tmp_path, capsys):
     base = load_calibration("bench")
     wrong, mended = tmp_path / "wrong.yaml", tmp_path / "mended.yaml"
     save_calibration(base.changed(young_modulus=1.5 * base.young_modulus), wrong)
-    options = ["weigh", str(RECORDING), "--contact", "fixed:case", "--calibration", str(wrong)]
+    whole = read_recording(RECORDING)
+    begin = int(whole.jaw("left").keypoints.stamps[0])
+    bag = write_recording(cut(whole, begin, begin + 19 * 10**9), tmp_path / "four_holds")
+    options = ["weigh", str(bag), "--contact", "fixed:case", "--calibration", str(wrong)]
     assert main(options) == 0
     spans = [line.split()[2:5:2] for line in capsys.readouterr().out.splitlines() if line.startswith("hold ")]
-    track, truth = (getattr(read_recording(RECORDING).jaw("left"), name) for name in ("keypoints", "truth"))
+    track, truth = (getattr(whole.jaw("left"), name) for name in ("keypoints", "truth"))
     ends = track.stamps[0] * 1e-9 + np.array([float(end) for _, end in spans])
     weights = [np.interp(end - 0.5, truth.stamps * 1e-9, np.abs(truth.force[:, 0])) for end in ends]
     grams = [f"{1e3 * weight / GRAVITY:.0f}" for weight in weights]
