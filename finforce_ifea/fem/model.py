@@ -1,5 +1,6 @@
 """What every mechanical model of a jaw offers to the solvers, and factorised stiffness matrices: banded or sparse."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
@@ -14,10 +15,20 @@ LARGEST_MOVE, LARGEST_TURN = 2e-3, 0.3
 Across = Literal["middle", "half", "both"]
 
 
-class BandedFactor:
-    """Cholesky factor of a positive definite banded matrix."""
+class Factor:
+    """Factors of a symmetric stiffness matrix K; `positive` when the state that it belongs to is stable."""
 
     positive = True
+    solve: Callable[[NDArray], NDArray]
+
+    def condense(self, b: sparse.csr_matrix) -> NDArray:
+        """Return b^T K^-1 b (k, k), symmetric, for sparse b of shape (n, k)."""
+        found = b.T @ self.solve(b.toarray())
+        return 0.5 * (found + found.T)
+
+
+class BandedFactor(Factor):
+    """Cholesky factor of a positive definite banded matrix."""
 
     def __init__(self, factor: NDArray) -> None:
         self._factor = factor
@@ -44,6 +55,8 @@ class SparsePlan:
         lower.sort_indices()
         columns = lower.tocsc()
         self.rows, self.columns = (lower.indptr, lower.indices), (columns.indptr, columns.indices)
+        lengths = np.append(np.diff(columns.indptr), -1)
+        self._twins = _find_twins(*self.rows) & (lengths[:-1] == lengths[1:] + 1)
 
     def factorise(self, upper: NDArray) -> "DiagonalFactor | None":
         """Factorise a matrix by its upper entries (k,); return None where that loses digits without exchanging rows.
@@ -52,13 +65,13 @@ class SparsePlan:
         """
         pointer, index = self._pattern
         values, pivots = np.empty(len(self.rows[1])), np.empty(len(pointer) - 1)
-        _eliminate(pointer, index, upper, *self.rows, *self.columns, values, pivots)
+        _eliminate(pointer, index, upper, *self.rows, *self.columns, self._twins, values, pivots)
         factor = DiagonalFactor(self, values, pivots)
         is_exact = factor.positive or np.abs(values).max(initial=0.0) < _LARGEST_GROWTH
         return factor if is_exact else None
 
 
-class DiagonalFactor:
+class DiagonalFactor(Factor):
     """Factors L D L^T of a sparse symmetric matrix."""
 
     def __init__(self, plan: SparsePlan, values: NDArray, pivots: NDArray) -> None:
@@ -70,6 +83,13 @@ class DiagonalFactor:
         x = np.array(b, float, order="C").reshape(len(b), -1)
         _substitute(*self._parts, x)
         return x.reshape(b.shape)
+
+    def condense(self, b: sparse.csr_matrix) -> NDArray:
+        """Return b^T K^-1 b (k, k), symmetric: with Y = L^-1 b, most rows of which are zero, Y^T D^-1 Y."""
+        x, reached = b.toarray(), np.diff(b.indptr) > 0
+        _substitute_forward(*self._parts[:3], x, reached)
+        x = x[reached]
+        return x.T @ (self._parts[3][reached, None] * x)
 
 
 # Entries of L up to which an indefinite matrix keeps half of its digits.
@@ -102,35 +122,80 @@ def _find_rows(pointer, index, first, rows):
 
 
 @njit(**_OPTIONS)
-def _eliminate(pointer, index, data, row_pointer, row_index, first, rows, values, pivots):
-    """Write L's values (k,) by columns, and 1 / D (n,), row by row."""
+def _find_twins(pointer, index):
+    """Return which rows of L (n,) the next one repeats, and adds one entry to."""
+    n = len(pointer) - 1
+    twins = np.zeros(n, np.bool_)
+    for k in range(n - 1):
+        first, last, end = pointer[k], pointer[k + 1], pointer[k + 2]
+        twins[k] = end - last == last - first + 1 and (index[first:last] == index[last : end - 1]).all()
+    return twins
+
+
+@njit(**_OPTIONS)
+def _eliminate(pointer, index, data, row_pointer, row_index, first, rows, twins, values, pivots):
+    """Write L's values (k,) by columns, and 1 / D (n,), by rows: those of one node, `twins` (n,), two at a time."""
     n = len(pivots)
-    row, end = np.zeros(n), first[:n].copy()
-    for k in range(n):
-        for p in range(pointer[k], pointer[k + 1]):
-            row[index[p]] = data[p]
-        pivot, row[k] = row[k], 0.0
-        for q in range(row_pointer[k], row_pointer[k + 1]):
+    row, end = np.zeros((n + 1, 2)), first[:n].copy()
+    k = 0
+    while k < n:
+        wide = 2 if twins[k] else 1
+        for side in range(wide):
+            for p in range(pointer[k + side], pointer[k + side + 1]):
+                row[index[p], side] = data[p]
+        q, last = row_pointer[k], row_pointer[k + 1]
+        while q < last:
             i = row_index[q]
-            value, row[i] = row[i], 0.0
-            for p in range(first[i], end[i]):
-                row[rows[p]] -= values[p] * value
-            values[end[i]] = value * pivots[i]
-            pivot -= values[end[i]] * value
-            end[i] += 1
-        pivots[k] = 1.0 / pivot
+            a, b, c, d, further = row[i, 0], row[i, 1], 0.0, 0.0, 0
+            pair = 2 if twins[i] and q + 1 < last and row_index[q + 1] == i + 1 else 1
+            if pair == 2:
+                c, d = row[i + 1, 0] - values[first[i]] * a, row[i + 1, 1] - values[first[i]] * b
+                row[i + 1, 0], row[i + 1, 1] = c, d
+                further = first[i + 1] - first[i] - 1
+            for p in range(first[i] + pair - 1, end[i]):
+                there, one, other = rows[p], values[p], values[p + further]
+                row[there, 0] -= one * a + other * c
+                row[there, 1] -= one * b + other * d
+            for j in range(i, i + pair):
+                a, b = row[j, 0], row[j, 1]
+                row[j, 0], row[j, 1] = 0.0, 0.0
+                values[end[j]] = a * pivots[j]
+                if wide == 2:
+                    values[end[j] + 1] = b * pivots[j]
+                row[k, 0] -= a * a * pivots[j]
+                row[k, 1] -= a * b * pivots[j]
+                row[k + 1, 1] -= b * b * pivots[j]
+                end[j] += wide
+            q += pair
+        pivots[k] = 1.0 / row[k, 0]
+        if wide == 2:
+            values[end[k]] = row[k, 1] * pivots[k]
+            pivots[k + 1] = 1.0 / (row[k + 1, 1] - row[k, 1] * values[end[k]])
+            end[k] += 1
+        row[k : k + 2] = 0.0
+        k += wide
+
+
+@njit(**_OPTIONS)
+def _substitute_forward(first, rows, values, x, reached):
+    """Replace x (n, k) by L^-1 x, all of whose rows are zero but those that are reached (n,), which are added to."""
+    n, columns = x.shape
+    for i in range(n):
+        if not reached[i]:
+            continue
+        here = x[i]
+        for p in range(first[i], first[i + 1]):
+            there, value = x[rows[p]], values[p]
+            reached[rows[p]] = True
+            for c in range(columns):
+                there[c] -= value * here[c]
 
 
 @njit(**_OPTIONS)
 def _substitute(first, rows, values, pivots, x):
     """Replace x (n, k) by (L D L^T)^-1 x."""
     n, columns = x.shape
-    for i in range(n):
-        here = x[i]
-        for p in range(first[i], first[i + 1]):
-            there, value = x[rows[p]], values[p]
-            for c in range(columns):
-                there[c] -= value * here[c]
+    _substitute_forward(first, rows, values, x, np.ones(n, np.bool_))
     for i in range(n - 1, -1, -1):
         here = x[i]
         for c in range(columns):
@@ -141,7 +206,7 @@ def _substitute(first, rows, values, pivots, x):
                 here[c] -= value * there[c]
 
 
-class SparseFactor:
+class SparseFactor(Factor):
     """LU factor of any regular symmetric matrix (n, n)."""
 
     def __init__(self, matrix: sparse.csc_matrix) -> None:
@@ -156,10 +221,6 @@ class SparseFactor:
     def solve(self, b: NDArray) -> NDArray:
         """Return K^-1 b for b of shape (n,) or (n, k)."""
         return self._lu.solve(np.asarray(b))
-
-
-# of a symmetric matrix; `positive` when the state that it belongs to is stable
-Factor = BandedFactor | DiagonalFactor | SparseFactor
 
 
 def _factorise_sparse(matrix: sparse.csc_matrix, pivoting: float) -> SuperLU:

@@ -65,13 +65,14 @@ class PlaneModel(SolidModel):
         free[:, 1] = False
         self._number_unknowns(standing[column], free)
         self._plan_assembly()
+        self._moves = self.dof[standing][:, ::2]
 
     def linearize(self, q: NDArray, *, tangent: bool = True) -> Linearization:
         """Evaluate internal force, energy and, unless `tangent` is False, the tangent stiffness at q (size,) [m]."""
-        f = np.zeros_like(self.mesh.nodes)
+        f = np.zeros(self._moves.shape)
         energy, smallest = _add_triangles(
-            self.expand(q),
-            self._elements,
+            np.append(q, 0.0)[self._moves],
+            self.plane.triangles,
             self._gradients,
             self._volumes,
             self._lame,
@@ -80,7 +81,7 @@ class PlaneModel(SolidModel):
             f,
             self._Ke,
         )
-        force = np.bincount(self.dof.ravel(), f.ravel(), self.size + 1)[: self.size]
+        force = np.bincount(self._moves.ravel(), f.ravel(), self.size + 1)[: self.size]
         return Linearization(
             force=force, energy=energy, smallest_det=smallest, tangent=self._assemble() if tangent else None
         )
@@ -121,7 +122,7 @@ def _add_triangles(u, elements, gradients, volumes, lame, shear, with_tangent, f
             g, weight = gradients[e, p], volumes[e, p]
             xx, xz, zx, zz = 1.0, 0.0, 0.0, 1.0
             for i in range(6):
-                ux, uz = u[elements[e, i], 0], u[elements[e, i], 2]
+                ux, uz = u[elements[e, i], 0], u[elements[e, i], 1]
                 xx, xz = xx + ux * g[i, 0], xz + ux * g[i, 1]
                 zx, zz = zx + uz * g[i, 0], zz + uz * g[i, 1]
             smallest = min(smallest, xx * zz - xz * zx)
@@ -135,7 +136,7 @@ def _add_triangles(u, elements, gradients, volumes, lame, shear, with_tangent, f
                 a[i, 0], a[i, 1] = xx * g[i, 0] + xz * g[i, 1], zx * g[i, 0] + zz * g[i, 1]
                 sx, sz = s_xx * g[i, 0] + s_xz * g[i, 1], s_xz * g[i, 0] + s_zz * g[i, 1]
                 force[elements[e, i], 0] += weight * (xx * sx + xz * sz)
-                force[elements[e, i], 2] += weight * (zx * sx + zz * sz)
+                force[elements[e, i], 1] += weight * (zx * sx + zz * sz)
             if not with_tangent:
                 continue
             k, m = weight * lame, weight * shear

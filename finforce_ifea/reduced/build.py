@@ -44,7 +44,7 @@ class Face:
         sides = np.stack([np.interp(heights, surface.heights, y) for y in columns], axis=1)
         points = np.array([[face.read(z), y, z] for z, row in zip(heights, sides, strict=True) for y in row])
         self._probe, self._across, self._count = self._model.attach(points, 1e-3), surface.across, len(heights)
-        self._loads: NDArray | None = None
+        self._loads: sparse.csr_matrix | None = None
         self._share = None if has_own_rows(mechanics) else self._share_nodes(mechanics, heights)
         self.basis = np.zeros((self._model.size, 0))
 
@@ -71,16 +71,16 @@ class Face:
 
     def describe(self, q: NDArray) -> dict[str, NDArray]:
         """Return the equilibrium of unknowns q (size,) and what unit loads at the rows do to it, as in `Manifold`."""
-        model, count = self._model, 2 * self._count
-        responses, state = self._respond(q), model.linearize(q, tangent=False)
-        moves = self._average(model.project(self._probe, q, responses)).reshape(count, count)
+        model, loads = self._model, self._unit_loads(q)
+        state = model.linearize(q)
+        factor = model.factorise(state.tangent)
         moved = model.positions(self._probe, q) - model.positions(self._probe, np.zeros(model.size))
         return {
-            "loads": self._find_load(q, state.force),
-            "moves": self._average(moved[:, :, None]).reshape(count),
-            "compliance": (0.5 * (moves + moves.T)).astype(np.float32),
+            "loads": self._find_load(loads, state.force),
+            "moves": moved.reshape(self._count, self._across, 3).mean(1)[:, [0, 2]].ravel(),
+            "compliance": factor.condense(loads).astype(np.float32),
             "shapes": self.basis.T @ q,
-            "shape_compliance": (self.basis.T @ responses).astype(np.float32),
+            "shape_compliance": (loads.T @ factor.solve(self.basis)).T.astype(np.float32),
         }
 
     def describe_all(self, states: NDArray) -> list[dict[str, NDArray]]:
@@ -91,34 +91,25 @@ class Face:
         """Set the basis to the `count` shapes that say most of equilibria (m, size) and of what loads do to them."""
         parts, largest = [], 0.0
         for q in states[:: _EVERY**2]:
-            responses = self._respond(q)[:, ::_EVERY]
+            factor = self._model.factorise(self._model.linearize(q).tangent)
+            responses = factor.solve(self._unit_loads(q)[:, ::_EVERY].toarray())
             largest = max(largest, np.abs(responses).max())
             parts.append(_condense(responses, _LEADING))
         share = (np.abs(states).max() or 1.0) / largest / len(states)
         samples = np.concatenate([states.T, share * np.concatenate(parts, axis=1)], axis=1)
         self.basis = np.linalg.qr(_condense(samples, min(count, *samples.shape)))[0]
 
-    def _respond(self, q: NDArray) -> NDArray:
-        """Return the changes (size, 2 n) of the unknowns by unit loads at the rows."""
-        model = self._model
-        return model.factorise(model.linearize(q).tangent).solve(self._unit_loads(q))
-
-    def _find_load(self, q: NDArray, force: NDArray) -> NDArray:
+    def _find_load(self, loads: sparse.csr_matrix, force: NDArray) -> NDArray:
         """Return the load on the rows (2 n,) [N] that balances an internal force (size,), as far as it can."""
         if self._share is not None:
             return self._share @ force
-        loads = sparse.csc_matrix(self._unit_loads(q))
         normal = (loads.T @ loads).tocsc()
         normal += _RIDGE * normal.diagonal().max() * sparse.eye(normal.shape[0], format="csc")
         load = splu(normal).solve(loads.T @ force)
         load[np.abs(load) < _NOTHING * np.abs(load).max()] = 0.0
         return load
 
-    def _average(self, moves: NDArray) -> NDArray:
-        """Return x and z motions (n, 2, k) of the rows, the mean across the face, of those of points (p, 3, k)."""
-        return moves.reshape(self._count, self._across, 3, -1).mean(1)[:, [0, 2]]
-
-    def _unit_loads(self, q: NDArray) -> NDArray:
+    def _unit_loads(self, q: NDArray) -> sparse.csr_matrix:
         """Return the loads (size, 2 n) of unit forces along x and z at each row."""
         if self._loads is not None:
             return self._loads
@@ -128,9 +119,10 @@ class Face:
                 forces = np.zeros((self._count * self._across, 3))
                 forces[row * self._across : (row + 1) * self._across, axis] = 1.0 / self._across
                 columns[:, 2 * row + number] = self._model.load(self._probe, q, forces)
+        loads = sparse.csr_matrix(columns)
         if isinstance(self._model, SolidModel):  # whose loads do not depend on its state
-            self._loads = columns
-        return columns
+            self._loads = loads
+        return loads
 
 
 def _condense(samples: NDArray, count: int) -> NDArray:
@@ -154,9 +146,10 @@ _HARDEST = 12.0
 # Longer steps [m] of a solid must agree with its motions at both ends, to this share; the longest of a frame, whose
 # hinged bars snap over.
 _SURE, _APART, _LONGEST = 0.1e-3, 0.1, 0.5e-3
-# Shortest step of a depth [m]; iterations to an equilibrium, and its tolerance [m]. What takes more is no near one, nor
-# what corrects as much as at first after so many.
-_SHORTEST, _ITERATIONS, _TOLERANCE, _TRIED = 0.02e-3, 9, 1e-9, 5
+# Shortest step of a depth [m]; iterations to an equilibrium, and its tolerance [m], a hundredth of what a camera tells
+# apart. What takes more is no near one, nor what corrects as much as at first after so many. Steps below the last [m]
+# are followed by much smaller ones.
+_SHORTEST, _ITERATIONS, _TOLERANCE, _TRIED, _NEAR = 0.02e-3, 9, 1e-8, 5, 1e-6
 # Quarters of a path that are tried next where it cannot be divided.
 _KEPT = 3
 _FEWEST_ROWS, _MOST_ROWS = 12, 84
@@ -388,11 +381,13 @@ class _Rod:
         """Return the equilibrium at a depth [m] of the rod, by one above it and one below it if known; or None."""
         contact, model = self._contact, self._contact.model
         place = np.array([self._touch + depth, np.log(self._radius), self._height])
-        q, before, first = np.zeros(model.size), _TOLERANCE, np.inf
+        q, before, first = np.zeros(model.size), _NEAR, np.inf
         if start is not None and end is not None:
             q = _join(start, end)(depth)
         elif start is not None:
             q = start.q + start.state.modes[:, 0] * (depth - start.depth)
+        elif end is not None:
+            q = end.q * (depth / end.depth)
         for count in range(_ITERATIONS):
             state = contact.linearize(q, place)
             if not state.touches:

@@ -119,13 +119,14 @@ def test_a_turn_costs_nothing():
     """A strip without a clamp in its way: all nodes turned by a radian hold no energy."""
     model = plane_model(make_section(), share=2.0)
     angle = 1.0
-    turn = np.array([[np.cos(angle), 0.0, np.sin(angle)], [0.0, 1.0, 0.0], [-np.sin(angle), 0.0, np.cos(angle)]])
-    moved = model.mesh.nodes @ turn.T - model.mesh.nodes
-    force = np.zeros_like(model.mesh.nodes)
+    turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    moved = model.plane.points @ turn.T - model.plane.points
+    force = np.zeros_like(moved)
     from finforce_ifea.fem.plane import _add_triangles
 
+    triangles = model.plane.triangles
     energy, smallest = _add_triangles(
-        moved, model._elements, model._gradients, model._volumes, model._lame, model._shear, False, force, model._Ke
+        moved, triangles, model._gradients, model._volumes, model._lame, model._shear, False, force, model._Ke
     )
     assert energy < 1e-20 and smallest == pytest.approx(1.0)
     assert np.abs(force).max() < 1e-9
