@@ -25,6 +25,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from finforce.camera_topics import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
+from finforce.gripper_frames import SIDES
 from finforce.health import IDLE
 from finforce.messages import NANOSECONDS
 from finforce.systems.processes import Process, ReplayOptions, compose, replay_processes
@@ -131,7 +132,6 @@ TOGETHER, APART, BUSY, SKIPPING = "one process", "four processes", "one, a core 
 BURN = "while True: pass"
 TARE = 1.8  # [s] from the first image, in which the solvers take their tare and give no force
 STEP = 1e-3  # [s] between two times at which the error now is taken
-SIDES = ("left", "right")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

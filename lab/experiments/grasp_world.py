@@ -16,7 +16,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce.gripper_frames import jaw_in_gripper
 from finforce.messages import magnitude_stddev
+from finforce.transforms import invert_pose
 from finforce_contact.estimator import ContactEstimator
 from finforce_contact.loop import ForceLoop
 from finforce_driver.grasp.load_watch import ForceSample, TouchSample
@@ -25,7 +27,6 @@ from finforce_driver.gripper import Gripper
 from finforce_driver.settings import GraspGoal, GraspSettings
 from finforce_driver.state import GraspPhase, GraspStatus, Phase
 from finforce_ifea.estimator import ForceEstimator
-from finforce_ifea.grasp_force import R_GRIPPER_JAW
 from finforce_ifea.jaw.calibration import load_calibration
 from finforce_ifea.observation import Observation, Solution
 from finforce_ifea.relaxation import Relaxation, RelaxationTerm
@@ -273,10 +274,7 @@ class JawSensor:
 
     def take_pose(self, stamp: float, T_gripper_object: NDArray, origin_x: float) -> None:
         """Take a pose of the object in the gripper's frame, where the jaw's origin is at x [m]."""
-        T_jaw_gripper = np.eye(4)
-        T_jaw_gripper[:3, :3] = R_GRIPPER_JAW[self._side].T
-        T_jaw_gripper[:3, 3] = -T_jaw_gripper[:3, 0] * origin_x
-        self._loop.take_pose(stamp, T_jaw_gripper @ T_gripper_object)
+        self._loop.take_pose(stamp, invert_pose(jaw_in_gripper(self._side, origin_x)) @ T_gripper_object)
 
     def solve(self, observation: Observation) -> Solution:
         """Return what the solver says of key points."""

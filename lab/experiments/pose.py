@@ -146,7 +146,8 @@ def track_object(recording: Recording) -> TrackedObject:
         raise RecordingError(f"{recording.name}: the built-in tracker needs depth images, which are not in it")
     mesh = load_object_mesh(require_mesh(recording))
     tracker, view = PoseTracker(mesh, images.camera), MeshView(mesh)
-    known, first = recording.object_pose, _read_poses(recording.object_pose)[0]
+    known = recording.object_pose
+    first = pose_from_quaternion(known.position[0], known.quaternion[0])
     stamps, poses, times, lost = [], [], [], 0
     for stamp, image in images.at(images.stamps[images.stamps >= known.stamps[0] - FIRST_WITHIN]):
         began = time.perf_counter()
@@ -189,11 +190,6 @@ def find_pose(
         return tracker.locate(image.stamp, image.depth, mask, [T_first]).T_camera_object
     except PoseLostError:
         return None
-
-
-def _read_poses(track: PoseTrack) -> list[NDArray]:
-    """Return the poses (4, 4) of a track."""
-    return [pose_from_quaternion(*numbers) for numbers in zip(track.position, track.quaternion, strict=True)]
 
 
 POSE = Experiment(

@@ -40,7 +40,7 @@ def run(truth):
         for side in ("left", "right"):
             log.sent[side][stamp] = 0.0
         log.grasp[stamp], log.grasp_latency[stamp] = 0.1 * index + 0.2, 0.03
-    return NodeRun(log=log, cpu={"solver": 12.0, "other": 3.0}, memory={"solver": 3e8}, others=1.0, seconds=4.0)
+    return NodeRun(log=log, cpu={"solver": 12.0, "other": 3.0}, memory={"solver": 3e8}, others=1.0)
 
 
 def test_everything_answered_is_nothing_dropped(run, truth):
