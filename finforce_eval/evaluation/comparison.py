@@ -151,14 +151,11 @@ def _find_stddev(before: Mapping[str, Any], after: Mapping[str, Any], first: flo
     """
     if not first + second > 0.0:
         return 0.0 if first == second == 0.0 else inf
-    seconds, other = (
-        pd.DataFrame(case.get("seconds", ()), columns=["second", "square", "frames"]).set_index("second")
-        for case in (before, after)
-    )
-    common = seconds.join(other.square.rename("after"), how="inner").astype(float).sort_index()
-    weighted = pd.DataFrame({"sum": common.frames * (common.after - common.square), "frames": common.frames})
-    blocks = weighted.groupby(np.arange(len(weighted)) // _BLOCK).sum()
-    if len(blocks) < _FEWEST:
+    rows, others = (np.array(case.get("seconds", ()), dtype=float).reshape(-1, 3) for case in (before, after))
+    _, mine, theirs = np.intersect1d(rows[:, 0], others[:, 0], return_indices=True)
+    starts, frames = np.arange(0, len(mine), _BLOCK), rows[mine, 2]
+    if len(starts) < _FEWEST:
         return inf
-    means = blocks["sum"] / blocks.frames.clip(lower=1.0)
-    return float(means.std() / sqrt(len(means)) / (first + second))
+    sums = np.add.reduceat(frames * (others[theirs, 1] - rows[mine, 1]), starts)
+    means = sums / np.maximum(np.add.reduceat(frames, starts), 1.0)
+    return float(np.std(means, ddof=1) / sqrt(len(means)) / (first + second))
