@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from finforce.gripper_frames import SIDES
 from finforce.messages import NANOSECONDS, stamp_of
 from finforce_eval.cli.parser import CommandResult
 from finforce_eval.errors import OptionError, RecordingError
@@ -19,7 +20,7 @@ from finforce_eval.machine import version
 from finforce_eval.recordings.bags import bag_source, check_types, open_bag
 from finforce_eval.recordings.dataset import Dataset, is_dataset, open_dataset, read_parquet, rows_of
 from finforce_eval.recordings.recording import WRENCH
-from finforce_eval.recordings.tracks import JAWS, WrenchTrack
+from finforce_eval.recordings.tracks import WrenchTrack
 from finforce_eval.recordings.writer import STATUS
 from finforce_eval.table import AXES, ForceSeries, stddev_along
 from finforce_eval.tasks import is_manifest
@@ -78,13 +79,13 @@ def read_forces(path: Path) -> list[ForceSeries]:
     if is_dataset(path):
         return _read_episodes(open_dataset(path, None))
     source = bag_source(path)
-    types = {f"/{side}/{kind}": (STATUS if kind == _STATUS else WRENCH,) for side in JAWS for kind in KINDS}
+    types = {f"/{side}/{kind}": (STATUS if kind == _STATUS else WRENCH,) for side in SIDES for kind in KINDS}
     samples: dict[str, list[Any]] = {}
     with open_bag(source, path.stem) as bag:
         check_types(bag.connections, types, path.stem)
         for sample in bag.raw(types):
             samples.setdefault(sample.topic, []).append(bag.decode(sample))
-    sides = [side for side in JAWS if f"/{side}/{_FORCE}" in samples]
+    sides = [side for side in SIDES if f"/{side}/{_FORCE}" in samples]
     if not sides:
         raise RecordingError(f"{path.stem}: no forces: /left/wrench and /right/wrench have no messages; see annotate")
     return [_make_series(f"{path.stem}/{side}" if len(sides) > 1 else path.stem, side, samples) for side in sides]
@@ -92,7 +93,7 @@ def read_forces(path: Path) -> list[ForceSeries]:
 
 def _read_episodes(dataset: Dataset) -> list[ForceSeries]:
     """Return the forces of all episodes of a dataset, as `annotate` writes them."""
-    names = [name for name in dataset.info["features"] if name.endswith(tuple(f".force.{side}" for side in JAWS))]
+    names = [name for name in dataset.info["features"] if name.endswith(tuple(f".force.{side}" for side in SIDES))]
     if not names:
         raise RecordingError(f"{dataset.folder.name}: no forces: no feature ends in .force.left or .force.right")
     found = []

@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from finforce.errors import ObservationError
+from finforce.gripper_frames import SIDES
 from finforce.health import Idling
 from finforce_contact.loop import ContactSource, ForceLoop, GivenContact
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.gripper import with_distances
 from finforce_eval.evaluation.pressure_centre import InnerSurface, true_lines
 from finforce_eval.evaluation.scoring import ONSET_FORCE, compare_detection, match_samples, match_truth
-from finforce_eval.recordings.tracks import JAWS, Recording
+from finforce_eval.recordings.tracks import Recording
 from finforce_eval.table import AXES, ForceSeries, Snapshot
 from finforce_eval.tasks import progress_bar
 
@@ -89,7 +90,7 @@ def estimate_forces(
     sides = sides or list(recording.jaws)
     for side in sides:
         check_keypoint_count(recording, side, setup.jaw)
-    both, found = len(sides) == len(JAWS), {}
+    both, found = len(sides) == len(SIDES), {}
     how = {"strict": strict, "as_live": setup.as_live, "stills": setup.stills, "progress": progress, "watch": watch}
     for side in sides:
         own = setup.side(side)

@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 
 from finforce.camera import ImageError
 from finforce.errors import FinforceError, PoseError, suggest
-from finforce.gripper_frames import read_extrinsics
+from finforce.gripper_frames import SIDES, read_extrinsics
 from finforce.health import Idling
 from finforce.messages import NANOSECONDS
 from finforce.transforms import pose_from_quaternion, pose_numbers, quaternion_from_pose
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.recordings.images import DEPTH_ENDS, ImageChoice, ImageTrack
 from finforce_eval.recordings.recording import read_recording
-from finforce_eval.recordings.tracks import JAWS, DetectionTrack, JawTrack, KeypointTrack, PoseTrack, Recording
+from finforce_eval.recordings.tracks import DetectionTrack, JawTrack, KeypointTrack, PoseTrack, Recording
 from finforce_eval.tasks import progress_bar
 from finforce_keypoints.errors import KeypointError
 from finforce_keypoints.rig import read_rig
@@ -214,7 +214,7 @@ def _true_track(track: JawTrack) -> JawTrack:
 def sides_of(options: argparse.Namespace) -> tuple[str, ...]:
     """Return the jaws that images show, none where the option does not say."""
     jaws = getattr(options, "jaws", None)
-    return {None: (), "both": JAWS}.get(jaws, (jaws,))
+    return {None: (), "both": SIDES}.get(jaws, (jaws,))
 
 
 def parse_source(options: argparse.Namespace) -> KeypointSource:

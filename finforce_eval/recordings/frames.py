@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 
 from finforce.camera import MILLIMETRE, CameraIntrinsics, ImageError, decode_picture
 from finforce.files import FileError, check_plain, read_bytes
+from finforce.gripper_frames import SIDES
 from finforce.messages import NANOSECONDS
 from finforce.optional import import_library
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.recordings.bags import list_pictures
 from finforce_eval.recordings.image_files import read_intrinsics
 from finforce_eval.recordings.images import ImageChoice, StampedImage
-from finforce_eval.recordings.tracks import JAWS, JawTrack, KeypointTrack, Recording, WrenchTrack
+from finforce_eval.recordings.tracks import JawTrack, KeypointTrack, Recording, WrenchTrack
 from finforce_keypoints.images import RgbdImage, check_image
 
 STILL_RATE = 1.0  # Hz of pictures that say nothing of their times
@@ -86,7 +87,7 @@ class FrameImages:
     ) -> Recording:
         """Return the pictures as a recording of two jaws, or of those that are named, which are still to be found."""
         truth = truth or {}
-        jaws = {side: JawTrack(keypoints=KeypointTrack.empty(), truth=truth.get(side)) for side in sides or JAWS}
+        jaws = {side: JawTrack(keypoints=KeypointTrack.empty(), truth=truth.get(side)) for side in sides or SIDES}
         return Recording(name=self.name, path=path, jaws=jaws, images=self, notes=tuple(notes))
 
     def __iter__(self) -> Iterator[StampedImage]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from finforce.errors import ObservationError
 from finforce.files import FileError, read_json
+from finforce.gripper_frames import SIDES
 from finforce.messages import Keypoints, decode_columns, decode_keypoints, stamp_of
 from finforce_eval.errors import DamagedError, RecordingError
 from finforce_eval.recordings.bags import bag_source, check_messages, check_types, is_buffer, is_frames, open_bag
@@ -18,7 +19,6 @@ from finforce_eval.recordings.frames import read_frames
 from finforce_eval.recordings.images import ImageChoice, ImageTrack, find_images
 from finforce_eval.recordings.salvage import SalvagedCopy
 from finforce_eval.recordings.tracks import (
-    JAWS,
     DetectionTruth,
     JawTrack,
     KeypointTrack,
@@ -38,7 +38,7 @@ TRUTH_COLUMNS = ("x", "y", "z", "u", "v", "visible")
 TRUE_KEYPOINTS, TRUE_POSE = "ground_truth_keypoints", "ground_truth_jaw_pose"
 PHASE = "/bench/phase"
 TOPICS = {"/object_pose": POSE, PHASE: STRING}
-for _side in JAWS:
+for _side in SIDES:
     TOPICS |= {
         f"/{_side}/keypoints": CLOUD,
         f"/{_side}/ground_truth_wrench": WRENCH,
@@ -101,9 +101,9 @@ def read_recording(
         copy = SalvagedCopy(source, str(error))
         samples, phases, images, notes = _read_samples(copy.path, name, choice)
         notes.append(copy.note.removeprefix(f"{name}: "))
-    known = [side for side in JAWS if _has_jaw(samples, side, images is not None) or (images and side in sides)]
+    known = [side for side in SIDES if _has_jaw(samples, side, images is not None) or (images and side in sides)]
     if images and not known:
-        known = JAWS
+        known = SIDES
         notes.append("no topic states which jaws its images show: looking for both; --jaws left or right selects one")
     jaws = {side: _jaw_track(samples, side, name) for side in known}
     if not jaws:

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from finforce_eval.recordings.images import ImageTrack
     from finforce_eval.recordings.salvage import SalvagedCopy
 
-JAWS = ("left", "right")
 DIRECTIONS = ("load", "unload")
 STAGES = ("ramp", "settle", "record")
 

@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce.gripper_frames import HALF_TURN
+from finforce.gripper_frames import HALF_TURN, SIDES
 from finforce.messages import NANOSECONDS
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.frames import FrameImages, choose_camera
 from finforce_eval.recordings.images import ImageChoice
-from finforce_eval.recordings.tracks import JAWS, Recording, WrenchTrack
+from finforce_eval.recordings.tracks import Recording, WrenchTrack
 from finforce_eval.recordings.zarr_store import ZarrStore
 
 ENDS, CAMERA, CAMERA_FT = "meta/episode_ends", "camera0_rgb", "rgb_0"
@@ -109,7 +109,7 @@ def _read_wrenches(
     UMI-FT's tool frame has x to the right, y down and z forward in the picture; its left finger is that at lower x. A
     camera across the gripper from where its x runs sees the jaws the other way round.
     """
-    keys = {side: f"{group}/wrench_{side}_0" for side in JAWS}
+    keys = {side: f"{group}/wrench_{side}_0" for side in SIDES}
     if not any(key.rpartition("/")[2] in store.list_members(group) for key in keys.values()):
         return {}, (f"{group}: no wrenches",)
     if choice.T_gripper_camera is None:

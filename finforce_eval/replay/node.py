@@ -22,9 +22,9 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 
 from finforce.camera_topics import COLOR_TOPIC
+from finforce.gripper_frames import SIDES
 from finforce.ros import node as ros
 from finforce.settings import setting
-from finforce_eval.recordings.tracks import JAWS
 from finforce_eval.replay.live import ReplayLog
 from finforce_eval.replay.playback import Playback, RawMessage, ReadAhead
 
@@ -182,7 +182,7 @@ def find_awaited(types: Iterable[str], parameters: PlayerParameters) -> set[str]
         return {topic for topic in types if topic.endswith(tuple(f"/{kind}" for kind in kinds))}
     if parameters.composed:
         return {COLOR_TOPIC}
-    sides = [side for side in JAWS if any(topic.startswith(f"/{side}/") for topic in types)]
+    sides = [side for side in SIDES if any(topic.startswith(f"/{side}/") for topic in types)]
     return {COLOR_TOPIC, *(f"/{side}/{kind}" for side in sides for kind in kinds)}
 
 

@@ -10,6 +10,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 from finforce.camera_topics import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
+from finforce.gripper_frames import SIDES
 from finforce.health import IDLE
 from finforce.ros.tracing import FOLDER
 from finforce.systems.processes import Process, ReplayOptions, compose, replay_processes
@@ -21,7 +22,7 @@ from finforce_eval.evaluation.keypoint_source import IMAGES, TRUTH, KeypointSour
 from finforce_eval.evaluation.scoring import Evaluation, GraspScore, score_grasp, score_results
 from finforce_eval.evaluation.setup import EvaluationSetup
 from finforce_eval.recordings.objects import find_mesh, require_mesh
-from finforce_eval.recordings.tracks import JAWS, Recording
+from finforce_eval.recordings.tracks import Recording
 from finforce_eval.recordings.writer import write_recording
 from finforce_eval.replay.live import ReplayLog, live_result, with_heard_keypoints
 from finforce_eval.replay.node_run import run_nodes
@@ -267,7 +268,7 @@ def _score(recording: Recording, setup: EvaluationSetup, log: ReplayLog) -> Eval
         threshold = setup.settings.likelihood_threshold
         result = live_result(recording, side, log, likelihood_threshold=threshold, estimator=estimator)
         results.append(result if len(sides) == 1 else result.renamed(f"{recording.name}/{side}"))
-    if len(sides) == len(JAWS):
+    if len(sides) == len(SIDES):
         results = list(with_distances(dict(zip(sides, results, strict=True)), recording).values())
     return score_results(results, [recording])
 
