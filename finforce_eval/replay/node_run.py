@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from finforce.systems.processes import Process
     from finforce_eval.replay.node import PlayerNode
 
-PATIENCE = 180.0  # [s]; a first start compiles the element loops
+PATIENCE = 400.0  # [s]; a first start compiles all that is compiled, three processes at once on few slow cores
 PLAYER = "player"
 OBJECT_TOPIC = "/object_pose"
 QUIET = 25.0  # [% of a core] that everything else may take; above it latencies are those of a busy machine
