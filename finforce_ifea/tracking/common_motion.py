@@ -6,8 +6,9 @@ the shift and turn b in the plane that moves them by B_k b,
 
     r_k = J_k y + B_k b + noise,
 
-are fitted robustly (Geman and McClure). A Kalman filter follows b over the images: it drifts slowly, and jumps where an
-image is beyond chance. With b and its covariance P, the camera has stood still or was bumped by Bayes' rule from
+are fitted robustly (Geman and McClure). What they tell of b is summed over the last 1, 2, 4, ... images: a new bump shows
+in few of them, and a small one only in many. With b and its covariance P from each sum, the camera has stood still or was
+bumped by Bayes' rule from
 
     N(b; 0, P + s^2),    s as errors of the mechanics feign a motion, or as large as a bump.
 """
@@ -23,12 +24,12 @@ from finforce_ifea.tracking.contact_state import ContactState, measure_along
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
 # Probability that a camera was bumped since the tare, of which nothing is known.
-_SELDOM = 0.01
+_SELDOM = 0.05
 # Motion by a bump, one standard deviation [m]; that which errors of the mechanics feign, and its share of the bending.
 _BUMP, _FEIGNED, _FEIGNED_SHARE = 1e-3, 0.04e-3, 0.02
 _SIZES = (0.25e-3, 0.5e-3, 1e-3, 2e-3)
-# Drift of the motion from image to image [m]; and squared Mahalanobis distance of three numbers beyond chance.
-_DRIFT, _BEYOND = 0.04e-3, 14.2
+# Numbers of images over which the motion is averaged.
+_WINDOWS = (1, 2, 4, 8, 16, 32, 64)
 # Fewer key points do not tell. Standard deviations of the depth, which is free, and of a height that may be wrong [m].
 _FEWEST, _FREE, _ELSEWHERE = 6, 10e-3, 30e-3
 # Squared distance that keeps a quarter of its weight, median of one in two axes; iterations for the noise, and after.
@@ -36,7 +37,16 @@ _GATE, _MEDIAN_SQUARE, _FIRST, _ROUNDS = 9.0, 1.386, 3, 6
 _STATE, _MOTION = 3, 3
 _SIZE = _STATE + _MOTION
 
-_TRACK = np.dtype([("b", float, _MOTION), ("P", float, (_MOTION, _MOTION)), ("change", float, _STATE)], align=True)
+# Of the last images: information on the motion, and this times the motion; how the motion changes the state.
+_TRACK = np.dtype(
+    [
+        ("A", float, (_WINDOWS[-1], _MOTION, _MOTION)),
+        ("told", float, (_WINDOWS[-1], _MOTION)),
+        ("lever", float, (_STATE, _MOTION)),
+        ("count", int),
+    ],
+    align=True,
+)
 
 
 class CommonMotion:
@@ -61,7 +71,7 @@ class CommonMotion:
         """
         if tare is not self._tare:
             self._tare = tare
-            self._track["b"], self._track["P"], self._track["change"] = 0.0, _FEIGNED**2 * np.eye(_MOTION), 0.0
+            self._track = np.zeros((), _TRACK)
         if not tare.is_taken:
             return
         follow_motion(points, positions, state, *expected, self._track)
@@ -81,27 +91,52 @@ def follow_motion(points, positions, state, mean, variance, track):
     """
     state, track = state[()], track[()]
     rows, left, bend = _collect_residuals(points, positions)
-    for i in range(_MOTION):
-        track.P[i, i] += _DRIFT**2
     if np.isfinite(left[:, 0]).sum() >= _FEWEST:
         H, found = _fit_motion(points, rows, left, (mean - state.x[1:], variance))
-        _update_track(H, found, track)
-    state.bumped = _judge_motion(track.b, track.P, _FEIGNED**2 + _FEIGNED_SHARE**2 * bend)
-    state.motion = np.sqrt((track.b * track.b).sum())
-    for i in range(_STATE):
-        for j in range(_STATE):
-            state.covariance[i, j] += state.bumped * track.change[i] * track.change[j]
+        _add_image(track, H, found)
+    odds, motions = _weigh_windows(track, _FEIGNED**2 + _FEIGNED_SHARE**2 * bend)
+    total = odds.sum()
+    state.bumped = total / (1.0 + total)
+    state.motion = np.sqrt((motions[odds.argmax()] ** 2).sum())
+    for k in range(len(odds)):
+        change = _multiply(track.lever, motions[k])
+        for i in range(_STATE):
+            for j in range(_STATE):
+                state.covariance[i, j] += odds[k] / (1.0 + total) * change[i] * change[j]
     state.stddev = measure_along(state.force, state.force_modes, state.covariance)
 
 
 @njit(**_OPTIONS)
-def _judge_motion(b, P, feigned):
-    """Return the probability that a motion (3,) of covariance P is a bump, where errors feign some variance."""
-    still, bumped = _measure_surprise(b, P, feigned), 0.0
-    for size in _SIZES:
-        bumped += np.exp(0.5 * min(still - _measure_surprise(b, P, size**2), 60.0)) / len(_SIZES)
-    bumped *= _SELDOM
-    return bumped / (bumped + 1.0 - _SELDOM)
+def _add_image(track, H, found):
+    """Add what an image tells, by Hessian (6, 6) and maximum (6,) of the log posterior of state and motion."""
+    A, lever = _take_state_out(H)
+    newest = track.count % len(track.A)
+    track.told[newest] = _multiply(A, found[_STATE:])
+    for i in range(_MOTION):
+        A[i, i] -= 1.0 / _BUMP**2
+    track.A[newest], track.lever[:] = A, lever
+    track.count += 1
+
+
+@njit(**_OPTIONS)
+def _weigh_windows(track, feigned):
+    """Return the odds (W,) of a bump that lasts for as many images, and the motion (W, 3) that they show.
+
+    Errors of the mechanics feign motions of the variance `feigned` [m^2].
+    """
+    odds, motions = np.zeros(len(_WINDOWS)), np.zeros((len(_WINDOWS), _MOTION))
+    A, told, added = 1e-3 / _BUMP**2 * np.eye(_MOTION), np.zeros(_MOTION), 0
+    for k in range(len(_WINDOWS)):
+        while added < min(_WINDOWS[k], track.count):
+            added += 1
+            A += track.A[(track.count - added) % len(track.A)]
+            told += track.told[(track.count - added) % len(track.A)]
+        P = invert_symmetric(A)
+        motions[k] = _multiply(P, told)
+        still = _measure_surprise(motions[k], P, feigned)
+        for size in _SIZES:
+            odds[k] += np.exp(0.5 * min(still - _measure_surprise(motions[k], P, size**2), 60.0))
+    return odds * (_SELDOM / (1.0 - _SELDOM) / len(_SIZES) / len(_WINDOWS)), motions
 
 
 @njit(**_OPTIONS)
@@ -205,27 +240,6 @@ def _take_state_out(H):
             for k in range(_STATE):
                 A[i, j] -= H[_STATE + i, k] * change[k, j]
     return A, -change
-
-
-@njit(**_OPTIONS)
-def _update_track(H, found, track):
-    """Take what an image tells of the motion, by Hessian (6, 6) and maximum (6,), into the track."""
-    A, change = _take_state_out(H)
-    told = _multiply(A, found[_STATE:])
-    alone = A.copy()
-    for i in range(_MOTION):
-        A[i, i] -= 1.0 / _BUMP**2
-        alone[i, i] -= (1.0 - 1e-3) / _BUMP**2
-    alone = invert_symmetric(alone)
-    away = _multiply(alone, told) - track.b
-    if _measure_square(away, alone + track.P) > _BEYOND:
-        for i in range(_MOTION):
-            for j in range(_MOTION):
-                track.P[i, j] += away[i] * away[j]
-    prior = invert_symmetric(track.P)
-    track.P[:] = invert_symmetric(prior + A)
-    track.b[:] = _multiply(track.P, told + _multiply(prior, track.b))
-    track.change[:] = _multiply(change, track.b)
 
 
 @njit(**_OPTIONS)

@@ -248,6 +248,13 @@ def test_camera_that_was_bumped_under_load_is_noticed_within_a_third_of_a_second
     assert any("all key points have moved together" in solution.message for solution in solutions)
 
 
+@pytest.mark.parametrize("motion", [(0.3e-3, 0, 0), (-0.4e-3, 0, 0), (0, 0, 0.3e-3)], ids=str)
+def test_motion_of_a_third_of_a_millimetre_shows_after_two_seconds(motion):
+    recording = pressed(40)
+    spoilt = recording.changed(range(HELD_5, HELD_5 + 90), bump((*motion, 0, 0, 0)))
+    assert statuses(run(spoilt, solver="frame")[HELD_5 + 60 : HELD_5 + 90]) == {"unobservable"}
+
+
 @pytest.mark.parametrize("height", [20, 40, 60])
 def test_camera_that_stands_still_is_not_said_to_have_moved(height):
     assert not any("moved together" in solution.message for solution in solved(height))
