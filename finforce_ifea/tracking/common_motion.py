@@ -7,7 +7,7 @@ the shift and turn b in the plane that moves them by B_k b,
     r_k = J_k y + B_k b + noise,
 
 are fitted robustly (Geman and McClure). What they tell of b is summed over the last 1, 2, 4, ... images: a new bump
-shows in few of them, and a small one only in many. With b and its covariance P from each sum, the camera has stood still
+in few of them, and a small one only in many. With b and its covariance P from each sum, the camera has stood
 still or was bumped by Bayes' rule from
 
     N(b; 0, P + s^2),    s as errors of the mechanics feign a motion, or as large as a bump.
