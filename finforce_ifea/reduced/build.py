@@ -143,9 +143,9 @@ _DENSER = 0.5
 _EARLY = 0.8
 # The rod stops where it needs this many times the force that it needs half way up at full depth.
 _HARDEST = 12.0
-# Longer steps [m] of a solid must agree with its motions at both ends, to this share; the longest of a frame, whose
-# hinged bars snap over.
-_SURE, _APART, _LONGEST = 0.1e-3, 0.1, 0.5e-3
+# Steps of a solid must agree with its motions at both ends, to this share; short ones [m], in which these may change,
+# go less than so many times as far. The longest of a frame, whose hinged bars snap over.
+_APART, _SURE, _FURTHER, _LONGEST = 0.1, 0.1e-3, 1.5, 0.5e-3
 # Shortest step of a depth [m]; iterations to an equilibrium, and its tolerance [m], a hundredth of what a camera tells
 # apart. What takes more is no near one, nor what corrects as much as at first after so many. Steps below the last [m]
 # are followed by much smaller ones.
@@ -310,6 +310,8 @@ def _are_joined(start: _Equilibrium, end: _Equilibrium) -> bool:
     """Whether a jaw went from one equilibrium to another as it moves at both, and not over to another shape."""
     moved = end.q - start.q
     along = 0.5 * (end.depth - start.depth) * (start.state.modes[:, 0] + end.state.modes[:, 0])
+    if end.depth - start.depth <= _SURE:
+        return bool(np.linalg.norm(moved) < _FURTHER * np.linalg.norm(along))
     return bool(np.linalg.norm(moved - along) < _APART * np.linalg.norm(moved))
 
 
@@ -351,7 +353,7 @@ class _Rod:
         while done < depth:
             last = way[-1] if way else start
             found = self._settle(done + step if done + step < depth - 1e-9 else depth, last)
-            if found is None or (is_solid and step > _SURE and last and not _are_joined(last, found)):
+            if found is None or (is_solid and last and not _are_joined(last, found)):
                 step *= 0.5
                 if step < _SHORTEST:
                     break

@@ -145,6 +145,16 @@ def test_a_solid_that_is_no_prism_is_taken_in_layers(tmp_path, surface, kind):
         assert jaw.section.read_width(face[:1]) == pytest.approx(WIDTH * MILLIMETRE - depth, abs=1e-5)
 
 
+def test_parts_that_touch_along_an_edge_are_closed(tmp_path, surface):
+    low, middle = surface.bounds[0], surface.bounds.mean(axis=0)
+    holes = [((3.0, 2 * WIDTH, 3.0), [at, middle[1], low[2] + 3.0 + at]) for at in (0.0, 3.0)]
+    mesh = boxes_joined(surface, *holes, cut=True)
+    mesh.merge_vertices()
+    assert not mesh.is_watertight
+    whole = read_mesh(tmp_path, surface).polygon
+    assert whole.area - read_mesh(tmp_path, mesh).polygon.area == pytest.approx(2 * 9e-6, rel=1e-3)
+
+
 def test_layers_of_a_section_file_that_are_apart_are_refused(tmp_path):
     squares = [[[x, 0.0], [x + 10.0, 0.0], [x + 10.0, 60.0], [x, 60.0]] for x in (0.0, 30.0)]
     layers = [{"y": [10.0 * number, 10.0 * number + 10.0], "loops": [square]} for number, square in enumerate(squares)]
@@ -204,13 +214,20 @@ def test_a_blade_on_a_wider_base_has_its_own_width_where_the_clamp_holds_the_bas
     assert finger.width == pytest.approx(WIDTH * MILLIMETRE)
 
 
-@pytest.mark.parametrize("kind", ["nut", "slot"])
+def draw_seat(kind, x):
+    if kind.endswith("slot"):
+        return shapely.LineString([(x - 1.3, 5.0), (x + (4.0 if kind == "long slot" else 1.3), 5.0)]).buffer(1.5)
+    angles = np.pi / 4.0 + np.pi / 2.0 * np.arange(4) if kind == "square nut" else np.pi / 3.0 * np.arange(6)
+    return shapely.Polygon(np.column_stack([x + 1.7 * np.cos(angles), 5.0 + 1.7 * np.sin(angles)]))
+
+
+@pytest.mark.parametrize("kind", ["nut", "square nut", "slot", "long slot"])
 def test_seats_of_nuts_and_slots_are_bolts_and_no_cells(kind):
-    polygon = draw_polygon(bolts=())
-    for x in (-8.0, 8.0):
-        nut = shapely.Polygon([(x + 1.7 * np.cos(a), 5.0 + 1.7 * np.sin(a)) for a in np.pi / 3.0 * np.arange(6)])
-        slot = shapely.LineString([(x - 1.3, 5.0), (x + 1.3, 5.0)]).buffer(1.5)
-        polygon = polygon.difference(slot if kind == "slot" else nut)
+    polygon = draw_polygon(bolts=()).difference(shapely.union_all([draw_seat(kind, x) for x in (-8.0, 4.0)]))
+    if kind == "square nut":  # is a smaller one than the bolt
+        found = recognize(shapely.affinity.scale(polygon, 1e-3, 1e-3, origin=(0, 0)), 0.02, Overrides())
+        assert len(found.bolts) == 2 and len(found.ribs) == RIBS
+        return
     check_found(recognize(shapely.affinity.scale(polygon, 1e-3, 1e-3, origin=(0, 0)), 0.02, Overrides()))
 
 
@@ -467,6 +484,14 @@ def test_a_bolt_above_a_whole_cell_is_held_by_itself():
     assert finger.clamped_circles[0, 1:] == pytest.approx([0.040, 3e-3], abs=2e-4)
 
 
+def test_a_hole_in_the_tip_holds_nothing_and_a_window_in_the_base_no_more_than_the_base():
+    polygon = draw_polygon(bolts=()).difference(shapely.Point(12.0, 67.5).buffer(0.8, quad_segs=12))
+    polygon = polygon.difference(shapely.box(-4.0, 3.0, 4.0, 9.0))
+    finger = recognize(shapely.affinity.scale(polygon, 1e-3, 1e-3, origin=(0, 0)), 0.02, Overrides())
+    assert len(finger.clamped_circles) == 0 and len(finger.ribs) == RIBS
+    assert 0.8 * BASE * MILLIMETRE < finger.clamped_z <= BASE * MILLIMETRE
+
+
 def write_dxf(path, loops):
     ezdxf = pytest.importorskip("ezdxf")
     document = ezdxf.new(units=4)
@@ -642,7 +667,7 @@ def test_another_origin_is_another_number_alone(tmp_path, surface):
 def holed_plate():
     plate = shapely.box(0.0, 0.0, 30.0, 90.0)
     for z in (15.0, 35.0, 55.0, 75.0):
-        plate = plate.difference(shapely.box(6.0, z - 5.0, 24.0, z + 5.0))
+        plate = plate.difference(shapely.box(2.0, z - 9.0, 28.0, z + 9.0))
     return plate
 
 

@@ -4,11 +4,14 @@ import logging
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import fields, replace
 from multiprocessing import get_context
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from mechanics_fakes import BENCH, bench_mechanics
 
+from finforce_ifea.contact_mechanics.pressed_jaw import PressedState
+from finforce_ifea.fem.solid import SolidModel
 from finforce_ifea.jaw.drawing import Drawing
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.mechanics import build_mechanics
@@ -222,3 +225,45 @@ def test_a_folder_that_others_can_write_is_neither_read_nor_written(folder, capl
     with caplog.at_level(logging.WARNING):
         fetch_manifold(KEY, build)
     assert build.count == 2 and "others can write there" in caplog.text
+
+
+class SnappingModel(SolidModel):
+    """One unknown, how far the jaw has moved [m]."""
+
+    def __init__(self):
+        self.size, self.reach = 1, 2e-3
+
+
+class SnappingContact:
+    """A jaw that a spring joins to the rod, and whose force q - drop width tanh((q - 2 mm) / width) gives way."""
+
+    surface = SimpleNamespace(heights=np.array([0.0, 0.1]))
+
+    def __init__(self, width, drop, spring):
+        self.model, self.width, self.drop, self.spring = SnappingModel(), width, drop, spring
+
+    def set_indenter(self, indenter):
+        pass
+
+    def find_touch(self, place):
+        return 0.0
+
+    def find_depth(self, q):
+        bend = np.tanh((q - 2e-3) / self.width) + np.tanh(2e-3 / self.width)
+        return q + (q - self.drop * self.width * bend) / self.spring
+
+    def linearize(self, q, place):
+        stiffness = self.spring + 1.0 - self.drop / np.cosh((q - 2e-3) / self.width) ** 2
+        correction = self.spring * (place[0] - self.find_depth(q)) / stiffness
+        modes = np.column_stack([self.spring / stiffness, [0.0], [0.0]])
+        force = self.spring * (place[0] - q - correction)
+        return PressedState(True, correction, modes, force, modes, force, force, 1.0, 0.0)
+
+
+@pytest.mark.parametrize("shape", [(0.1e-3, 3.0, 0.2), (0.3e-3, 3.0, 0.5), (0.6e-3, 1.4, 0.2), (1e-3, 1.25, 0.2)])
+def test_a_path_ends_where_the_jaw_would_snap_over_to_another_shape(shape):
+    contact, shapes = SnappingContact(*shape), np.linspace(0.0, 6e-3, 6001)
+    last = int(np.flatnonzero(np.diff(contact.find_depth(shapes)) < 0.0)[0])
+    depth, states = manifold_build._press_rod(contact, np.inf, 0.05)
+    assert 0.98 * contact.find_depth(shapes[last]) < depth < contact.find_depth(shapes[last])
+    assert np.max(states) < shapes[last]

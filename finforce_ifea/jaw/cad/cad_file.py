@@ -10,7 +10,6 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
-from shapely.ops import polygonize, unary_union
 
 from finforce.camera import ImageError
 from finforce.files import FileError
@@ -179,8 +178,8 @@ def _cut_surface(mesh: trimesh.Trimesh, unit: str | None, body: int | None, laye
     mesh = _choose_body(_drop_doubles(mesh, notes), body, scale, notes)
     mesh.apply_scale(scale)
     _close_holes(mesh, notes)
-    if not mesh.is_watertight:
-        _, count = np.unique(np.sort(mesh.edges, axis=1), axis=0, return_counts=True)
+    _, count = np.unique(np.sort(mesh.edges, axis=1), axis=0, return_counts=True)
+    if (count % 2).any():  # of parts that touch along an edge four faces meet there
         raise JawFileError(
             f"its surface has {int((count == 1).sum())} open and {int((count > 2).sum())} doubled edges, expected a "
             "closed one: repair it in the program that it comes from, or in a slicer"
@@ -485,7 +484,8 @@ def _fill_lines(lines: list[NDArray] | NDArray) -> shapely.Geometry:
     else:
         strings = np.array([shapely.LineString(np.round(line / _GRID) * _GRID) for line in lines])
     strings = strings[shapely.length(strings) > 0.0]
-    areas = sorted(polygonize(unary_union(strings)), key=lambda area: -area.area) if len(strings) else []
+    found = shapely.polygonize(shapely.get_parts(shapely.union_all(strings)))
+    areas = sorted(found.geoms, key=lambda area: -area.area)
     if not areas:
         raise JawFileError(f"{len(lines)} lines bound no area, expected closed loops: an outline and its holes")
     # a face within an odd number of others' outlines is a hole

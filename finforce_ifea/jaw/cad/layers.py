@@ -70,7 +70,7 @@ def _thick(area: shapely.Geometry, apart: float) -> shapely.Geometry:
     """Return the parts of an area that are thicker than a distance [m]."""
     area = area.buffer(0.0)  # without lines
     kept = area.buffer(-0.5 * apart, join_style="mitre").buffer(0.51 * apart, join_style="mitre")
-    return shapely.intersection(kept, area, grid_size=_GRID)
+    return shapely.intersection(kept, area, grid_size=_GRID).buffer(0.0)
 
 
 def _share_lines(cut: shapely.Geometry, others: list[shapely.Geometry], apart: float) -> shapely.Geometry:

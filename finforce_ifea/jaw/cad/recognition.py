@@ -16,9 +16,10 @@ from finforce_ifea.errors import JawFileError
 from finforce_ifea.jaw.section import Section, cut_below, find_reach, order_rings
 
 # A hole is a bolt's when its area is this share of the circle's with its outline: a round one, or one that is the same
-# after half a turn, as the seat of a nut or a slot; cells narrow towards the tip, and square ones are at 0.79.
+# after half a turn, as the seat of a nut or a slot; cells narrow towards the tip. Square seats and long slots are told
+# from cells, whose walls are springs, by walls thicker than this share of their size.
 _ROUND, _ROUND_POINTS = 0.955, 8
-_COMPACT, _SYMMETRIC = 0.8, 0.98
+_COMPACT, _SYMMETRIC, _ALONE = 0.8, 0.98, 0.35
 # Points closer to the line between their neighbours than this [m] say nothing.
 _CHORD = 4e-6
 # Spacing of the places [m] where walls are measured.
@@ -29,8 +30,8 @@ _STRAIGHT = 4e-3
 _TEETH = 3e-3
 # The section narrows towards the tip, to less than this share of its width at the base.
 _NARROWER = 0.75
-# A bolt holds about so many of its radii above its middle, and around it.
-_GRIP, _WASHER = 3.0, 2.0
+# A bolt holds about so many of its radii above its middle, and around it; a larger hole is a window [m].
+_GRIP, _WASHER, _LARGEST = 3.0, 2.0, 3e-3
 # Least cosine between a cell's side and the face of the band beyond it.
 _FACES = 0.7
 _NEIGHBOURS, _LONGER = 3e-3, 1.4
@@ -275,7 +276,11 @@ def _say_range(values) -> str:
 def _split_holes(polygon: shapely.Polygon) -> tuple[list[NDArray], list[NDArray]]:
     """Return the holes (n, 2) of a section: the round ones, and the others, which are cells."""
     holes = [np.array(ring.coords)[:-1] for ring in polygon.interiors]
-    return [hole for hole in holes if _is_round(hole)], [hole for hole in holes if not _is_round(hole)]
+    are_round = [_is_round(hole, polygon) for hole in holes]
+    kinds = {
+        kind: [hole for hole, found in zip(holes, are_round, strict=True) if found is kind] for kind in (True, False)
+    }
+    return kinds[True], kinds[False]
 
 
 def has_cells(polygon: shapely.Polygon) -> bool:
@@ -283,14 +288,16 @@ def has_cells(polygon: shapely.Polygon) -> bool:
     return len(_split_holes(polygon)[1]) > 1
 
 
-def _is_round(hole: NDArray) -> bool:
-    """Whether a hole is a bolt's: a circle of some corners, the seat of a nut, a slot."""
+def _is_round(hole: NDArray, polygon: shapely.Polygon) -> bool:
+    """Whether a hole of a section is a bolt's: a circle of some corners, the seat of a nut, a slot."""
     shape = shapely.Polygon(hole)
     roundness = 4.0 * np.pi * shape.area / shape.length**2
     if roundness > _ROUND:
         return len(hole) >= _ROUND_POINTS
     turned = affinity.rotate(shape, 180.0, origin=shape.centroid)
-    return roundness > _COMPACT and shape.intersection(turned).area > _SYMMETRIC * shape.area
+    if shape.intersection(turned).area < _SYMMETRIC * shape.area:
+        return False
+    return roundness > _COMPACT or shape.buffer(_ALONE * np.sqrt(shape.area)).difference(shape).within(polygon)
 
 
 def _fit_bolts(holes: list[NDArray]) -> NDArray:
@@ -480,13 +487,14 @@ def _propose_clamp(
     """Return the height at x = 0 below which everything is clamped, and circles about bolts farther up (c, 3) [m].
 
     Heights are counted along z from a line that is as tilted as the base (rise with x, height at x = 0). A bolt belongs
-    to the base unless a whole cell lies below it.
+    to the base unless a whole cell lies below it; a window and a hole beyond all cells are none: the tip is free.
     """
     slope, floor = base
     lows, tops = (np.array([pick(cell[:, 1] - slope * cell[:, 0]) for cell in cells]) for pick in (np.min, np.max))
     height_of = bolts[:, 1] - slope * bolts[:, 0]
-    is_base = height_of <= tops.min()
-    circles = bolts[~is_base] * [1.0, 1.0, _WASHER]
+    is_bolt = (bolts[:, 2] < _LARGEST) & (height_of < tops.max())
+    is_base = is_bolt & (height_of <= tops.min())
+    circles = bolts[is_bolt & ~is_base] * [1.0, 1.0, _WASHER]
     off = f", along its base, {np.degrees(np.arctan(slope)):.0f} degrees off the face's normal" if slope else ""
     if overrides.clamp_z is not None:
         at = " at the inner face" if slope else ""
