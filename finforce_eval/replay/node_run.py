@@ -73,7 +73,7 @@ def _await_listeners(player: PlayerNode, nodes: ProcessGroup, topics: Collection
     """Wait until somebody other than the player listens to each of the topics.
 
     Raises:
-        ProcessError: a process ended, or nobody listens after three minutes.
+        ProcessError: a process ended, or nobody listens after `PATIENCE`.
     """
 
     def ready() -> bool:

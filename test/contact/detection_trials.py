@@ -1,4 +1,4 @@
-"""Claims about poses as FoundationPose's ROS nodes publish them; run by test_pose_source.py, with vision_msgs."""
+"""Claims about poses as FoundationPose's ROS nodes publish them; run by test_pose_detections.py, with vision_msgs."""
 
 from time import time_ns
 
