@@ -37,12 +37,14 @@ _GATE, _MEDIAN_SQUARE, _FIRST, _ROUNDS = 9.0, 1.386, 3, 6
 _STATE, _MOTION = 3, 3
 _SIZE = _STATE + _MOTION
 
-# Of the last images: information on the motion, and this times the motion; how the motion changes the state.
+# Of the last images: information on the motion, this times the motion, how it changes the state, and the share of the
+# variance that is the same in all of them.
 _TRACK = np.dtype(
     [
         ("A", float, (_WINDOWS[-1], _MOTION, _MOTION)),
         ("told", float, (_WINDOWS[-1], _MOTION)),
         ("lever", float, (_STATE, _MOTION)),
+        ("lasting", float, _WINDOWS[-1]),
         ("count", int),
     ],
     align=True,
@@ -92,7 +94,8 @@ def follow_motion(points, positions, state, mean, variance, track):
     state, track = state[()], track[()]
     rows, left, bend = _collect_residuals(points, positions)
     if np.isfinite(left[:, 0]).sum() >= _FEWEST:
-        H, found = _fit_motion(points, rows, left, (mean - state.x[1:], variance))
+        H, found, level = _fit_motion(points, rows, left, (mean - state.x[1:], variance))
+        track.lasting[track.count % len(track.A)] = _measure_lasting(points, left, level)
         _add_image(track, H, found)
     odds, motions = _weigh_windows(track, _FEIGNED**2 + _FEIGNED_SHARE**2 * bend)
     total = odds.sum()
@@ -125,14 +128,17 @@ def _weigh_windows(track, feigned):
     Errors of the mechanics feign motions of the variance `feigned` [m^2].
     """
     odds, motions = np.zeros(len(_WINDOWS)), np.zeros((len(_WINDOWS), _MOTION))
-    A, told, added = 1e-3 / _BUMP**2 * np.eye(_MOTION), np.zeros(_MOTION), 0
+    A, told, lasting, added = 1e-3 / _BUMP**2 * np.eye(_MOTION), np.zeros(_MOTION), 0.0, 0
     for k in range(len(_WINDOWS)):
         while added < min(_WINDOWS[k], track.count):
             added += 1
-            A += track.A[(track.count - added) % len(track.A)]
-            told += track.told[(track.count - added) % len(track.A)]
+            i = (track.count - added) % len(track.A)
+            A += track.A[i]
+            told += track.told[i]
+            lasting += track.lasting[i]
         P = invert_symmetric(A)
         motions[k] = _multiply(P, told)
+        P *= 1.0 + max(lasting, 0.0) * (1.0 - 1.0 / max(added, 1))
         still = _measure_surprise(motions[k], P, feigned)
         for size in _SIZES:
             odds[k] += np.exp(0.5 * min(still - _measure_surprise(motions[k], P, size**2), 60.0))
@@ -170,19 +176,19 @@ def _collect_residuals(points, positions):
 
 @njit(**_OPTIONS)
 def _fit_motion(points, rows, left, prior):
-    """Return the Hessian (6, 6) of the log posterior of state and motion, and both (6,) as an image asks for them.
+    """Return Hessian (6, 6) and maximum (6,) of the log posterior of state and motion, and the noise level [-].
 
-    The prior is mean and variance of shape and height, each (2,).
+    The prior is mean and variance of shape and height, each (2,); the noise is counted in that of the tare.
     """
     offset, variance = prior
     known = np.isfinite(left[:, 0])
-    H, found, level = np.zeros((_SIZE, _SIZE)), np.zeros(_SIZE), 1.0
+    H, found, seen = np.zeros((_SIZE, _SIZE)), np.zeros(_SIZE), 1.0
     for a in range(2):
         found[_STATE + a] = np.median(left[known, a])
     squares = np.empty(len(points))
     for turn in range(_ROUNDS):
         if turn == _FIRST:
-            level = max(1.0, np.median(squares[known]) / _MEDIAN_SQUARE)
+            seen = np.median(squares[known]) / _MEDIAN_SQUARE
         H[:] = 0.0
         g = np.zeros((_SIZE, 1))
         _add_prior(H, g, 0, -found[0], _FREE**2)
@@ -192,13 +198,25 @@ def _fit_motion(points, rows, left, prior):
             _add_prior(H, g, i, -found[i], _BUMP**2)
         for k in range(len(points)):
             if known[k]:
-                squares[k] = _add_point(points[k], rows[k], left[k], level, found, H, g)
+                squares[k] = _add_point(points[k], rows[k], left[k], max(1.0, seen), found, H, g)
         for i in range(_SIZE):
             for j in range(i):
                 H[j, i] = H[i, j]
         eliminate(H.copy(), g)
         found += g[:, 0]
-    return H, found
+    return H, found, seen
+
+
+@njit(**_OPTIONS)
+def _measure_lasting(points, left, level):
+    """Return the share of the variance that averages do not lessen: offsets, biases, and noise beyond the tare's."""
+    lasting, total = 0.0, 0.0
+    for k in range(len(points)):
+        if np.isfinite(left[k, 0]):
+            scatter = 0.5 * (points[k].tare_noise[0, 0] + points[k].tare_noise[1, 1]) / max(points[k].trust, 1e-6)
+            lasting += points[k].offset_variance + (level - 1.0) * scatter
+            total += points[k].offset_variance + max(level, 1.0) * scatter
+    return lasting / total
 
 
 @njit(**_OPTIONS)
