@@ -7,7 +7,7 @@ the shift and turn b in the plane that moves them by B_k b,
     r_k = J_k y + B_k b + noise,
 
 are fitted robustly (Geman and McClure). What they tell of b is summed over the last 1, 2, 4, ... images: a new bump
-in few of them, and a small one only in many. With b and its covariance P from each sum, the camera has stood
+shows in few of them, and a small one only in many. With b and its covariance P from each sum, the camera has stood
 still or was bumped by Bayes' rule from
 
     N(b; 0, P + s^2),    s as errors of the mechanics feign a motion, or as large as a bump.
@@ -95,8 +95,7 @@ def follow_motion(points, positions, state, mean, variance, track):
     rows, left, bend = _collect_residuals(points, positions)
     if np.isfinite(left[:, 0]).sum() >= _FEWEST:
         H, found, level = _fit_motion(points, rows, left, (mean - state.x[1:], variance))
-        track.lasting[track.count % len(track.A)] = _measure_lasting(points, left, level)
-        _add_image(track, H, found)
+        _add_image(track, H, found, _measure_lasting(points, left, level))
     odds, motions = _weigh_windows(track, _FEIGNED**2 + _FEIGNED_SHARE**2 * bend)
     total = odds.sum()
     state.bumped = total / (1.0 + total)
@@ -110,14 +109,14 @@ def follow_motion(points, positions, state, mean, variance, track):
 
 
 @njit(**_OPTIONS)
-def _add_image(track, H, found):
-    """Add what an image tells, by Hessian (6, 6) and maximum (6,) of the log posterior of state and motion."""
+def _add_image(track, H, found, lasting):
+    """Add what an image tells, by Hessian (6, 6) and maximum (6,) of the log posterior, and its lasting share."""
     A, lever = _take_state_out(H)
     newest = track.count % len(track.A)
     track.told[newest] = _multiply(A, found[_STATE:])
     for i in range(_MOTION):
         A[i, i] -= 1.0 / _BUMP**2
-    track.A[newest], track.lever[:] = A, lever
+    track.A[newest], track.lasting[newest], track.lever[:] = A, lasting, lever
     track.count += 1
 
 

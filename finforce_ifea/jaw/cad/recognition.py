@@ -275,11 +275,10 @@ def _say_range(values) -> str:
 
 def _split_holes(polygon: shapely.Polygon) -> tuple[list[NDArray], list[NDArray]]:
     """Return the holes (n, 2) of a section: the round ones, and the others, which are cells."""
-    holes = [np.array(ring.coords)[:-1] for ring in polygon.interiors]
-    are_round = [_is_round(hole, polygon) for hole in holes]
-    kinds = {
-        kind: [hole for hole, found in zip(holes, are_round, strict=True) if found is kind] for kind in (True, False)
-    }
+    kinds: dict[bool, list[NDArray]] = {True: [], False: []}
+    for ring in polygon.interiors:
+        hole = np.array(ring.coords)[:-1]
+        kinds[_is_round(hole, polygon)].append(hole)
     return kinds[True], kinds[False]
 
 
