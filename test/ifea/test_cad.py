@@ -19,10 +19,11 @@ from section_fakes import BASE, LENGTH, MILLIMETRE, TPU, WIDTH, draw_polygon, ma
 from finforce_eval.cli.main import main
 from finforce_ifea.errors import JawFileError
 from finforce_ifea.fem.plane import PlaneModel
-from finforce_ifea.jaw.cad.cad_file import _GRID, _cut, _span, read_section
+from finforce_ifea.jaw.cad.cad_file import _GRID, _cut, read_section
 from finforce_ifea.jaw.cad.make_jaw import _doubt_walls, choose_keypoints, make_jaw
 from finforce_ifea.jaw.cad.photo import Photo, read_photo
 from finforce_ifea.jaw.cad.recognition import Overrides, recognize
+from finforce_ifea.jaw.cad.surface import build_surface
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.jaw.section import Layer, join_loops, order_rings
 from finforce_ifea.jaw.section_mesh import extrude_section, mesh_section
@@ -189,13 +190,15 @@ def test_a_finger_without_ribs_is_taken_as_a_solid(tmp_path):
     assert len(jaw.keypoints) > 10
 
 
-def test_a_cut_is_closed_wherever_its_ends_are_rounded(monkeypatch):
-    # two triangles place the end that they share on either side of the middle between two lines of the grid
-    corners = (np.array([[0, 0], [40001, 0], [40001, 20001], [0, 20001]]) + 0.5) * _GRID
-    ends = np.stack([corners - 1e-12, np.roll(corners, -1, axis=0) + 1e-12], axis=1)
-    lines = np.insert(ends, 2, 0.0, axis=2)
-    monkeypatch.setattr(trimesh.intersections, "mesh_plane", lambda *_: lines @ np.stack([*_span(UP), UP]))
-    assert _cut(None, UP, 0.0).area == pytest.approx(shapely.Polygon(corners).area, rel=1e-3)
+def test_a_cut_is_closed_wherever_it_meets_vertices_and_rounding():
+    # a lattice of vertices on the plane itself, and walls whose cut is rounded next to the middle of two grid lines
+    block = trimesh.creation.box((40.0, 20.0, 10.0)).subdivide().subdivide()
+    surface = build_surface((block.vertices + 0.5 * _GRID / MILLIMETRE) * MILLIMETRE, block.faces)
+    turned = Rotation.from_euler("xy", [0.3, 0.5]).as_matrix()
+    skew = replace(surface, vertices=surface.vertices @ turned.T)
+    for height in (0.5 * _GRID, 0.5 * _GRID + 2.5e-3, 1e-3):
+        for mesh, axis in ((surface, UP), (skew, turned @ UP)):
+            assert _cut(mesh, axis, height).area == pytest.approx(800e-6, rel=1e-3)
 
 
 @pytest.mark.parametrize(("height", "clamp"), [(8.0, 10.5), (15.0, 15.0), (40.0, None)])

@@ -6,10 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import shapely
-import trimesh
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from finforce.camera import ImageError
 from finforce.files import FileError
@@ -19,6 +16,7 @@ from finforce_ifea.errors import JawFileError
 from finforce_ifea.jaw.cad.curves import read_dxf, read_svg
 from finforce_ifea.jaw.cad.layers import find_layers
 from finforce_ifea.jaw.cad.photo import PHOTOS, SCALE, Photo, read_photo
+from finforce_ifea.jaw.cad.surface import Surface, build_surface
 from finforce_ifea.jaw.section import UNITS, Layer, SectionFile, check_loops, join_loops, read_section_file
 
 SURFACES = (".stl", ".obj", ".ply", ".off", ".3mf", ".glb")
@@ -34,6 +32,8 @@ _ASIDE, _SIDE, _RULINGS = 0.5, 1e-4, 4
 # Cuts across it, evenly over the width: they may differ from the usual one by so much of its area on average, and few
 # of them by what is seen; what differs by more is another section.
 _CUTS, _ALIKE, _SEEN, _RARE, _OTHER = 25, 0.02, 0.01, 0.2, 0.1
+# Cuts of the same walls are one where these move by less than this [m] over the width.
+_ALONG = 2e-6
 # A base is shorter than this share of the blade on it.
 _SHORT = 0.6
 # Ends of cut triangles are joined on a grid of this size [m].
@@ -109,7 +109,8 @@ def read_section(path: Path, *, unit: str | None = None, body: int | None = None
             extent = np.ptp(np.concatenate(loops), axis=0).max()
             scale, note = _choose_unit(float(extent), unit or named)
             return RawSection(polygon=_join_lines([scale * loop for loop in loops]), width=None, notes=[note])
-        return _cut_surface(_load_surface(path), unit, body, layered)
+        notes = []
+        return _cut_surface(_load_surface(path, unit, notes), body, layered, notes)
     except (JawFileError, FileError, ImageError, SandboxError) as error:
         prefix = "" if str(error).startswith(path.name) else f"{path.name}: "
         raise JawFileError(f"{prefix}{error}") from error
@@ -156,8 +157,8 @@ def _choose_unit(extent: float, unit: str | None) -> tuple[float, str]:
     return UNITS[guess], f"unit: {guess}, since {size} (--unit)"
 
 
-def _load_surface(path: Path) -> trimesh.Trimesh:
-    """Load the triangles of a file."""
+def _load_surface(path: Path, unit: str | None, notes: list[str]) -> Surface:
+    """Load the triangles of a file, in metres."""
     vertices, triangles = read_surface(path)
     if not 0 < len(triangles) <= _MOST_TRIANGLES:
         raise JawFileError(
@@ -166,26 +167,22 @@ def _load_surface(path: Path) -> trimesh.Trimesh:
         )
     if not np.isfinite(vertices).all():
         raise JawFileError("has coordinates that are not finite")
-    mesh = trimesh.Trimesh(vertices, triangles, process=True)
-    mesh.merge_vertices()
-    return mesh
+    scale, note = _choose_unit(float(np.ptp(vertices[triangles], axis=(0, 1)).max()), unit)
+    notes.append(note)
+    return build_surface(scale * vertices, triangles)
 
 
-def _cut_surface(mesh: trimesh.Trimesh, unit: str | None, body: int | None, layered: bool) -> RawSection:
+def _cut_surface(mesh: Surface, body: int | None, layered: bool, notes: list[str]) -> RawSection:
     """Return the section of a closed surface across the direction in which it was extruded, or its layers."""
-    scale, note = _choose_unit(float(mesh.extents.max()), unit)
-    notes = [note]
-    mesh = _choose_body(_drop_doubles(mesh, notes), body, scale, notes)
-    mesh.apply_scale(scale)
-    _close_holes(mesh, notes)
-    _, count = np.unique(np.sort(mesh.edges, axis=1), axis=0, return_counts=True)
+    mesh = _close_holes(_choose_body(_drop_doubles(mesh, notes), body, notes), notes)
+    count = mesh.sides_per_edge
     if (count % 2).any():  # of parts that touch along an edge four faces meet there
         raise JawFileError(
             f"its surface has {int((count == 1).sum())} open and {int((count > 2).sum())} doubled edges, expected a "
             "closed one: repair it in the program that it comes from, or in a slicer"
         )
     if mesh.volume < 0.0:
-        mesh.invert()
+        mesh = mesh.turned()
         notes.append("its surface was inside out and has been turned")
     axis, share = _find_axis(mesh)
     if layered:
@@ -209,12 +206,12 @@ def _cut_surface(mesh: trimesh.Trimesh, unit: str | None, body: int | None, laye
     return RawSection(polygon=cuts.section, width=width, notes=notes, base=base)
 
 
-def _cut_layers(mesh: trimesh.Trimesh, axis: NDArray, notes: list[str]) -> RawSection:
+def _cut_layers(mesh: Surface, axis: NDArray, notes: list[str]) -> RawSection:
     """Return the layers of a closed surface along an axis, and of its cuts in one piece the one that is most usual."""
     height = mesh.vertices @ axis
     low, high = float(height.min()), float(height.max())
-    flat = np.abs(mesh.face_normals @ axis) > 1.0 - _UPRIGHT**2
-    steps = np.unique(np.round(height[mesh.faces[flat]].mean(axis=1), 5))
+    flat = np.abs(mesh.normals @ axis) > 1.0 - _UPRIGHT**2
+    steps = np.unique(np.round(height[mesh.triangles[flat]].mean(axis=1), 5))
     layers = find_layers(lambda at: _cut(mesh, axis, at), (low, high), steps[(steps > low) & (steps < high)].tolist())
     usual = _find_usual(layers)
     across = f"along {np.round(axis, 3).tolist()} of the file, {1e3 * (high - low):.4g} mm in all"
@@ -222,26 +219,29 @@ def _cut_layers(mesh: trimesh.Trimesh, axis: NDArray, notes: list[str]) -> RawSe
     return RawSection(polygon=usual, width=high - low, notes=notes, layers=tuple(layers))
 
 
-def _measure_blade(mesh: trimesh.Trimesh, axis: NDArray, base: shapely.Geometry) -> float:
+def _measure_blade(mesh: Surface, axis: NDArray, base: shapely.Geometry) -> float:
     """Return the width [m] along an axis of what stands out of a wider base."""
     flat = mesh.vertices @ np.stack(_span(axis)).T
     return float(np.ptp((mesh.vertices @ axis)[~shapely.contains_xy(base.buffer(_CHORD), *flat.T)]))
 
 
-def _drop_doubles(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
+def _drop_doubles(mesh: Surface, notes: list[str]) -> Surface:
     """Return a surface without faces that are there twice."""
-    kept = mesh.unique_faces()
-    if not kept.all():
-        notes.append(f"mended: {int((~kept).sum())} doubled faces left out")
-        mesh.update_faces(kept)
-    return mesh
+    doubled = mesh.find_doubles()
+    if not doubled.any():
+        return mesh
+    notes.append(f"mended: {int(doubled.sum())} doubled faces left out")
+    return mesh.take(~doubled)
 
 
-def _close_holes(mesh: trimesh.Trimesh, notes: list[str]) -> None:
-    """Close holes of a missing triangle or two in a surface."""
-    before = len(mesh.faces)
-    if not mesh.is_watertight and trimesh.repair.fill_holes(mesh):
-        notes.append(f"mended: holes closed by {len(mesh.faces) - before} triangles")
+def _close_holes(mesh: Surface, notes: list[str]) -> Surface:
+    """Return a surface with holes of a missing triangle or two closed."""
+    if (mesh.sides_per_edge == 2).all():
+        return mesh
+    filled = mesh.fill_holes()
+    if more := len(filled.triangles) - len(mesh.triangles):
+        notes.append(f"mended: holes closed by {more} triangles")
+    return filled
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -289,20 +289,27 @@ class _Cuts:
         )
 
 
-def _cut_often(mesh: trimesh.Trimesh, axis: NDArray) -> _Cuts:
+def _cut_often(mesh: Surface, axis: NDArray) -> _Cuts:
     """Return cuts of a body across an axis.
 
     Raises:
         JawFileError: no cut is in one piece.
     """
     low, high = np.sort(mesh.vertices @ axis)[[0, -1]]
-    found = [_cut(mesh, axis, low + (number + 0.5) / _CUTS * (high - low)) for number in range(_CUTS)]
+    upright = np.abs(mesh.normals @ axis) < _ALONG / (high - low)
+    found: list[shapely.Geometry] = []
+    crossed = np.zeros(len(mesh.triangles), bool)
+    for height in low + (np.arange(_CUTS) + 0.5) / _CUTS * (high - low):
+        before, crossed = crossed, mesh.find_crossed(axis, height)
+        is_same = found and (crossed == before).all() and upright[crossed].all()
+        found.append(found[-1] if is_same else _cut(mesh, axis, height))
     whole = [cut for cut in found if cut.geom_type == "Polygon"]
     if not whole:
         raise JawFileError(f"its section has {len(found[_CUTS // 2].geoms)} separate areas, expected one finger")
     typical = float(np.median([cut.area for cut in found]))
     section = min(whole, key=lambda cut: abs(cut.area - typical))
-    difference = np.array([cut.symmetric_difference(section).area for cut in found]) / section.area
+    difference = [0.0 if cut is section else cut.symmetric_difference(section).area for cut in found]
+    difference = np.array(difference) / section.area
     return _Cuts(
         section=section,
         difference=difference,
@@ -313,18 +320,18 @@ def _cut_often(mesh: trimesh.Trimesh, axis: NDArray) -> _Cuts:
     )
 
 
-def _choose_body(mesh: trimesh.Trimesh, body: int | None, scale: float, notes: list[str]) -> trimesh.Trimesh:
+def _choose_body(mesh: Surface, body: int | None, notes: list[str]) -> Surface:
     """Return the one body of a file, or the one that is asked for."""
-    bodies = mesh.split(only_watertight=False, repair=False)
+    bodies = mesh.split()
     # what a few triangles enclose is no part of a finger
-    bodies = sorted((item for item in bodies if len(item.faces) >= 4), key=lambda item: -np.prod(item.extents))
+    bodies = sorted((item for item in bodies if len(item.triangles) >= 4), key=lambda item: -np.prod(item.extents))
     voids = [item for item in bodies[1:] if _is_void(item, bodies[0])]
     if len(bodies) - len(voids) <= 1 and body in (None, 1):
         if voids:
             notes.append(f"{len(voids)} closed voids inside")
         return mesh
     sizes = "; ".join(
-        f"{number}: " + " x ".join(f"{1e3 * scale * value:.3g}" for value in item.extents)
+        f"{number}: " + " x ".join(f"{1e3 * value:.3g}" for value in item.extents)
         for number, item in enumerate(bodies[:8], start=1)
     )
     if body is None or not 1 <= body <= len(bodies):
@@ -336,15 +343,15 @@ def _choose_body(mesh: trimesh.Trimesh, body: int | None, scale: float, notes: l
     return bodies[body - 1]
 
 
-def _is_void(body: trimesh.Trimesh, other: trimesh.Trimesh) -> bool:
+def _is_void(body: Surface, other: Surface) -> bool:
     """Whether a body lies inside another one with its surface turned inwards."""
     inside = (body.bounds[0] > other.bounds[0]).all() and (body.bounds[1] < other.bounds[1]).all()
     return bool(inside and body.volume * other.volume < 0.0)
 
 
-def _find_axis(mesh: trimesh.Trimesh) -> tuple[NDArray, float]:
+def _find_axis(mesh: Surface) -> tuple[NDArray, float]:
     """Return the direction (3,) that most of a surface goes with, upright on it or across it, and that share."""
-    normals, areas = mesh.face_normals, mesh.area_faces
+    normals, areas = mesh.normals, mesh.areas
     turned = normals * np.where(normals[:, [2]] + 1e-3 * normals[:, [1]] + 1e-6 * normals[:, [0]] < 0.0, -1.0, 1.0)
     _, number = np.unique(np.round(turned, 2), axis=0, return_inverse=True)
     number = number.ravel()
@@ -364,7 +371,7 @@ def _find_axis(mesh: trimesh.Trimesh) -> tuple[NDArray, float]:
     return best, most
 
 
-def _cut_tapered(mesh: trimesh.Trimesh, axis: NDArray, notes: list[str]) -> RawSection:
+def _cut_tapered(mesh: Surface, axis: NDArray, notes: list[str]) -> RawSection:
     """Return the section of a body whose walls all run in one direction between two sides that are any planes.
 
     Args:
@@ -375,7 +382,7 @@ def _cut_tapered(mesh: trimesh.Trimesh, axis: NDArray, notes: list[str]) -> RawS
     Raises:
         JawFileError: Walls run in several directions, or a side is no plane.
     """
-    normals, areas = mesh.face_normals, mesh.area_faces
+    normals, areas = mesh.normals, mesh.areas
     axis = max((_find_ruling(mesh, start) for start in (axis, *np.eye(3))), key=lambda found: _weigh_walls(mesh, found))
     slope = normals @ axis
     walls = np.abs(slope) < _UPRIGHT
@@ -391,7 +398,7 @@ def _cut_tapered(mesh: trimesh.Trimesh, axis: NDArray, notes: list[str]) -> RawS
     across = np.stack(_span(axis))
     low, high = (_fit_side(mesh, side, axis, across) for side in sides)
     taper, width = (high - low)[:2], float((high - low)[2])
-    corners = mesh.vertices[np.unique(mesh.faces[walls])] @ across.T
+    corners = mesh.vertices[np.unique(mesh.triangles[walls])] @ across.T
     widths = corners @ taper + width
     # where both sides are there everywhere
     bottom, top = (corners @ plane[:2] + plane[2] for plane in (low, high))
@@ -405,29 +412,29 @@ def _cut_tapered(mesh: trimesh.Trimesh, axis: NDArray, notes: list[str]) -> RawS
     return RawSection(polygon=polygon, width=width, notes=notes, taper=taper)
 
 
-def _find_ruling(mesh: trimesh.Trimesh, axis: NDArray) -> NDArray:
+def _find_ruling(mesh: Surface, axis: NDArray) -> NDArray:
     """Return the direction (3,) nearest to an axis that as many walls as possible run along."""
     for _ in range(_RULINGS):
-        walls = np.abs(mesh.face_normals @ axis) < _ASIDE
-        normals, areas = mesh.face_normals[walls], mesh.area_faces[walls, None]
+        walls = np.abs(mesh.normals @ axis) < _ASIDE
+        normals, areas = mesh.normals[walls], mesh.areas[walls, None]
         # what all walls are across to
         found = np.linalg.eigh((normals * areas).T @ normals)[1][:, 0]
         axis = found if found @ axis > 0.0 else -found
     return axis
 
 
-def _weigh_walls(mesh: trimesh.Trimesh, axis: NDArray) -> float:
+def _weigh_walls(mesh: Surface, axis: NDArray) -> float:
     """Return the area [m^2] of what runs along an axis."""
-    return float(mesh.area_faces[np.abs(mesh.face_normals @ axis) < _UPRIGHT].sum())
+    return float(mesh.areas[np.abs(mesh.normals @ axis) < _UPRIGHT].sum())
 
 
-def _fit_side(mesh: trimesh.Trimesh, faces: NDArray, axis: NDArray, across: NDArray) -> NDArray:
+def _fit_side(mesh: Surface, faces: NDArray, axis: NDArray, across: NDArray) -> NDArray:
     """Return how high a side is along an axis: by both directions across, and at their origin [m] (3,).
 
     Raises:
         JawFileError: It is no plane.
     """
-    points = mesh.vertices[np.unique(mesh.faces[faces])]
+    points = mesh.vertices[np.unique(mesh.triangles[faces])]
     design = np.column_stack([points @ across.T, np.ones(len(points))])
     plane, *_ = np.linalg.lstsq(design, points @ axis, rcond=None)
     off = float(np.abs(design @ plane - points @ axis).max())
@@ -446,15 +453,9 @@ def _span(axis: NDArray) -> tuple[NDArray, NDArray]:
     return first, np.cross(axis, first)
 
 
-def _cut(mesh: trimesh.Trimesh, axis: NDArray, height: float) -> shapely.Geometry:
+def _cut(mesh: Surface, axis: NDArray, height: float) -> shapely.Geometry:
     """Return the cut of a body across an axis at a height [m], a polygon or several."""
-    lines = trimesh.intersections.mesh_plane(mesh, axis, height * axis)
-    first, second = _span(axis)
-    flat = np.stack([lines @ first, lines @ second], axis=-1).reshape(-1, 2)
-    # two triangles place the end that they share to rounding alike: on either side of a line of the grid, maybe
-    near = cKDTree(flat).sparse_distance_matrix(cKDTree(flat), _GRID, output_type="coo_matrix")
-    _, first, number = np.unique(connected_components(near)[1], return_index=True, return_inverse=True)
-    return _fill_lines(flat[first][number].reshape(-1, 2, 2))
+    return _fill_lines(mesh.cut(axis, height) @ np.stack(_span(axis)).T)
 
 
 def _join_lines(lines: list[NDArray]) -> shapely.Polygon:

@@ -9,7 +9,6 @@ from itertools import combinations
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from shapely import affinity
 
 from finforce_ifea.errors import JawFileError
@@ -660,5 +659,5 @@ def _meet(end: NDArray, middle: NDArray, band: Wall) -> NDArray:
     if len(places):
         return places[np.linalg.norm(places - tip, axis=1).argmin()]
     beyond = tip + 0.5 * band.usual * direction
-    far, nearest = cKDTree(line).query(beyond)
-    return line[nearest] if far < _NEIGHBOURS else beyond
+    far = np.linalg.norm(line - beyond, axis=1)
+    return line[far.argmin()] if far.min() < _NEIGHBOURS else beyond
