@@ -495,6 +495,30 @@ def test_a_hole_in_the_tip_holds_nothing_and_a_window_in_the_base_no_more_than_t
     assert 0.8 * BASE * MILLIMETRE < finger.clamped_z <= BASE * MILLIMETRE
 
 
+def test_bolts_of_a_large_finger_are_large():
+    # 2.2 times as large, its bolts are M6, which clear 3.3 mm
+    scale = 2.2 * MILLIMETRE
+    finger = recognize(shapely.affinity.scale(draw_polygon(), scale, scale, origin=(0, 0)), 0.02, Overrides())
+    assert finger.clamped_z == pytest.approx((5.0 + 3 * 1.5) * scale, abs=6e-4)
+    assert any("2 base bolts" in note for note in finger.notes)
+
+
+@pytest.mark.parametrize("is_round", [True, False])
+def test_a_window_beside_the_bolts_is_no_bolt_and_no_cell(is_round):
+    triangle = shapely.Polygon([(-3.0, 4.0), (4.0, 4.0), (0.0, 9.0)])
+    window = shapely.Point(0.0, 6.0).buffer(3.2, quad_segs=12) if is_round else triangle
+    polygon = shapely.affinity.scale(draw_polygon().difference(window), 1e-3, 1e-3, origin=(0, 0))
+    finger = recognize(polygon, 0.02, Overrides())
+    check_found(replace(finger, bolts=finger.bolts[[0, -1]]))
+    assert any("1 window in its base" in note for note in finger.notes) != is_round
+
+
+def test_a_hole_with_a_wall_as_thin_as_a_band_is_a_cell():
+    hole = shapely.Polygon([(-12.2, 1.9), (-12.2, 11.0), (-10.0, 11.0)])
+    polygon = shapely.affinity.scale(draw_polygon(bolts=()).difference(hole), 1e-3, 1e-3, origin=(0, 0))
+    assert len(recognize(polygon, 0.02, Overrides()).ribs) == RIBS + 1
+
+
 def write_dxf(path, loops):
     ezdxf = pytest.importorskip("ezdxf")
     document = ezdxf.new(units=4)

@@ -29,8 +29,12 @@ _STRAIGHT = 4e-3
 _TEETH = 3e-3
 # The section narrows towards the tip, to less than this share of its width at the base.
 _NARROWER = 0.75
-# A bolt holds about so many of its radii above its middle, and around it; a larger hole is a window [m].
-_GRIP, _WASHER, _LARGEST = 3.0, 2.0, 3e-3
+# A bolt holds about so many of its radii above its middle, and around it. Two of these washers fit side by side between
+# the bands, and bolts of one base are alike: a hole with a larger share of that distance, or so many times as large as
+# another one, is a window.
+_GRIP, _WASHER, _LARGEST, _UNLIKE = 3.0, 2.0, 0.125, 2.0
+# So is what lies below all cells, where it is so many times as far from the outline as they are.
+_APART = 2.0
 # Least cosine between a cell's side and the face of the band beyond it.
 _FACES = 0.7
 _NEIGHBOURS, _LONGER = 3e-3, 1.4
@@ -161,10 +165,10 @@ def recognize(
     turned, frame = _turn_upright(polygon, cells, overrides, notes)
     turned = turned.simplify(_CHORD)
     bolts, cells = _split_holes(turned)
-    bolts, cells = _fit_bolts(bolts), _order_cells(cells)
+    bolts, cells = _fit_bolts(bolts), _drop_windows(turned, _order_cells(cells), notes)
     inner, outer, ribs = _measure_walls(turned, cells)
     slope, floor = _find_floor(turned, (inner, outer))
-    clamped_z, circles = _propose_clamp(cells, bolts, inner, (slope, floor), overrides, notes)
+    clamped_z, circles = _propose_clamp(cells, bolts, (inner, outer), (slope, floor), overrides, notes)
     top = -np.inf if wider is None else _find_top(wider, frame, slope, turned)
     if top > clamped_z:
         clamped_z = top
@@ -311,6 +315,20 @@ def _fit_bolts(holes: list[NDArray]) -> NDArray:
 def _order_cells(cells: list[NDArray]) -> list[NDArray]:
     """Return the cells by the height of their middles."""
     return sorted(cells, key=lambda cell: shapely.Polygon(cell).centroid.y)
+
+
+def _drop_windows(polygon: shapely.Polygon, cells: list[NDArray], notes: list[str]) -> list[NDArray]:
+    """Return the cells, lowest first, without windows in the base, whose walls are no bands."""
+    shapes = [shapely.Polygon(cell) for cell in cells]
+    walls = [shape.distance(polygon.exterior) for shape in shapes]
+    is_window = [
+        wall > max(_APART * np.median(walls), _ALONE * np.sqrt(shape.area))
+        for wall, shape in zip(walls, shapes, strict=True)
+    ]
+    count = is_window.index(False)
+    if count:
+        notes.append(f"{count} window{'s' * (count > 1)} in its base: no cell")
+    return cells[count:]
 
 
 def _turn_upright(
@@ -477,7 +495,7 @@ def _choose_origin(polygon: shapely.Polygon, held: shapely.Geometry, overrides: 
 def _propose_clamp(
     cells: list[NDArray],
     bolts: NDArray,
-    inner: Wall,
+    bands: tuple[Wall, Wall],
     base: tuple[float, float],
     overrides: Overrides,
     notes: list[str],
@@ -490,7 +508,9 @@ def _propose_clamp(
     slope, floor = base
     lows, tops = (np.array([pick(cell[:, 1] - slope * cell[:, 0]) for cell in cells]) for pick in (np.min, np.max))
     height_of = bolts[:, 1] - slope * bolts[:, 0]
-    is_bolt = (bolts[:, 2] < _LARGEST) & (height_of < tops.max())
+    smallest = bolts[height_of <= tops.min(), 2].min(initial=np.inf)
+    largest = min(_LARGEST * _measure_stance(bands), _UNLIKE * smallest)
+    is_bolt = (bolts[:, 2] < largest) & (height_of < tops.max())
     is_base = is_bolt & (height_of <= tops.min())
     circles = bolts[is_bolt & ~is_base] * [1.0, 1.0, _WASHER]
     off = f", along its base, {np.degrees(np.arctan(slope)):.0f} degrees off the face's normal" if slope else ""
@@ -503,7 +523,7 @@ def _propose_clamp(
         reason = f"a radius of its {is_base.sum()} base bolts above their heads"
     else:
         least = 0.5 * (floor + float(lows.min()))  # of a base as thin as a band half of it
-        height = max(float(lows.min()) - inner.usual * np.hypot(1.0, slope), least)
+        height = max(float(lows.min()) - bands[0].usual * np.hypot(1.0, slope), least)
         reason = "the solid base below its first cell"
     height = height if slope or floor > _FLAT or height < _THIN else round(2e3 * height) / 2e3
     around = "".join(f", and around the bolt at z = {1e3 * z:.4g} mm" for _, z, _ in circles)
