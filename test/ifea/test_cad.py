@@ -93,6 +93,20 @@ def test_what_else_programs_export_is_the_same_finger(tmp_path, surface, name):
     check_found(recognize((raw := read_mesh(tmp_path, surface, name)).polygon, raw.width, Overrides()))
 
 
+def test_a_crumb_beside_a_finger_is_left_out_and_a_void_in_it_stays(tmp_path, surface):
+    crumb = trimesh.creation.box((0.8, WIDTH, 0.04), trimesh.transformations.translation_matrix((30.0, 0.0, 40.0)))
+    void = trimesh.creation.box((2.0, 2.0, 2.0), trimesh.transformations.translation_matrix((0.0, 0.0, 9.0)))
+    void.invert()
+    raw = read_mesh(tmp_path, trimesh.util.concatenate([surface, crumb, void]))
+    check_found(recognize(raw.polygon, raw.width, Overrides()))
+    assert {"1 crumb of its surface left out", "1 closed voids inside"} < set(raw.notes)
+    solid = read_mesh(tmp_path, trimesh.util.concatenate([surface, crumb, void]), layered=True)
+    assert min(layer.area.area for layer in solid.layers) < raw.polygon.area - 3e-6
+    crumb.apply_scale(5.0)
+    with pytest.raises(JawFileError, match="holds 2 bodies"):
+        read_mesh(tmp_path, trimesh.util.concatenate([surface, crumb]))
+
+
 def test_a_floor_and_a_slot_are_named_with_their_place(tmp_path, surface):
     low, high = surface.bounds
     size, middle, side = high - low, 0.5 * (low + high), np.array([0.0, 0.5 * WIDTH, 0.0])
@@ -517,6 +531,16 @@ def test_a_hole_with_a_wall_as_thin_as_a_band_is_a_cell():
     hole = shapely.Polygon([(-12.2, 1.9), (-12.2, 11.0), (-10.0, 11.0)])
     polygon = shapely.affinity.scale(draw_polygon(bolts=()).difference(hole), 1e-3, 1e-3, origin=(0, 0))
     assert len(recognize(polygon, 0.02, Overrides()).ribs) == RIBS + 1
+
+
+def test_a_slot_in_a_band_is_no_cell():
+    # along the outer band, 4 mm thick there
+    polygon = draw_polygon().union(shapely.LineString([(-8.5, 20.0), (-1.0, 38.0)]).buffer(2.0, cap_style="flat"))
+    wall = shapely.LineString([(-7.5, 23.0), (-3.3, 33.0)])
+    drawn = shapely.affinity.scale(polygon.difference(wall.buffer(0.8)), 1e-3, 1e-3, origin=(0, 0))
+    finger = recognize(drawn, 0.02, Overrides())
+    assert len(finger.ribs) == RIBS
+    assert any("1 slot in its bands: no cell" in note for note in finger.notes)
 
 
 def write_dxf(path, loops):

@@ -16,13 +16,15 @@ from finforce_ifea.errors import JawFileError
 from finforce_ifea.jaw.cad.curves import read_dxf, read_svg
 from finforce_ifea.jaw.cad.layers import find_layers
 from finforce_ifea.jaw.cad.photo import PHOTOS, SCALE, Photo, read_photo
-from finforce_ifea.jaw.cad.surface import Surface, build_surface
+from finforce_ifea.jaw.cad.surface import Surface, build_surface, join_surfaces
 from finforce_ifea.jaw.section import UNITS, Layer, SectionFile, check_loops, join_loops, read_section_file
 
 SURFACES = (".stl", ".obj", ".ply", ".off", ".3mf", ".glb")
 SUFFIXES = (*SURFACES, ".step", ".stp", ".dxf", ".svg", ".json", *PHOTOS)
 # Largest size of a finger [m]; the second pair is for a unit that was stated.
 _PLAUSIBLE, _POSSIBLE = (0.015, 0.25), (0.005, 1.0)
+# What encloses less than this share of the largest body is no part of a finger.
+_CRUMB = 1e-4
 _MOST_TRIANGLES, _LARGEST_FILE = 2_000_000, 200_000_000
 # A surface is prismatic when so much of it stands upright on, or lies across, the direction of extrusion.
 _UPRIGHT, _PRISMATIC = 0.02, 0.97
@@ -322,13 +324,16 @@ def _cut_often(mesh: Surface, axis: NDArray) -> _Cuts:
 
 def _choose_body(mesh: Surface, body: int | None, notes: list[str]) -> Surface:
     """Return the one body of a file, or the one that is asked for."""
-    bodies = mesh.split()
-    # what a few triangles enclose is no part of a finger
-    bodies = sorted((item for item in bodies if len(item.triangles) >= 4), key=lambda item: -np.prod(item.extents))
+    parts = [part for part in mesh.split() if len(part.triangles) >= 4]
+    least = _CRUMB * max((abs(part.volume) for part in parts), default=0.0)
+    bodies = sorted((part for part in parts if abs(part.volume) > least), key=lambda item: -np.prod(item.extents))
     voids = [item for item in bodies[1:] if _is_void(item, bodies[0])]
     if len(bodies) - len(voids) <= 1 and body in (None, 1):
         if voids:
             notes.append(f"{len(voids)} closed voids inside")
+        if crumbs := len(parts) - len(bodies):
+            notes.append(f"{crumbs} crumb{'s' * (crumbs > 1)} of its surface left out")
+            return join_surfaces([bodies[0], *voids])
         return mesh
     sizes = "; ".join(
         f"{number}: " + " x ".join(f"{1e3 * value:.3g}" for value in item.extents)

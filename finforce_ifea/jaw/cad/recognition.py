@@ -35,6 +35,8 @@ _NARROWER = 0.75
 _GRIP, _WASHER, _LARGEST, _UNLIKE = 3.0, 2.0, 0.125, 2.0
 # So is what lies below all cells, where it is so many times as far from the outline as they are.
 _APART = 2.0
+# A slot in a band fills so much of the rectangle around it, and is narrower than this share of the cell beside it.
+_OBLONG, _NARROW = 0.75, 0.5
 # Least cosine between a cell's side and the face of the band beyond it.
 _FACES = 0.7
 _NEIGHBOURS, _LONGER = 3e-3, 1.4
@@ -318,7 +320,7 @@ def _order_cells(cells: list[NDArray]) -> list[NDArray]:
 
 
 def _drop_windows(polygon: shapely.Polygon, cells: list[NDArray], notes: list[str]) -> list[NDArray]:
-    """Return the cells, lowest first, without windows in the base, whose walls are no bands."""
+    """Return the cells, lowest first, without windows in the base, whose walls are no bands, and slots in bands."""
     shapes = [shapely.Polygon(cell) for cell in cells]
     walls = [shape.distance(polygon.exterior) for shape in shapes]
     is_window = [
@@ -326,9 +328,21 @@ def _drop_windows(polygon: shapely.Polygon, cells: list[NDArray], notes: list[st
         for wall, shape in zip(walls, shapes, strict=True)
     ]
     count = is_window.index(False)
-    if count:
-        notes.append(f"{count} window{'s' * (count > 1)} in its base: no cell")
-    return cells[count:]
+    kept = [not _is_slot(shape, shapes) for shape in shapes[count:]]
+    for number, name in ((count, "window in its base"), (kept.count(False), "slot in its bands")):
+        if number:
+            notes.append(f"{number} {name.replace(' ', 's ', 1) if number > 1 else name}: no cell")
+    return [cell for cell, is_kept in zip(cells[count:], kept, strict=True) if is_kept]
+
+
+def _is_slot(shape: shapely.Polygon, cells: list[shapely.Polygon]) -> bool:
+    """Whether a hole is an oblong beside which there is a cell that is much wider; a rib may be beside its middle."""
+    left, _, right, _ = shapely.MultiPolygon(cells).bounds
+    _, low, _, high = shape.bounds
+    levels = [shapely.LineString([(left, z), (right, z)]) for z in low + np.array([0.25, 0.5, 0.75]) * (high - low)]
+    widest = shapely.length(shapely.intersection(np.array(cells)[:, None], levels)).max()
+    is_oblong = shape.area > _OBLONG * shape.minimum_rotated_rectangle.area
+    return bool(is_oblong and shape.intersection(levels[1]).length < _NARROW * widest)
 
 
 def _turn_upright(

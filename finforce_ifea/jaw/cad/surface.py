@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -132,3 +133,10 @@ def build_surface(vertices: NDArray, triangles: NDArray) -> Surface:
     triangles = number.ravel()[triangles]
     has_three = (triangles != np.roll(triangles, 1, axis=1)).all(axis=1)
     return Surface(vertices=vertices[first], triangles=triangles).take(has_three)
+
+
+def join_surfaces(parts: Sequence[Surface]) -> Surface:
+    """Return separate surfaces as one."""
+    first = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
+    triangles = [part.triangles + start for part, start in zip(parts, first, strict=True)]
+    return Surface(vertices=np.concatenate([part.vertices for part in parts]), triangles=np.concatenate(triangles))
