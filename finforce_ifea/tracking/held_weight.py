@@ -10,9 +10,10 @@ residual is remembered from when the hold began, and the change since then is ex
     a force T along the finger, a force S across it, and a moment M that twists it, for what is held by two flat faces
     does not roll with either,
 
-where T and S rise or fall steadily over the images that are averaged. Where gravity's direction is known, T and S are
-expected as it points: its share along the finger and across, plus what little acts from outside. Whether the object
-is lifted at all is a hypothesis: the change counts by its probability p, where
+where T and S rise or fall steadily over the images that are averaged, and have risen no farther than they can in the
+time since the memory was complete: what shows at once, as jaws open right after it, is no weight. Where gravity's
+direction is known, T and S are expected as it points: its share along the finger and across, plus what little acts from
+outside. Whether the object is lifted at all is a hypothesis: the change counts by its probability p, where
 
     p / (1 - p) = p0 N(0; 0, P) / N(0; m, C) / (1 - p0)
 
@@ -86,7 +87,7 @@ class HeldWeight:
 
     def _begin(self) -> None:
         """Start to remember."""
-        self._images, self._x = 0, np.zeros(3)
+        self._images, self._x, self._elapsed = 0, np.zeros(3), 0.0
         self._forget_changes()
         self._before, self._lifted, self._led = np.array([self.force, self.lateral]), False, np.zeros(2)
 
@@ -150,13 +151,15 @@ class HeldWeight:
         left = _find_left(image, offset, self._before) - self._memory
         beyond = _BEYOND**2 * (offset[DEPTH] ** 2 + offset[HEIGHT] ** 2 + (_TILT_ARM * self._led[0]) ** 2)
         self._information, self._vector = _age(self._information, self._vector, dt)
+        self._elapsed += dt
         _accumulate(image, left, known, beyond, self._information, self._vector)
         moment = self._arm * hypot(state["pressing"][0], state["pressing"][2]) + _LEAST_MOMENT
-        settles = np.array([0.0, 0.0, _WEIGHT, _WEIGHT, moment, _RISES, _RISES]) ** 2
+        risen = min(_WEIGHT, _RISES * self._elapsed)
+        settles = np.array([0.0, 0.0, risen, risen, moment, _RISES, _RISES]) ** 2
         settles[:2] = _SETTLES**2 * prior + (_SLIDES * self._led) ** 2
         expected = np.diag(1.0 / settles)
         if gravity is not None:
-            expected[_T : _S + 1, _T : _S + 1] = _expect_weight(gravity)
+            expected[_T : _S + 1, _T : _S + 1] = _expect_weight(gravity, risen / _WEIGHT)
         spread = np.linalg.inv(self._information / _ALIKE + expected)
         asked = self._vector / _ALIKE
         asked[:2] += self._led / settles[:2]
@@ -200,10 +203,10 @@ def project_response(motions: NDArray, gain: NDArray) -> NDArray:
     return seen
 
 
-def _expect_weight(gravity: NDArray) -> NDArray:
-    """Return the inverse covariance (2, 2) [1/N^2] of T and S before anything is seen of them."""
+def _expect_weight(gravity: NDArray, share: float) -> NDArray:
+    """Return the inverse covariance (2, 2) [1/N^2] of T and S before anything is seen of them, a share of their own."""
     pulls = gravity[[2, 1]]
-    return np.linalg.inv(_WEIGHT**2 * np.outer(pulls, pulls) + _OUTSIDE**2 * np.eye(2))
+    return np.linalg.inv(_WEIGHT**2 * np.outer(pulls, pulls) + _OUTSIDE**2 * np.eye(2)) / share**2
 
 
 @njit(**_OPTIONS)

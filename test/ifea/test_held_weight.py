@@ -73,6 +73,16 @@ def test_a_lean_that_is_counted_already_is_not_counted_twice():
     assert follow(held, [frame(0.6, ratio=0.15) for _ in range(60)])[-1] == pytest.approx(0.6, abs=0.03)
 
 
+@pytest.mark.parametrize("gravity", [None, np.array([0.0, 0.0, -1.0])])
+def test_what_shows_at_once_as_the_jaws_open_is_no_weight(gravity):
+    held, weak = begin(), MODES * [1.0, 1.0, 1.0, 0.05]  # 0.05 mm a newton, as fingers have it
+    follow(held, [with_modes(frame(), weak) for _ in range(24)], gravity)
+    ways = np.linspace(0.5e-3, 2.4e-3, 4)
+    # what moves the points as a weight of 2 N would
+    opening = follow(held, [with_modes(frame(0.1, x=(3e-3 - way, 0.0, 0.04)), weak) for way in ways], gravity)
+    assert np.abs(opening).max() < 0.2
+
+
 def test_jaws_that_move_on_keep_the_weight():
     held = begin()
     follow(held, [frame() for _ in range(30)])
