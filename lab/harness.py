@@ -37,7 +37,6 @@ class Figures:
 PARTS = {
     "solvers": "Run time against force error of the solver tiers",
     "chain": "Latency against force error of the whole chain",
-    "start": "From a node's start until it is ready, and its memory",
 }
 USUAL = ("solvers", "chain")  # measured when none is named
 

@@ -32,18 +32,16 @@ class RecordedContact(ContactLoop):
     Args:
         estimator: a fresh ContactEstimator.
         track: the object's poses in the jaw frame.
-        delay: after which a pose arrives [ns].
         name: for reports.
         idling: passes images over as the contact estimator's node does; None for none.
     """
 
     def __init__(
-        self, estimator: Any, track: ObjectTrack, delay: int = 0, name: str = "estimate", idling: Idling | None = None
+        self, estimator: Any, track: ObjectTrack, name: str = "estimate", idling: Idling | None = None
     ) -> None:
         super().__init__(estimator)
         self._idling = idling
         self.name, self._track, self._next = name, track, 0
-        self._arrivals = track.stamps + delay
 
     def contact_at(self, stamp: int) -> Contact | None:
         """Give the poses that have arrived by an image [ns] to the estimator, and return its contact.
@@ -51,7 +49,7 @@ class RecordedContact(ContactLoop):
         Raises:
             RecordingError: the estimator refuses a pose.
         """
-        while self._next < len(self._arrivals) and self._arrivals[self._next] <= stamp + ROUNDING:
+        while self._next < len(self._track.stamps) and self._track.stamps[self._next] <= stamp + ROUNDING:
             self._take_recorded(self._next)
             self._next += 1
         if self._idling is None:
@@ -97,7 +95,7 @@ def build_source(
         return GivenContact(Contact.fixed(jaw, height), f"fixed:{1e3 * height:g}")
     estimator = build_estimator(choice, mode, recording, jaw, mesh)
     track, idling = track_object(recording, jaw.side), Idling() if as_live else None
-    return RecordedContact(estimator, track, choice.pose_delay, mode, idling)
+    return RecordedContact(estimator, track, mode, idling)
 
 
 def build_estimator(choice: ContactChoice, mode: str, recording: Recording, jaw: Jaw, mesh: str = "default") -> Any:
@@ -194,7 +192,6 @@ class ContactChoice:
         by_name: recording name -> height [mm], before everything else.
         object_file: mesh for every recording; None takes it from each recording's `case.json`.
         object_unit: unit of the mesh.
-        pose_delay: after which a pose arrives [ns].
     """
 
     mode: str = AUTOMATIC
@@ -202,7 +199,6 @@ class ContactChoice:
     by_name: Mapping[str, float] = field(default_factory=dict)
     object_file: str | None = None
     object_unit: str = "m"
-    pose_delay: int = 0
 
     def mode_for(self, recording: Recording, side: str) -> str:
         """Return "estimate", "closest", "paper" or "fixed" for one jaw of a recording."""

@@ -16,7 +16,6 @@ import psutil
 from finforce.errors import FinforceError
 from finforce.systems.processes import SINGLE_THREAD, Process
 
-_MOST_WORDS = 1 << 24  # bytes of a log that are looked through
 # how long each signal is given before the next, harder one [s]
 PATIENCE = ((signal.SIGINT, 5.0), (signal.SIGTERM, 3.0), (signal.SIGKILL, 3.0))
 
@@ -91,10 +90,6 @@ class ProcessGroup:
         if any(statuses):
             self.check()
         return any(part.ends_all and status == 0 for part, status in zip(self._processes, statuses, strict=True))
-
-    def count_lines(self, word: bytes) -> int:
-        """Return how many lines with a word the processes have printed."""
-        return sum(word in line for log in self._logs for line in os.pread(log.fileno(), _MOST_WORDS, 0).splitlines())
 
     def __exit__(self, *_: Any) -> None:
         for number, patience in PATIENCE:

@@ -22,7 +22,6 @@ EXPERIMENTS = {
     "grasp": ("27 grasps: three objects, places and forces, both jaws", "grasp"),
     "manipulation": ("a held weight of 100 g that is turned, in two lights", "manipulation"),
     "chip": ("an object that breaks at 5.43 N, grasped to 5 N by force, position and current", "chip"),
-    "pose": ("poses of the object that are late, flipped or lost", "pose"),
 }
 
 

@@ -9,14 +9,11 @@ from types import SimpleNamespace
 import numpy as np
 import pandas as pd
 import pytest
-from eval_fakes import FakeContactEstimator, cut, make_recording
+from eval_fakes import cut, make_recording
 
 from finforce.errors import FinforceError
 from finforce_eval.cli.main import main
-from finforce_eval.errors import RecordingError
-from finforce_eval.evaluation.contact_source import RecordedContact
 from finforce_eval.machine import describe_sources
-from finforce_eval.recordings.objects import ObjectTrack
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.writer import write_recording
 from finforce_eval.table import ForceSeries
@@ -29,7 +26,6 @@ from lab.experiments.experiment import (
     Experiment,
     RunOptions,
     average,
-    build_scene,
     keep_poses,
     list_missing,
     run_experiment,
@@ -38,9 +34,7 @@ from lab.experiments.experiment import (
 from lab.experiments.grasp import GRASP, find_phases, score_grasp
 from lab.experiments.manipulation import MANIPULATION, score_weight, tell_gravity, true_gravity
 from lab.experiments.paper_tables import BENCH
-from lab.experiments.pose import POSE, drop_poses, flip_poses, track_object
 from lab.harness import Figures, format_figures
-from lab.scenes import find_scene
 
 DATA = Path(__file__).parents[2] / "finforce_eval" / "data"
 
@@ -238,14 +232,7 @@ def test_the_twin_has_27_grasps_with_seeds_of_their_own():
 
 
 def test_quick_cases_are_some_of_the_others():
-    kinds = (
-        GRASP,
-        MANIPULATION,
-        CHIP,
-        BENCH,
-        POSE,
-    )
-    for kind in kinds:
+    for kind in (GRASP, MANIPULATION, CHIP, BENCH):
         every, few = ([c.name for c in kind.list_cases(RunOptions(quick=q))] for q in (False, True))
         assert set(few) < set(every)
 
@@ -317,50 +304,6 @@ def test_an_object_that_is_hidden_has_no_poses_any_more():
     assert len(one.object_pose.stamps) > 5
 
 
-def test_some_poses_are_turned_by_half_a_turn_and_others_stay():
-    one = make_recording("one", frames=900)
-    before, after = one.object_pose, flip_poses(one, 3).object_pose
-    dots = np.abs((before.quaternion * after.quaternion).sum(axis=1))
-    turned = dots < 1e-9
-    assert 0.03 < turned.mean() < 0.2
-    assert dots[~turned] == pytest.approx(1.0)
-    assert (before.position == after.position).all()
-
-
-def test_gaps_leave_no_pose_for_a_while():
-    one = make_recording("one", frames=900)
-    stamps = drop_poses(one).object_pose.stamps
-    gaps = np.diff(stamps)
-    assert (gaps > 0.75e9).sum() > 5
-    assert len(stamps) < 0.7 * len(one.object_pose.stamps)
-
-
-def test_the_built_in_tracker_stands_in_for_the_recorded_poses(tmp_path):
-    pytest.importorskip("open3d", reason="the tracker casts rays: pip install open3d")
-    changes = {"clearance": 0.001, "displacement": 0.001, "closing_speed": 0.01, "settle": 0.1, "record": 0.1}
-    case = RunOptions(size="320x240").scene_case("small", "grasp_asymmetric", changes, 0)
-    recording = read_recording(find_scene(build_scene(case.settings), tmp_path))
-    tracked = track_object(recording)
-    assert tracked.lost == 0
-    found, recorded = tracked.recording.object_pose, recording.object_pose
-    rows = np.searchsorted(found.stamps, recorded.stamps)
-    assert len(found.stamps) > 2 * len(recorded.stamps) and (found.stamps[rows] == recorded.stamps).all()
-    away = np.linalg.norm(found.position[rows] - recorded.position, axis=1)
-    assert 0.3e-3 < np.median(away) < 0.8e-3  # the recorded ones have noise of 0.3 mm along each axis
-    with pytest.raises(RecordingError, match="the built-in tracker needs depth images"):
-        track_object(replace(recording, images=recording.images.colors_alone()))
-
-
-def test_poses_that_are_late_come_late():
-    track = ObjectTrack(stamps=1000 * np.array([0, 100, 200]), poses=np.tile(np.eye(4), (3, 1, 1)))
-    fake = FakeContactEstimator()
-    source = RecordedContact(fake, track, delay=150_000)
-    for stamp in (100_000, 150_000, 249_000, 350_000):
-        source.contact_at(stamp)
-        taken = [round(1e9 * when) for name, when, *_ in fake.calls if name == "pose"]
-        assert taken == [when for when in (0, 100_000, 200_000) if when + 150_000 <= stamp]
-
-
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
@@ -407,20 +350,6 @@ def test_averages_are_of_what_is_known_in_the_order_of_the_groups():
     assert means.g.tolist() == ["late", "early"] and means.n.tolist() == [2, 1]
     assert means["error/N"].tolist() == pytest.approx([2.0, np.nan], nan_ok=True)
     assert means["±error/N"].tolist() == pytest.approx([1.0, np.nan], nan_ok=True)
-
-
-def test_what_each_way_of_poses_adds_is_counted_from_those_on_time(tmp_path):
-    def grasp(*errors):
-        ways = ("on time", "late")
-        scores = {"answered_pct": 99.0, "place_median_mm": 1.0, "within_3_sigma_pct": 100.0}
-        scores |= {"sharpness x": 1.5, "sharpness y": 1.0, "sharpness z": 2.0}
-        return {"ways": {way: {"rmse_N": {"all": error}, **scores} for way, error in zip(ways, errors, strict=True)}}
-
-    found = POSE.find(RunOptions(), {"one": grasp(0.1, 0.1), "two": grasp(0.1, 0.4)}, tmp_path)
-    rows = first_table(found).set_index("poses")
-    assert rows["added/N"].to_dict() == pytest.approx({"on time": 0.0, "late": 0.15})
-    assert rows["most added/N"]["late"] == pytest.approx(0.3)
-    assert rows["sharp x"]["late"] == pytest.approx(1.5)
 
 
 def test_grasps_and_turns_are_put_in_tables(tmp_path):
