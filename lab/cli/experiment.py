@@ -17,7 +17,6 @@ QUICK_SIZE = "320x240"
 
 # what each does, and the module in which it stands under its name in capitals
 EXPERIMENTS = {
-    "bench": ("Table I: nine cylinders pressed on one jaw", "paper_tables"),
     "places": ("Table II: value of knowing the contact location", "paper_tables"),
     "grasp": ("27 grasps: three objects, places and forces, both jaws", "grasp"),
     "manipulation": ("a held weight of 100 g that is turned, in two lights", "manipulation"),

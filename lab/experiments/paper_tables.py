@@ -1,4 +1,4 @@
-"""The paper's static evaluations: cylinders at three places (Table I), and what knowing the place is worth (II)."""
+"""The paper's Table II: a cylinder pressed at three places, and what knowing the place is worth."""
 
 from __future__ import annotations
 
@@ -20,14 +20,11 @@ from finforce_eval.table import AXES
 from lab.experiments.experiment import SHARP, Case, Experiment, RunOptions, axis_sharpness, build_setup
 from lab.harness import Figures
 
-# Ø [mm] and height of the axis [mm] of the twin's cylinders, whose finger the paper's heights do not fit
-DIAMETERS = (15, 25, 35)
-HEIGHTS = {"upper": 58.0, "middle": 40.0, "lower": 24.0}
+DIAMETER = 15  # [mm] of the cylinder
+HEIGHTS = {"upper": 58.0, "middle": 40.0, "lower": 24.0}  # of its axis [mm] on the twin's finger, not the paper's
 BENCH_HEIGHTS = {"upper": 60.0, "middle": 40.0, "lower": 20.0}  # of the bench recordings [mm]
-QUICK_CASES = ((15, "upper"), (25, "middle"), (15, "lower"))
 SHORT = {"levels": 1, "settle": 0.3, "record": 0.5, "displacement": 0.004}
-# RMSE [N] of the paper, Table I by place and diameter, and Table II by real and assumed place
-TABLE_I = {"upper": (0.22, 0.52, 0.57), "middle": (0.24, 0.28, 0.24), "lower": (0.69, 0.62, 1.21)}
+# RMSE [N] of the paper by real and assumed place
 TABLE_II = {
     "upper": {"estimate": 0.20, "upper": 0.22, "middle": 1.21, "lower": 5.91},
     "middle": {"estimate": 0.26, "upper": 0.93, "middle": 0.24, "lower": 4.93},
@@ -38,53 +35,50 @@ LEAST_SOLVED = 1.0  # [%] of the images under load, below which nothing is said 
 OTHERS = {"closest": "closest point", "paper": "Algorithm 1"}
 
 
-def list_cylinders(options: RunOptions, chosen: Sequence[tuple[int, str]]) -> list[Case]:
-    """Return cylinders on the twin's bench, or the bench recordings of one's own that are some of these.
+def list_places(options: RunOptions) -> Sequence[Case]:
+    """Return the cylinder at its places on the twin's bench, or those of the bench recordings of one's own.
 
     Raises:
         RecordingError: a recording does not say what is pressed on, and where.
     """
+    places = ("middle",) if options.quick else tuple(HEIGHTS)
     if options.bags:
-        return _list_own(options, chosen)
+        return _list_own(options, places)
     cases = []
-    for number, (diameter, place) in enumerate(chosen):
-        changes = {"object": f"rod{diameter}", "height": 1e-3 * HEIGHTS[place]} | (SHORT if options.quick else {})
-        words = {"diameter": diameter, "place": place, "height_mm": HEIGHTS[place]}
-        cases.append(options.scene_case(f"cyl{diameter}_{place}", "bench_cylinder", changes, number, words=words))
+    for number, place in enumerate(places):
+        changes = {"object": f"rod{DIAMETER}", "height": 1e-3 * HEIGHTS[place]} | (SHORT if options.quick else {})
+        name = f"cyl{DIAMETER}_{place}"
+        cases.append(options.scene_case(name, "bench_cylinder", changes, number, words={"place": place}))
     return cases
 
 
-def _list_own(options: RunOptions, chosen: Sequence[tuple[int, str]]) -> list[Case]:
+def _list_own(options: RunOptions, places: Sequence[str]) -> list[Case]:
     cases = []
     for case, recording in options.read_bags(needed=("left",)):
         shape = recording.case.get("object")
         diameter, z = (shape.get(key) if isinstance(shape, Mapping) else None for key in ("diameter", "z"))
         place = next((place for place, height in BENCH_HEIGHTS.items() if height == z), None)
-        if place is None or diameter not in DIAMETERS:
-            sizes, heights = (", ".join(f"{v:g}" for v in values) for values in (DIAMETERS, BENCH_HEIGHTS.values()))
+        if place is None or diameter != DIAMETER:
+            heights = ", ".join(f"{height:g}" for height in BENCH_HEIGHTS.values())
             raise RecordingError(
                 f"{case.settings['bag']}: object.diameter {diameter!r} and object.z {z!r} in its case.json; expected a "
-                f"cylinder of {sizes} mm at {heights} mm"
+                f"cylinder of {DIAMETER} mm at {heights} mm"
             )
-        if (diameter, place) in chosen:
-            words = {"diameter": diameter, "place": place, "height_mm": z}
-            cases.append(replace(case, settings={**case.settings, "words": words}))
+        if place in places:
+            cases.append(replace(case, settings={**case.settings, "words": {"place": place}}))
     if not cases:
-        raise RecordingError(f"none of {len(options.bags)} recordings is one of {chosen}")
+        raise RecordingError(f"none of {len(options.bags)} recordings is at {', '.join(places)}")
     return cases
 
 
-def measure_contacts(
-    options: RunOptions, case: Case, folder: Path, contacts: Mapping[str, ContactChoice]
-) -> dict[str, Any]:
-    """Return what `score_contact` says of a cylinder under each contact, by name."""
+def run_places(options: RunOptions, case: Case, folder: Path) -> dict[str, Any]:
+    """Return what `score_contact` says of the cylinder under every contact, by name."""
+    heights = BENCH_HEIGHTS if options.bags else HEIGHTS
+    contacts = {mode: ContactChoice(mode=mode) for mode in (ESTIMATE, *OTHERS)}
+    contacts |= {place: ContactChoice(mode="fixed", height_mm=height) for place, height in heights.items()}
     with options.open_case(case, folder) as recording:
-        return {
-            "contacts": {
-                name: score_contact(recording, build_setup(case.settings, contact))
-                for name, contact in contacts.items()
-            }
-        }
+        setups = {name: build_setup(case.settings, contact) for name, contact in contacts.items()}
+        return {"contacts": {name: score_contact(recording, setup) for name, setup in setups.items()}}
 
 
 def score_contact(recording: Recording, setup: EvaluationSetup) -> dict[str, Any]:
@@ -113,59 +107,13 @@ def _share_solved(evaluation: Evaluation) -> float:
     return 100.0 * answered / max(sum(int(rows.sum()) for rows, _ in loaded), 1)
 
 
-def _fixed(height_mm: float) -> ContactChoice:
-    return ContactChoice(mode="fixed", height_mm=height_mm)
-
-
-def list_bench(options: RunOptions) -> Sequence[Case]:
-    """Return the cylinders of Table I."""
-    every = [(diameter, place) for diameter in DIAMETERS for place in HEIGHTS]
-    return list_cylinders(options, QUICK_CASES if options.quick else every)
-
-
-def run_bench(options: RunOptions, case: Case, folder: Path) -> dict[str, Any]:
-    """Return the errors on a cylinder."""
-    own = _fixed(case.settings["words"]["height_mm"])
-    return measure_contacts(options, case, folder, {"given": own, ESTIMATE: ContactChoice(mode="estimate")})
-
-
-def find_bench(options: RunOptions, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Figures:
-    """Return Table I."""
-    tables, notes = {}, []
-    for contact, words in (("given", "the place given, as in the paper"), (ESTIMATE, "the place estimated")):
-        rows = []
-        for place in HEIGHTS:
-            cells = [_find_cell(figures, diameter, place, contact) for diameter in DIAMETERS]
-            paper = TABLE_I[place]
-            rows.append((place, *(f"{_format(one)} ({own:.2f})" for one, own in zip(cells, paper, strict=True))))
-        tables[f"With {words}"] = pd.DataFrame(rows, columns=("RMSE/N", *(f"Ø{diameter}" for diameter in DIAMETERS)))
-        known = [row["contacts"][contact]["rmse_N"] for row in figures.values()]
-        known = [value for value in known if value is not None]
-        if known:
-            notes.append(f"With {words}: mean {np.mean(known):.3f} N, worst {np.max(known):.3f} N.")
-    return Figures(tables=tables | tabulate_deviations(figures), notes=[*notes, "The paper's in brackets."])
-
-
-def list_places(options: RunOptions) -> Sequence[Case]:
-    """Return the places of Table II."""
-    return list_cylinders(options, [(DIAMETERS[0], place) for place in (("middle",) if options.quick else HEIGHTS)])
-
-
-def run_places(options: RunOptions, case: Case, folder: Path) -> dict[str, Any]:
-    """Return the errors at a place under every contact."""
-    heights = BENCH_HEIGHTS if options.bags else HEIGHTS
-    contacts = {mode: ContactChoice(mode=mode) for mode in (ESTIMATE, *OTHERS)}
-    contacts |= {place: _fixed(height) for place, height in heights.items()}
-    return measure_contacts(options, case, folder, contacts)
-
-
 def find_places(options: RunOptions, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Figures:
     """Return Table II."""
     rows = []
     for place, paper in TABLE_II.items():
-        cells = {contact: _find_cell(figures, DIAMETERS[0], place, contact) for contact in paper}
+        cells = {contact: _find_cell(figures, place, contact) for contact in paper}
         if any(cells.values()):
-            others = (_format(_find_cell(figures, DIAMETERS[0], place, contact)) for contact in OTHERS)
+            others = (_format(_find_cell(figures, place, contact)) for contact in OTHERS)
             ours = (f"{_format(cells[contact])} ({own:.2f})" for contact, own in paper.items())
             rows.append((place, *ours, *others))
     head = ("really at", "estimated", *(f"fixed {place}" for place in HEIGHTS), *OTHERS.values())
@@ -189,12 +137,10 @@ def tabulate_deviations(figures: Mapping[str, Mapping[str, Any]]) -> dict[str, p
     return {"Stated deviations": pd.DataFrame(rows).astype(float, errors="ignore")} if rows else {}
 
 
-def _find_cell(
-    figures: Mapping[str, Mapping[str, Any]], diameter: int, place: str, contact: str
-) -> Mapping[str, Any] | None:
-    """Return what was measured on a cylinder under a contact; None where it was not."""
+def _find_cell(figures: Mapping[str, Mapping[str, Any]], place: str, contact: str) -> Mapping[str, Any] | None:
+    """Return what was measured at a place under a contact; None where it was not."""
     for row in figures.values():
-        if (row["diameter"], row["place"]) == (diameter, place):
+        if row["place"] == place:
             return row["contacts"].get(contact)
     return None
 
@@ -207,18 +153,6 @@ def _format(cell: Mapping[str, Any] | None) -> str:
     return f"{cell['rmse_N']:.2f}" + ("" if cell["solved_pct"] > 99.9 else f", {cell['solved_pct']:.0f} %")
 
 
-BENCH = Experiment(
-    name="bench",
-    title="Table I: cylinders pressed on one jaw",
-    about=(
-        "The paper presses cylinders of 15, 25 and 35 mm on one jaw at three locations, in three levels up and down, "
-        "three times, and gives the location to its solver. Here it is either given or estimated from the object's "
-        "mesh and pose. On `twin` everything is rendered and the key points are detected."
-    ),
-    list_cases=list_bench,
-    run=run_bench,
-    find=find_bench,
-)
 PLACES = Experiment(
     name="places",
     title="Table II: value of knowing the contact location",

@@ -122,7 +122,7 @@ def beside(bench, call):
     found = []
     thread = Thread(target=lambda: found.append(call()), daemon=True)
     thread.start()
-    bench.probe.wait_for(lambda: not thread.is_alive(), 60.0)
+    bench.probe.wait_for(lambda: not thread.is_alive(), START)
     return found[0]
 
 

@@ -33,7 +33,7 @@ from lab.experiments.experiment import (
 )
 from lab.experiments.grasp import GRASP, find_phases, score_grasp
 from lab.experiments.manipulation import MANIPULATION, score_weight, tell_gravity, true_gravity
-from lab.experiments.paper_tables import BENCH
+from lab.experiments.paper_tables import PLACES
 from lab.harness import Figures, format_figures
 
 DATA = Path(__file__).parents[2] / "finforce_eval" / "data"
@@ -228,11 +228,11 @@ def test_the_twin_has_27_grasps_with_seeds_of_their_own():
     assert len({case.settings["seed"] for case in cases}) == 27
     assert len(MANIPULATION.list_cases(RunOptions())) == 12
     assert len(CHIP.list_cases(RunOptions())) == 60
-    assert len(BENCH.list_cases(RunOptions())) == 9
+    assert len(PLACES.list_cases(RunOptions())) == 3
 
 
 def test_quick_cases_are_some_of_the_others():
-    for kind in (GRASP, MANIPULATION, CHIP, BENCH):
+    for kind in (GRASP, MANIPULATION, CHIP, PLACES):
         every, few = ([c.name for c in kind.list_cases(RunOptions(quick=q))] for q in (False, True))
         assert set(few) < set(every)
 
@@ -324,17 +324,25 @@ def test_what_cannot_be_run_is_one_line(words, expected, tmp_path, capsys):
     assert expected in error and error.count("\n") == 1
 
 
-def test_the_bench_runs_on_the_recording_in_the_package(tmp_path, capsys):
+def test_places_run_on_a_recording_and_only_of_the_papers_cylinder(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("lab.experiments.paper_tables.OTHERS", {})  # what takes long, and is tested elsewhere
     whole = read_recording(DATA / "bench_cyl25_middle")
     begin = int(whole.jaw("left").keypoints.stamps[0])
     (tmp_path / "objects").symlink_to(DATA / "objects")
-    bag = str(write_recording(cut(whole, begin, begin + 11 * 10**9), tmp_path / "bench_cyl25_middle"))
-    command = ["experiment", "bench", "--on", bag, "--calibration", "bench", "--report", str(tmp_path)]
-    assert main(command) == 0
-    figures = json.loads((tmp_path / "bench" / "bench.json").read_text())["bench"]
-    assert figures["figures"]["bench_cyl25_middle"]["contacts"]["estimate"]["rmse_N"] < 0.2
-    assert "(0.28)" in capsys.readouterr().out
-    assert bag not in (tmp_path / "bench" / "README.md").read_text()
+    pressed = cut(whole, begin, begin + 11 * 10**9)
+    bag = str(write_recording(pressed, tmp_path / "bench_cyl25_middle"))
+    command = ["experiment", "places", "--calibration", "bench", "--report", str(tmp_path), "--on"]
+    assert main([*command, bag]) == 2
+    assert "object.diameter 25 and" in capsys.readouterr().err
+    named = replace(pressed, case={**pressed.case, "object": {**pressed.case["object"], "diameter": 15}})
+    bag = str(write_recording(named, tmp_path / "named_15"))
+    assert main([*command, bag]) == 0
+    contacts = json.loads((tmp_path / "places" / "places.json").read_text())["places"]["figures"]["named_15"][
+        "contacts"
+    ]
+    assert contacts["estimate"]["rmse_N"] < 0.2 and contacts["middle"]["rmse_N"] < 0.2
+    assert "(0.24)" in capsys.readouterr().out
+    assert bag not in (tmp_path / "places" / "README.md").read_text()
 
 
 def test_tables_have_a_title_and_a_note():
