@@ -4,7 +4,7 @@ lab/data/pressed_bench.npz is described in test_truth.py.
 """
 
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -96,9 +96,17 @@ def make_estimator(jaw=BENCH, *, calibration=CALIBRATION, **options):
     return ForceEstimator(jaw, settings=EstimatorSettings(**options), calibration=calibration)
 
 
+@lru_cache(maxsize=8)
+def kept_estimator(**options):
+    """An estimator for many tests: building one takes as long as a recording, and `reset` forgets everything."""
+    return make_estimator(**options)
+
+
 def run(recording, estimator=None, contact=None, **options):
     """The solutions of a recording, from an estimator that starts anew."""
-    estimator = estimator or make_estimator(**options)
+    if estimator is None:
+        estimator = kept_estimator(**options)
+        estimator.reset()
     contact = recording.contact if contact is None else contact
     return [estimator.update(observation, contact) for observation in recording.observations]
 

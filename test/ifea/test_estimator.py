@@ -124,7 +124,7 @@ def begun(solver):
 
 @pytest.mark.parametrize("solver", [*MODELS, "paper"])
 def test_two_runs_are_identical_to_the_bit(solver):
-    assert_identical(run(pressed().first(90), solver=solver), begun(solver)[:90])
+    assert_identical(run(pressed().first(90), make_estimator(solver=solver)), begun(solver)[:90])
 
 
 def test_reset_forgets_everything():
