@@ -271,6 +271,9 @@ class NoisyCamera:
 SEED = 1
 FACTORISATIONS = 20
 WARM_UP_FRAMES = 150
+# Every tier that tells what it does not know leaves a few deep presses next to the base unanswered; a tier that leaves
+# more than this share is not compared [%].
+LEAST_ANSWERED = 90.0
 # Quoted: SOFA v25.06 with SoftRobots.Inverse on the same 522 vertices and 45 shapes, and its yardstick.
 SOFA = {"step_ms": 3.9, "yardstick_ms": 3.0, "rmse_N": 20.9, "factor_per_height_N": 0.74}
 
@@ -484,3 +487,29 @@ def quoted_shapes() -> dict[str, float]:
     """Return SOFA's row of the shapes, as quoted."""
     quoted = {"nothing fitted/N": SOFA["rmse_N"], "a factor per height/N": SOFA["factor_per_height_N"]}
     return {"shapes": 45, "solved": 45, **quoted, "rate in SOFA's": 1.0, "by the yardstick": 1.0}
+
+
+def find_front(tiers: pd.DataFrame) -> pd.DataFrame:
+    """Return the tiers that answer and have none both as fast and better beside them; the fastest first."""
+    known = tiers[tiers["answered/%"] >= LEAST_ANSWERED].sort_values(["step p50/ms", "RMSE/N"])
+    return known[known["RMSE/N"] < known["RMSE/N"].cummin().shift(fill_value=np.inf)]
+
+
+def draw_tiers(tiers: pd.DataFrame, path: Path) -> None:
+    """Draw time against error with noise, and the front; hollow tiers leave more than a tenth without an answer."""
+    from matplotlib.ticker import LogFormatter
+
+    from finforce_eval.figures.figures import new_figure, style_axes
+
+    figure, tiers = new_figure(9.5, 5.2), tiers[tiers["key points"] == "noisy"]
+    axes, front = figure.subplots(), find_front(tiers)
+    style_axes(axes)
+    axes.step(front["step p50/ms"], front["RMSE/N"], where="post", color="0.8", linewidth=5, zorder=0)
+    for tier in tiers.to_dict("records"):
+        place, answers = (tier["step p50/ms"], tier["RMSE/N"]), tier["answered/%"] >= LEAST_ANSWERED
+        axes.plot(*place, "o", color="tab:blue", fillstyle="full" if answers else "none")
+        axes.annotate(tier["tier"], place, xytext=(6, 3), textcoords="offset points", fontsize=8)
+    axes.set(xscale="log", yscale="log", xlabel="Time of a step (median) [ms]", ylabel="RMSE of the force [N]")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set(major_formatter="{x:g}", minor_formatter=LogFormatter(minor_thresholds=(2, 0.4)))
+    figure.savefig(path)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import argparse
 from importlib import import_module
+from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 from finforce.errors import FinforceError
-from finforce_eval.cli.parser import CommandResult
+from finforce_eval.cli.parser import CommandResult, picture_file
 from finforce_eval.machine import describe_machine, write_figures
 from lab.harness import PARTS, figures_json, format_figures, select_parts
 
@@ -17,6 +18,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
     text = f"parts to measure: {', '.join(PARTS)} (those of `make bench`)"
     parser.add_argument("--parts", metavar="A,B", help=text)
+    text = "picture of time against error, of the part solvers"
+    parser.add_argument("--figure", type=picture_file, metavar="PNG", help=text)
     parser.add_argument("--quick", action="store_true", help="measure fewer cases")
 
 
@@ -24,15 +27,15 @@ def run(options: argparse.Namespace) -> CommandResult:
     """Measure the parts and print each one's tables."""
     machine, content = describe_machine(), {}
     for part in select_parts(options.parts):
-        content[part] = _run_part(part, options.quick)
+        content[part] = _run_part(part, options.quick, options.figure)
         if options.json:  # what comes next may fail
             write_figures(options.json, content)
     print(f"\n{machine['processor']}, {machine['cores']} cores, Python {machine['python']}, {machine['commit']}")
     return CommandResult(content)
 
 
-def _run_part(part: str, quick: bool) -> dict[str, Any]:
-    """Measure one part, print it, and return it as plain values."""
+def _run_part(part: str, quick: bool, picture: str | None) -> dict[str, Any]:
+    """Measure one part, print it and draw the solvers; return it as plain values."""
     print(f"\n{PARTS[part]}\n")
     begin = perf_counter()
     try:
@@ -41,4 +44,8 @@ def _run_part(part: str, quick: bool) -> dict[str, Any]:
         print(f"not measured: {error}")
         return {"not_measured": str(error)}
     print(format_figures(figures))
+    if picture and part == "solvers":
+        from lab.bench.solvers import draw_tiers
+
+        draw_tiers(figures.tables["tiers"], Path(picture))
     return {**figures_json(figures), "took_s": round(perf_counter() - begin, 1)}

@@ -4,6 +4,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from finforce_ifea.settings import SOLVERS
@@ -104,3 +105,16 @@ def test_tier_that_does_not_exist_is_noted_and_the_others_are_measured(monkeypat
     assert set(figures.tables["tiers"]["tier"]) == {"frame"}
     assert figures.notes[0].startswith("nothing: not measured: solver: got 'nothing'")
     assert figures.tables["tiers"]["RMSE/N"].max() == 0.0
+
+
+def test_the_front_has_what_nothing_is_faster_and_better_than_and_leaves_out_what_hardly_answers(tmp_path):
+    rows = [
+        ("lookup", 0.1, 0.3, 95.0),
+        ("slow", 2.0, 0.2, 95.0),
+        ("worse", 1.0, 0.4, 95.0),
+        ("seldom", 0.01, 0.1, 20.0),
+    ]
+    tiers = pd.DataFrame(rows, columns=["tier", "step p50/ms", "RMSE/N", "answered/%"])
+    assert bench.find_front(tiers)["tier"].tolist() == ["lookup", "slow"]
+    bench.draw_tiers(tiers.assign(**{"key points": "noisy"}), tmp_path / "tiers.png")
+    assert (tmp_path / "tiers.png").stat().st_size
