@@ -533,13 +533,14 @@ def test_a_hole_with_a_wall_as_thin_as_a_band_is_a_cell():
     assert len(recognize(polygon, 0.02, Overrides()).ribs) == RIBS + 1
 
 
-def test_a_slot_in_a_band_is_no_cell():
+@pytest.mark.parametrize("half", [0.8, 0.5])  # mm; the walls of the narrower one are thick for its size
+def test_a_slot_in_a_band_is_no_cell_and_no_bolt(half):
     # along the outer band, 4 mm thick there
     polygon = draw_polygon().union(shapely.LineString([(-8.5, 20.0), (-1.0, 38.0)]).buffer(2.0, cap_style="flat"))
     wall = shapely.LineString([(-7.5, 23.0), (-3.3, 33.0)])
-    drawn = shapely.affinity.scale(polygon.difference(wall.buffer(0.8)), 1e-3, 1e-3, origin=(0, 0))
+    drawn = shapely.affinity.scale(polygon.difference(wall.buffer(half)), 1e-3, 1e-3, origin=(0, 0))
     finger = recognize(drawn, 0.02, Overrides())
-    assert len(finger.ribs) == RIBS
+    assert len(finger.ribs) == RIBS and len(finger.clamped_circles) == 0
     assert any("1 slot in its bands: no cell" in note for note in finger.notes)
 
 

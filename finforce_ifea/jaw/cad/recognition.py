@@ -19,6 +19,8 @@ from finforce_ifea.jaw.section import Section, cut_below, find_reach, order_ring
 # from cells, whose walls are springs, by walls thicker than this share of their size.
 _ROUND, _ROUND_POINTS = 0.955, 8
 _COMPACT, _SYMMETRIC, _ALONE = 0.8, 0.98, 0.35
+# A slot whose roundness is less is over six times as long as wide: nobody moves a bolt so far.
+_LONG_SLOT = 0.4
 # Points closer to the line between their neighbours than this [m] say nothing.
 _CHORD = 4e-6
 # Spacing of the places [m] where walls are measured.
@@ -301,7 +303,8 @@ def _is_round(hole: NDArray, polygon: shapely.Polygon) -> bool:
     turned = affinity.rotate(shape, 180.0, origin=shape.centroid)
     if shape.intersection(turned).area < _SYMMETRIC * shape.area:
         return False
-    return roundness > _COMPACT or shape.buffer(_ALONE * np.sqrt(shape.area)).difference(shape).within(polygon)
+    is_alone = shape.buffer(_ALONE * np.sqrt(shape.area)).difference(shape).within(polygon)
+    return roundness > _COMPACT or (roundness > _LONG_SLOT and is_alone)
 
 
 def _fit_bolts(holes: list[NDArray]) -> NDArray:
