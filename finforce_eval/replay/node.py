@@ -18,6 +18,7 @@ from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.executors import Executor, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.signals import uninstall_signal_handlers
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 
@@ -173,6 +174,7 @@ def open_player(domain: int) -> Iterator[PlayerNode]:
     finally:
         node.destroy_node()
         rclpy.try_shutdown(context=context)
+        uninstall_signal_handlers()  # else SIGTERM would end nothing from here on
 
 
 def find_awaited(types: Iterable[str], parameters: PlayerParameters) -> set[str]:

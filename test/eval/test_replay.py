@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from eval_fakes import cut, with_both_jaws
 from process_fakes import running
+from rclpy.signals import SignalHandlerOptions, get_current_signal_handlers_options
 
 from finforce.ros.transport import free_domain
 from finforce.transforms import pose_from_quaternion, quaternion_from_pose
@@ -87,6 +88,12 @@ def test_a_context_that_a_signal_has_taken_away_is_no_fault(ended, monkeypatch):
         monkeypatch.setattr(player._spinner, "spin_once", fail)
         with pytest.raises(KeyboardInterrupt if ended else RuntimeError):
             player.spin_until(monotonic() + 1.0)
+
+
+def test_a_process_that_has_played_ends_at_a_signal_again():
+    with open_player(free_domain()):
+        assert get_current_signal_handlers_options() == SignalHandlerOptions.ALL
+    assert get_current_signal_handlers_options() == SignalHandlerOptions.NO  # the middleware's would let it go on
 
 
 def test_a_signal_ends_the_replay_and_its_nodes():
