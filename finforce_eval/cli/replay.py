@@ -28,9 +28,8 @@ def format_replay(result: Replay) -> str:
     return "\n".join([*lines, "", *format_summary(result)])
 
 
-_FEW = (
-    0.25  # share of the images with a force: while nothing moves every third is answered, with fewer some came too late
-)
+# Of the images with a force: at rest every third is answered, with fewer some came too late.
+_FEW = 0.25
 
 
 def format_summary(result: Replay) -> list[str]:
@@ -38,8 +37,9 @@ def format_summary(result: Replay) -> list[str]:
     score, sight = result.grasp_score, result.evaluation.total.sight
     error, delay, lines = score.error, score.delay, []
     if error.rmse_N is not None:
-        where = f"of {score.largest:.2f} N at most; {error.n} of {score.frames} images in the record phases answered"
-        lines.append(f"Grasp force: {error.rmse_N:.3f} N RMSE, {error.max_error_N:.3f} N largest error, {where}")
+        errors = f"{error.rmse_N:.3f} N RMSE, {error.max_error_N:.3f} N largest error, of {score.largest:.2f} N at most"
+        answered = f"{error.n} of {score.frames} images in the record phases answered; ten a second are, at rest"
+        lines.append(f"Grasp force: {errors}; {answered}")
     if error.n < _FEW * score.frames:
         lines.append("Few images were answered: where the machine was too busy, --rate 0.5 plays at half the speed")
     if sight["pixel_median_px"] is not None:
