@@ -38,8 +38,8 @@ def format_summary(result: Replay) -> list[str]:
     error, delay, lines = score.error, score.delay, []
     if error.rmse_N is not None:
         errors = f"{error.rmse_N:.3f} N RMSE, {error.max_error_N:.3f} N largest error, of {score.largest:.2f} N at most"
-        answered = f"{error.n} of {score.frames} images in the record phases answered; ten a second are, at rest"
-        lines.append(f"Grasp force: {errors}; {answered}")
+        answered = f"{error.n} of {score.frames} images in the record phases answered"
+        lines.append(f"Grasp force: {errors}; {answered}; at rest, two of three may be skipped")
     if error.n < _FEW * score.frames:
         lines.append("Few images were answered: where the machine was too busy, --rate 0.5 plays at half the speed")
     if sight["pixel_median_px"] is not None:

@@ -122,7 +122,7 @@ def replay_of(recording):
 def test_the_figures_that_matter_are_error_pixels_and_delay(played):
     assert replay.format_summary(replay_of(played)) == [
         "Grasp force: 0.030 N RMSE, 0.030 N largest error, of 2.00 N at most; "
-        "40 of 40 images in the record phases answered; ten a second are, at rest",
+        "40 of 40 images in the record phases answered; at rest, two of three may be skipped",
         "Key points: 1.00 px off in the median, 1.00 px at the 95th percentile",
         "Delay: the grasp force shows 77 ms after its true onset",
     ]
