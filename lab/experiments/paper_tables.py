@@ -22,7 +22,8 @@ from lab.harness import Figures
 
 DIAMETER = 15  # [mm] of the cylinder
 HEIGHTS = {"upper": 58.0, "middle": 40.0, "lower": 24.0}  # of its axis [mm] on the twin's finger, not the paper's
-BENCH_HEIGHTS = {"upper": 60.0, "middle": 40.0, "lower": 20.0}  # of the bench recordings [mm]
+# Of the bench recordings [mm].
+BENCH_DIAMETERS, BENCH_HEIGHTS = (15, 25, 35), {"upper": 60.0, "middle": 40.0, "lower": 20.0}
 SHORT = {"levels": 1, "settle": 0.3, "record": 0.5, "displacement": 0.004}
 # RMSE [N] of the paper by real and assumed place
 TABLE_II = {
@@ -58,16 +59,17 @@ def _list_own(options: RunOptions, places: Sequence[str]) -> list[Case]:
         shape = recording.case.get("object")
         diameter, z = (shape.get(key) if isinstance(shape, Mapping) else None for key in ("diameter", "z"))
         place = next((place for place, height in BENCH_HEIGHTS.items() if height == z), None)
-        if place is None or diameter != DIAMETER:
-            heights = ", ".join(f"{height:g}" for height in BENCH_HEIGHTS.values())
+        if place is None or diameter not in BENCH_DIAMETERS:
+            known = (BENCH_DIAMETERS, BENCH_HEIGHTS.values())
+            sizes, heights = (", ".join(f"{value:g}" for value in values) for values in known)
             raise RecordingError(
                 f"{case.settings['bag']}: object.diameter {diameter!r} and object.z {z!r} in its case.json; expected a "
-                f"cylinder of {DIAMETER} mm at {heights} mm"
+                f"cylinder of {sizes} mm at {heights} mm"
             )
-        if place in places:
+        if diameter == DIAMETER and place in places:
             cases.append(replace(case, settings={**case.settings, "words": {"place": place}}))
     if not cases:
-        raise RecordingError(f"none of {len(options.bags)} recordings is at {', '.join(places)}")
+        raise RecordingError(f"none of {len(options.bags)} recordings is of {DIAMETER} mm at {', '.join(places)}")
     return cases
 
 

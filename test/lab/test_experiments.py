@@ -330,16 +330,21 @@ def test_places_run_on_a_recording_and_only_of_the_papers_cylinder(tmp_path, cap
     begin = int(whole.jaw("left").keypoints.stamps[0])
     (tmp_path / "objects").symlink_to(DATA / "objects")
     pressed = cut(whole, begin, begin + 11 * 10**9)
-    bag = str(write_recording(pressed, tmp_path / "bench_cyl25_middle"))
+
+    def write(name, diameter):
+        case = {**pressed.case, "object": {**pressed.case["object"], "diameter": diameter}}
+        return str(write_recording(replace(pressed, case=case), tmp_path / name))
+
     command = ["experiment", "places", "--calibration", "bench", "--report", str(tmp_path), "--on"]
-    assert main([*command, bag]) == 2
-    assert "object.diameter 25 and" in capsys.readouterr().err
-    named = replace(pressed, case={**pressed.case, "object": {**pressed.case["object"], "diameter": 15}})
-    bag = str(write_recording(named, tmp_path / "named_15"))
-    assert main([*command, bag]) == 0
-    contacts = json.loads((tmp_path / "places" / "places.json").read_text())["places"]["figures"]["named_15"][
-        "contacts"
-    ]
+    assert main([*command, write("named_12", 12)]) == 2
+    assert "object.diameter 12 and" in capsys.readouterr().err
+    other, bag = write("named_25", 25), write("named_15", 15)
+    assert main([*command, other]) == 2
+    assert "none of 1 recordings is of 15 mm" in capsys.readouterr().err
+    assert main([*command, other, bag]) == 0
+    figures = json.loads((tmp_path / "places" / "places.json").read_text())["places"]["figures"]
+    assert list(figures) == ["named_15"]
+    contacts = figures["named_15"]["contacts"]
     assert contacts["estimate"]["rmse_N"] < 0.2 and contacts["middle"]["rmse_N"] < 0.2
     assert "(0.24)" in capsys.readouterr().out
     assert bag not in (tmp_path / "places" / "README.md").read_text()
