@@ -159,7 +159,7 @@ class HeldWeight:
         settles[:2] = _SETTLES**2 * prior + (_SLIDES * self._led) ** 2
         expected = np.diag(1.0 / settles)
         if gravity is not None:
-            expected[_T : _S + 1, _T : _S + 1] = _expect_weight(gravity, risen / _WEIGHT)
+            expected[_T : _S + 1, _T : _S + 1] = _expect_weight(gravity) * (_WEIGHT / risen) ** 2
         spread = np.linalg.inv(self._information / _ALIKE + expected)
         asked = self._vector / _ALIKE
         asked[:2] += self._led / settles[:2]
@@ -203,10 +203,10 @@ def project_response(motions: NDArray, gain: NDArray) -> NDArray:
     return seen
 
 
-def _expect_weight(gravity: NDArray, share: float) -> NDArray:
-    """Return the inverse covariance (2, 2) [1/N^2] of T and S before anything is seen of them, a share of their own."""
+def _expect_weight(gravity: NDArray) -> NDArray:
+    """Return the inverse covariance (2, 2) [1/N^2] of T and S before anything is seen of them."""
     pulls = gravity[[2, 1]]
-    return np.linalg.inv(_WEIGHT**2 * np.outer(pulls, pulls) + _OUTSIDE**2 * np.eye(2)) / share**2
+    return np.linalg.inv(_WEIGHT**2 * np.outer(pulls, pulls) + _OUTSIDE**2 * np.eye(2))
 
 
 @njit(**_OPTIONS)

@@ -310,8 +310,8 @@ def _cut_often(mesh: Surface, axis: NDArray) -> _Cuts:
         raise JawFileError(f"its section has {len(found[_CUTS // 2].geoms)} separate areas, expected one finger")
     typical = float(np.median([cut.area for cut in found]))
     section = min(whole, key=lambda cut: abs(cut.area - typical))
-    difference = [0.0 if cut is section else cut.symmetric_difference(section).area for cut in found]
-    difference = np.array(difference) / section.area
+    differing = [0.0 if cut is section else cut.symmetric_difference(section).area for cut in found]
+    difference = np.array(differing) / section.area
     return _Cuts(
         section=section,
         difference=difference,

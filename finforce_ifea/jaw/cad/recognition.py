@@ -332,9 +332,9 @@ def _drop_windows(polygon: shapely.Polygon, cells: list[NDArray], notes: list[st
     ]
     count = is_window.index(False)
     kept = [not _is_slot(shape, shapes) for shape in shapes[count:]]
-    for number, name in ((count, "window in its base"), (kept.count(False), "slot in its bands")):
+    for number, name, where in ((count, "window", "base"), (kept.count(False), "slot", "bands")):
         if number:
-            notes.append(f"{number} {name.replace(' ', 's ', 1) if number > 1 else name}: no cell")
+            notes.append(f"{number} {name}{'s' * (number > 1)} in its {where}: no cell")
     return [cell for cell, is_kept in zip(cells[count:], kept, strict=True) if is_kept]
 
 
