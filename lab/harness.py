@@ -38,16 +38,15 @@ PARTS = {
     "solvers": "Run time against force error of the solver tiers",
     "chain": "Latency against force error of the whole chain",
 }
-USUAL = ("solvers", "chain")  # measured when none is named
 
 
 def select_parts(names: str | None) -> tuple[str, ...]:
-    """Return the parts of a comma-separated list, the usual ones without a list.
+    """Return the parts of a comma-separated list, all of them without a list.
 
     Raises:
         OptionError: a name is none of a part.
     """
-    wanted = [name.strip() for name in names.split(",") if name.strip()] if names else USUAL
+    wanted = [name.strip() for name in names.split(",") if name.strip()] if names else PARTS
     for name in wanted:
         if name not in PARTS:
             raise OptionError(f"--parts: there is no part {name!r}, expected some of {', '.join(PARTS)}")

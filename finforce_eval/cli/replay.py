@@ -57,9 +57,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("bag", metavar="BAG", help=BAG_HELP)
     add_run_options(parser, settings=False)
     parser.add_argument("--rate", type=float, default=1.0, help="playback speed; other than 1 uses /clock (1)")
-    parser.add_argument("--sim-time", action="store_true", help="keep the stamps and publish /clock")
     parser.add_argument("--domain", type=int, metavar="ID", help="ROS_DOMAIN_ID, for example to watch in RViz (random)")
-    parser.add_argument("--params", default="", metavar="FILE", help="YAML file with ROS parameters of the solvers")
     parser.add_argument("--report", metavar="DIR", help="write a page with figures to this folder")
 
 
@@ -74,9 +72,7 @@ def run(options: argparse.Namespace) -> CommandResult:
     if options.domain is not None and not 0 <= options.domain <= 232:
         raise OptionError(f"--domain {options.domain}: expected 0 to 232")
     setup = make_setup(options)
-    playing = Playing(
-        rate=options.rate, sim_time=options.sim_time, domain=options.domain, parameter_file=options.params
-    )
+    playing = Playing(rate=options.rate, domain=options.domain)
     keypoints, calibration = parse_source(options), options.calibration or ""
     recording = keypoints.read(options.bag)
     result = replay(recording, setup, calibration_file=calibration, playing=playing, keypoints=keypoints)

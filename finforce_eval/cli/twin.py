@@ -79,7 +79,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     record.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help=text)
     text = "write uncompressed images, 46 MB per second, instead of jpeg colour and png depth"
     record.add_argument("--raw", action="store_true", help=text)
-    record.add_argument("--storage", default="mcap", choices=("mcap", "sqlite3"), help="format of the recording")
     record.set_defaults(run=run_record)
 
 
@@ -114,7 +113,7 @@ def run_record(options: argparse.Namespace) -> CommandResult:
     check_new(folder)
     scenario = scenario_from_options(options)
     camera = parse_size(options.size, options.lens)
-    form = RecordingForm(compressed=not options.raw, storage=options.storage, depth_step=1e-3 * options.depth_step)
+    form = RecordingForm(compressed=not options.raw, depth_step=1e-3 * options.depth_step)
     record_scene(scenario, options.seed, folder, camera=camera, form=form, finger=options.finger)
     size = sum(path.stat().st_size for path in folder.iterdir()) / 1e6
     print(f"Recording: {folder} ({size:.1f} MB)")
@@ -164,13 +163,11 @@ class RecordingForm:
     Attributes:
         compressed: jpeg colour and png depth; else plain images.
         farthest: depth beyond it is left out, which makes a recording smaller [m].
-        storage: "mcap" or "sqlite3".
         depth_step: of the depth image [m], that of the footage.
     """
 
     compressed: bool = True
     farthest: float = math.inf
-    storage: str = "mcap"
     depth_step: float = 1e-3
 
 
@@ -202,7 +199,7 @@ def write_footage(
     folder.parent.mkdir(parents=True, exist_ok=True)
     is_new = not folder.exists()
     try:
-        write_entries(footage_entries(footage, form, seen), folder, storage=form.storage)
+        write_entries(footage_entries(footage, form, seen), folder)
     except BaseException:
         if is_new:  # half a recording would look like a whole one
             rmtree(folder, ignore_errors=True)

@@ -37,26 +37,22 @@ class Playing:
     """How a recording is played.
 
     Attributes:
-        rate: speed; other than 1 the recorded stamps stay and the nodes take their time from /clock.
-        sim_time: the same at the recorded speed; else the stamps are shifted to now.
+        rate: speed; at 1 the stamps are shifted to now, else they stay and the nodes take their time from /clock.
         domain: ROS_DOMAIN_ID; None takes one by chance.
-        parameter_file: YAML file with further ROS parameters of the solvers.
         composed: detector, contact estimator and solvers in one process.
         trace: folder in which the nodes note when they were at work; empty for none. Then only the grasp
             force is received: more would add work.
     """
 
     rate: float = 1.0
-    sim_time: bool = False
     domain: int | None = None
-    parameter_file: str = ""
     composed: bool = True
     trace: str = ""
 
     @property
     def has_clock(self) -> bool:
         """Whether the nodes take their time from /clock."""
-        return self.sim_time or self.rate != 1.0
+        return self.rate != 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -225,7 +221,6 @@ def _graph_options(
         calibration_file=calibration_file,
         **_contact_options(recording, setup.contacts),
         solver=setup.settings.solver,
-        parameter_file=playing.parameter_file,
         use_sim_time=playing.has_clock,
     )
 

@@ -26,7 +26,6 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--object-mm", type=float, help="width of the object between the jaws [mm] (no object)")
     parser.add_argument("--stiffness", type=float, help="stiffness of the object [N per mm of opening] (rigid)")
     parser.add_argument("--ack", choices=ACK_MODES, default="none", help="acknowledgements of the adapter (none)")
-    parser.add_argument("--baud", type=int, help="baud rate that the host must set (any)")
     parser.add_argument("--latency-ms", type=float, default=0.0, help="latency from the bus to the host [ms] (0)")
     return parser
 
@@ -52,7 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Serve an emulated gripper until Ctrl-C or a request to end; return the exit status."""
     options = build_parser().parse_args(arguments)
     try:
-        with StopSignals() as stop, PtyPort(build_adapter(options), options.link, options.baud) as port:
+        with StopSignals() as stop, PtyPort(build_adapter(options), options.link) as port:
             print(port.path, flush=True)
             while not stop.wait():  # another handled signal wakes it, too
                 pass

@@ -5,20 +5,18 @@ from __future__ import annotations
 import os
 import pty
 import select
-import termios
 import tty
 from contextlib import suppress
 from pathlib import Path
 from threading import Event, RLock, Thread
 from time import monotonic
 
-from finforce_driver.errors import LinkError, TargetError
+from finforce_driver.errors import LinkError
 from finforce_sim.emulator.adapter import EmulatedAdapter
 
 _IDLE_PERIOD = 0.004  # [s] between two steps of the emulation while nothing comes in
 _BUSY_PERIOD = 0.0005  # [s] the same while an answer waits for its time
 _LARGEST_READ = 4096
-_GARBLED = bytes(0x80 | (byte * 5 & 0x7F) for byte in range(256))  # what a receiver at another speed takes for bytes
 
 
 class PtyPort:
@@ -31,23 +29,16 @@ class PtyPort:
         lock: held by the thread while it steps and answers.
     """
 
-    def __init__(self, adapter: EmulatedAdapter, link: str | Path | None = None, baud_rate: int | None = None) -> None:
+    def __init__(self, adapter: EmulatedAdapter, link: str | Path | None = None) -> None:
         """Prepare a port; `open` makes it.
 
         Args:
             adapter: behind the port.
             link: path of a symbolic link to the port, whose own name changes each time; None: no link.
-            baud_rate: that the other side must set, else both sides get garbage; None: any, as with USB adapters.
-
-        Raises:
-            TargetError: there is no such baud rate.
         """
         self.adapter = adapter
         self.lock = RLock()
         self._link = Path(link) if link is not None else None
-        self._speed = None if baud_rate is None else getattr(termios, f"B{baud_rate}", None)
-        if baud_rate is not None and self._speed is None:
-            raise TargetError(f"baud_rate: got {baud_rate!r}, expected one that termios knows, such as 115200")
         self._master = self._slave = -1
         self._name = ""
         self._stop = Event()
@@ -152,12 +143,10 @@ class PtyPort:
     def _exchange(self) -> None:
         if self._master < 0:
             return
-        garbles = self._speed is not None and termios.tcgetattr(self._slave)[4] != self._speed
         with suppress(BlockingIOError):  # nothing came
-            data = os.read(self._master, _LARGEST_READ)
-            self.adapter.write(data.translate(_GARBLED) if garbles else data)
+            self.adapter.write(os.read(self._master, _LARGEST_READ))
         answer = self.adapter.read()
         if not answer:
             return
         with suppress(BlockingIOError):  # nobody reads, and the buffer is full: an adapter loses it too
-            os.write(self._master, answer.translate(_GARBLED) if garbles else answer)
+            os.write(self._master, answer)

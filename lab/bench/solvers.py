@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator
 
 from finforce.errors import FinforceError
 from finforce_eval.evaluation.scoring import rms
@@ -29,41 +30,18 @@ from finforce_ifea.jaw.jaw_file import Material
 from finforce_ifea.observation import Contact, ObjectOutline, Observation
 from finforce_ifea.settings import SOLVERS, EstimatorSettings
 from lab.harness import Figures, percentiles
+from lab.presses import PressHistory, circle
 
 TRUTH = Path(__file__).parents[1] / "data" / "pressed_bench.npz"
 YOUNG_MODULUS, POISSON_RATIO = 30e6, 0.45
 HEIGHTS = {"lower": 0.020, "middle": 0.040, "upper": 0.060}
+QUICK_RADIUS = 0.0125  # of the three cases that do where time is short [m]
 LEVELS = (0.002, 0.004, 0.006, 0.008, 0.010)
 PERIOD = 1.0 / 30.0
 REST_FRAMES, HOLD_FRAMES, SCORED_FRAMES = 60, 45, 30
 SPEED = 2e-3
-# Corners of the polygon that stands for a cylinder.
-_CORNERS = 96
 # Constant errors of a tracked object's origin [m] and turn [rad], as the contact estimator expects them.
 _POSE_ERROR = np.array([0.5e-3, 0.5e-3, 5e-3])
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class BenchCase:
-    """One cylinder pressed into the finger.
-
-    Attributes:
-        name: for tables.
-        height_name: a key of `HEIGHTS`.
-        height: of the cylinder's axis [m].
-        radius: of the cylinder [m].
-        depth: (n,) [m], rising.
-        moved: displacements of the key points (n, K, 3) [m].
-        force: on the jaw (n, 3) [N].
-    """
-
-    name: str
-    height_name: str
-    height: float
-    radius: float
-    depth: NDArray
-    moved: NDArray
-    force: NDArray
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -76,32 +54,34 @@ class ReplayedPress:
         contacts: image by image, with the "height" of first touch and with the object's "outline".
         force: true forces on the jaw (n, 3) [N].
         held: images in the last second of a level (n,) bool.
-        ends: the last image of each level (levels,).
     """
 
-    case: BenchCase
+    case: PressHistory
     observations: Sequence[Observation]
     contacts: Mapping[str, Sequence[Contact]]
     force: NDArray
     held: NDArray
-    ends: NDArray
+
+    @property
+    def ends(self) -> NDArray:
+        """The last image of each level (levels,)."""
+        return np.flatnonzero(self.held & ~np.append(self.held[1:], False))
 
 
-def load_cases(path: Path | str = TRUTH) -> tuple[BenchCase, ...]:
+def load_cases(path: Path | str = TRUTH) -> tuple[PressHistory, ...]:
     """Return the nine cases."""
-    data = np.load(path)
-    cases = []
+    data, rest, cases = np.load(path), bench_finger().keypoints, []
     for key in sorted(name.removesuffix("_depth") for name in data if name.endswith("_depth")):
         diameter, height = key.split("_")
+        depths = 1e-3 * np.r_[0.0, data[f"{key}_depth"]]
+        moved = 1e-3 * (data[f"{key}_keypoints"].astype(float) - data["keypoints0"])
         cases.append(
-            BenchCase(
-                name=f"Ø{diameter} {height}",
-                height_name=height,
-                height=HEIGHTS[height],
+            PressHistory(
                 radius=5e-4 * float(diameter),
-                depth=1e-3 * data[f"{key}_depth"].astype(float),
-                moved=1e-3 * (data[f"{key}_keypoints"].astype(float) - data["keypoints0"]),
-                force=data[f"{key}_force"].astype(float),
+                height=HEIGHTS[height],
+                depth=float(depths[-1]),
+                keypoints=PchipInterpolator(depths, rest + np.concatenate([np.zeros_like(moved[:1]), moved])),
+                forces=PchipInterpolator(depths, np.concatenate([np.zeros((1, 3)), data[f"{key}_force"]])),
             )
         )
     return tuple(cases)
@@ -113,10 +93,8 @@ def bench_finger() -> Jaw:
     return replace(jaw, material=Material(young_modulus=YOUNG_MODULUS, poisson_ratio=POISSON_RATIO))
 
 
-def record_press(case: BenchCase, jaw: Jaw, camera: NoisyCamera | None = None, seed: int = 0) -> ReplayedPress:
+def record_press(case: PressHistory, jaw: Jaw, camera: NoisyCamera | None = None, seed: int = 0) -> ReplayedPress:
     """Return a press to all levels at 2 mm/s, each held for 1.5 s, after two seconds at rest.
-
-    Between the depths of the truth key points and forces are interpolated without overshoot.
 
     Args:
         case: what is pressed.
@@ -124,14 +102,8 @@ def record_press(case: BenchCase, jaw: Jaw, camera: NoisyCamera | None = None, s
         camera: makes noise and hides points; None sees everything exactly.
         seed: of the noise.
     """
-    from scipy.interpolate import PchipInterpolator  # megabytes that a process measuring its memory need not have
-
-    motion = _build_motion()
-    depth = motion.depth
-    grid = np.r_[0.0, case.depth]
-    shapes = np.concatenate([np.zeros((1, *jaw.keypoints.shape)), case.moved])
-    points = jaw.keypoints + PchipInterpolator(grid, shapes)(depth)
-    force = PchipInterpolator(grid, np.concatenate([np.zeros((1, 3)), case.force]))(depth)
+    depth, held = _build_motion()
+    points, force = case.keypoints(depth), case.forces(depth)
     axes = np.stack([jaw.inner_face_x + case.radius - depth, np.full(len(depth), case.height)], axis=1)
     random = np.random.default_rng([seed, round(1e4 * case.radius), round(1e3 * case.height)])
     likelihood = np.ones(points.shape[:2])
@@ -147,39 +119,23 @@ def record_press(case: BenchCase, jaw: Jaw, camera: NoisyCamera | None = None, s
         ],
         contacts={"height": [contact] * len(depth), "outline": outlines},
         force=force,
-        held=motion.held,
-        ends=motion.ends,
+        held=held,
     )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _PressMotion:
-    """Depths (n,) [m] image by image, which of them are held (n,), and the last image of each level (levels,)."""
-
-    depth: NDArray
-    held: NDArray
-    ends: NDArray
-
-
-def _build_motion() -> _PressMotion:
-    """Return rest, then ramps to the levels, and holds."""
-    parts, ends = [np.zeros(REST_FRAMES)], []
+def _build_motion() -> tuple[NDArray, NDArray]:
+    """Return depths (n,) [m]: rest, then ramps to the levels, and holds; and in which images a level is held (n,)."""
+    parts, held = [np.zeros(REST_FRAMES)], [np.zeros(REST_FRAMES, bool)]
     for level in LEVELS:
         steps = max(round((level - parts[-1][-1]) / SPEED / PERIOD), 1)
         parts += [np.linspace(parts[-1][-1], level, steps + 1)[1:], np.full(HOLD_FRAMES, level)]
-        ends.append(sum(map(len, parts)) - 1)
-    depth = np.concatenate(parts)
-    held = np.zeros(len(depth), bool)
-    for end in ends:
-        held[end - SCORED_FRAMES + 1 : end + 1] = True
-    return _PressMotion(depth=depth, held=held, ends=np.array(ends))
+        held.append(np.arange(-steps, HOLD_FRAMES) >= HOLD_FRAMES - SCORED_FRAMES)
+    return np.concatenate(parts), np.concatenate(held)
 
 
 def _outlines(contact: Contact, axes: NDArray, radius: float, error: NDArray | float) -> list[Contact]:
     """Return the contact with a round outline at axes (n, 2) [m], its pose off by `error` standard deviations (3,)."""
-    angles = 2.0 * np.pi * np.arange(_CORNERS) / _CORNERS
-    polygons = (radius * np.stack([np.cos(angles), np.sin(angles)], axis=1),)
-    wrong = _POSE_ERROR * error
+    polygons, wrong = (circle(radius),), _POSE_ERROR * error
     return [
         replace(
             contact,
@@ -329,7 +285,7 @@ def measure(quick: bool) -> Figures:
         quick: three cases instead of nine, and no slow tier.
     """
     finger, tiers = bench_finger(), list_tiers(slow=not quick)
-    cases = [case for case in load_cases() if case.name.startswith("Ø25") or not quick]
+    cases = [case for case in load_cases() if case.radius == QUICK_RADIUS or not quick]
     presses = {
         "noise-free": [record_press(case, finger) for case in cases],
         "noisy": [record_press(case, finger, NoisyCamera(), SEED) for case in cases],
@@ -449,8 +405,8 @@ def score_shapes(runs: Sequence[Run]) -> dict[str, Any]:
     """
     estimated = np.concatenate([np.linalg.norm(run.force[run.press.ends], axis=1) for run in runs])
     true = np.concatenate([np.linalg.norm(run.press.force[run.press.ends], axis=1) for run in runs])
-    heights = np.concatenate([[run.press.case.height_name] * len(run.press.ends) for run in runs])
-    factors = {name: _best_factor(estimated[heights == name], true[heights == name]) for name in set(heights)}
+    heights = np.concatenate([[run.press.case.height] * len(run.press.ends) for run in runs])
+    factors = {height: _best_factor(estimated[heights == height], true[heights == height]) for height in set(heights)}
     scaled = estimated * np.array([factors[height] for height in heights])
     return {
         "shapes": len(true),

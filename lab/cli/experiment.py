@@ -39,7 +39,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--calibration", metavar="FILE", help=text)
     parser.add_argument("--seed", type=int, default=100, help="seed of the first scene (100)")
     parser.add_argument("--size", metavar="WxH", help="size of the rendered images (640x480; 320x240 with --quick)")
-    parser.add_argument("--keep", action="store_true", help="keep the rendered recordings, about 20 MB per grasp")
     add_engine_options(parser)
 
 
@@ -62,7 +61,6 @@ def read_options(options: argparse.Namespace) -> RunOptions:
         source=options.source,
         seed=options.seed,
         size=options.size or (QUICK_SIZE if options.quick else RunOptions.size),
-        keep=options.keep,
         quick=options.quick,
     )
 

@@ -64,7 +64,6 @@ class RunOptions:
         source: of the key points, see `KeypointSource`; empty for images of the twin, and for what bags have.
         seed: of the first scene.
         size: of the twin's images, WIDTHxHEIGHT.
-        keep: keep the twin's recordings when they have been scored.
         quick: few and small cases.
     """
 
@@ -74,7 +73,6 @@ class RunOptions:
     source: str = ""
     seed: int = 100
     size: str = "640x480"
-    keep: bool = False
     quick: bool = False
 
     @property
@@ -128,7 +126,7 @@ class RunOptions:
         else:
             bag, source = find_scene(build_scene(settings), folder / RECORDINGS), source or "images"
         yield KeypointSource(source=source, jaw_file=settings["jaw"]).apply(read_recording(bag))
-        if not is_own and not self.keep:
+        if not is_own:
             rmtree(bag, ignore_errors=True)
 
 

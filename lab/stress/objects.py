@@ -13,10 +13,9 @@ from finforce_contact.localization.section import cut_outline
 from finforce_contact.loop import ForceLoop
 from finforce_contact.mesh.object_mesh import ObjectMesh
 from finforce_contact.parameters import ContactSettings
-from finforce_ifea.contact_mechanics.indenter import OutlineIndenter, PenaltyContact, flat_profile
 from finforce_ifea.errors import ContactError
 from finforce_ifea.observation import Solution
-from lab.forward_press import PressState, press_jaw
+from lab.presses import PressState, RigidOutline, circle, press_jaw
 from lab.stress.session import LIKELIHOOD, OFFSET, PERIOD, Bench, SessionStep, judge, noise_of
 from lab.stress.stress import Family, Plan, Trial, attempt
 
@@ -24,27 +23,6 @@ APPROACH, RISE, HOLD = 10, 20, 20
 CLEAR = 0.02
 # Noise of the poses [m], white on each axis.
 POSE_NOISE = 1e-4
-
-
-class _PressedOutline:
-    """A rigid outline for the forward problem; depth counts from first touch with the undeformed jaw."""
-
-    def __init__(self, polygons: tuple[NDArray, ...], length: float) -> None:
-        """Build the field of polygons (n, 2) [m] for a jaw of some length [m]; raises ContactError if too small."""
-        self._indenter, self._length = OutlineIndenter(polygons), length
-
-    def find_origin(self, face_x: float, depth: float, height: float) -> float:
-        """Return x [m] of the outline's origin at a depth and height [m]."""
-        return face_x + self._indenter.pressed.front - float(self._place(depth, height)[0])
-
-    def press(self, points: NDArray, stiffness: NDArray, face_x: float, depth: float, height: float) -> PenaltyContact:
-        """See `lab.forward_press.RigidObject`."""
-        return self._indenter.press(points, stiffness, face_x, self._place(depth, height))
-
-    def _place(self, depth: float, height: float) -> NDArray:
-        place = np.array([0.0, 0.0, height])
-        place[0] = depth + self._indenter.find_touch(place, flat_profile(0.0, self._length))
-        return place
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -75,7 +53,7 @@ def press_scene(bench: Bench, scene: HardScene) -> list[PressedImage]:
     height = bench.find_height(scene.height)
     polygons = cut_outline(scene.mesh, R, float(surface.high[0]), scene.across)
     try:
-        rigid = _PressedOutline(polygons, float(surface.high[1]))
+        rigid = RigidOutline(polygons, float(surface.high[1]))
     except ContactError:
         rigid = None
     depths, presses = plan_depths(bench.find_depth(scene.depth)), {}
@@ -175,7 +153,6 @@ FAMILIES = (
 )
 
 
-AROUND = 96
 LENGTH = 0.06
 
 
@@ -215,12 +192,6 @@ def build_prism(section: NDArray, length: float = LENGTH) -> ObjectMesh:
     vertices = np.vstack([ring, ring + [0.0, length, 0.0], ends])
     triangles = np.concatenate([sides, low, high]).astype(np.int32)
     return ObjectMesh(vertices=vertices, triangles=triangles, watertight=True, name="prism")
-
-
-def circle(radius: float) -> NDArray:
-    """Return a round section (n, 2) [m]."""
-    angles = 2.0 * np.pi * np.arange(AROUND) / AROUND
-    return radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
 
 
 def rectangle(size_x: float, size_z: float) -> NDArray:

@@ -16,7 +16,7 @@ from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_ifea.mechanics import build_mechanics
 from finforce_ifea.observation import Contact, Observation, Solution
 from finforce_ifea.settings import EstimatorSettings
-from lab.forward_press import RigidCylinder, follow_points, press_jaw
+from lab.presses import PressHistory, RigidCylinder, press_jaw
 from lab.stress.stress import Plan, Trial, attempt
 
 PERIOD = 1 / 30
@@ -181,27 +181,6 @@ OWN_MECHANICS = ("solid", "frame", "plane")
 _BENCH_REACH = (0.008, 0.073)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class PressHistory:
-    """A jaw pressed ever deeper by a cylinder.
-
-    Attributes:
-        height: of first touch [m].
-        radius: of the cylinder [m].
-        depth: the largest [m].
-        keypoints: by depth, (n,) -> (n, K, 3) [m].
-        forces: by depth, (n,) -> (n, 3) [N].
-        torques: by depth, (n,) -> (n, 3) [N m].
-    """
-
-    height: float
-    radius: float
-    depth: float
-    keypoints: PchipInterpolator
-    forces: PchipInterpolator
-    torques: PchipInterpolator
-
-
 class Bench:
     """One jaw with an estimator, and the same mechanics to press it with."""
 
@@ -250,14 +229,13 @@ class Bench:
         """
         height, depth = self.find_height(height), self.find_depth(depth)
         model, surface = self.mechanics.model, self.mechanics.contact.surface
-        depths = np.linspace(0.0, depth, COURSE_STEPS + 1)[1:]
+        depths, probe = np.linspace(0.0, depth, COURSE_STEPS + 1), model.attach(self.jaw.keypoints, max_distance=1.0)
         presses = press_jaw(model, surface, self.jaw.inner_face_x, RigidCylinder(radius=radius), height, depths)
-        grid, zero = np.r_[0.0, depths], np.zeros((1, 3))
         return PressHistory(
             height=height,
             radius=radius,
             depth=depth,
-            keypoints=PchipInterpolator(grid, follow_points(model, self.jaw.keypoints, presses)),
-            forces=PchipInterpolator(grid, np.concatenate([zero, [press.force for press in presses]])),
-            torques=PchipInterpolator(grid, np.concatenate([zero, [press.torque for press in presses]])),
+            keypoints=PchipInterpolator(depths, [model.positions(probe, press.q) for press in presses]),
+            forces=PchipInterpolator(depths, [press.force for press in presses]),
+            torques=PchipInterpolator(depths, [press.torque for press in presses]),
         )

@@ -8,7 +8,7 @@ from the real one's place: its image is the rectified picture.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -39,7 +39,7 @@ from finforce_sim.render import (
 )
 from finforce_sim.sensor import expose
 from lab.training.commands import one_line_errors, read_share
-from lab.training.fingers import FIRST_VALIDATION, SEED, BentFinger, Finger, draw_finger, outline
+from lab.training.fingers import FIRST_VALIDATION, SEED, BentFinger, draw_finger, outline
 from lab.training.pictures import MARGIN, TRAIN, VALIDATION, FingerPictures, make_all, save_shard
 
 STATES = 8  # pictures of a finger
@@ -141,9 +141,8 @@ class _Solid:
         return np.vstack(sides)
 
 
-def extrude(finger: Finger) -> _Solid:
-    """Return a finger as a surface that can bend."""
-    rings = outline(finger)
+def extrude(rings: Sequence[NDArray], half: Callable[[NDArray], NDArray]) -> _Solid:
+    """Return what is inside some rings (n, 2) [m] as a surface that can bend, so wide as `half` says of heights."""
     points = np.vstack(rings)
     count = len(points)
     cells = shapely.constrained_delaunay_triangles(shapely.Polygon(rings[0], rings[1:])).geoms
@@ -162,7 +161,7 @@ def extrude(finger: Finger) -> _Solid:
         start += len(ring)
     # seen from +y, x to the right and z down: what is counterclockwise in (x, z) is clockwise there
     triangles = np.vstack((caps + count, caps[:, ::-1], *sides))
-    return _Solid(section=points, triangles=triangles, half=finger.half_width(points[:, 1]))
+    return _Solid(section=points, triangles=triangles, half=half(points[:, 1]))
 
 
 def _box(low: ArrayLike, high: ArrayLike, paint: Paint | _PicturePaint, decals: tuple[Decal, ...] = ()) -> Body:
@@ -170,8 +169,8 @@ def _box(low: ArrayLike, high: ArrayLike, paint: Paint | _PicturePaint, decals: 
     return build_box(np.array([low, high], dtype=float), np.eye(4), paint, decals)
 
 
-def _rod(rng: np.random.Generator, radius: NDArray, half: float, *, round_: bool) -> tuple[NDArray, NDArray, NDArray]:
-    """Return the outline (n, 2), the vertices (2 n, 3) and triangles of a cylinder or a turned box along y [m]."""
+def _rod(rng: np.random.Generator, radius: NDArray, half: float, *, round_: bool) -> _Solid:
+    """Return a cylinder or a turned box along y, of some radius and half length [m]."""
     if round_:
         angles = np.linspace(0.0, 2.0 * np.pi, 48, endpoint=False)
         line = np.column_stack((np.cos(angles), np.sin(angles))) * radius
@@ -179,19 +178,7 @@ def _rod(rng: np.random.Generator, radius: NDArray, half: float, *, round_: bool
         turn = rng.uniform(-0.5, 0.5) if rng.random() < 0.5 else 0.0
         c, s = np.cos(turn), np.sin(turn)
         line = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]) * radius @ np.array([[c, s], [-s, c]])
-    count = len(line)
-    index = np.arange(count)
-    following = (index + 1) % count
-    lids = np.column_stack((np.zeros(count - 2, int), index[1:-1], index[2:]))
-    triangles = np.vstack(
-        (
-            np.column_stack((index, index + count, following)),
-            np.column_stack((following, index + count, following + count)),
-            lids[:, ::-1],
-            lids + count,
-        )
-    )
-    return line, np.vstack([np.insert(line, 1, y, axis=1) for y in (-half, half)]), triangles
+    return extrude([line], lambda z: np.full(len(z), half))
 
 
 class FingerScenes:
@@ -207,7 +194,7 @@ class FingerScenes:
         self._held = held
         self._finger = finger = draw_finger(rng)
         self._bent = BentFinger(finger, rng)
-        self._solid = extrude(finger)
+        self._solid = extrude(outline(finger), finger.half_width)
         self._attached = self._bent.attach(self._solid.section)
         self.shape = SideShape(
             rings=outline(finger), clamped_z=finger.clamped_z, reference=finger.reference, bolts=finger.bolts
@@ -372,7 +359,8 @@ class FingerScenes:
             radius = rng.uniform(0.05, 0.35, 2) * length
             round_ = bool(rng.random() < 0.6)
             radius = radius[:1].repeat(2) if round_ else radius
-            line, vertices, triangles = _rod(rng, radius, half, round_=round_)
+            rod = _rod(rng, radius, half, round_=round_)
+            line, triangles, vertices = rod.section, rod.triangles, rod.rest()
             rest = vertices
         # moved towards the finger until it touches
         near = section[(section[:, 1] > height + line[:, 1].min()) & (section[:, 1] < height + line[:, 1].max())]
@@ -405,9 +393,8 @@ def _left_side(line: NDArray) -> tuple[NDArray, NDArray]:
 def _mirror(body: Body, middle: float) -> Body:
     """Return the image of a body in the plane x = middle."""
     turn = np.array([-1.0, 1.0, 1.0])
-    decals = tuple(replace(decal) for decal in body.decals)
     vertices = body.vertices * turn + np.array([2.0 * middle, 0.0, 0.0])
-    return replace(body, vertices=vertices, triangles=body.triangles[:, ::-1], decals=decals)
+    return replace(body, vertices=vertices, triangles=body.triangles[:, ::-1])
 
 
 @lru_cache(maxsize=1)

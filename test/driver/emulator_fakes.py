@@ -253,14 +253,26 @@ def message_of(line: str) -> CanMessage:
 PATIENT = {"gripper.reply_timeout": 0.5, "grasp.stale_after": 1.0, "max_age": 1.0, "grasp.force_timeout": 5.0}
 
 
+class GarbledAdapter(EmulatedAdapter):
+    """An adapter whose serial line runs at another speed than the host's: both sides take bytes for others."""
+
+    GARBLED = bytes(0x80 | (byte * 5 & 0x7F) for byte in range(256))
+
+    def write(self, data):
+        super().write(data.translate(self.GARBLED))
+
+    def read(self):
+        return super().read().translate(self.GARBLED)
+
+
 class Bench:
     """An emulated gripper, its port, the driver node on it, and a probe that listens to both."""
 
-    def __init__(self, probe, variant="new", *, calibrated=True, open_port=True, baud_rate=None, **parameters):
+    def __init__(self, probe, variant="new", *, calibrated=True, open_port=True, garbled=False, **parameters):
         self.probe = probe
         self.gripper = EmulatedGripper(variant)
         self.gripper.calibrated = calibrated
-        self.port = PtyPort(EmulatedAdapter(self.gripper), baud_rate=baud_rate)
+        self.port = PtyPort((GarbledAdapter if garbled else EmulatedAdapter)(self.gripper))
         if open_port:
             self.port.open()
         port = self.port.path or "/dev/no_such_port"

@@ -137,7 +137,7 @@ def test_a_gripper_at_another_node_is_found(bench):
 
 
 def test_a_wrong_adapter_speed_is_silence_with_advice(bench):
-    bench = bench(baud_rate=57600, **HASTY)
+    bench = bench(garbled=True, **HASTY)
     bench.diagnosis(Level.ERROR, "baud_rate")
     assert not bench.joints
 

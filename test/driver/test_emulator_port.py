@@ -13,7 +13,7 @@ import serial
 from emulator_faults import FaultKind, FaultyAdapter
 from process_fakes import running
 
-from finforce_driver.errors import LinkError, TargetError
+from finforce_driver.errors import LinkError
 from finforce_sim.emulator.__main__ import build_adapter, build_parser, main
 from finforce_sim.emulator.adapter import EmulatedAdapter
 from finforce_sim.emulator.firmware import EmulatedGripper
@@ -101,24 +101,6 @@ def test_adapter_that_unplugs_itself_takes_the_port_along(link):
             adapter.inject(FaultKind.UNPLUGGED, duration=0.1)
         assert wait_for(lambda: not os.path.lexists(link))
         assert wait_for(lambda: link.exists())
-
-
-def test_another_baud_rate_is_garbage():
-    with PtyPort(make_adapter(), baud_rate=115200) as port:
-        with open_serial(port, 9600) as device:
-            device.write(b"S8\rO\r")
-            device.timeout = 0.1
-            assert ask(device) == b""
-        with open_serial(port, 115200) as device:
-            device.write(b"\rS8\rO\r")
-            assert ask(device) == REPLY
-            device.baudrate = 9600
-            with port.lock:
-                port.adapter.write(POLL)
-            garbage = device.read(len(REPLY))
-            assert len(garbage) == len(REPLY) and min(garbage) >= 0x80
-    with pytest.raises(TargetError, match="baud_rate"):
-        PtyPort(make_adapter(), baud_rate=12345)
 
 
 def test_a_file_in_place_of_the_link_is_not_overwritten(tmp_path):

@@ -21,11 +21,7 @@ from finforce_eval.recordings.writer import write_entries
 from finforce_eval.replay.playback import Playback
 from finforce_sim.footage import encode_depth
 
-FORMS = {
-    "jpeg": RecordingForm(),
-    "raw": RecordingForm(compressed=False),
-    "sqlite3": RecordingForm(compressed=False, storage="sqlite3"),
-}
+FORMS = {"jpeg": RecordingForm(), "raw": RecordingForm(compressed=False)}
 
 
 class Message:

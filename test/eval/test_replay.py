@@ -120,7 +120,6 @@ def test_a_signal_ends_the_replay_and_its_nodes():
         ([SHIPPED, "--domain", "500"], "--domain 500"),
         ([SHIPPED, "--jaw", "no_such_jaw"], "no_such_jaw"),
         ([SHIPPED, "--jaw", "steel"], "key points"),
-        ([SHIPPED, "--params", "no_such_file"], "no_such_file"),
     ],
 )
 def test_what_cannot_be_played_ends_with_two_and_one_line(words, reason, capsys):

@@ -60,6 +60,6 @@ class RigidBox:
     edge_radius: float
 
     def press(self, points: NDArray, stiffness: NDArray, face_x: float, depth: float, height: float) -> PenaltyContact:
-        """See `lab.forward_press.RigidObject`."""
+        """See `lab.presses.RigidCylinder`."""
         half = (0.5 * self.size_x, 0.5 * self.size_z)
         return press_box(points, stiffness, (face_x + half[0] - depth, height), half, self.edge_radius)

@@ -11,13 +11,12 @@ import numpy as np
 from mechanics_fakes import BENCH, MODULUS, bench_mechanics
 from scipy.interpolate import PchipInterpolator
 
-from finforce_ifea.contact_mechanics.indenter import OutlineIndenter, flat_profile
 from finforce_ifea.estimator import ForceEstimator
 from finforce_ifea.jaw.calibration import Calibration
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE
 from finforce_ifea.observation import Contact, ObjectOutline, Observation, Solution
 from finforce_ifea.settings import EstimatorSettings
-from lab.forward_press import press_jaw
+from lab.presses import RigidOutline, press_jaw
 
 PERIOD = 1 / 30
 TRUTH = np.load(Path(__file__).parents[2] / "lab" / "data" / "pressed_bench.npz")
@@ -181,18 +180,6 @@ def contact_with(polygons, height, tilt=0.0):
     return Contact(points=point, weights=np.ones(1), outline=outline(polygons, height, tilt))
 
 
-class Pressed:
-    """A known outline at one tilt, for the forward problem; depth counts from first touch."""
-
-    def __init__(self, polygons, tilt):
-        self.indenter, self.tilt = OutlineIndenter(polygons), tilt
-
-    def press(self, points, stiffness, face_x, depth, height):
-        place = np.array([0.0, self.tilt, height])
-        place[0] = depth + self.indenter.find_touch(place, flat_profile(0.0, 0.08))
-        return self.indenter.press(points, stiffness, face_x, place)
-
-
 @cache
 def press_shape(name, height, tilt=0.0, depths=(0.002, 0.004, 0.006)):
     """Equilibria of the bench finger's default mesh."""
@@ -201,7 +188,7 @@ def press_shape(name, height, tilt=0.0, depths=(0.002, 0.004, 0.006)):
         mechanics.model,
         mechanics.contact.surface,
         BENCH.inner_face_x,
-        Pressed(SHAPES[name], tilt),
+        RigidOutline(SHAPES[name], 0.08, tilt),
         height,
         depths,
     )

@@ -17,7 +17,7 @@ from finforce_ifea.jaw.jaw_file import Material
 from finforce_ifea.jaw.mesh import build_volume_mesh, to_tet4, to_tet10
 from finforce_ifea.mechanics import build_mechanics
 from finforce_ifea.settings import EstimatorSettings
-from lab.forward_press import RigidCylinder, press_jaw
+from lab.presses import RigidCylinder, press_jaw
 
 SHIPPED_BENCH = load_jaw("bench")
 MODULUS, RATIO = 30e6, 0.45

@@ -28,7 +28,7 @@ from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE, load_jaw
 from finforce_ifea.mechanics import build_mechanics
 from finforce_ifea.observation import Contact, Observation, check_observation
 from finforce_ifea.settings import EstimatorSettings
-from lab.forward_press import RigidCylinder, press_jaw
+from lab.presses import RigidCylinder, press_jaw
 
 # --- contacts
 

@@ -9,7 +9,7 @@ from mechanics_fakes import BENCH, bench_mechanics, bench_press
 
 from finforce_ifea.contact_mechanics.pressed_jaw import build_contact_surface
 from finforce_ifea.errors import ContactError, MeshError
-from lab.forward_press import RigidCylinder, press_jaw
+from lab.presses import RigidCylinder, press_jaw
 
 FACE = BENCH.inner_face_x
 STEPS = tuple(np.arange(1, 41) * 0.2)

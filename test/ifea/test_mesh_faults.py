@@ -16,7 +16,7 @@ from finforce_ifea.fem.solid import SolidModel
 from finforce_ifea.jaw.drawing import PRESETS
 from finforce_ifea.jaw.mesh import VolumeMesh, build_volume_mesh, check_connection, to_tet10
 from finforce_ifea.mechanics import LockingWarning, measure_shape, warn_of_locking
-from lab.forward_press import RigidCylinder, press_jaw
+from lab.presses import RigidCylinder, press_jaw
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -9,7 +9,6 @@ from estimator_fakes import (
     SHAPES,
     STDDEV,
     WEDGE,
-    Pressed,
     box,
     circle,
     contact_with,
@@ -33,7 +32,7 @@ from finforce_ifea.contact_mechanics.indenter import (
 )
 from finforce_ifea.errors import ContactError
 from finforce_ifea.observation import ObjectOutline
-from lab.forward_press import RigidCylinder, press_jaw
+from lab.presses import RigidCylinder, RigidOutline, press_jaw
 
 FACE = BENCH.inner_face_x
 
@@ -115,7 +114,7 @@ def test_springs_and_tilt_derivatives_are_those_of_the_forces(name, tilt):
 def test_circle_presses_like_the_cylinder_that_it_is():
     mechanics = bench_mechanics("coarse", "solid")
     args = mechanics.model, mechanics.contact.surface, FACE
-    by_outline = press_jaw(*args, Pressed(circle(0.0125, 720), 0.0), 0.030, [0.005])[-1]
+    by_outline = press_jaw(*args, RigidOutline(circle(0.0125, 720), 0.08), 0.030, [0.005])[-1]
     by_radius = press_jaw(*args, RigidCylinder(radius=0.0125), 0.030, [0.005])[-1]
     np.testing.assert_allclose(by_outline.force, by_radius.force, atol=0.003 * np.linalg.norm(by_radius.force))
     assert by_outline.pressure_location[2] == pytest.approx(by_radius.pressure_location[2], abs=0.1e-3)
@@ -124,7 +123,7 @@ def test_circle_presses_like_the_cylinder_that_it_is():
 def test_box_presses_like_a_box_with_slightly_rounded_edges():
     mechanics = bench_mechanics("coarse", "solid")
     args = mechanics.model, mechanics.contact.surface, FACE
-    by_outline = press_jaw(*args, Pressed(box(0.010, 0.0125), 0.0), 0.040, [0.004])[-1]
+    by_outline = press_jaw(*args, RigidOutline(box(0.010, 0.0125), 0.08), 0.040, [0.004])[-1]
     rounded = press_jaw(*args, RigidBox(size_x=0.020, size_z=0.025, edge_radius=0.001), 0.040, [0.004])[-1]
     np.testing.assert_allclose(by_outline.force, rounded.force, atol=0.03 * np.linalg.norm(rounded.force))
     assert by_outline.pressure_location[2] == pytest.approx(rounded.pressure_location[2], abs=0.5e-3)

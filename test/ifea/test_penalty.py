@@ -5,7 +5,7 @@ import pytest
 from box_fakes import RigidBox, press_box
 
 from finforce_ifea.contact_mechanics.indenter import RoundIndenter
-from lab.forward_press import RigidCylinder
+from lab.presses import RigidCylinder
 
 STIFFNESS = 1e4
 CENTRE, RADIUS = (0.020, 0.040), 0.010

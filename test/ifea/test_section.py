@@ -23,7 +23,7 @@ from finforce_ifea.observation import Contact, Observation
 from finforce_ifea.reduced.build import Face, has_own_rows
 from finforce_ifea.reduced.cache import name_manifold
 from finforce_ifea.settings import EstimatorSettings
-from lab.forward_press import RigidCylinder, press_jaw
+from lab.presses import RigidCylinder, press_jaw
 
 DATA = Path(__file__).parents[1] / "data"
 

@@ -27,7 +27,7 @@ from finforce_ifea.jaw.drawing import MeshDensity
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.mechanics import build_mechanics
 from finforce_ifea.settings import EstimatorSettings
-from lab.forward_press import RigidCylinder, press_jaw
+from lab.presses import RigidCylinder, press_jaw
 
 
 def on_edge(nodes):

@@ -10,7 +10,7 @@ from mechanics_fakes import BENCH, bench_mechanics, bench_press
 from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, SHAPE
 from finforce_ifea.contact_mechanics.pressed_jaw import limit_step
 from finforce_ifea.observation import Contact
-from lab.forward_press import RigidCylinder, press_jaw
+from lab.presses import RigidCylinder, press_jaw
 
 MODELS = [("coarse", "solid"), ("default", "frame")]
 PLACE = np.array([0.004, np.log(0.0125), 0.030])

@@ -51,8 +51,7 @@ def two_parts(monkeypatch):
         monkeypatch.setitem(sys.modules, f"lab.bench.{name}", SimpleNamespace(measure=measure))
         return f"Title of {name}"
 
-    parts = {name: make(name) for name in ("first", "second", "third")}
-    monkeypatch.setattr(harness, "USUAL", ("first", "second"))
+    parts = {name: make(name) for name in ("first", "second")}
     monkeypatch.setattr(harness, "PARTS", parts)
     monkeypatch.setattr(bench, "PARTS", parts)
     return asked
@@ -92,11 +91,12 @@ def test_a_process_takes_memory_until_it_has_gone():
     assert resident_bytes(child.pid) == 0
 
 
-def test_usual_parts_are_measured_unless_others_are_named(two_parts):
+def test_all_parts_are_measured_unless_some_are_named(two_parts):
     assert select_parts(None) == ("first", "second")
-    assert select_parts("third, first,third") == ("third", "first")
-    with pytest.raises(OptionError, match="no part 'fourth', expected some of first, second, third"):
-        select_parts("fourth")
+    assert select_parts("second, first,second") == ("second", "first")
+    assert select_parts("second") == ("second",)
+    with pytest.raises(OptionError, match="no part 'third', expected some of first, second"):
+        select_parts("third")
 
 
 def test_every_listed_part_can_be_measured():

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from lab.bench.solvers import HEIGHTS, LEVELS, NoisyCamera, bench_finger, load_cases, record_press
+from lab.bench.solvers import HEIGHTS, LEVELS, TRUTH, NoisyCamera, bench_finger, load_cases, record_press
 
 JAW = bench_finger()
-CASES = {case.name: case for case in load_cases()}
-WIDE = CASES["Ø35 middle"]
+CASES = {(round(2e3 * case.radius), case.height): case for case in load_cases()}
+WIDE = CASES[35, HEIGHTS["middle"]]
 
 
 @pytest.fixture(scope="module")
@@ -25,8 +25,7 @@ def stack(press):
 
 
 def test_nine_cases_are_three_objects_at_three_heights():
-    assert len(CASES) == len({(case.radius, case.height) for case in CASES.values()}) == 9
-    assert {case.height_name for case in CASES.values()} == set(HEIGHTS)
+    assert set(CASES) == {(diameter, height) for diameter in (15, 25, 35) for height in HEIGHTS.values()}
 
 
 def test_press_rests_then_holds_every_level_with_the_true_shape_and_force(exact):
@@ -34,9 +33,11 @@ def test_press_rests_then_holds_every_level_with_the_true_shape_and_force(exact)
     np.testing.assert_allclose(points[:60], np.broadcast_to(JAW.keypoints, (60, 15, 3)), atol=1e-15)
     assert (exact.force[:60] == 0).all()
     assert exact.held.sum() == 30 * len(LEVELS)
-    levels = [int(np.argmin(np.abs(WIDE.depth - level))) for level in LEVELS]
-    np.testing.assert_allclose(exact.force[exact.ends], WIDE.force[levels], atol=1e-9)
-    np.testing.assert_allclose(points[exact.ends] - JAW.keypoints, WIDE.moved[levels], atol=1e-12)
+    told = np.load(TRUTH)  # [mm], [N]
+    levels = [int(np.argmin(np.abs(1e-3 * told["35_middle_depth"] - level))) for level in LEVELS]
+    np.testing.assert_allclose(exact.force[exact.ends], told["35_middle_force"][levels], atol=1e-9)
+    moved = 1e-3 * (told["35_middle_keypoints"][levels].astype(float) - told["keypoints0"])
+    np.testing.assert_allclose(points[exact.ends] - JAW.keypoints, moved, atol=1e-12)
     assert (np.diff([observation.stamp for observation in exact.observations]) > 0).all()
 
 
@@ -56,7 +57,7 @@ def test_outline_is_the_cylinder_that_comes_into_the_face(exact, noisy):
 
 
 def test_noise_has_the_size_of_the_bench_across_and_along_the_sight():
-    press = record_press(CASES["Ø25 upper"], JAW, NoisyCamera(gross=0.0, holes=0.0), seed=5)
+    press = record_press(CASES[25, HEIGHTS["upper"]], JAW, NoisyCamera(gross=0.0, holes=0.0), seed=5)
     seen = [0, 1, 2, 3, 7, 8, 9]  # below the object, which hides none of them
     rest = stack(press)[:60, seen]
     scatter = (rest - rest.mean(axis=0)).reshape(-1, 3)

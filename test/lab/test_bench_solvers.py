@@ -10,6 +10,7 @@ import pytest
 from finforce_ifea.settings import SOLVERS
 from lab.bench import solvers as bench
 from lab.bench.solvers import (
+    QUICK_RADIUS,
     Run,
     Tier,
     bench_finger,
@@ -22,8 +23,7 @@ from lab.bench.solvers import (
 )
 
 JAW = bench_finger()
-CASES = {case.name: case for case in load_cases()}
-PRESSES = [record_press(CASES[f"Ø25 {height}"], JAW) for height in ("lower", "middle", "upper")]
+PRESSES = [record_press(case, JAW) for case in load_cases() if case.radius == QUICK_RADIUS]
 
 
 def perfect(press, factor=1.0):
@@ -93,7 +93,7 @@ def test_peer_is_compared_on_this_machine_and_on_its_own():
 def test_tier_that_does_not_exist_is_noted_and_the_others_are_measured(monkeypatch):
     tiers = (Tier(name="nothing", solver="nothing"), Tier(name="frame", solver="frame", contact="outline"))
     monkeypatch.setattr(bench, "list_tiers", lambda slow: tiers)
-    monkeypatch.setattr(bench, "load_cases", lambda: (CASES["Ø25 middle"],))
+    monkeypatch.setattr(bench, "load_cases", lambda: (PRESSES[1].case,))
     monkeypatch.setattr(bench, "time_factorisation", lambda: [3e-3])
 
     def run(tier, jaw, presses, progress):

@@ -12,7 +12,7 @@ from finforce_ifea.fem.model import SparseFactor, factorise_banded
 from finforce_ifea.jaw.mesh import build_volume_mesh, check_connection, to_tet4, to_tet10
 from finforce_ifea.mechanics import LockingWarning, build_mechanics, measure_locking, warn_of_locking
 from finforce_ifea.settings import EstimatorSettings
-from lab.forward_press import RigidCylinder, press_jaw
+from lab.presses import RigidCylinder, press_jaw
 from lab.stress.session import Bench, open_session, update
 from lab.stress.stress import Plan
 
