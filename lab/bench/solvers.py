@@ -73,7 +73,7 @@ def load_cases(path: Path | str = TRUTH) -> tuple[PressHistory, ...]:
     data, rest, cases = np.load(path), bench_finger().keypoints, []
     for key in sorted(name.removesuffix("_depth") for name in data if name.endswith("_depth")):
         diameter, height = key.split("_")
-        depths = 1e-3 * np.r_[0.0, data[f"{key}_depth"]]
+        depths = 1e-3 * np.r_[0.0, data[f"{key}_depth"].astype(float)]
         moved = 1e-3 * (data[f"{key}_keypoints"].astype(float) - data["keypoints0"])
         cases.append(
             PressHistory(
