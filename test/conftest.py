@@ -17,12 +17,18 @@ if worker := os.environ.get("PYTEST_XDIST_WORKER"):
 
 
 @pytest.fixture(autouse=True)
-def nothing_kept_warm():
-    """Estimators that the tasks of a process share are a test's own."""
+def nothing_kept_warm(request):
+    """Estimators that the tasks of a process share are its own of a test that patches something."""
+
+    def forget():
+        setup = sys.modules.get("finforce_eval.evaluation.setup")
+        if patches and setup is not None:
+            setup.forget_setup()
+
+    patches = "monkeypatch" in request.fixturenames
+    forget()
     yield
-    setup = sys.modules.get("finforce_eval.evaluation.setup")
-    if setup is not None:
-        setup.forget_setup()
+    forget()
 
 
 @pytest.fixture

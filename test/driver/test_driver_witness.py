@@ -65,8 +65,7 @@ def test_the_motor_is_compared_by_what_the_first_grasps_taught(ratios, noticed):
             grasp._compare_motor(state)
 
 
-@pytest.mark.parametrize("stiffness", [400.0, 1300.0])
-@pytest.mark.parametrize("force", [1.0, 3.0])
+@pytest.mark.parametrize(("stiffness", "force"), [(400.0, 3.0), (1300.0, 1.0), (1300.0, 3.0)])
 def test_a_blind_camera_crushes_nothing(variant, stiffness, force):
     world, course = grasp(FrozenSensor(0.0), stiffness=stiffness, force=force, variant=variant)
     assert max(course.forces) < 5.5  # the limit of a grasp is 8 N; the motor could give 60
@@ -87,8 +86,10 @@ def test_a_camera_that_freezes_on_the_way_crushes_nothing(variant):
     assert course.error and world.force < 2.5
 
 
-@pytest.mark.parametrize(("stiffness", "force"), [(300.0, 1.0), (1300.0, 1.0), (1300.0, 3.0), (1300.0, 5.0)])
-@pytest.mark.parametrize("speed", [0.004, 0.008])
+@pytest.mark.parametrize(
+    ("stiffness", "force", "speed"),
+    [(300.0, 1.0, 0.008), (1300.0, 1.0, 0.004), (1300.0, 3.0, 0.008), (1300.0, 5.0, 0.004), (1300.0, 5.0, 0.008)],
+)
 def test_a_grasp_that_is_seen_is_held(variant, stiffness, force, speed):
     sensor = NoisySensor(0.05, 3)
     plant = Plant(name="spring", force_at=build_spring(stiffness))

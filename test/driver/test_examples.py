@@ -59,7 +59,7 @@ def simulation(tmp_path):
     """The domain of a robot with `sim:=true`, once its jaws are watched."""
     domain = free_domain()
     environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-    options = RobotOptions(composed=False, sim=True, camera_name="", gripper_port=str(tmp_path / "gripper"))
+    options = RobotOptions(sim=True, camera_name="", gripper_port=str(tmp_path / "gripper"))
     parts = [eased(part) for part in robot_processes(options, ROOT) if part.package == "finforce"]
     with (tmp_path / "log").open("w+") as log, ExitStack() as stack:
         started = [running(part.command(), env=environment, stdout=log, stderr=log) for part in parts]
