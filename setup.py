@@ -59,8 +59,6 @@ setup(
         "mcap",  # recordings that were cut off, record by record
         "manifold3d",  # Boolean intersections and outlines of object meshes
         "trimesh",  # object mesh files, surfaces of fingers
-        "networkx",  # 3MF files, of which trimesh builds a graph
-        "lxml",  # the same, which are XML
         "shapely",  # polygons: sections of fingers, what lies in them, whether they are sound
         # ray casting, registration with scale, Poisson surfaces; the build without CUDA is a quarter of the size
         "open3d-cpu; platform_machine == 'x86_64' and sys_platform == 'linux'",

@@ -6,9 +6,15 @@ Formats that can announce more than they hold are read in a sandbox.
 from __future__ import annotations
 
 import io
+import sys
+import zipfile
+from collections.abc import Iterator
 from contextlib import redirect_stderr, redirect_stdout
 from functools import lru_cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +23,12 @@ from finforce.errors import FinforceError, one_line
 from finforce.files import FileError, read_bytes
 from finforce.optional import import_library, import_trimesh
 from finforce.sandbox import SandboxError, run_limited
+from finforce.triangle_surface import Surface, join_surfaces
 
 LARGEST = 1 << 30  # bytes, more than any format needs for millions of triangles
 # What these formats take goes with the size of the file.
 _PLAIN = (".stl", ".obj", ".ply", ".off")
 _STL = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])  # after 80 bytes and a number
-_LIBRARIES = {".step": ("cascadio",), ".stp": ("cascadio",), ".3mf": ("networkx", "lxml")}
 _MEMORY, _SECONDS = 2 << 30, 60
 
 
@@ -34,8 +40,6 @@ def read_surface(path: Path) -> tuple[NDArray, NDArray]:
         MissingDependencyError: The library that reads it is not installed.
     """
     suffix = path.suffix.lower()
-    for library in _LIBRARIES.get(suffix, ()):
-        import_library(library, f"reading {path.name}, which may be exported as STL instead,")
     try:
         if suffix in _PLAIN:
             return _load_triangles(path)
@@ -112,6 +116,10 @@ def _load_triangles(path: Path) -> tuple[NDArray, NDArray]:
     if kind == "stl" and count and len(content) == 84 + count * _STL.itemsize:  # trimesh takes a second to load
         vertices = np.frombuffer(content, _STL, offset=84)["corners"].reshape(-1, 3).astype(float)
         triangles = np.arange(len(vertices)).reshape(-1, 3)
+    elif kind == "3mf":
+        vertices, triangles = _read_3mf(content)
+    elif kind in ("step", "stp"):
+        vertices, triangles = _read_step(content)
     else:
         scene = import_trimesh().load_scene(io.BytesIO(content), file_type=kind, process=False, skip_materials=True)
         mesh = scene.to_mesh()
@@ -119,3 +127,57 @@ def _load_triangles(path: Path) -> tuple[NDArray, NDArray]:
     if len(triangles) and not np.ptp(vertices, axis=0).any():
         raise FileError("has all its points in one place, as where they are compressed in a way that is not read")
     return vertices.reshape(-1, 3), triangles.reshape(-1, 3)
+
+
+def _read_step(content: bytes) -> tuple[NDArray, NDArray]:
+    """Return the vertices [m] and triangles of a STEP file, which come by way of an OBJ file in millimetres."""
+    sys.modules.setdefault("trimesh", None)  # which cascadio would load for a second; this process ends with its file
+    cascadio = import_library("cascadio", "reading STEP files, which may be exported as STL instead,")
+    with TemporaryDirectory() as folder:
+        step, obj = Path(folder) / "whole.step", Path(folder) / "whole.obj"
+        step.write_bytes(content)
+        cascadio.step_to_obj(str(step), str(obj), use_colors=False)
+        rows = [line.split() for line in obj.read_text().splitlines()]
+    vertices = [row[1:4] for row in rows if row[:1] == ["v"]]
+    triangles = [[corner.partition("/")[0] for corner in row[1:4]] for row in rows if row[:1] == ["f"]]
+    return 1e-3 * np.array(vertices, float), np.array(triangles, int) - 1
+
+
+def _read_3mf(content: bytes) -> tuple[NDArray, NDArray]:
+    """Return vertices and triangles of what a 3MF file, zipped XML, builds."""
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        files = [info for info in archive.infolist() if info.filename.lower().endswith(".model")]
+        if (size := sum(info.file_size for info in files)) > LARGEST:
+            raise FileError(f"unzips to {size >> 20} MB, expected at most {LARGEST >> 20}")
+        texts = {f"/{info.filename}": archive.read(info) for info in files}
+    if any(b"<!ENTITY" in text.replace(b"\0", b"") for text in texts.values()):  # in UTF-16, too
+        raise FileError("declares entities, expected none in a 3MF file")
+    models = {name: ElementTree.fromstring(text) for name, text in texts.items()}
+    items = [(item, name) for name, model in models.items() for item in model.iterfind("{*}build/{*}item")]
+    placed = [part for item, name in items for part in _place_part(item, name, np.eye(4, 3), models)]
+    if not placed:
+        raise FileError("builds no object, expected one of triangles")
+    whole = join_surfaces(placed)
+    return whole.vertices, whole.triangles
+
+
+def _place_part(reference: Element, name: str, T: NDArray, models: dict[str, Element]) -> Iterator[Surface]:
+    """Yield the surfaces of the object that an item or a component refers to, and of what that consists of.
+
+    Args:
+        reference: in the model of a name, unless it states another one.
+        name: of that model.
+        T: (4, 3), where the whole is placed: rows (x, y, z, 1) times T.
+        models: by their names.
+    """
+    name = next((value for key, value in reference.items() if key.endswith("}path")), name)
+    within = np.array(reference.get("transform", "1 0 0 0 1 0 0 0 1 0 0 0").split(), float).reshape(4, 3)
+    T = within @ T[:3] + np.outer([0.0, 0.0, 0.0, 1.0], T[3])
+    part = models[name].find(f"{{*}}resources/{{*}}object[@id='{reference.get('objectid')}']")
+    for mesh in part.iterfind("{*}mesh"):
+        corners = [[one.get(axis) for axis in "xyz"] for one in mesh.iterfind("{*}vertices/{*}vertex")]
+        triangles = [[one.get(f"v{k}") for k in (1, 2, 3)] for one in mesh.iterfind("{*}triangles/{*}triangle")]
+        vertices = np.array(corners, float).reshape(-1, 3) @ T[:3] + T[3]
+        yield Surface(vertices=vertices, triangles=np.array(triangles, int).reshape(-1, 3))
+    for component in part.iterfind("{*}components/{*}component"):
+        yield from _place_part(component, name, T, models)

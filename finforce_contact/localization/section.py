@@ -10,7 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from finforce.errors import PoseError
 from finforce.optional import import_manifold3d
-from finforce_contact.mesh.object_mesh import ObjectMesh, chain_loops
+from finforce.triangle_surface import chain_loops
+from finforce_contact.mesh.object_mesh import ObjectMesh
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
 # A wall whose far side lies no deeper than this in the jaw is still taken for what the jaw touches [m].

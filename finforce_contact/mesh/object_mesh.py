@@ -1,11 +1,10 @@
-"""Object meshes: a record of triangles and their edges, read from a file or arrays, checked, repaired and decimated."""
+"""Object meshes: surfaces read from a file or arrays, checked, repaired and decimated."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from finforce.files import FileError
 from finforce.optional import import_manifold3d, import_open3d
 from finforce.surfaces import read_surface
+from finforce.triangle_surface import Surface
 from finforce_contact.errors import ObjectMeshError
 
 if TYPE_CHECKING:
@@ -28,7 +28,6 @@ _COMMON = 0.1  # [m], the size that tells which unit is the likely one
 CRACK = 1e-5  # [m], vertices of an open mesh this close are one; below what contact can tell
 HOLE_SHARE = 0.1  # [-], radius of the holes that are filled, of the largest extent; an opening to grasp into is larger
 MOST_OPEN = 0.75  # [-], share of edges with one triangle only; a closed surface has none
-_GRID_BITS = 21  # three coordinates in one integer of 64 bits
 _MOST_BODIES = 1000  # beyond, the mesh is fragments and its bodies mean nothing
 DEVIATION_LIMIT = 1e-4  # [m], a fifth of the error of a good pose; more is said in the note
 RUIN = 0.1  # [-], deviation of the largest extent; what deviates by more is another object
@@ -38,119 +37,16 @@ _INSIDE = 0.5  # turns of a surface around a point, above which that is inside
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class EdgeTable:
-    """The edges of a triangle mesh and the triangles along each.
-
-    Attributes:
-        ends: (e, 2) vertex indices, the smaller first.
-        of_triangles: (m, 3) edge index; edge k of a triangle runs from its corner k to the next.
-        directions: (m, 3) int8, +1 where a triangle runs along an edge from its smaller to its larger end, else -1.
-    """
-
-    ends: NDArray
-    of_triangles: NDArray
-    directions: NDArray
-
-    @cached_property
-    def is_balanced(self) -> bool:
-        """Each edge is run along as often one way as the other, so that the triangles bound solids."""
-        return not self.surplus.any()
-
-    @cached_property
-    def is_branching(self) -> bool:
-        """More than two triangles meet at some edge."""
-        return bool(np.bincount(self.of_triangles.ravel()).max(initial=0) > 2)
-
-    @cached_property
-    def open_share(self) -> float:
-        """Share [-] of the edges that belong to one triangle only, 1 where no two triangles are neighbours."""
-        uses = np.bincount(self.of_triangles.ravel(), minlength=len(self.ends))
-        return float((uses == 1).mean()) if len(uses) else 0.0
-
-    @cached_property
-    def is_consistent(self) -> bool:
-        """Neighbours run along their common edge in opposite ways; holes do not matter."""
-        return bool(np.abs(self.surplus).max(initial=0.0) <= 1.0)
-
-    @cached_property
-    def surplus(self) -> NDArray:
-        """How often (e,) triangles run along each edge, less how often against it."""
-        return self.sum_along(np.ones(len(self.of_triangles)))
-
-    def sum_along(self, weights: NDArray) -> NDArray:
-        """Return the same with each triangle counted by a weight (m,)."""
-        signed = self.directions * weights[:, None]
-        return np.bincount(self.of_triangles.ravel(), weights=signed.ravel(), minlength=len(self.ends))
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ObjectMesh:
+class ObjectMesh(Surface):
     """The surface of an object in its own frame.
 
     Attributes:
-        vertices: (n, 3) [m], object frame.
-        triangles: (m, 3) int32, counterclockwise seen from outside.
         watertight: the triangles bound solids without a gap.
         name: what messages call the object.
-        notes: what was repaired or decimated, a sentence each.
     """
 
-    vertices: NDArray
-    triangles: NDArray
     watertight: bool
     name: str
-    notes: tuple[str, ...] = ()
-
-    @cached_property
-    def edges(self) -> EdgeTable:
-        """The edges of the triangles, found once."""
-        return build_edge_table(self.triangles)
-
-    @cached_property
-    def bounds(self) -> NDArray:
-        """Least and greatest coordinates (2, 3) [m]."""
-        return np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)])
-
-    @property
-    def middle(self) -> NDArray:
-        """The middle of the bounding box (3,) [m]."""
-        return 0.5 * (self.bounds[0] + self.bounds[1])
-
-    def with_triangles(self, vertices: NDArray, triangles: NDArray, note: str = "") -> ObjectMesh:
-        """Return the object with other triangles (m, 3), on those of the vertices (n, 3) that they use, and a note."""
-        used, compact = np.unique(triangles, return_inverse=True)
-        return replace(
-            self,
-            vertices=np.ascontiguousarray(vertices[used]),
-            triangles=compact.reshape(-1, 3).astype(np.int32),
-            notes=(*self.notes, note) if note else self.notes,
-        )
-
-
-def build_edge_table(triangles: NDArray) -> EdgeTable:
-    """Return the edges of triangles (m, 3), each edge once."""
-    starts = triangles.astype(np.int64)
-    stops = np.roll(starts, -1, axis=1)
-    low, high = np.minimum(starts, stops), np.maximum(starts, stops)
-    base = int(high.max(initial=0)) + 1
-    keys, of_triangles = np.unique(low * base + high, return_inverse=True)
-    return EdgeTable(
-        ends=np.stack([keys // base, keys % base], axis=1),
-        of_triangles=of_triangles.reshape(-1, 3),
-        directions=np.where(starts < stops, 1, -1).astype(np.int8),
-    )
-
-
-def compute_areas(vertices: NDArray, triangles: NDArray) -> NDArray:
-    """Return the areas (m,) [m^2] of triangles (m, 3) on vertices (n, 3) [m]."""
-    first, second, third = vertices[triangles].transpose(1, 0, 2)
-    return 0.5 * np.linalg.norm(np.cross(second - first, third - first), axis=1)
-
-
-def compute_volumes(vertices: NDArray, triangles: NDArray) -> NDArray:
-    """Return the volumes (m,) [m^3] from the mean vertex to the triangles, det(a, b, c) / 6; inward ones negative."""
-    first, second, third = (vertices - vertices.mean(axis=0))[triangles].transpose(1, 0, 2)
-    return np.einsum("ij,ij->i", first, np.cross(second, third)) / 6.0
 
 
 def to_manifold(mesh: ObjectMesh) -> Manifold | None:
@@ -278,8 +174,7 @@ def prepare_object_mesh(
     _check_origin(vertices, triangles, name)
     if not triangle_limit >= 100:
         raise ObjectMeshError(f"{name}: got triangle_limit {triangle_limit}, expected 100 at least; 20000 is usual")
-    raw = ObjectMesh(vertices=vertices, triangles=triangles, watertight=False, name=name)
-    mesh = repair(raw.with_triangles(vertices, triangles))
+    mesh = repair(ObjectMesh(vertices=vertices, triangles=triangles, watertight=False, name=name))
     _check_body(mesh)
     return decimate(mesh, triangle_limit) if len(mesh.triangles) > triangle_limit else mesh
 
@@ -337,7 +232,7 @@ def _check_origin(vertices: NDArray, triangles: NDArray, name: str) -> None:
 
 def _check_body(mesh: ObjectMesh) -> None:
     """Refuse a mesh without area, or thin as a sheet in some direction."""
-    area = float(compute_areas(mesh.vertices, mesh.triangles).sum())
+    area = float(mesh.areas.sum())
     if area < THINNEST**2:
         problem = f"got {len(mesh.triangles)} triangles of {area * 1e6:.2g} mm^2 in all, expected a surface"
     else:
@@ -347,13 +242,6 @@ def _check_body(mesh: ObjectMesh) -> None:
             return
         problem = f"got a sheet {thickness * 1e3:.2g} mm thick, expected a body"
     raise ObjectMeshError(f"{mesh.name}: {problem}; export the whole object")
-
-
-def _open3d_mesh(mesh: ObjectMesh) -> Any:
-    """Return a mesh as an open3d.geometry.TriangleMesh."""
-    open3d = import_open3d()
-    vectors = open3d.utility.Vector3dVector(mesh.vertices), open3d.utility.Vector3iVector(mesh.triangles)
-    return open3d.geometry.TriangleMesh(*vectors)
 
 
 def describe_mesh(mesh: ObjectMesh) -> str:
@@ -369,9 +257,11 @@ def repair(mesh: ObjectMesh) -> ObjectMesh:
 
     Raises:
         ObjectMeshError: The triangles are fragments.
-        MissingDependencyError: manifold3d is not installed, or the mesh is open and open3d is not.
+        MissingDependencyError: manifold3d is not installed.
     """
-    mesh = merge_vertices(mesh)
+    merged = mesh.merge_vertices()
+    dropped = len(mesh.triangles) - len(merged.triangles)
+    mesh = merged.noted(f"{dropped} triangles without area were removed.") if dropped else merged
     if not mesh.edges.is_balanced:
         mesh = close(mesh)
     if not len(mesh.triangles):
@@ -381,21 +271,7 @@ def repair(mesh: ObjectMesh) -> ObjectMesh:
     if solid is not None:
         return unite_bodies(replace(mesh, watertight=True), solid)
     note = "The surface is not closed: its outline bridges the gaps, and booleans of solids are not possible."
-    return replace(mesh, watertight=False, notes=(*mesh.notes, note))
-
-
-def merge_vertices(mesh: ObjectMesh) -> ObjectMesh:
-    """Return the mesh with equal vertices as one, without the triangles that have a corner twice."""
-    low = mesh.vertices.min(axis=0)
-    # An even number of cells: the middle, where symmetric objects have their poles, is no rounding boundary.
-    cell = np.ptp(mesh.vertices, axis=0).max() / (2**_GRID_BITS - 2)
-    x, y, z = np.round((mesh.vertices - low) / cell).astype(np.int64).T
-    _, first, place = np.unique((x << 2 * _GRID_BITS) | (y << _GRID_BITS) | z, return_index=True, return_inverse=True)
-    merged = place[mesh.triangles]
-    merged = merged[(merged != np.roll(merged, 1, axis=1)).all(axis=1)]
-    dropped = len(mesh.triangles) - len(merged)
-    note = f"{dropped} triangles without area were removed." if dropped else ""
-    return mesh.with_triangles(mesh.vertices[first], merged, note)
+    return mesh.noted(note)
 
 
 def close(mesh: ObjectMesh) -> ObjectMesh:
@@ -404,72 +280,40 @@ def close(mesh: ObjectMesh) -> ObjectMesh:
     Raises:
         ObjectMeshError: The triangles are fragments, of which hardly any have neighbours.
     """
-    geometry = _open3d_mesh(mesh)
-    geometry.merge_close_vertices(CRACK)
-    geometry.remove_degenerate_triangles()
-    geometry.remove_duplicated_triangles()
-    before = len(mesh.triangles)
-    triangles = np.asarray(geometry.triangles)
-    note = f"Vertices within {CRACK * 1e3:g} mm were merged; {before - len(triangles)} of {before} triangles fell away."
-    merged = mesh.with_triangles(np.asarray(geometry.vertices), triangles, note)
-    if len(triangles) > 1 and merged.edges.open_share > MOST_OPEN:
-        share = 100.0 * merged.edges.open_share
+    merged = mesh.close_cracks(CRACK).drop_doubles()
+    before, count = len(mesh.triangles), len(merged.triangles)
+    merged = merged.noted(
+        f"Vertices within {CRACK * 1e3:g} mm were merged; {before - count} of {before} triangles fell away."
+    )
+    uses = merged.edges.uses
+    if count > 1 and (uses == 1).mean() > MOST_OPEN:
         raise ObjectMeshError(
-            f"{mesh.name}: got {len(triangles)} triangles with no neighbour at {share:.0f} % of their edges, expected "
-            "a connected surface; merge its vertices in a mesh editor"
+            f"{mesh.name}: got {count} triangles with no neighbour at {100.0 * (uses == 1).mean():.0f} % of their "
+            "edges, expected a connected surface; merge its vertices in a mesh editor"
         )
-    if merged.edges.is_branching:
-        note = "More than two triangles meet at an edge; their sense was left and holes were not filled."
-        return replace(merged, notes=(*merged.notes, note))
-    if not merged.edges.is_consistent:
-        if not geometry.orient_triangles():
-            return replace(merged, notes=(*merged.notes, "The surface has one side only, and so no outside."))
-        merged = merged.with_triangles(np.asarray(geometry.vertices), np.asarray(geometry.triangles))
-    return merged if merged.edges.is_balanced else fill_holes(merged)
-
-
-def fill_holes(mesh: ObjectMesh) -> ObjectMesh:
-    """Return the mesh with a fan of triangles in each hole that a small sphere about its middle covers."""
-    surplus = mesh.edges.surplus
-    ends = mesh.edges.ends[surplus != 0.0]
-    # A fan runs against its neighbour, whose sense is the sign of the surplus.
-    ends = np.where(surplus[surplus != 0.0, None] > 0.0, ends[:, ::-1], ends)
-    vertices, fans, left = [mesh.vertices], [mesh.triangles], 0
-    limit = HOLE_SHARE * np.ptp(mesh.vertices, axis=0).max()
-    for loop in chain_loops(ends[:, 0], ends[:, 1]):
-        middle = mesh.vertices[loop].mean(axis=0)
-        if np.linalg.norm(mesh.vertices[loop] - middle, axis=1).max() > limit:
-            left += 1
-            continue
-        apex = np.full(len(loop), len(mesh.vertices) + len(vertices) - 1)
-        vertices.append(middle[None])
-        fans.append(np.stack([loop, np.roll(loop, -1), apex], axis=1))
-    note = f"{len(fans) - 1} holes up to {limit * 1e3:.1f} mm in radius were filled, {left} larger ones were left."
-    return mesh.with_triangles(np.concatenate(vertices), np.concatenate(fans), note)
+    if uses.max(initial=0) > 2:
+        return merged.noted("More than two triangles meet at an edge; their sense was left and holes were not filled.")
+    oriented = merged.orient()
+    if oriented is None:
+        return merged.noted("The surface has one side only, and so no outside.")
+    limit = HOLE_SHARE * mesh.extents.max()
+    mesh, filled, left = oriented.fill_holes(
+        lambda hole: np.linalg.norm(hole - hole.mean(axis=0), axis=1).max() <= limit
+    )
+    note = f"{filled} holes up to {limit * 1e3:.1f} mm in radius were filled, {left} larger ones were left."
+    return mesh.noted(note) if filled + left else mesh
 
 
 def turn_outward(mesh: ObjectMesh) -> ObjectMesh:
-    """Return the mesh with inside-out bodies turned, each together with the cavities in it."""
-    body = label_bodies(mesh)
-    count = int(body.max()) + 1
-    volumes = np.bincount(body, weights=compute_volumes(mesh.vertices, mesh.triangles), minlength=count)
-    turned = (volumes[_find_containers(mesh, body, count)] < 0.0)[body]
+    """Return the mesh with inside-out bodies turned, each together with the cavities in it; of fragments all as one."""
+    body = mesh.label_bodies(np.inf)
+    if body.max() >= _MOST_BODIES:
+        body = np.zeros_like(body)
+    volumes = np.bincount(body, weights=mesh.volumes)
+    turned = (volumes[_find_containers(mesh, body, len(volumes))] < 0.0)[body]
     if not turned.any():
         return mesh
-    triangles = np.where(turned[:, None], mesh.triangles[:, ::-1], mesh.triangles)
-    note = f"{turned.sum()} of {len(turned)} triangles were inside-out and were turned."
-    return mesh.with_triangles(mesh.vertices, triangles, note)
-
-
-def label_bodies(mesh: ObjectMesh) -> NDArray:
-    """Return for each triangle the number (m,) of its connected body; one body for mere fragments."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    ends, count = mesh.edges.ends, len(mesh.vertices)
-    graph = coo_array((np.ones(len(ends), dtype=bool), (ends[:, 0], ends[:, 1])), shape=(count, count))
-    bodies, label = connected_components(graph, directed=False)
-    return label[mesh.triangles[:, 0]] if bodies <= _MOST_BODIES else np.zeros(len(mesh.triangles), dtype=int)
+    return mesh.turn(turned).noted(f"{turned.sum()} of {len(turned)} triangles were inside-out and were turned.")
 
 
 def unite_bodies(mesh: ObjectMesh, solid: Manifold) -> ObjectMesh:
@@ -477,14 +321,14 @@ def unite_bodies(mesh: ObjectMesh, solid: Manifold) -> ObjectMesh:
     bodies = solid.decompose()
     if len(bodies) == 1:
         return mesh
-    mesh = replace(mesh, notes=(*mesh.notes, f"The object consists of {len(bodies)} separate surfaces."))
+    mesh = mesh.noted(f"The object consists of {len(bodies)} separate surfaces.")
     if len(bodies) > _MOST_BODIES or any(body.volume() < 0.0 for body in bodies):
         return mesh  # a union would fill the cavities
     manifold3d = import_manifold3d()
     union = manifold3d.Manifold.batch_boolean(bodies, manifold3d.OpType.Add)
     if union.volume() > (1.0 - 1e-6) * solid.volume():
         return mesh
-    return mesh.with_triangles(*triangles_of_solid(union), "Bodies that overlap were united.")
+    return mesh.with_triangles(*triangles_of_solid(union)).noted("Bodies that overlap were united.")
 
 
 def _find_containers(mesh: ObjectMesh, body: NDArray, count: int) -> NDArray:
@@ -495,43 +339,6 @@ def _find_containers(mesh: ObjectMesh, body: NDArray, count: int) -> NDArray:
     np.maximum.at(high, body, corners.max(axis=1))
     contains = (low[:, None] <= low[None]).all(axis=2) & (high[:, None] >= high[None]).all(axis=2)
     return np.argmax(contains * np.linalg.norm(high - low, axis=1)[:, None], axis=0)
-
-
-def chain_loops(starts: NDArray, stops: NDArray) -> list[NDArray]:
-    """Return closed loops that together run along each edge once.
-
-    Edges that do not close are left out; where every node has as many edges in as out, none is.
-
-    Args:
-        starts: (e,) node at which each edge begins.
-        stops: (e,) node at which it ends.
-
-    Returns:
-        Node indices (n,) of each loop in its order; the last is joined to the first.
-    """
-    ways: dict[int, list[int]] = {}
-    for start, stop in zip(starts.tolist(), stops.tolist(), strict=True):
-        ways.setdefault(start, []).append(stop)
-    loops = []
-    for start in list(ways):
-        while ways[start]:
-            loop = _follow(ways, start)
-            if loop:
-                loops.append(np.array(loop))
-    return loops
-
-
-def _follow(ways: dict[int, list[int]], start: int) -> list[int]:
-    """Take edges from the ways until back at the start; nothing when the way ends before."""
-    loop, node = [], start
-    while True:
-        loop.append(node)
-        onward = ways.get(node)
-        if not onward:
-            return []
-        node = onward.pop()
-        if node == start:
-            return loop
 
 
 def decimate(mesh: ObjectMesh, triangle_limit: int) -> ObjectMesh:
@@ -562,12 +369,14 @@ def decimate(mesh: ObjectMesh, triangle_limit: int) -> ObjectMesh:
         )
     warning = "" if deviation <= DEVIATION_LIMIT else ", more than contact should have: is this one object?"
     note = f"Decimated from {count} to {left} triangles; the surface deviates by {deviation * 1e3:.3f} mm at most"
-    return replace(thinned, notes=(*thinned.notes, f"{note}{warning}."))
+    return thinned.noted(f"{note}{warning}.")
 
 
 def _thin_by_quadric(mesh: ObjectMesh, triangle_limit: int) -> ObjectMesh:
     """Return the mesh after edges were collapsed in the order of their quadric error."""
-    thinned = _open3d_mesh(mesh).simplify_quadric_decimation(triangle_limit)
+    open3d = import_open3d()
+    vectors = open3d.utility.Vector3dVector(mesh.vertices), open3d.utility.Vector3iVector(mesh.triangles)
+    thinned = open3d.geometry.TriangleMesh(*vectors).simplify_quadric_decimation(triangle_limit)
     return mesh.with_triangles(np.asarray(thinned.vertices), np.asarray(thinned.triangles))
 
 

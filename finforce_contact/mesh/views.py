@@ -54,8 +54,7 @@ class MeshView:
         vertices = np.ascontiguousarray(mesh.vertices, dtype=np.float32)
         triangles = np.ascontiguousarray(mesh.triangles, dtype=np.uint32)
         self._scene.add_triangles(self._tensor(vertices), self._tensor(triangles))
-        bounds = np.array([vertices.min(axis=0), vertices.max(axis=0)], dtype=float)
-        self._corners = np.array(list(product(*bounds.T)))
+        self._corners = np.array(list(product(*mesh.bounds.T)))
 
     def render(self, T_camera_object: NDArray, camera: CameraIntrinsics, step: int = 1) -> RenderedMesh:
         """Return what the camera sees of the mesh.
@@ -136,20 +135,11 @@ def _towards_camera(normals: NDArray, points: NDArray) -> NDArray:
     return np.where(away[:, None], -normals, normals) / lengths
 
 
-def sample_surface(mesh: ObjectMesh, count: int, rng: np.random.Generator) -> NDArray:
-    """Return points (count, 3), drawn evenly over the area of a mesh."""
-    return sample_with_normals(mesh, count, rng)[0]
-
-
-def sample_with_normals(mesh: ObjectMesh, count: int, rng: np.random.Generator) -> tuple[NDArray, NDArray]:
-    """Return points (count, 3), drawn evenly over the area of a mesh, and the normals of their triangles there."""
-    corners = mesh.vertices[mesh.triangles]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    areas = np.linalg.norm(across, axis=1)
-    which = rng.choice(len(areas), size=count, p=areas / areas.sum())
-    chosen = corners[which]
+def sample_surface(mesh: ObjectMesh, count: int, rng: np.random.Generator) -> SurfacePoints:
+    """Return so many points, drawn evenly over the area of a mesh."""
+    which = rng.choice(len(mesh.areas), size=count, p=mesh.areas / mesh.areas.sum())
+    first, second, third = mesh.vertices[mesh.triangles[which].T]
     u, v = rng.random((2, count, 1))
     folds = u + v > 1.0
     u, v = np.where(folds, 1.0 - u, u), np.where(folds, 1.0 - v, v)
-    points = chosen[:, 0] + u * (chosen[:, 1] - chosen[:, 0]) + v * (chosen[:, 2] - chosen[:, 0])
-    return points, across[which] / areas[which, None]
+    return SurfacePoints(points=first + u * (second - first) + v * (third - first), normals=mesh.normals[which])

@@ -299,18 +299,11 @@ def _across(rays: NDArray, tangents: NDArray, first: NDArray, second: NDArray) -
 
 
 def _place_points(mesh: ObjectMesh, spacing: float) -> _Edges:
-    table = mesh.edges
-    corners = mesh.vertices[mesh.triangles]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
-    flat = table.of_triangles.ravel()
-    paired = np.flatnonzero(np.bincount(flat, minlength=len(table.ends)) == 2)
-    order = np.argsort(flat, kind="stable")
-    starts = np.searchsorted(flat[order], paired)
-    one, other = order[starts] // 3, order[starts + 1] // 3
-    begin, end = mesh.vertices[table.ends[paired, 0]], mesh.vertices[table.ends[paired, 1]]
+    normals = mesh.normals
+    one, other = (mesh.edges.pairs // 3).T
+    begin, end = mesh.vertices[mesh.edges.ends[mesh.edges.uses == 2].T]
     # seen from one face, the middle of the other one lies below an edge that can be an outline
-    dip = np.einsum("ij,ij->i", normals[one], corners[other].mean(axis=1) - begin)
+    dip = np.einsum("ij,ij->i", normals[one], mesh.vertices[mesh.triangles[other]].mean(axis=1) - begin)
     convex = dip < -1e-6 * spacing
     one, other, begin, end = one[convex], other[convex], begin[convex], end[convex]
     lengths = np.linalg.norm(end - begin, axis=1)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from finforce.transforms import rotation_between
 from finforce_contact.mesh.object_mesh import ObjectMesh
-from finforce_contact.mesh.views import sample_with_normals
+from finforce_contact.mesh.views import sample_surface
 from finforce_ifea.errors import ContactError
 
 AUTO, NONE, FULL = "auto", "none", "full"
@@ -113,8 +113,8 @@ def find_symmetries(mesh: ObjectMesh) -> tuple[str, ...]:
     from scipy.spatial import cKDTree
     from scipy.spatial.transform import Rotation
 
-    points, normals = sample_with_normals(mesh, _SAMPLES, np.random.default_rng(0))
-    points = points - mesh.middle
+    samples = sample_surface(mesh, _SAMPLES, np.random.default_rng(0))
+    points, normals = samples.points - mesh.middle, samples.normals
     tree, size = cKDTree(points), float(np.linalg.norm(np.ptp(points, axis=0)))
 
     def fits(axis: NDArray, angle: float) -> bool:

@@ -118,7 +118,7 @@ def build_poisson_mesh(mesh: ObjectMesh) -> ObjectMesh:
         ObjectMeshError: it has no body.
         MissingDependencyError: Open3D is not installed.
     """
-    points = sample_surface(mesh, POISSON_POINTS, np.random.default_rng(0))
+    points = sample_surface(mesh, POISSON_POINTS, np.random.default_rng(0)).points
     normals = MeshView(mesh).closest(points, np.eye(4)).normals
     for room in POISSON_ROOMS:
         vertices, triangles = solve_poisson(points, normals, room)

@@ -458,10 +458,5 @@ def _start_with(turn: Rotation | None = None, elongation: float = 0.0) -> Placem
 
 def _hull_mesh(points: NDArray, name: str) -> ObjectMesh:
     """Return the closed convex surface through points (n, 3) about the origin."""
-    triangles = ConvexHull(points).simplices
-    corners = points[triangles]
-    inward = (
-        np.einsum("ij,ij->i", np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), corners[:, 0]) < 0
-    )
-    triangles = np.where(inward[:, None], triangles[:, ::-1], triangles).astype(np.int32)
-    return ObjectMesh(vertices=points, triangles=triangles, watertight=True, name=name)
+    hull = ObjectMesh(vertices=points, triangles=ConvexHull(points).simplices, watertight=True, name=name)
+    return hull.turn(hull.volumes < 0.0)

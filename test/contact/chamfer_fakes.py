@@ -39,8 +39,8 @@ def compute_chamfer(mesh_a: ObjectMesh, mesh_b: ObjectMesh, *, count: int = SAMP
         seed: of the drawing.
     """
     rng = np.random.default_rng(seed)
-    there = _distances(sample_surface(mesh_a, count, rng), mesh_b)
-    back = _distances(sample_surface(mesh_b, count, rng), mesh_a)
+    there = _distances(sample_surface(mesh_a, count, rng).points, mesh_b)
+    back = _distances(sample_surface(mesh_b, count, rng).points, mesh_a)
     return Chamfer(
         mean=float(0.5 * (there.mean() + back.mean())),
         rms=float(np.sqrt(0.5 * ((there**2).mean() + (back**2).mean()))),

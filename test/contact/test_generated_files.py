@@ -48,7 +48,7 @@ def write_generated(guess: GeneratedMesh, path: Path, rng: np.random.Generator) 
 
 def _encode_splats(guess: GeneratedMesh, rng: np.random.Generator) -> bytes:
     """A PLY file of Gaussian splats on a mesh, some of them faint and astray."""
-    places = sample_surface(guess.mesh, SPLATS, rng) + SPREAD * rng.standard_normal((SPLATS, 3))
+    places = sample_surface(guess.mesh, SPLATS, rng).points + SPREAD * rng.standard_normal((SPLATS, 3))
     places = np.vstack((places, rng.uniform(-0.6, 0.6, (STRAYS, 3))))
     names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
     names += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]

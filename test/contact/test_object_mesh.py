@@ -13,7 +13,6 @@ from finforce_contact.errors import ObjectMeshError
 from finforce_contact.mesh import object_mesh
 from finforce_contact.mesh.object_mesh import (
     UNITS,
-    compute_volumes,
     load_object_mesh,
     prepare_object_mesh,
     read_triangles,
@@ -33,7 +32,7 @@ def write(folder, name, mesh, factor=1.0):
 
 
 def volume(mesh):
-    return compute_volumes(mesh.vertices, mesh.triangles).sum()
+    return mesh.volume
 
 
 def says(mesh, text):

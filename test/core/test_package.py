@@ -82,7 +82,6 @@ def test_every_library_that_is_imported_is_required_and_no_other(described):
     names = set().union(*(imported(path) for path in SOURCES))
     libraries = names - set(sys.stdlib_module_names) - ours - ROS - LAUNCH
     required = {re.split(r"[<>=\[; ]", text)[0] for text in described["install_requires"]} - {"open3d-cpu"}
-    required -= {"networkx", "lxml"}  # which trimesh imports for 3MF files
     assert {MODULES.get(name, name) for name in libraries} == required
 
 

@@ -29,8 +29,6 @@ KEYS = {
     "matplotlib": "python3-matplotlib",
     "tqdm": "python3-tqdm",
     "joblib": "python3-joblib",
-    "lxml": "python3-lxml",
-    "networkx": "python3-networkx",
     "psutil": "python3-psutil",
 }
 # packages of ROS that launch files start, and that a user asks for by an argument

@@ -1,7 +1,9 @@
 """Claims about files of surfaces: what they announce has to be in them, and what crashes a reader costs a sentence."""
 
+import io
 import json
 import struct
+import zipfile
 
 import numpy as np
 import pytest
@@ -47,6 +49,31 @@ def scattered(count):
     return changed(meshes=[part], nodes=nodes, scenes=[{"nodes": list(range(count))}])
 
 
+CORE = "http://schemas.microsoft.com/3dmanufacturing/core/2015/02"
+PRODUCTION = "http://schemas.microsoft.com/3dmanufacturing/production/2015/06"
+
+
+def zip_models(encoding="utf-8", **models):
+    """A 3MF file of models by name: the XML between the tags of each."""
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, text in models.items():
+            root = f'<model xmlns="{CORE}" xmlns:p="{PRODUCTION}">{text}</model>'
+            archive.writestr(f"3D/{name}.model", (text if text.startswith("<!") else root).encode(encoding))
+    return packed.getvalue()
+
+
+def describe_object(number, inside):
+    return f'<object id="{number}">{inside}</object>'
+
+
+MESH = (
+    '<mesh><vertices><vertex x="0" y="0" z="0"/><vertex x="1" y="0" z="0"/><vertex x="0" y="2" z="0"/></vertices>'
+    '<triangles><triangle v1="0" v2="1" v3="2"/></triangles></mesh>'
+)
+ITSELF = describe_object(1, '<components><component objectid="1"/></components>')
+ENTITIES = f'<!DOCTYPE m [<!ENTITY a "aaaaaaaa">]><model xmlns="{CORE}"><build>&a;</build></model>'
+
 BAD = {
     "count.glb": (
         changed(accessors=[{"bufferView": 0, "componentType": 5126, "count": 10**8, "type": "VEC3"}]),
@@ -63,6 +90,14 @@ BAD = {
     "many.glb": (scattered(20_000), "more than"),
     "loop.step": (b"ISO-10303-21;\nDATA;\n#1=SHELL_BASED_SURFACE_MODEL('',(#1));\nENDSEC;\n", "reader fail|crash"),
     "empty.ply": (b"", "got 0 bytes"),
+    "loop.3mf": (
+        zip_models(a=f'<resources>{ITSELF}</resources><build><item objectid="1"/></build>'),
+        "made its reader fail",
+    ),
+    "entities.3mf": (zip_models(a=ENTITIES), "declares entities"),
+    "wide_entities.3mf": (zip_models(a=ENTITIES, encoding="utf-16"), "declares entities"),
+    "nothing.3mf": (zip_models(a=f"<resources>{describe_object(1, MESH)}</resources><build/>"), "builds no object"),
+    "no_zip.3mf": (b"PK\3\4 no more", "made its reader fail"),
 }
 
 
@@ -76,6 +111,22 @@ def test_what_a_file_announces_has_to_be_in_it(name, tmp_path, monkeypatch):
     with pytest.raises(FileError, match=words) as caught:
         read_surface(tmp_path / name)
     assert "\n" not in str(caught.value)
+
+
+def test_parts_of_a_3mf_file_stand_where_their_transforms_put_them(monkeypatch):
+    whole = describe_object(7, '<components><component p:path="/3D/b.model" objectid="1" transform="{}"/></components>')
+    turned, moved = "0 1 0 -1 0 0 0 0 1 10 0 0", "1 0 0 0 1 0 0 0 1 0 0 5"
+    content = zip_models(
+        a=f'<resources>{whole.format(turned)}</resources><build><item objectid="7" transform="{moved}"/></build>',
+        b=f"<resources>{describe_object(1, MESH)}</resources>",
+    )
+    vertices, triangles = surfaces._read_3mf(content)
+    # x to y, y to -x, then 10 along x, then 5 along z
+    np.testing.assert_allclose(vertices[triangles[0]], [[10, 0, 5], [10, 1, 5], [8, 0, 5]])
+    assert len(triangles) == 1
+    monkeypatch.setattr(surfaces, "LARGEST", 100)
+    with pytest.raises(FileError, match="unzips to 0 MB, expected at most 0"):
+        surfaces._read_3mf(content)
 
 
 def test_sound_files_are_read(tmp_path):

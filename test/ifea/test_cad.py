@@ -2,7 +2,6 @@
 
 import json
 import re
-import sys
 from dataclasses import replace
 
 import cv2
@@ -16,6 +15,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 from section_fakes import BASE, LENGTH, MILLIMETRE, TPU, WIDTH, draw_polygon, make_section
 
+from finforce.triangle_surface import Surface
 from finforce_eval.cli.main import main
 from finforce_ifea.errors import JawFileError
 from finforce_ifea.fem.plane import PlaneModel
@@ -23,7 +23,6 @@ from finforce_ifea.jaw.cad.cad_file import _GRID, _cut, read_section
 from finforce_ifea.jaw.cad.make_jaw import _doubt_walls, choose_keypoints, make_jaw
 from finforce_ifea.jaw.cad.photo import Photo, read_photo
 from finforce_ifea.jaw.cad.recognition import Overrides, recognize
-from finforce_ifea.jaw.cad.surface import build_surface
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.jaw.section import Layer, join_loops, order_rings
 from finforce_ifea.jaw.section_mesh import extrude_section, mesh_section
@@ -207,7 +206,7 @@ def test_a_finger_without_ribs_is_taken_as_a_solid(tmp_path):
 def test_a_cut_is_closed_wherever_it_meets_vertices_and_rounding():
     # a lattice of vertices on the plane itself, and walls whose cut is rounded next to the middle of two grid lines
     block = trimesh.creation.box((40.0, 20.0, 10.0)).subdivide().subdivide()
-    surface = build_surface((block.vertices + 0.5 * _GRID / MILLIMETRE) * MILLIMETRE, block.faces)
+    surface = Surface(vertices=(block.vertices + 0.5 * _GRID / MILLIMETRE) * MILLIMETRE, triangles=block.faces)
     turned = Rotation.from_euler("xy", [0.3, 0.5]).as_matrix()
     skew = replace(surface, vertices=surface.vertices @ turned.T)
     for height in (0.5 * _GRID, 0.5 * _GRID + 2.5e-3, 1e-3):
@@ -376,6 +375,19 @@ def test_a_missing_triangle_and_doubled_faces_are_mended_with_a_word(tmp_path, s
         raw = read_mesh(tmp_path, mesh)
         assert any(note.startswith("mended") for note in raw.notes)
         check_found(recognize(raw.polygon, raw.width, Overrides()))
+
+
+def test_cracks_are_closed_and_facets_that_look_inwards_are_turned(tmp_path, surface):
+    corners = surface.triangles.reshape(-1, 3)
+    apart = corners + np.random.default_rng(0).uniform(-2e-3, 2e-3, corners.shape)  # a fifth of what is closed
+    raw = read_mesh(tmp_path, trimesh.Trimesh(apart, np.arange(len(apart)).reshape(-1, 3), process=False))
+    assert any("vertices merged with others within 0.01 mm" in note for note in raw.notes)
+    assert raw.polygon.area == pytest.approx(draw_polygon().area * MILLIMETRE**2, rel=2e-3)
+    tapered = taper_surface(surface, 0.12, 0.0)
+    faces = tapered.faces.copy()
+    faces[::3] = faces[::3, ::-1]
+    turned = read_mesh(tmp_path, trimesh.Trimesh(tapered.vertices, faces, process=False))
+    np.testing.assert_allclose(turned.taper, read_mesh(tmp_path, tapered).taper, atol=1e-9)
 
 
 @pytest.mark.parametrize(("unit", "scale"), [("um", 1e3), ("m", 1e-3)])
@@ -796,7 +808,8 @@ def test_metres_in_options_are_refused(tmp_path, capsys, surface, option, messag
 
 
 def test_step_without_its_reader_says_what_to_install(tmp_path, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "cascadio", None)
+    (tmp_path / "cascadio.py").write_text("raise ImportError")
+    monkeypatch.syspath_prepend(tmp_path)  # handed on to the process that reads the file
     (tmp_path / "finger.step").write_text("ISO-10303-21;")
     assert main(["jaw", str(tmp_path / "finger.step")]) == 2
     assert "needs cascadio: pip install cascadio" in capsys.readouterr().err

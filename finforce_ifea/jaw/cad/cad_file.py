@@ -12,11 +12,11 @@ from finforce.camera import ImageError
 from finforce.files import FileError
 from finforce.sandbox import SandboxError, run_limited
 from finforce.surfaces import read_surface
+from finforce.triangle_surface import Surface, join_surfaces
 from finforce_ifea.errors import JawFileError
 from finforce_ifea.jaw.cad.curves import read_dxf, read_svg
 from finforce_ifea.jaw.cad.layers import find_layers
 from finforce_ifea.jaw.cad.photo import PHOTOS, SCALE, Photo, read_photo
-from finforce_ifea.jaw.cad.surface import Surface, build_surface, join_surfaces
 from finforce_ifea.jaw.section import UNITS, Layer, SectionFile, check_loops, join_loops, read_section_file
 
 SURFACES = (".stl", ".obj", ".ply", ".off", ".3mf", ".glb")
@@ -25,6 +25,8 @@ SUFFIXES = (*SURFACES, ".step", ".stp", ".dxf", ".svg", ".json", *PHOTOS)
 _PLAUSIBLE, _POSSIBLE = (0.015, 0.25), (0.005, 1.0)
 # What encloses less than this share of the largest body is no part of a finger.
 _CRUMB = 1e-4
+# Vertices of open edges that are as close as this [m] are one; an edge of so many sides is that of two triangles.
+_CRACK, _MISSING = 1e-5, 4
 _MOST_TRIANGLES, _LARGEST_FILE = 2_000_000, 200_000_000
 # A surface is prismatic when so much of it stands upright on, or lies across, the direction of extrusion.
 _UPRIGHT, _PRISMATIC = 0.02, 0.97
@@ -110,7 +112,8 @@ def read_section(path: Path, *, unit: str | None = None, body: int | None = None
             check_loops(loops, path.name)
             extent = np.ptp(np.concatenate(loops), axis=0).max()
             scale, note = _choose_unit(float(extent), unit or named)
-            return RawSection(polygon=_join_lines([scale * loop for loop in loops]), width=None, notes=[note])
+            polygon = _one_piece(_fill_lines([scale * loop for loop in loops]))
+            return RawSection(polygon=polygon, width=None, notes=[note])
         notes = []
         return _cut_surface(_load_surface(path, unit, notes), body, layered, notes)
     except (JawFileError, FileError, ImageError, SandboxError) as error:
@@ -171,20 +174,20 @@ def _load_surface(path: Path, unit: str | None, notes: list[str]) -> Surface:
         raise JawFileError("has coordinates that are not finite")
     scale, note = _choose_unit(float(np.ptp(vertices[triangles], axis=(0, 1)).max()), unit)
     notes.append(note)
-    return build_surface(scale * vertices, triangles)
+    return Surface(vertices=scale * vertices, triangles=triangles).merge_vertices()
 
 
 def _cut_surface(mesh: Surface, body: int | None, layered: bool, notes: list[str]) -> RawSection:
     """Return the section of a closed surface across the direction in which it was extruded, or its layers."""
-    mesh = _close_holes(_choose_body(_drop_doubles(mesh, notes), body, notes), notes)
-    count = mesh.sides_per_edge
-    if (count % 2).any():  # of parts that touch along an edge four faces meet there
+    mesh = _choose_body(_mend(mesh, notes), body, notes)
+    uses = mesh.edges.uses
+    if (uses % 2).any():  # of parts that touch along an edge four faces meet there
         raise JawFileError(
-            f"its surface has {int((count == 1).sum())} open and {int((count > 2).sum())} doubled edges, expected a "
+            f"its surface has {int((uses == 1).sum())} open and {int((uses > 2).sum())} doubled edges, expected a "
             "closed one: repair it in the program that it comes from, or in a slicer"
         )
     if mesh.volume < 0.0:
-        mesh = mesh.turned()
+        mesh = mesh.turn()
         notes.append("its surface was inside out and has been turned")
     axis, share = _find_axis(mesh)
     if layered:
@@ -227,23 +230,21 @@ def _measure_blade(mesh: Surface, axis: NDArray, base: shapely.Geometry) -> floa
     return float(np.ptp((mesh.vertices @ axis)[~shapely.contains_xy(base.buffer(_CHORD), *flat.T)]))
 
 
-def _drop_doubles(mesh: Surface, notes: list[str]) -> Surface:
-    """Return a surface without faces that are there twice."""
-    doubled = mesh.find_doubles()
-    if not doubled.any():
-        return mesh
-    notes.append(f"mended: {int(doubled.sum())} doubled faces left out")
-    return mesh.take(~doubled)
-
-
-def _close_holes(mesh: Surface, notes: list[str]) -> Surface:
-    """Return a surface with holes of a missing triangle or two closed."""
-    if (mesh.sides_per_edge == 2).all():
-        return mesh
-    filled = mesh.fill_holes()
-    if more := len(filled.triangles) - len(mesh.triangles):
-        notes.append(f"mended: holes closed by {more} triangles")
-    return filled
+def _mend(mesh: Surface, notes: list[str]) -> Surface:
+    """Return a surface without doubled faces, in one sense, its cracks and small holes closed."""
+    single = mesh.drop_doubles()
+    if single.edges.is_balanced:
+        mended, filled = single, 0
+    else:
+        merged = single.close_cracks(_CRACK).drop_doubles()
+        mended, filled, _ = (merged.orient() or merged).fill_holes(lambda hole: len(hole) <= _MISSING)
+        if count := len(single.vertices) - len(merged.vertices):
+            notes.append(f"mended: {count} vertices merged with others within {1e3 * _CRACK:g} mm")
+    if count := len(mesh.triangles) - len(single.triangles):
+        notes.append(f"mended: {count} doubled faces left out")
+    if filled:
+        notes.append(f"mended: {filled} hole{'s' * (filled > 1)} of a missing triangle or two closed")
+    return mended
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -388,7 +389,8 @@ def _cut_tapered(mesh: Surface, axis: NDArray, notes: list[str]) -> RawSection:
         JawFileError: Walls run in several directions, or a side is no plane.
     """
     normals, areas = mesh.normals, mesh.areas
-    axis = max((_find_ruling(mesh, start) for start in (axis, *np.eye(3))), key=lambda found: _weigh_walls(mesh, found))
+    found = [_find_ruling(mesh, start) for start in (axis, *np.eye(3))]
+    axis = max(found, key=lambda axis: areas[np.abs(normals @ axis) < _UPRIGHT].sum())
     slope = normals @ axis
     walls = np.abs(slope) < _UPRIGHT
     sides = [np.flatnonzero(slope < -_ASIDE), np.flatnonzero(slope > _ASIDE)]
@@ -428,11 +430,6 @@ def _find_ruling(mesh: Surface, axis: NDArray) -> NDArray:
     return axis
 
 
-def _weigh_walls(mesh: Surface, axis: NDArray) -> float:
-    """Return the area [m^2] of what runs along an axis."""
-    return float(mesh.areas[np.abs(mesh.normals @ axis) < _UPRIGHT].sum())
-
-
 def _fit_side(mesh: Surface, faces: NDArray, axis: NDArray, across: NDArray) -> NDArray:
     """Return how high a side is along an axis: by both directions across, and at their origin [m] (3,).
 
@@ -463,15 +460,6 @@ def _cut(mesh: Surface, axis: NDArray, height: float) -> shapely.Geometry:
     return _fill_lines(mesh.cut(axis, height) @ np.stack(_span(axis)).T)
 
 
-def _join_lines(lines: list[NDArray]) -> shapely.Polygon:
-    """Return the polygon that lines (n, 2) [m], open or closed, bound together.
-
-    Raises:
-        JawFileError: They bound none, or several separate ones.
-    """
-    return _one_piece(_fill_lines(lines))
-
-
 def _one_piece(area: shapely.Geometry) -> shapely.Polygon:
     """Return a polygon; raises JawFileError for several separate ones."""
     if area.geom_type != "Polygon":
@@ -485,10 +473,8 @@ def _fill_lines(lines: list[NDArray] | NDArray) -> shapely.Geometry:
     Raises:
         JawFileError: They bound nothing.
     """
-    if isinstance(lines, np.ndarray):
-        strings = shapely.linestrings(np.round(lines / _GRID) * _GRID)
-    else:
-        strings = np.array([shapely.LineString(np.round(line / _GRID) * _GRID) for line in lines])
+    number = np.repeat(np.arange(len(lines)), list(map(len, lines)))
+    strings = shapely.linestrings(np.round(np.concatenate(lines) / _GRID) * _GRID, indices=number)
     strings = strings[shapely.length(strings) > 0.0]
     found = shapely.polygonize(shapely.get_parts(shapely.union_all(strings)))
     areas = sorted(found.geoms, key=lambda area: -area.area)

@@ -76,31 +76,18 @@ def make_jaw(
     picture = picture or output.with_suffix(".png")
     output.parent.mkdir(parents=True, exist_ok=True)
     raw = _read_section(file, unit, body, picture, solid)
-    if len(raw.layers) == 1 and has_cells(raw.polygon):  # a prism
-        raw = replace(raw, layers=())
-    width = width or raw.width
-    if width is None:
-        raise JawFileError(f"{file.name}: a flat file has no width; give it in millimetres: --width 25")
-    try:
-        finger = _recognize(raw, width, overrides)
-        doubt = 0.0 if raw.photo is None else _doubt_walls(finger, raw.photo)
-    except JawFileError as error:
-        draw_refused(raw.polygon, str(error), picture)
-        raise JawFileError(f"{file.name}: {error} (its section is drawn in {picture})") from error
+    finger, doubt = _find_finger(file, raw, width, overrides, picture)
     reference, place = _choose_reference(finger)
     section = output.with_suffix(".section.json")
     section.write_text(_describe_section(finger, file.name), encoding="utf-8")
     heading = f"# {name}, from {file.name}. Lengths in metres, jaw frame (x closing, y width, z base to tip)."
     lines = [heading, f"name: {name}", *_describe_finger(finger, section.name, material, doubt)]
     lines.append(f"reference_point: {_list(_put_on_side(finger, *reference))}  # {place}")
-    output.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    jaw = load_jaw(output)
+    jaw = _write_jaw(output, lines)
     if finger.layers and measure_warping and (warping := measure_warping(jaw)) > _WARPING:
         raw.notes.append(f"its layers move apart (stiffness {warping:.0%} off), thus `model: solid`, which is slow")
-        lines = [*lines, "model: solid"]
         lines[lines.index("section:")] += f"\n  size: {_SIZE}"
-        output.write_text("\n".join(lines) + "\n", encoding="utf-8")
-        jaw = load_jaw(output)
+        jaw = _write_jaw(output, [*lines, "model: solid"])
     draw_finger(finger, jaw, picture)
     spread = f"{1e-6 * jaw.material.young_modulus:.3g} MPa +- {jaw.material.spread:.0%}"
     notes = [
@@ -113,15 +100,42 @@ def make_jaw(
     return [output, section, picture], notes
 
 
+def _write_jaw(output: Path, lines: Sequence[str]) -> Jaw:
+    """Write the lines of a jaw file and return the jaw that they describe."""
+    output.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return load_jaw(output)
+
+
 def _read_section(file: Path, unit: str | None, body: int | None, picture: Path, solid: bool) -> RawSection:
     """Read the section of a finger; draw the usual one of a solid that has others, too."""
     try:
-        return read_section(file, unit=unit, body=body, layered=solid)
+        raw = read_section(file, unit=unit, body=body, layered=solid)
     except JawFileError as error:
         if not isinstance(error.__cause__, UnlikeSectionsError):
             raise
         draw_refused(error.__cause__.section, str(error), picture)
         raise JawFileError(f"{error} (its usual section is drawn in {picture})") from error
+    is_prism = len(raw.layers) == 1 and has_cells(raw.polygon)
+    return replace(raw, layers=()) if is_prism else raw
+
+
+def _find_finger(
+    file: Path, raw: RawSection, width: float | None, overrides: Overrides, picture: Path
+) -> tuple[RecognizedFinger, float]:
+    """Return the finger in a section and the relative deviation of its stiffness; draw one that shows none.
+
+    Raises:
+        JawFileError: The section shows no fin-ray finger, or the file names no width and none is given.
+    """
+    width = width or raw.width
+    if width is None:
+        raise JawFileError(f"{file.name}: a flat file has no width; give it in millimetres: --width 25")
+    try:
+        finger = _recognize(raw, width, overrides)
+        return finger, 0.0 if raw.photo is None else _doubt_walls(finger, raw.photo)
+    except JawFileError as error:
+        draw_refused(raw.polygon, str(error), picture)
+        raise JawFileError(f"{file.name}: {error} (its section is drawn in {picture})") from error
 
 
 def _doubt_walls(finger: RecognizedFinger, photo: Photo) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from finforce_ifea.jaw.cad.recognition import RecognizedFinger
+from finforce_ifea.jaw.cad.recognition import RecognizedFinger, say_range
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_ifea.jaw.mesh import VolumeMesh
 from finforce_ifea.jaw.section import order_rings
@@ -37,7 +37,7 @@ def draw_finger(finger: RecognizedFinger, jaw: Jaw, path: Path) -> None:
     _draw_points(flat, finger, jaw)
     flat.set(xlabel="x / mm, towards the object", ylabel="z / mm, base to tip", aspect="equal")
     widths = finger.read_width(finger.rings[0])
-    flat.set_title(f"{jaw.name}: {1e3 * size[0]:.1f} x {_say(widths)} x {1e3 * size[1]:.1f} mm")
+    flat.set_title(f"{jaw.name}: {1e3 * size[0]:.1f} x {say_range(widths)} x {1e3 * size[1]:.1f} mm")
     flat.legend(loc="upper left", fontsize=8, framealpha=0.9)
     _draw_solid(solid, jaw.build_mesh("coarse"))
     figure.savefig(path, dpi=110)
@@ -95,17 +95,12 @@ def _draw_walls(axes, finger: RecognizedFinger) -> None:
     """Draw the centre lines with their thickness."""
     for wall, colour, name in ((finger.inner, _INNER, "inner band"), (finger.outer, _OUTER, "outer band")):
         free = wall.line[:, 1] > finger.clamp_height(wall.line[:, 0])
-        label = f"{name}, {_say(wall.thickness[free])} mm"
+        label = f"{name}, {say_range(wall.thickness[free])} mm"
         axes.plot(*(1e3 * wall.line[free].T), color=colour, linewidth=1.2, label=label)
     for number, rib in enumerate(finger.ribs):
         ends = 1e3 * np.array([rib.inner, rib.outer])
-        label = f"{len(finger.ribs)} ribs, {_say([rib.wall.usual for rib in finger.ribs])} mm"
+        label = f"{len(finger.ribs)} ribs, {say_range([rib.wall.usual for rib in finger.ribs])} mm"
         axes.plot(*ends.T, color=_RIB, linewidth=1.2, label=None if number else label)
-
-
-def _say(values) -> str:
-    low, high = 1e3 * np.percentile(values, [5, 95]) if len(values) else (np.nan, np.nan)
-    return f"{low:.2f}" if high - low < 0.1 else f"{low:.2f} to {high:.2f}"
 
 
 def _draw_points(axes, finger: RecognizedFinger, jaw: Jaw) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 import numpy as np
@@ -121,6 +121,23 @@ class RecognizedFinger(Section):
     frame: NDArray
     notes: list[str] = field(default_factory=list)
 
+    def moved(self, shift: float) -> RecognizedFinger:
+        """Return the finger farther along x [m]."""
+        move = np.array([shift, 0.0])
+        return replace(
+            self,
+            rings=tuple(ring + move for ring in self.rings),
+            width=self.width - float(self.taper @ move),
+            bolts=self.bolts + [shift, 0.0, 0.0],
+            inner=self.inner.moved(move),
+            outer=self.outer.moved(move),
+            ribs=[rib.moved(move) for rib in self.ribs],
+            clamped_z=self.clamped_z - self.clamp_slope * shift,
+            clamped_circles=self.clamped_circles + [shift, 0.0, 0.0],
+            face_x=self.face_x + shift,
+            frame=self.frame + [[0.0, 0.0, shift], [0.0, 0.0, 0.0]],
+        )
+
 
 @dataclass(frozen=True, kw_only=True)
 class Overrides:
@@ -167,41 +184,32 @@ def recognize(
         )
     notes: list[str] = []
     turned, frame = _turn_upright(polygon, cells, overrides, notes)
-    turned = turned.simplify(_CHORD)
     bolts, cells = _split_holes(turned)
-    bolts, cells = _fit_bolts(bolts), _drop_windows(turned, _order_cells(cells), notes)
+    bolts, cells = _fit_bolts(bolts), _drop_windows(turned, cells, notes)
     inner, outer, ribs = _measure_walls(turned, cells)
     slope, floor = _find_floor(turned, (inner, outer))
     clamped_z, circles = _propose_clamp(cells, bolts, (inner, outer), (slope, floor), overrides, notes)
-    top = -np.inf if wider is None else _find_top(wider, frame, slope, turned)
-    if top > clamped_z:
-        clamped_z = top
-        notes.append(f"clamped up to z = {1e3 * top:.4g} mm, as far as it is wider than the blade")
-    held = _find_held(turned, clamped_z, slope, circles)
-    _check_legs(held, (inner, outer), clamped_z)
-    face_x, deviation = _measure_face(turned, cells, clamped_z, slope)
-    if deviation > _FLAT:
-        notes.append(f"inner face curved: it leaves its plane by {1e3 * deviation:.2g} mm")
-    shift = _choose_origin(turned, held, overrides, face_x)
-    move = np.array([shift, 0.0])
+    if wider is not None:
+        clamped_z = _raise_clamp(clamped_z, wider, frame, slope, turned, notes)
+    face_x, deviation = _measure_face(turned, cells, clamped_z, slope, notes)
     taper = np.zeros(2) if taper is None else frame[:, :2] @ taper
-    width -= float(taper @ (frame[:, 2] + move))
     finger = RecognizedFinger(
-        rings=order_rings(affinity.translate(turned, shift, 0.0)),
-        width=width,
+        rings=order_rings(turned),
+        width=width - float(taper @ frame[:, 2]),
         taper=taper,
-        bolts=bolts + [shift, 0.0, 0.0],
-        inner=inner.moved(move),
-        outer=outer.moved(move),
-        ribs=[rib.moved(move) for rib in ribs],
-        clamped_z=clamped_z - slope * shift,
+        bolts=bolts,
+        inner=inner,
+        outer=outer,
+        ribs=ribs,
+        clamped_z=clamped_z,
         clamp_slope=slope,
-        clamped_circles=circles + [shift, 0.0, 0.0],
-        face_x=face_x + shift,
+        clamped_circles=circles,
+        face_x=face_x,
         face_deviation=deviation,
-        frame=frame + [[0.0, 0.0, shift], [0.0, 0.0, 0.0]],
+        frame=frame,
         notes=notes,
     )
+    finger = finger.moved(_choose_origin(finger, overrides))
     notes.append(f"{len(cells)} cells, {_describe_walls(finger)}")
     return finger
 
@@ -211,36 +219,16 @@ def _describe_walls(finger: RecognizedFinger) -> str:
     bands = (finger.inner, finger.outer)
     free = [band.thickness[band.line[:, 1] > finger.clamp_height(band.line[:, 0])] for band in bands]
     return (
-        f"{len(finger.ribs)} ribs of {_say_range([rib.wall.usual for rib in finger.ribs])} mm, inner band "
-        f"{_say_range(free[0])} mm, outer band {_say_range(free[1])} mm; {len(finger.bolts)} bolt holes"
-        + (f" of {_say_range(2.0 * finger.bolts[:, 2])} mm" if len(finger.bolts) else "")
+        f"{len(finger.ribs)} ribs of {say_range([rib.wall.usual for rib in finger.ribs])} mm, inner band "
+        f"{say_range(free[0])} mm, outer band {say_range(free[1])} mm; {len(finger.bolts)} bolt holes"
+        + (f" of {say_range(2.0 * finger.bolts[:, 2])} mm" if len(finger.bolts) else "")
     )
 
 
-def _find_held(polygon: shapely.Polygon, clamped_z: float, slope: float, circles: NDArray) -> shapely.Geometry:
-    """Return the part of a section that a clamp holds."""
-    around = [shapely.Point(x, z).buffer(radius) for x, z, radius in circles]
-    return polygon.intersection(shapely.union_all([cut_below(polygon, clamped_z, slope), *around]))
-
-
-def _check_legs(held: shapely.Geometry, bands: tuple[Wall, Wall], clamped_z: float) -> None:
-    """Refuse a clamp that does not reach from one band to the other: a finger on one leg is many times too soft.
-
-    Raises:
-        JawFileError: It does not.
-    """
-    apart = _measure_stance(bands)
-    reach = 0.0 if held.is_empty else held.bounds[2] - held.bounds[0]
-    if reach < _HELD * apart:
-        raise JawFileError(
-            f"what lies below z = {1e3 * clamped_z:.3g} mm is {1e3 * reach:.3g} mm wide, and its bands start "
-            f"{1e3 * apart:.3g} mm apart: one of them would not be held; state the clamp's height (--clamp), or export "
-            "the finger with its base across the inner face"
-        )
-
-
-def _find_top(wider: shapely.Geometry, frame: NDArray, slope: float, polygon: shapely.Polygon) -> float:
-    """Return up to which height at x = 0 [m] a body is wider than its blade, whose frame is given (2, 3).
+def _raise_clamp(
+    clamped_z: float, wider: shapely.Geometry, frame: NDArray, slope: float, polygon: shapely.Polygon, notes: list[str]
+) -> float:
+    """Return the height of a clamp [m] that holds all that is wider than its blade, whose frame is given (2, 3).
 
     Raises:
         JawFileError: That is far up: no clamp holds it.
@@ -252,7 +240,9 @@ def _find_top(wider: shapely.Geometry, frame: NDArray, slope: float, polygon: sh
             f"it is wider than its blade up to z = {1e3 * top:.3g} of {1e3 * polygon.bounds[3]:.3g} mm: more than a "
             "base; export the blade alone, or use a volume mesh (`mesh:` in the jaw file)"
         )
-    return top
+    if top > clamped_z:
+        notes.append(f"clamped up to z = {1e3 * top:.4g} mm, as far as it is wider than the blade")
+    return max(top, clamped_z)
 
 
 def _measure_stance(bands: tuple[Wall, Wall]) -> float:
@@ -274,7 +264,7 @@ def _find_floor(polygon: shapely.Polygon, bands: tuple[Wall, Wall]) -> tuple[flo
     return slope, float(start[1] - slope * start[0])
 
 
-def _say_range(values) -> str:
+def say_range(values) -> str:
     """Return the middle of some lengths [m] in millimetres, with their range where they differ."""
     low, middle, high = 1e3 * np.percentile(values, [5, 50, 95]) if len(values) else (np.nan,) * 3
     return f"{middle:.2f}" if high - low < 0.15 * middle else f"{middle:.2f} ({low:.2f} to {high:.2f})"
@@ -317,13 +307,9 @@ def _fit_bolts(holes: list[NDArray]) -> NDArray:
     return np.array(sorted(rows, key=lambda row: row[1])).reshape(-1, 3)
 
 
-def _order_cells(cells: list[NDArray]) -> list[NDArray]:
-    """Return the cells by the height of their middles."""
-    return sorted(cells, key=lambda cell: shapely.Polygon(cell).centroid.y)
-
-
 def _drop_windows(polygon: shapely.Polygon, cells: list[NDArray], notes: list[str]) -> list[NDArray]:
     """Return the cells, lowest first, without windows in the base, whose walls are no bands, and slots in bands."""
+    cells = sorted(cells, key=lambda cell: shapely.Polygon(cell).centroid.y)
     shapes = [shapely.Polygon(cell) for cell in cells]
     walls = [shape.distance(polygon.exterior) for shape in shapes]
     is_window = [
@@ -383,7 +369,8 @@ def _turn_upright(
     )
     turned = affinity.affine_transform(polygon, [outward[0], outward[1], up[0], up[1], 0.0, 0.0])
     shift = np.array([-turned.bounds[2], -turned.bounds[1]])
-    return affinity.translate(turned, *shift), np.column_stack([np.stack([outward, up]), shift])
+    turned = affinity.translate(turned, *shift).simplify(_CHORD)
+    return turned, np.column_stack([np.stack([outward, up]), shift])
 
 
 def _find_direction(polygon: shapely.Polygon, middles: NDArray, overrides: Overrides) -> NDArray:
@@ -442,12 +429,11 @@ def _measure_widths(polygon: shapely.Polygon, direction: NDArray) -> tuple[float
     return tuple(float(np.ptp(across[(share >= low) & (share <= high)])) for low, high in ((0.05, 0.3), (0.85, 0.95)))
 
 
-def _sample_ring(ring: NDArray, spacing: float = _SPACING) -> NDArray:
+def _sample_ring(ring: NDArray) -> NDArray:
     """Return points (n, 2) along a closed ring."""
-    closed = np.vstack([ring, ring[:1]])
-    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
-    at = np.linspace(0.0, arc[-1], max(int(arc[-1] / spacing), 8), endpoint=False)
-    return np.stack([np.interp(at, arc, closed[:, axis]) for axis in (0, 1)], axis=1)
+    line = shapely.LinearRing(ring)
+    at = np.linspace(0.0, line.length, max(int(line.length / _SPACING), 8), endpoint=False)
+    return shapely.get_coordinates(shapely.line_interpolate_point(line, at))
 
 
 def _fit_line(points: NDArray, direction: NDArray) -> tuple[NDArray, float]:
@@ -501,10 +487,25 @@ def _find_base(polygon: shapely.Polygon, direction: NDArray) -> tuple[NDArray, N
     return begin[longest], along[longest]
 
 
-def _choose_origin(polygon: shapely.Polygon, held: shapely.Geometry, overrides: Overrides, face_x: float) -> float:
-    """Return by how much [m] the section is moved along x: what the clamp holds is half on either side of x = 0."""
+def _choose_origin(finger: RecognizedFinger, overrides: Overrides) -> float:
+    """Return by how much [m] a finger is moved along x: what the clamp holds is half on either side of x = 0.
+
+    Raises:
+        JawFileError: The clamp does not reach from one band to the other: on one leg it is many times too soft.
+    """
+    polygon = finger.polygon
+    around = [shapely.Point(x, z).buffer(radius) for x, z, radius in finger.clamped_circles]
+    held = polygon.intersection(shapely.union_all([cut_below(polygon, finger.clamped_z, finger.clamp_slope), *around]))
+    apart = _measure_stance((finger.inner, finger.outer))
+    reach = 0.0 if held.is_empty else held.bounds[2] - held.bounds[0]
+    if reach < _HELD * apart:
+        raise JawFileError(
+            f"what lies below z = {1e3 * finger.clamped_z:.3g} mm is {1e3 * reach:.3g} mm wide, and its bands start "
+            f"{1e3 * apart:.3g} mm apart: one of them would not be held; state the clamp's height (--clamp), or export "
+            "the finger with its base across the inner face"
+        )
     if overrides.face_x is not None:
-        return overrides.face_x - face_x
+        return overrides.face_x - finger.face_x
     base = held.union(cut_below(polygon, 0.02 * polygon.bounds[3]))
     return -0.5 * (base.bounds[0] + base.bounds[2])
 
@@ -550,7 +551,7 @@ def _propose_clamp(
 
 
 def _measure_face(
-    polygon: shapely.Polygon, cells: list[NDArray], clamped_z: float, slope: float
+    polygon: shapely.Polygon, cells: list[NDArray], clamped_z: float, slope: float, notes: list[str]
 ) -> tuple[float, float]:
     """Return the plane x [m] of the inner face and how far it leaves that, between the clamp and the last cell [m]."""
     low = max(clamped_z + slope * polygon.bounds[2], min(float(cell[:, 1].min()) for cell in cells))
@@ -558,8 +559,10 @@ def _measure_face(
     reach = find_reach(polygon, np.linspace(low, high, 80)[1:-1])
     face = float(np.median(reach))
     deviation = float(np.abs(reach - face).max())
-    # of a curved face the place that is farthest in front
-    return (face if deviation <= _FLAT else float(reach.max())), deviation
+    if deviation <= _FLAT:
+        return face, deviation
+    notes.append(f"inner face curved: it leaves its plane by {1e3 * deviation:.2g} mm")
+    return float(reach.max()), deviation  # the place that is farthest in front
 
 
 def _measure_walls(polygon: shapely.Polygon, cells: list[NDArray]) -> tuple[Wall, Wall, list[RecognizedRib]]:
@@ -597,22 +600,13 @@ def _shoot(polygon: shapely.Polygon, cells: list[NDArray]) -> Iterator[tuple[int
     rings = order_rings(polygon)
     segments = np.concatenate([np.hstack([ring, np.roll(ring, -1, axis=0)]) for ring in rings])
     begin, along = segments[:, :2], segments[:, 2:] - segments[:, :2]
-    cell_of = np.concatenate([np.full(len(ring), _find_cell(ring, cells)) for ring in rings])
+    numbers = {shapely.Polygon(cell).bounds: number for number, cell in enumerate(cells)}
+    cell_of = np.concatenate([np.full(len(ring), numbers.get(shapely.Polygon(ring).bounds, -1)) for ring in rings])
     for number, cell in enumerate(cells):
         for place, normal in _walk_sides(cell):
             far, segment = _cast(place, normal, begin, along)
             if segment >= 0 and cell_of[segment] != number:
                 yield number, place, normal, far, int(cell_of[segment])
-
-
-def _find_cell(ring: NDArray, cells: list[NDArray]) -> int:
-    """Return which cell a ring is, -1 for none."""
-    middle = ring.mean(axis=0)
-    size = np.ptp(ring, axis=0)
-    for number, cell in enumerate(cells):
-        if np.abs(cell.mean(axis=0) - middle).max() < 1e-9 and np.abs(np.ptp(cell, axis=0) - size).max() < 1e-9:
-            return number
-    return -1
 
 
 def _walk_sides(cell: NDArray) -> list[tuple[NDArray, NDArray]]:
