@@ -164,6 +164,11 @@ def describe_placement(found: CameraPlacement, jaws) -> str:
         lines.append(
             f"{side} jaw: {seen} of {count} key points to be seen, turned by {turned} degrees, at {places} mm{tag}"
         )
+    if len(next(iter(found.origins.values()))) == 1:
+        lines.append(
+            "WARNING: one picture hardly tells the camera's distance and where along the jaws it looks: give images "
+            "at several openings"
+        )
     if found.rival > RIVAL:
         lines.append(
             f"WARNING: key points {found.rival:.1f} px beside explain the pictures nearly as well (one rib further?): "

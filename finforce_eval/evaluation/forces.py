@@ -358,7 +358,9 @@ def why_unanswered(jaws: Collection[ForceSeries]) -> str:
         return ""
     counts = Counter(reason for each in jaws for reason in no_force_reasons(each) if reason)
     reasons = "; ".join(reason for reason, _ in counts.most_common(2))
-    return f"a force in {answered} of {images} images, on all jaws that were found: {reasons}"
+    is_taring = all(np.isin(each.column("status"), ("waiting", NOT_FOUND)).all() for each in jaws)
+    hint = " (separate photographs? give --stills)" if is_taring and found else ""
+    return f"a force in {answered} of {images} images, on all jaws that were found: {reasons}{hint}"
 
 
 def no_force_reasons(forces: ForceSeries) -> list[str]:

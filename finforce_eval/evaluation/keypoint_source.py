@@ -360,7 +360,7 @@ def detect_keypoints(
     warnings = [f"{side} jaw: {warning}" for side, warning in detector.warnings.items()]
     if not any(found.values()):
         commonest = max(reasons, key=reasons.get, default="")
-        why = commonest or "; ".join(warnings) or "no jaw stands where it could be; another --extrinsics?"
+        why = commonest or "; ".join(warnings) or "no jaw stands where it could be; another camera pose or rig?"
         raise RecordingError(f"{recording.name}: no key points in {len(images)} images: {why}")
     notes = [f"{count} images rejected: {text}" for text, count in reasons.items()] + warnings
     notes += [f"the {side} jaw is in none of the images" for side, seen in found.items() if not seen]

@@ -61,6 +61,19 @@ def test_a_force_now_and_then_is_none(tmp_path):
         assert why_unanswered([series]).startswith(expected) and bool(why_unanswered([series])) == bool(expected)
 
 
+class TaringEstimator(FakeEstimator):
+    def update(self, observation, contact):
+        return replace(super().update(observation, contact), status="waiting", message="44 more unloaded frames")
+
+
+@pytest.mark.parametrize(("estimator", "hinted"), [(TaringEstimator, True), (FakeEstimator, False)])
+def test_pictures_too_few_for_a_tare_are_told_to_be_taken_as_stills(estimator, hinted):
+    recording = make_recording(phases=False)
+    forces = [None] * len(recording.jaw("left").keypoints.stamps)
+    series = find_forces(recording, FakeJaw(), GivenContact(None), estimator(forces), "left")
+    assert ("--stills" in why_unanswered([series])) == hinted
+
+
 def write_renamed(folder, names, **options):
     """Footage whose camera topics have other names, and no topic of a jaw."""
     entries = footage_entries(make_footage(), RecordingForm(compressed=False))

@@ -387,7 +387,7 @@ def test_another_place_that_explains_the_pictures_as_well_is_named(contrast, tol
         return CameraPlacement(
             T_gripper_camera=ROBOT_CAMERA,
             mounts={"left": JawMount()},
-            origins={"left": np.array([x])},
+            origins={"left": np.array([x, x])},
             contrast=contrast,
             residual=0.5,
             seen={},
@@ -398,3 +398,5 @@ def test_another_place_that_explains_the_pictures_as_well_is_named(contrast, tol
     assert rival > 10.0 if told else rival == 0.0
     assert measure_rival(best, best, jaws, CAMERA) == 0.0
     assert ("WARNING" in describe_placement(replace(best, rival=rival), jaws)) == told
+    alone = replace(best, origins={"left": np.array([-0.04])})
+    assert "one picture hardly tells" in describe_placement(alone, jaws)
