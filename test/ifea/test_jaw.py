@@ -60,6 +60,11 @@ def test_steel_hinges_are_where_they_were_measured():
 
 def test_shipped_jaws_load_by_name_and_by_path():
     assert list_shipped_jaws() == ("bench", "ssg48_fin_ray_1", "ssg48_fin_ray_3", "steel", "umi", "xlerobot")
+
+
+def test_the_modulus_of_a_printed_jaw_is_a_datasheets_and_spreads():
+    printed = [jaw for jaw in map(load_jaw, list_shipped_jaws()) if jaw.material.young_modulus < 1e9]
+    assert len(printed) == 5 and all(jaw.material.spread == 0.3 for jaw in printed)
     for name in list_shipped_jaws():
         jaw = load_jaw(name)
         np.testing.assert_array_equal(load_jaw(jaw.path).keypoints, jaw.keypoints)
