@@ -15,6 +15,7 @@ y_c is expected where the object's mesh is nearest.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -84,6 +85,42 @@ def measure_torsion(jaw: Jaw, mesh: VolumeMesh) -> Torsion | None:
         jaw: with its material and key points.
         mesh: of that jaw, undeformed.
     """
+    side = "" if jaw.mesh_file is None else jaw.side  # a drawn finger is its own mirror image
+    stiffness = jaw.material.young_modulus, jaw.material.poisson_ratio
+    key = (jaw.digest, side, jaw.inner_face_x, *stiffness, len(mesh.nodes))
+    if key not in _LAST:
+        _LAST.clear()
+        _LAST[key] = _answer_at_rest(jaw, mesh)
+    answers = _LAST[key]
+    if answers is None:
+        return None
+    model, rest = answers.model, np.zeros(answers.model.size)
+    by = np.moveaxis(model.project(model.attach(jaw.keypoints, KEYPOINT_DISTANCE), rest, answers.steps), 2, 0)
+    return Torsion(
+        heights=answers.heights,
+        half_width=answers.half_width,
+        by_moment=np.ascontiguousarray(by[::2]),
+        by_force=np.ascontiguousarray(by[1::2]),
+        roll=answers.roll,
+    )
+
+
+class _Answers(NamedTuple):
+    """How a model at rest moves, steps (size, 2 m), by a moment and a lateral force at each height; see `Torsion`."""
+
+    model: SolidModel
+    steps: NDArray
+    heights: NDArray
+    half_width: float
+    roll: NDArray
+
+
+# Of the finger that was measured last, whose other jaw and later estimators need not wait for it.
+_LAST: dict[tuple, _Answers | None] = {}
+
+
+def _answer_at_rest(jaw: Jaw, mesh: VolumeMesh) -> _Answers | None:
+    """Return the answers of a jaw; None where it is no solid, or its mesh too large."""
     is_solid = jaw.drawing is None or jaw.drawing.is_solid
     mesh = mesh if jaw.section is None else jaw.build_mesh("coarse")
     if not is_solid or len(mesh.nodes) > _MOST_NODES:
@@ -101,19 +138,11 @@ def measure_torsion(jaw: Jaw, mesh: VolumeMesh) -> Torsion | None:
     twist[0, 0], twist[2, 0], across[1, 1] = 0.5 / arm, -0.5 / arm, 1.0
     loads = [model.load(probe, rest, force) for probe in probes for force in (twist, across)]
     steps = model.factorise(model.linearize(rest).tangent).solve(np.stack(loads, axis=1))
-    motions = model.project(model.attach(jaw.keypoints, KEYPOINT_DISTANCE), rest, steps)
     roll = [
         (moved[2, 0] - moved[0, 0]) / (2.0 * arm)
         for moved in (model.project(probe, rest, steps[:, [2 * row]])[:, :, 0] for row, probe in enumerate(probes))
     ]
-    by = np.moveaxis(motions, 2, 0)
-    return Torsion(
-        heights=heights,
-        half_width=half,
-        by_moment=np.ascontiguousarray(by[::2]),
-        by_force=np.ascontiguousarray(by[1::2]),
-        roll=np.array(roll),
-    )
+    return _Answers(model=model, steps=steps, heights=heights, half_width=half, roll=np.array(roll))
 
 
 # Pressure is spread evenly: its centre strays from the middle by this share of what touches, and by less where that is
