@@ -53,6 +53,8 @@ _UNCALIBRATED = 0.1
 _EXTRAPOLATED = 0.015
 # Relative error of a jaw that is taken to be linear, 10 mm deep.
 _LINEAR = 0.05
+# Fingers and settings for which this process has compiled everything.
+_WARM: set[tuple[str, EstimatorSettings]] = set()
 
 
 class ForceEstimator:
@@ -144,8 +146,11 @@ class ForceEstimator:
         return self._tracked.slips.mobilised
 
     def warm_up(self) -> None:
-        """Compile what is compiled on first use, and leave no trace."""
-        warm_up(self.jaw, self.settings.tare_frames, self.update, self.forget)
+        """Compile what is compiled on first use, once in a process for each finger, and leave no trace."""
+        kind = self.jaw.digest, self.settings
+        if kind not in _WARM:
+            warm_up(self.jaw, self.settings.tare_frames, self.update, self.forget)
+            _WARM.add(kind)
 
     @property
     def tared(self) -> bool:

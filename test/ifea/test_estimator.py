@@ -27,6 +27,7 @@ from estimator_fakes import (
 )
 from mechanics_fakes import BENCH, bench_press
 
+from finforce_ifea.estimator import warm_up
 from finforce_ifea.jaw.attachment import attach_points
 from finforce_ifea.observation import Contact
 from finforce_ifea.relaxation import RelaxationTerm, apply_relaxation
@@ -141,7 +142,7 @@ def test_reset_forgets_everything():
 
 def test_warm_up_leaves_no_trace():
     estimator = make_estimator(solver="frame")
-    estimator.warm_up()
+    warm_up(estimator.jaw, estimator.settings.tare_frames, estimator.update, estimator.forget)
     assert_identical(run(pressed(), estimator), solved())
 
 
