@@ -5,12 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce.optional import import_manifold3d
+
+if TYPE_CHECKING:
+    from manifold3d import Manifold
+
 _GRID_BITS = 21  # three coordinates in one integer of 64 bits
+_OVERLAP = 1e-3  # [-], share of its volume in others of a part that overlaps them; parts that touch have none
 
 SurfaceT = TypeVar("SurfaceT", bound="Surface")
 
@@ -158,7 +164,7 @@ class Surface:
 
         loose = np.unique(self.edges.ends[self.edges.uses == 1])
         near = cKDTree(self.vertices[loose]).query_pairs(reach, output_type="ndarray")
-        return self._merge(_find_parts(loose[near], len(self.vertices)))
+        return self._merge(number_pieces(loose[near.T].ravel(), np.tile(np.arange(len(near)), 2), len(self.vertices)))
 
     def _merge(self: SurfaceT, places: NDArray) -> SurfaceT:
         """Return the surface with the vertices of one place, a number (n,), as the first of them."""
@@ -178,8 +184,8 @@ class Surface:
         count, sides = len(self.triangles), self.edges.pairs
         one, two = (sides // 3).T
         differs = self.edges.directions.ravel()[sides].sum(axis=1) != 0
-        links = np.stack([np.r_[one, one + count], np.r_[two + count * differs, two + count * ~differs]], axis=1)
-        kept, turned = _find_parts(links, 2 * count).reshape(2, -1)
+        states = np.r_[one, one + count, two + count * differs, two + count * ~differs]
+        kept, turned = number_pieces(states, np.tile(np.arange(2 * len(one)), 2), 2 * count).reshape(2, -1)
         votes = 2 * np.bincount(kept, minlength=2 * count)
         votes[np.maximum(kept, turned)] -= 1  # of as many for either, the first
         return None if (kept == turned).any() else self.turn(votes[kept] < votes[turned])
@@ -204,10 +210,8 @@ class Surface:
 
     def label_bodies(self, most: float = 2) -> NDArray:
         """Return for each triangle the number (m,) of its body: what hangs together by edges of so many at most."""
-        side = np.flatnonzero(self.edges.uses[self.edges.of_triangles.ravel()] <= most)
-        count, edges = len(self.triangles), self.edges.of_triangles.ravel()[side]
-        part = _find_parts(np.stack([side // 3, count + edges], axis=1), count + len(self.edges.ends))[:count]
-        return np.unique(part, return_inverse=True)[1]
+        triangle, side = np.nonzero(self.edges.uses[self.edges.of_triangles] <= most)
+        return number_pieces(triangle, self.edges.of_triangles[triangle, side], len(self.triangles))
 
     def split(self: SurfaceT) -> list[SurfaceT]:
         """Return the bodies."""
@@ -242,13 +246,44 @@ def join_surfaces(parts: Sequence[Surface]) -> Surface:
     return replace(parts[0], vertices=vertices, triangles=np.concatenate(triangles))
 
 
-def _find_parts(links: NDArray, count: int) -> NDArray:
-    """Return for each of so many things the number of what it is part of by links (k, 2)."""
+def solid_from_triangles(vertices: NDArray, triangles: NDArray) -> Manifold | None:
+    """Return the solid that triangles (m, 3) on vertices (n, 3) [m] bound, or None where they bound none."""
+    manifold3d = import_manifold3d()
+    corners = np.ascontiguousarray(vertices, dtype=np.float64)
+    solid = manifold3d.Manifold(manifold3d.Mesh64(corners, np.ascontiguousarray(triangles, dtype=np.uint64)))
+    sound = solid.status() == manifold3d.Error.NoError and not solid.is_empty()
+    return solid if sound else None
+
+
+def triangles_of_solid(solid: Manifold) -> tuple[NDArray, NDArray]:
+    """Return the vertices (n, 3) [m] and the triangles (m, 3) int32 of a solid."""
+    mesh = solid.to_mesh64()
+    return np.array(mesh.vert_properties[:, :3]), np.array(mesh.tri_verts, dtype=np.int32)
+
+
+def unite(parts: Sequence[Surface]) -> Surface | None:
+    """Return surfaces that all overlap others as the one that bounds all; None where one of them does not."""
+    solids = [solid_from_triangles(part.vertices, part.triangles) for part in parts]
+    if len(parts) < 2 or any(solid is None for solid in solids):
+        return None
+    manifold3d = import_manifold3d()
+    whole = manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Add)
+    for number, solid in enumerate(solids):
+        others = manifold3d.Manifold.batch_boolean(solids[:number] + solids[number + 1 :], manifold3d.OpType.Add)
+        if whole.volume() > others.volume() + (1.0 - _OVERLAP) * solid.volume():
+            return None
+    vertices, triangles = triangles_of_solid(whole)
+    return Surface(vertices=vertices, triangles=triangles)
+
+
+def number_pieces(rows: NDArray, columns: NDArray, count: int) -> NDArray:
+    """Return for each of so many rows the number of its piece: rows (k,) hang together that share a column (k,)."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    graph = coo_array((np.ones(len(links), bool), (links[:, 0], links[:, 1])), shape=(count, count))
-    return connected_components(graph, directed=False)[1]
+    size = count + int(columns.max(initial=-1)) + 1
+    graph = coo_array((np.ones(len(rows), bool), (rows, count + columns)), shape=(size, size))
+    return np.unique(connected_components(graph, directed=False)[1][:count], return_inverse=True)[1]
 
 
 def chain_loops(starts: NDArray, stops: NDArray) -> list[NDArray]:

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce.triangle_surface import solid_from_triangles, triangles_of_solid
 from finforce_contact.errors import ObjectMeshError
 from finforce_contact.localization.outline_localizer import (
     ContactLocation,
@@ -13,7 +14,7 @@ from finforce_contact.localization.outline_localizer import (
     InnerFace,
     Localizer,
 )
-from finforce_contact.mesh.object_mesh import ObjectMesh, solid_from_triangles, to_manifold, triangles_of_solid
+from finforce_contact.mesh.object_mesh import ObjectMesh, to_manifold
 from finforce_ifea.jaw.jaw import Jaw
 
 if TYPE_CHECKING:

@@ -160,8 +160,11 @@ class _Slab:
         nodes = np.where(times[kept, None] > 0.0, nodes, nodes[:, ::-1])
         return np.repeat(nodes, np.abs(times[kept]).astype(int), axis=0)
 
-    def cut_triangles(self, plane: int) -> "_Cut":
-        """Return where the triangles cross the plane on a side, -1 or 1."""
+    def cut_triangles(self, plane: int) -> tuple[NDArray, NDArray]:
+        """Return where triangles leave the slab over the plane on a side, -1 or 1, and come back: nodes (k, 2).
+
+        And which of them (k,) turn from x to z.
+        """
         beyond = (self.side == plane)[self.mesh.triangles]
         crossing = np.flatnonzero((beyond[:, 0] != beyond[:, 1]) | (beyond[:, 1] != beyond[:, 2]))
         here = beyond[crossing]
@@ -169,7 +172,7 @@ class _Slab:
         edges = self.mesh.edges.of_triangles[crossing]
         leaving = np.take_along_axis(edges, np.argmax(~here & following, axis=1)[:, None], axis=1)
         entering = np.take_along_axis(edges, np.argmax(here & ~following, axis=1)[:, None], axis=1)
-        return _Cut(nodes=self._node(np.hstack([leaving, entering]), plane), facing=self.facing[crossing])
+        return self._node(np.hstack([leaving, entering]), plane), self.facing[crossing]
 
     def locate(self, nodes: NDArray) -> NDArray:
         """Return x and z (k, 2) [m] of nodes (k,)."""
@@ -195,26 +198,12 @@ class _Slab:
         return len(self.points) + edges + np.where(np.asarray(plane) > 0, len(self.mesh.edges.ends), 0)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Cut:
-    """Where triangles cross a plane.
-
-    Attributes:
-        nodes: (k, 2), where a triangle leaves the slab and where it comes back, in its own sense.
-        facing: (k,), the triangle turns from x to z.
-    """
-
-    nodes: NDArray
-    facing: NDArray
-
-
 def _cover_solid(slab: _Slab) -> list[NDArray]:
     """Return the edges (k, 2) around what faces -y of a solid in the slab: its surface and its lower section."""
     times = slab.mesh.edges.sum_along(slab.facing.astype(float))
-    lower, upper = slab.cut_triangles(-1), slab.cut_triangles(1)
+    (lower, below), (upper, above) = slab.cut_triangles(-1), slab.cut_triangles(1)
     # The section runs against the triangles, and so cancels the cut edges of those that face -y.
-    section = lower.nodes[~lower.facing][:, ::-1]
-    return [np.concatenate([slab.keep_edges(times), section, upper.nodes[upper.facing]])]
+    return [np.concatenate([slab.keep_edges(times), lower[~below][:, ::-1], upper[above]])]
 
 
 def _cover_open(slab: _Slab) -> list[NDArray]:
@@ -222,9 +211,9 @@ def _cover_open(slab: _Slab) -> list[NDArray]:
     sense = np.where(slab.facing, 1.0, -1.0)
     surface, sections = [slab.keep_edges(slab.mesh.edges.sum_along(sense))], []
     for plane in (-1, 1):
-        cut = slab.cut_triangles(plane)
-        surface.append(np.where(cut.facing[:, None], cut.nodes, cut.nodes[:, ::-1]))
-        sections.append(np.concatenate([cut.nodes, _bridge(slab, cut.nodes)]))
+        nodes, facing = slab.cut_triangles(plane)
+        surface.append(np.where(facing[:, None], nodes, nodes[:, ::-1]))
+        sections.append(np.concatenate([nodes, _bridge(slab, nodes)]))
     return [np.concatenate(surface), *sections]
 
 

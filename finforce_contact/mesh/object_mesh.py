@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from finforce.files import FileError
 from finforce.optional import import_manifold3d, import_open3d
 from finforce.surfaces import read_surface
-from finforce.triangle_surface import Surface
+from finforce.triangle_surface import Surface, solid_from_triangles, triangles_of_solid
 from finforce_contact.errors import ObjectMeshError
 
 if TYPE_CHECKING:
@@ -58,21 +59,6 @@ def to_manifold(mesh: ObjectMesh) -> Manifold | None:
         MissingDependencyError: manifold3d is not installed.
     """
     return solid_from_triangles(mesh.vertices, mesh.triangles) if mesh.watertight else None
-
-
-def solid_from_triangles(vertices: NDArray, triangles: NDArray) -> Manifold | None:
-    """Return the solid that triangles (m, 3) on vertices (n, 3) [m] bound, or None where they bound none."""
-    manifold3d = import_manifold3d()
-    corners = np.ascontiguousarray(vertices, dtype=np.float64)
-    solid = manifold3d.Manifold(manifold3d.Mesh64(corners, np.ascontiguousarray(triangles, dtype=np.uint64)))
-    sound = solid.status() == manifold3d.Error.NoError and not solid.is_empty()
-    return solid if sound else None
-
-
-def triangles_of_solid(solid: Manifold) -> tuple[NDArray, NDArray]:
-    """Return the vertices (n, 3) [m] and the triangles (m, 3) int32 of a solid."""
-    mesh = solid.to_mesh64()
-    return np.array(mesh.vert_properties[:, :3]), np.array(mesh.tri_verts, dtype=np.int32)
 
 
 def surrounds(mesh: ObjectMesh, point: NDArray) -> bool:
@@ -127,7 +113,7 @@ def read_triangles(path: Path | str) -> tuple[NDArray, NDArray]:
     """
     path = Path(path)
     formats = " ".join(FORMATS)
-    if not _is_file(path):
+    if not os.path.isfile(path):  # of a name that no file can have Path raises an error
         raise ObjectMeshError(f"{str(path)[:200]}: there is no such file, expected a mesh ({formats}); check the path")
     if path.suffix.lower() not in FORMATS:
         raise ObjectMeshError(f"{path.name}: got ending {path.suffix!r}, expected one of {formats}; convert the file")
@@ -135,14 +121,6 @@ def read_triangles(path: Path | str) -> tuple[NDArray, NDArray]:
         return read_surface(path)
     except FileError as error:
         raise ObjectMeshError(f"{path.name}: {error}") from error
-
-
-def _is_file(path: Path) -> bool:
-    """Say whether a file can be looked at; a name that no file can have is none."""
-    try:
-        return path.is_file()
-    except OSError:
-        return False
 
 
 def prepare_object_mesh(
@@ -202,12 +180,9 @@ def _check_size(vertices: NDArray, triangles: NDArray, name: str, unit: str) -> 
     if SMALLEST <= extent * UNITS[unit] <= LARGEST:
         return
     is_metric = name.lower().endswith(".glb")  # metres by the standard: what is no such size is of any scale
-    sizes = (
-        {}
-        if is_metric
-        else {other: extent * factor for other, factor in UNITS.items() if SMALLEST <= extent * factor <= LARGEST}
-    )
-    likely = sorted(sizes.items(), key=lambda item: abs(np.log(item[1] / _COMMON)))
+    sizes = {} if is_metric else {other: extent * factor for other, factor in UNITS.items()}
+    likely = [(other, size) for other, size in sizes.items() if SMALLEST <= size <= LARGEST]
+    likely.sort(key=lambda item: abs(np.log(item[1] / _COMMON)))
     advice = "no unit makes it so; scale it, or remove what lies far from the object"
     if is_metric:
         advice = "a GLB is in metres by its standard, this one has a scale of its own: scale it to the object's size"

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from finforce.triangle_surface import number_pieces
 from finforce_ifea.errors import MeshError
 
 EDGES_TET10 = np.array([[0, 1], [1, 2], [2, 0], [0, 3], [1, 3], [2, 3]])
@@ -347,24 +348,24 @@ def _check_repeats(elements: NDArray) -> None:
 
 
 def _check_one_piece(nodes: NDArray, elements: NDArray) -> None:
-    number, piece = _number_pieces(np.repeat(np.arange(len(elements)), elements.shape[1]), elements.ravel(), elements)
-    if number > 1:
-        small = int(np.bincount(piece).argmin())
-        lone = np.flatnonzero(piece == small)
+    piece = number_pieces(np.repeat(np.arange(len(elements)), elements.shape[1]), elements.ravel(), len(elements))
+    sizes = np.bincount(piece)
+    if len(sizes) > 1:
+        lone = np.flatnonzero(piece == sizes.argmin())
         centre = np.round(1e3 * nodes[elements[lone[0]]].mean(axis=0), 2).tolist()
         raise MeshError(
-            f"the mesh falls into {number} pieces that share no node (the smallest has {len(lone)} elements, first: "
+            f"the mesh falls into {len(sizes)} pieces that share no node (the smallest: {len(lone)} elements, first: "
             f"element {lone[0]} at {centre} mm), expected one; merge the nodes where they touch, or remove it"
         )
 
 
 def _check_hinges(nodes: NDArray, elements: NDArray, face: NDArray, clamped: NDArray) -> None:
     """Refuse parts, elements joined by faces, that hang together with the rest by nodes on one line."""
-    number, part = _number_pieces(np.repeat(np.arange(len(face)), face.shape[1]), face.ravel(), elements)
-    if number == 1:
+    part = number_pieces(np.repeat(np.arange(len(face)), face.shape[1]), face.ravel(), len(face))
+    if not part.any():
         return
     held = set(clamped.tolist())
-    for index in range(number):
+    for index in range(part.max() + 1):
         inside = part == index
         own = np.unique(elements[inside])
         shared = np.intersect1d(own, elements[~inside])
@@ -376,16 +377,6 @@ def _check_hinges(nodes: NDArray, elements: NDArray, face: NDArray, clamped: NDA
                 f"a part of {int(inside.sum())} elements (first: element {first} at {centre} mm) is held by nodes on "
                 f"one line ({support[:4].tolist()}): it can turn about it; join it by faces"
             )
-
-
-def _number_pieces(rows: NDArray, columns: NDArray, elements: NDArray) -> tuple[int, NDArray]:
-    """Return how many pieces the elements make that are joined by common columns, and each one's piece (m,)."""
-    from scipy import sparse
-    from scipy.sparse.csgraph import connected_components
-
-    count = int(columns.max()) + 1
-    incidence = sparse.coo_matrix((np.ones(len(rows)), (rows, columns)), (len(elements), count)).tocsr()
-    return connected_components(incidence @ incidence.T, directed=False)
 
 
 def _on_one_line(points: NDArray, nodes: NDArray) -> bool:

@@ -119,6 +119,56 @@ def test_a_floor_and_a_slot_are_named_with_their_place(tmp_path, surface):
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["jaw.png"]
 
 
+@pytest.mark.parametrize(("top", "is_held"), [(8.0, True), (10.5, False), (22.0, False)])  # the clamp: 9.5 mm
+def test_a_fork_below_the_clamp_is_held_and_one_above_it_refused(tmp_path, surface, top, is_held):
+    low, high = surface.bounds
+    slot = ((0.6 * (high[0] - low[0]), 0.4 * WIDTH, 2.0 * top), [*0.5 * (low + high)[:2], low[2]])
+    fork = boxes_joined(surface, slot, cut=True)
+    if is_held:
+        raw = read_mesh(tmp_path, fork)
+        assert "its sections differ within the base, which the clamp has to hold" in raw.notes
+        check_found(recognize(raw.polygon, raw.width, Overrides(), base=raw.base, unlike=raw.unlike))
+        return
+    fork.export(tmp_path / "finger.stl")
+    with pytest.raises(JawFileError, match="is not prismatic along.*have another section.*section is drawn in"):
+        make_jaw(tmp_path / "finger.stl", tmp_path / "jaw.yaml", name="fork", overrides=Overrides())
+
+
+def test_a_floor_of_one_cell_is_no_base(tmp_path, surface):
+    low, high = surface.bounds
+    floor = boxes_joined(surface, ((20.0, 1.0, 8.0), [high[0] - 10.5, low[1] + 0.5, low[2] + 18.0]))
+    floor.export(tmp_path / "finger.stl")
+    with pytest.raises(JawFileError, match="is not prismatic along.*a floor"):
+        make_jaw(tmp_path / "finger.stl", tmp_path / "jaw.yaml", name="floor", overrides=Overrides())
+
+
+def test_marks_raised_on_a_side_are_left_out_and_a_rim_is_refused(tmp_path, surface):
+    low, high = surface.bounds
+    places = [[high[0] - 0.8, high[1], z] for z in np.arange(low[2] + 4.0, high[2] - 4.0, 5.0)]
+    raw = read_mesh(tmp_path, boxes_joined(surface, *[((1.0, 2.0, 2.0), place) for place in places]))
+    assert any("with raised marks, which are left out" in note for note in raw.notes)
+    assert raw.width == pytest.approx(WIDTH * MILLIMETRE) and raw.base is None
+    check_found(recognize(raw.polygon, raw.width, Overrides()))
+    rim = boxes_joined(surface, ((1.6, 8.0, high[2] - low[2]), [high[0] - 0.8, high[1], 0.5 * (low[2] + high[2])]))
+    with pytest.raises(JawFileError, match="have another section"):
+        read_mesh(tmp_path, rim)
+
+
+def test_shells_that_overlap_are_printed_as_one_and_those_that_touch_are_not(tmp_path, surface):
+    polygon, width = draw_polygon(ribs=0), WIDTH / 2
+    whole = [trimesh.creation.extrude_polygon(polygon, WIDTH)]
+    for z in (22.0, 32.0, 42.0, 54.0):
+        rib = shapely.LineString([(20.0, z), (-20.0, z + 5.0)]).buffer(0.6, cap_style="flat")
+        rib = rib.intersection(shapely.Polygon(polygon.exterior).buffer(-0.4))
+        whole.append(trimesh.creation.extrude_polygon(rib, WIDTH))
+    raw = read_mesh(tmp_path, trimesh.util.concatenate(whole))
+    assert "5 bodies that overlap are one, as printed (--body)" in raw.notes
+    assert len(recognize(raw.polygon, raw.width, Overrides()).ribs) == len(whole) - 1
+    pad = trimesh.creation.box((2.0, WIDTH, 30.0), trimesh.transformations.translation_matrix((15.0, width, 40.0)))
+    with pytest.raises(JawFileError, match="holds 6 bodies"):
+        read_mesh(tmp_path, trimesh.util.concatenate([*whole, pad]))
+
+
 def make_layered(folder):
     """The jaw of a folder's finger.stl, taken as a solid, and what was found."""
     options = {"name": "layered", "overrides": Overrides(), "solid": True, "measure_warping": measure_warping}
@@ -223,9 +273,9 @@ def test_a_blade_on_a_wider_base_has_its_own_width_where_the_clamp_holds_the_bas
     assert raw.width == pytest.approx(WIDTH * MILLIMETRE)
     if clamp is None:
         with pytest.raises(JawFileError, match="wider than its blade up to z = 40 of 70 mm"):
-            recognize(raw.polygon, raw.width, Overrides(), wider=raw.base)
+            recognize(raw.polygon, raw.width, Overrides(), base=raw.base)
         return
-    finger = recognize(raw.polygon, raw.width, Overrides(), wider=raw.base)
+    finger = recognize(raw.polygon, raw.width, Overrides(), base=raw.base)
     assert finger.clamped_z == pytest.approx(clamp * MILLIMETRE, abs=3e-4)
     assert finger.width == pytest.approx(WIDTH * MILLIMETRE)
 

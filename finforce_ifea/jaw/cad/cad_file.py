@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from finforce.camera import ImageError
 from finforce.files import FileError
 from finforce.sandbox import SandboxError, run_limited
 from finforce.surfaces import read_surface
-from finforce.triangle_surface import Surface, join_surfaces
+from finforce.triangle_surface import Surface, join_surfaces, unite
 from finforce_ifea.errors import JawFileError
 from finforce_ifea.jaw.cad.curves import read_dxf, read_svg
 from finforce_ifea.jaw.cad.layers import find_layers
@@ -25,6 +26,8 @@ SUFFIXES = (*SURFACES, ".step", ".stp", ".dxf", ".svg", ".json", *PHOTOS)
 _PLAUSIBLE, _POSSIBLE = (0.015, 0.25), (0.005, 1.0)
 # What encloses less than this share of the largest body is no part of a finger.
 _CRUMB = 1e-4
+# So many shells, as of ribs and raised letters, are looked at for whether they overlap.
+_MOST_SHELLS = 40
 # Vertices of open edges that are as close as this [m] are one; an edge of so many sides is that of two triangles.
 _CRACK, _MISSING = 1e-5, 4
 _MOST_TRIANGLES, _LARGEST_FILE = 2_000_000, 200_000_000
@@ -38,8 +41,8 @@ _ASIDE, _SIDE, _RULINGS = 0.5, 1e-4, 4
 _CUTS, _ALIKE, _SEEN, _RARE, _OTHER = 25, 0.02, 0.01, 0.2, 0.1
 # Cuts of the same walls are one where these move by less than this [m] over the width.
 _ALONG = 2e-6
-# A base is shorter than this share of the blade on it.
-_SHORT = 0.6
+# A base fits into a circle of this share of that around the blade on it, and what is in it into one of this share.
+_SHORT, _LOCAL = 0.67, 0.4
 # Ends of cut triangles are joined on a grid of this size [m].
 _GRID = 2e-7
 _CHORD = 2e-5
@@ -53,7 +56,8 @@ class RawSection:
         polygon: in metres, in a plane of the file's.
         width: along the extrusion [m], of a tapered finger at the section's origin; None where the file is flat.
         taper: (2,) [-], change of the width along the section's axes.
-        base: where the body is wider than that, which the clamp has to hold; None for nowhere.
+        base: where the body is no prism of this section, which the clamp has to hold; None for nowhere.
+        unlike: what it is there, unless it is wider.
         notes: what was found and guessed, a line each.
         photo: what it was traced from, if that is a photograph.
     """
@@ -63,6 +67,7 @@ class RawSection:
     notes: list[str] = field(default_factory=list)
     taper: NDArray = field(default_factory=lambda: np.zeros(2))
     base: shapely.Geometry | None = None
+    unlike: str = ""
     layers: tuple[Layer, ...] = ()
     photo: Photo | None = None
 
@@ -196,19 +201,24 @@ def _cut_surface(mesh: Surface, body: int | None, layered: bool, notes: list[str
     if share < _PRISMATIC and not cuts.is_one:
         return _cut_tapered(mesh, axis, notes)
     letters = np.round(axis, 3).tolist()
-    base, width = None, cuts.width
+    base, width, unlike = None, cuts.width, ""
     if not cuts.is_one:
-        base = cuts.find_base()
-        if base is None:
-            raise UnlikeSectionsError(f"is not prismatic along {letters}: {cuts.describe()}", cuts.section)
-        width = _measure_blade(mesh, axis, base)
-        notes.append(f"a blade {1e3 * width:.4g} mm wide on a base of {1e3 * cuts.width:.4g} mm")
+        unlike = f"is not prismatic along {letters}: {cuts.describe()}"
+        if (base := cuts.find_local()) is not None:
+            notes.append("its sections differ within the base, which the clamp has to hold")
+        elif (beside := cuts.find_beside()) is not None:
+            width, unlike = _measure_blade(mesh, axis, beside), ""
+            base = beside if cuts.is_short(beside, _SHORT) else None
+            what = "raised marks, which are left out" if base is None else f"a base of {1e3 * cuts.width:.4g} mm"
+            notes.append(f"a blade {1e3 * width:.4g} mm wide, {'on' if base is not None else 'with'} {what}")
+        else:
+            raise UnlikeSectionsError(unlike, cuts.section)
     notes.append(f"prismatic along {letters} of the file, {1e3 * width:.4g} mm wide")
     if share < _PRISMATIC:
         notes.append(f"edges that are chamfered or rounded are left out: {1.0 - share:.0%} of its surface")
-    if pieces := int((cuts.pieces > 1).sum()):
+    if pieces := int((shapely.get_num_geometries(cuts.found) > 1).sum()):
         notes.append(f"a hole across it is left out: it parts {pieces} of {_CUTS} cuts")
-    return RawSection(polygon=cuts.section, width=width, notes=notes, base=base)
+    return RawSection(polygon=cuts.section, width=width, notes=notes, base=base, unlike=unlike)
 
 
 def _cut_layers(mesh: Surface, axis: NDArray, notes: list[str]) -> RawSection:
@@ -253,30 +263,52 @@ class _Cuts:
 
     Attributes:
         section: the one that is most like all others, in one piece.
-        difference: (n,) of each cut from that, as a share of its area.
-        areas: (n,) [m^2].
-        pieces: (n,) into which each falls.
+        found: the cuts (n,).
+        difference: (n,) of each from that section, as a share of its area.
         width: of the body.
-        others: those that are another section.
     """
 
     section: shapely.Polygon
+    found: NDArray
     difference: NDArray
-    areas: NDArray
-    pieces: NDArray
     width: float
-    others: tuple[shapely.Geometry, ...]
 
-    def find_base(self) -> shapely.Geometry | None:
-        """Return what a base on both sides of a blade has for a section; None where the others are no such base."""
-        base = shapely.union_all(self.others)
-        extent, whole = (np.ptp(np.reshape(area.bounds, (2, 2)), axis=0).max() for area in (base, self.section))
-        return base if extent < _SHORT * whole else None
+    @cached_property
+    def areas(self) -> NDArray:
+        """Of the cuts (n,) [m^2]."""
+        return shapely.area(self.found)
+
+    def is_short(self, area: shapely.Geometry, share: float) -> bool:
+        """Whether the circle around an area is less than a share of that around the section."""
+        return shapely.minimum_bounding_radius(area) < share * shapely.minimum_bounding_radius(self.section)
+
+    def find_local(self) -> shapely.Geometry | None:
+        """Return where cuts differ from the section, if that is short: a fork, a bore or a void of the base."""
+        seen = self.found[self.difference > _SEEN]
+        apart = shapely.union_all(shapely.symmetric_difference(seen, self.section))
+        apart = apart.buffer(-_CHORD).buffer(_CHORD)  # without what rounding leaves along outlines
+        return apart if self.is_short(apart, _LOCAL) else None
+
+    def find_beside(self) -> shapely.Geometry | None:
+        """Return the section of what stands out beside a blade: a base, or marks on it; None where it is neither."""
+        is_other = self.difference > _OTHER
+        beside = shapely.union_all(self.found[is_other])
+        is_mark = self.areas[is_other].sum() <= _ALIKE * self.areas.sum()
+        is_beside = is_other.any() and (is_mark or self.is_short(beside, _SHORT))
+        return beside if is_beside and self.are_alike(~is_other) else None
 
     @property
     def is_one(self) -> bool:
         """Whether they are one section, but for holes, rounded edges and the like."""
-        return self.difference.mean() <= _ALIKE and (self.difference > _SEEN).mean() <= _RARE
+        return self.are_alike(np.full(len(self.found), True))
+
+    def are_alike(self, chosen: NDArray) -> bool:
+        """Whether chosen ones, (n,) bool, are the section but for holes, rounded edges and the like, without floors."""
+        seen = self.found[chosen & (self.difference > _SEEN)]
+        more = shapely.difference(seen, self.section)
+        floor = shapely.area(shapely.intersection(more, shapely.Polygon(self.section.exterior))).max(initial=0.0)
+        is_little = self.difference[chosen].mean() <= _ALIKE and len(seen) <= _RARE * chosen.sum()
+        return bool(is_little and floor <= _SEEN * self.section.area)
 
     def describe(self) -> str:
         """Say where the section changes, and what would do."""
@@ -313,14 +345,7 @@ def _cut_often(mesh: Surface, axis: NDArray) -> _Cuts:
     section = min(whole, key=lambda cut: abs(cut.area - typical))
     differing = [0.0 if cut is section else cut.symmetric_difference(section).area for cut in found]
     difference = np.array(differing) / section.area
-    return _Cuts(
-        section=section,
-        difference=difference,
-        others=tuple(cut for cut, much in zip(found, difference, strict=True) if much > _OTHER),
-        areas=np.array([cut.area for cut in found]),
-        pieces=np.array([len(getattr(cut, "geoms", [cut])) for cut in found]),
-        width=float(high - low),
-    )
+    return _Cuts(section=section, found=np.array(found), difference=difference, width=float(high - low))
 
 
 def _choose_body(mesh: Surface, body: int | None, notes: list[str]) -> Surface:
@@ -336,6 +361,10 @@ def _choose_body(mesh: Surface, body: int | None, notes: list[str]) -> Surface:
             notes.append(f"{crumbs} crumb{'s' * (crumbs > 1)} of its surface left out")
             return join_surfaces([bodies[0], *voids])
         return mesh
+    shells = [item.turn(item.volume < 0.0) for item in bodies if item not in voids]
+    if body is None and len(shells) <= _MOST_SHELLS and (united := unite(shells)) is not None:
+        notes.append(f"{len(shells)} bodies that overlap are one, as printed (--body)")
+        return join_surfaces([united, *voids])
     sizes = "; ".join(
         f"{number}: " + " x ".join(f"{1e3 * value:.3g}" for value in item.extents)
         for number, item in enumerate(bodies[:8], start=1)

@@ -157,7 +157,7 @@ def _recognize(raw: RawSection, width: float, overrides: Overrides) -> Recognize
         JawFileError: The section shows no fin-ray finger.
     """
     if not raw.layers:
-        return recognize(raw.polygon, width, overrides, raw.taper, raw.base)
+        return recognize(raw.polygon, width, overrides, raw.taper, raw.base, raw.unlike)
     try:
         return _layer(recognize(raw.polygon, width, overrides), raw)
     except JawFileError:

@@ -161,7 +161,8 @@ def recognize(
     width: float,
     overrides: Overrides,
     taper: NDArray | None = None,
-    wider: shapely.Geometry | None = None,
+    base: shapely.Geometry | None = None,
+    unlike: str = "",
 ) -> RecognizedFinger:
     """Find the parts of a fin-ray finger in its section.
 
@@ -170,27 +171,22 @@ def recognize(
         width: of the finger [m], where its sides are no parallel planes that at the origin of the section.
         overrides: what is given.
         taper: (2,) [-], change of the width along the section's axes; None for none.
-        wider: where the body is wider than that, as its base; None for nowhere.
+        base: where the body is no prism of this section, which the clamp has to hold; None for nowhere.
+        unlike: what it is there, unless it is wider and thus clamped as far up as that.
 
     Raises:
         JawFileError: The section shows no fin-ray finger; the message says what it shows and what to do.
     """
-    bolts, cells = _split_holes(polygon)
-    if len(cells) < 2:
-        raise JawFileError(
-            f"its section has {len(cells)} cells between ribs and {len(bolts)} round holes, expected at least two "
-            "cells: ribs that come from a slicer's infill are not in the file; model them, or describe the finger as a "
-            "drawing"
-        )
     notes: list[str] = []
-    turned, frame = _turn_upright(polygon, cells, overrides, notes)
+    turned, frame = _turn_upright(polygon, overrides, notes)
     bolts, cells = _split_holes(turned)
     bolts, cells = _fit_bolts(bolts), _drop_windows(turned, cells, notes)
     inner, outer, ribs = _measure_walls(turned, cells)
     slope, floor = _find_floor(turned, (inner, outer))
     clamped_z, circles = _propose_clamp(cells, bolts, (inner, outer), (slope, floor), overrides, notes)
-    if wider is not None:
-        clamped_z = _raise_clamp(clamped_z, wider, frame, slope, turned, notes)
+    if base is not None:
+        heights = (shapely.get_coordinates(base) @ frame[:, :2].T + frame[:, 2]) @ [-slope, 1.0]
+        clamped_z = _raise_clamp(clamped_z, heights, turned.bounds[3], unlike, notes)
     face_x, deviation = _measure_face(turned, cells, clamped_z, slope, notes)
     taper = np.zeros(2) if taper is None else frame[:, :2] @ taper
     finger = RecognizedFinger(
@@ -225,24 +221,24 @@ def _describe_walls(finger: RecognizedFinger) -> str:
     )
 
 
-def _raise_clamp(
-    clamped_z: float, wider: shapely.Geometry, frame: NDArray, slope: float, polygon: shapely.Polygon, notes: list[str]
-) -> float:
-    """Return the height of a clamp [m] that holds all that is wider than its blade, whose frame is given (2, 3).
+def _raise_clamp(clamped_z: float, base: NDArray, length: float, unlike: str, notes: list[str]) -> float:
+    """Return the height of a clamp [m] that holds a base, given by heights (n,) [m], of a finger of a length [m].
 
     Raises:
-        JawFileError: That is far up: no clamp holds it.
+        JawFileError: No clamp holds that, as it is far up; or it is unlike the blade, and no wider, above the clamp.
     """
-    places = shapely.get_coordinates(wider) @ frame[:, :2].T + frame[:, 2]
-    top = float((places @ [-slope, 1.0]).max())
-    if top > _LOW * polygon.bounds[3]:
+    top = float(base.max())
+    if top <= clamped_z + _SIDE:
+        return max(top, clamped_z)
+    if unlike:
+        raise JawFileError(unlike)
+    if top > _LOW * length:
         raise JawFileError(
-            f"it is wider than its blade up to z = {1e3 * top:.3g} of {1e3 * polygon.bounds[3]:.3g} mm: more than a "
-            "base; export the blade alone, or use a volume mesh (`mesh:` in the jaw file)"
+            f"it is wider than its blade up to z = {1e3 * top:.3g} of {1e3 * length:.3g} mm: more than a base; export "
+            "the blade alone, or use a volume mesh (`mesh:` in the jaw file)"
         )
-    if top > clamped_z:
-        notes.append(f"clamped up to z = {1e3 * top:.4g} mm, as far as it is wider than the blade")
-    return max(top, clamped_z)
+    notes.append(f"clamped up to z = {1e3 * top:.4g} mm, as far as it is wider than the blade")
+    return top
 
 
 def _measure_stance(bands: tuple[Wall, Wall]) -> float:
@@ -334,13 +330,12 @@ def _is_slot(shape: shapely.Polygon, cells: list[shapely.Polygon]) -> bool:
     return bool(is_oblong and shape.intersection(levels[1]).length < _NARROW * widest)
 
 
-def _turn_upright(
-    polygon: shapely.Polygon, cells: list[NDArray], overrides: Overrides, notes: list[str]
-) -> tuple[shapely.Polygon, NDArray]:
+def _turn_upright(polygon: shapely.Polygon, overrides: Overrides, notes: list[str]) -> tuple[shapely.Polygon, NDArray]:
     """Return the section with its inner face upright at the largest x, and its lowest point at z = 0.
 
     And how it got there: a rotation, perhaps mirrored, and a shift (2, 3).
     """
+    _, cells = _split_holes(polygon)
     middles = np.array([shapely.Polygon(cell).centroid.coords[0] for cell in cells])
     direction = _find_direction(polygon, middles, overrides)
     side = np.array([-direction[1], direction[0]])
@@ -377,8 +372,14 @@ def _find_direction(polygon: shapely.Polygon, middles: NDArray, overrides: Overr
     """Return the unit vector (2,) from base to tip along the middles (n, 2) of the cells.
 
     Raises:
-        JawFileError: Which end is the tip is not sure, or stated wrongly.
+        JawFileError: There are fewer than two cells, or which end is the tip is not sure, or stated wrongly.
     """
+    if len(middles) < 2:
+        raise JawFileError(
+            f"its section has {len(middles)} cells between ribs and {len(polygon.interiors) - len(middles)} round "
+            "holes, expected at least two cells: ribs that come from a slicer's infill are not in the file; model "
+            "them, or describe the finger as a drawing"
+        )
     direction = np.linalg.svd(middles - middles.mean(axis=0))[2][0]
     narrow = _measure_widths(polygon, direction)
     if narrow[0] < narrow[1]:
@@ -598,42 +599,36 @@ def _measure_walls(polygon: shapely.Polygon, cells: list[NDArray]) -> tuple[Wall
 def _shoot(polygon: shapely.Polygon, cells: list[NDArray]) -> Iterator[tuple[int, NDArray, NDArray, float, int]]:
     """Yield cell, place (2,), direction (2,), way [m] and the other cell that is met, or -1, all along the cells."""
     rings = order_rings(polygon)
-    segments = np.concatenate([np.hstack([ring, np.roll(ring, -1, axis=0)]) for ring in rings])
-    begin, along = segments[:, :2], segments[:, 2:] - segments[:, :2]
+    begin, along = np.concatenate(rings), np.concatenate([np.roll(ring, -1, axis=0) - ring for ring in rings])
     numbers = {shapely.Polygon(cell).bounds: number for number, cell in enumerate(cells)}
     cell_of = np.concatenate([np.full(len(ring), numbers.get(shapely.Polygon(ring).bounds, -1)) for ring in rings])
     for number, cell in enumerate(cells):
-        for place, normal in _walk_sides(cell):
-            far, segment = _cast(place, normal, begin, along)
-            if segment >= 0 and cell_of[segment] != number:
-                yield number, place, normal, far, int(cell_of[segment])
+        for place, normal in zip(*_walk_sides(cell), strict=True):
+            far, side = _cast(place, normal, begin, along)
+            if np.isfinite(far) and cell_of[side] != number:
+                yield number, place, normal, far, int(cell_of[side])
 
 
-def _walk_sides(cell: NDArray) -> list[tuple[NDArray, NDArray]]:
-    """Return places along the sides of a cell and the directions from there into the material."""
-    ring = np.array(shapely.geometry.polygon.orient(shapely.Polygon(cell), -1.0).exterior.coords)[:-1]
-    found = []
-    for start, end in zip(ring, np.roll(ring, -1, axis=0), strict=True):
-        way = end - start
-        size = float(np.linalg.norm(way))
-        if size < 1e-9:
-            continue
-        normal = np.array([-way[1], way[0]]) / size
-        count = max(int(size / _SPACING), 1)
-        found += [(start + (k + 0.5) / count * way, normal) for k in range(count)]
-    return found
+def _walk_sides(cell: NDArray) -> tuple[NDArray, NDArray]:
+    """Return places (p, 2) along the sides of a cell and the directions (p, 2) from there into the material."""
+    ring = shapely.get_coordinates(shapely.geometry.polygon.orient(shapely.Polygon(cell), -1.0).exterior)
+    way = np.diff(ring, axis=0)
+    size = np.hypot(*way.T)
+    count = np.where(size > 1e-9, np.maximum((size / _SPACING).astype(int), 1), 0)
+    side = np.repeat(np.arange(len(way)), count)
+    share = (np.arange(len(side)) - np.repeat(np.cumsum(count) - count, count) + 0.5) / count[side]
+    normals = np.stack([-way[side, 1], way[side, 0]], axis=1) / size[side, None]
+    return ring[side] + share[:, None] * way[side], normals
 
 
 def _cast(place: NDArray, normal: NDArray, begin: NDArray, along: NDArray) -> tuple[float, int]:
-    """Return how far [m] it is from a place in a direction to the first of some segments, and which one it is."""
-    gap = begin - place
-    across = normal[1] * along[:, 0] - normal[0] * along[:, 1]
+    """Return how far [m] it is from a place in a direction to the first of some sides, inf for none, and its number."""
+    (gap_x, gap_z), (x, z) = (begin - place).T, along.T
     with np.errstate(divide="ignore", invalid="ignore"):
-        far = (gap[:, 1] * along[:, 0] - gap[:, 0] * along[:, 1]) / across
-        share = (normal[0] * gap[:, 1] - normal[1] * gap[:, 0]) / across
+        across = normal[1] * x - normal[0] * z
+        far, share = (gap_z * x - gap_x * z) / across, (normal[0] * gap_z - normal[1] * gap_x) / across
     far = np.where((far > 1e-6) & (share >= 0.0) & (share <= 1.0), far, np.inf)
-    nearest = int(far.argmin())
-    return (float(far[nearest]), nearest) if np.isfinite(far[nearest]) else (np.inf, -1)
+    return float(far.min()), int(far.argmin())
 
 
 def _string_up(found: NDArray, name: str) -> Wall:
