@@ -41,7 +41,6 @@ COMMANDS = {
     "stress": "test the estimators with difficult input",
     "report": "show forces over time on an HTML page",
     "reconstruct": "make an object mesh and its pose from a masked depth image",
-    "version": "print the version",
 }
 LAB = ("bench", "experiment", "stress")  # these judge the product, and are in its checkout alone
 CHECKOUT = Path(__file__).parents[2]
@@ -68,13 +67,13 @@ def build_commands() -> Parser:
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=Parser)
     for name, text in COMMANDS.items():
         commands.add_parser(name, help=text, add_help=False)
-    parser.add_argument("--version", dest="command", action="store_const", const="version", help=COMMANDS["version"])
+    parser.add_argument("--version", action="store_true", help="print the version")
     return parser
 
 
 def read_command(words: Sequence[str]) -> str:
     """Return the subcommand that the words of a command line begin with; without one, print what there is and exit."""
-    return "version" if list(words[:1]) == ["--version"] else build_commands().parse_args(words[:1]).command
+    return build_commands().parse_args(words[:1]).command
 
 
 def build_parser(command: str) -> Parser:
@@ -123,6 +122,11 @@ def main(argv: Sequence[str] | None = None) -> int:
             complete(words)
         if quiet := not {"-q", "--quiet"}.isdisjoint(words):
             os.environ["TQDM_DISABLE"] = "1"
+        if words[:1] == ["--version"]:
+            from finforce_eval.machine import version
+
+            print(f"finforce {version()}")
+            return 0
         options = parse([word for word in words if word not in ("-q", "--quiet")])
         with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere if quiet else sys.stdout):
             outcome = options.run(options)
