@@ -253,6 +253,20 @@ def test_a_finger_without_ribs_is_taken_as_a_solid(tmp_path):
     assert len(jaw.keypoints) > 10
 
 
+def test_ribs_that_cross_are_taken_as_a_solid(tmp_path):
+    polygon = draw_polygon(ribs=0)
+    for z in (14.0, 26.0, 38.0):
+        for start, end in ((z, z + 14.0), (z + 14.0, z)):
+            rib = shapely.LineString([(20.0, start), (-20.0, end)]).buffer(0.6)
+            polygon = polygon.union(rib.intersection(shapely.Polygon(polygon.exterior)))
+    trimesh.creation.extrude_polygon(polygon, WIDTH).export(tmp_path / "finger.stl")
+    with pytest.raises(JawFileError, match="no rib that could be measured: .*take a closed solid as it is"):
+        make_jaw(tmp_path / "finger.stl", tmp_path / "jaw.yaml", name="lattice", overrides=Overrides())
+    jaw, notes = make_layered(tmp_path)
+    assert "no ribs found: key points stand at even heights, as if there were some" in notes
+    assert jaw.section.polygon.area == pytest.approx(polygon.area * MILLIMETRE**2, rel=1e-3)
+
+
 def test_a_cut_is_closed_wherever_it_meets_vertices_and_rounding():
     # a lattice of vertices on the plane itself, and walls whose cut is rounded next to the middle of two grid lines
     block = trimesh.creation.box((40.0, 20.0, 10.0)).subdivide().subdivide()

@@ -109,14 +109,12 @@ def _write_jaw(output: Path, lines: Sequence[str]) -> Jaw:
 def _read_section(file: Path, unit: str | None, body: int | None, picture: Path, solid: bool) -> RawSection:
     """Read the section of a finger; draw the usual one of a solid that has others, too."""
     try:
-        raw = read_section(file, unit=unit, body=body, layered=solid)
+        return read_section(file, unit=unit, body=body, layered=solid)
     except JawFileError as error:
         if not isinstance(error.__cause__, UnlikeSectionsError):
             raise
         draw_refused(error.__cause__.section, str(error), picture)
         raise JawFileError(f"{error} (its usual section is drawn in {picture})") from error
-    is_prism = len(raw.layers) == 1 and has_cells(raw.polygon)
-    return replace(raw, layers=()) if is_prism else raw
 
 
 def _find_finger(
@@ -159,7 +157,9 @@ def _recognize(raw: RawSection, width: float, overrides: Overrides) -> Recognize
     if not raw.layers:
         return recognize(raw.polygon, width, overrides, raw.taper, raw.base, raw.unlike)
     try:
-        return _layer(recognize(raw.polygon, width, overrides), raw)
+        finger = recognize(raw.polygon, width, overrides)
+        is_prism = len(raw.layers) == 1 and has_cells(raw.polygon)
+        return finger if is_prism else _layer(finger, raw)
     except JawFileError:
         finger = _layer(recognize(_open_cells(raw.polygon), width, overrides), raw)
     finger.notes[-1] = "no ribs found: key points stand at even heights, as if there were some"

@@ -591,7 +591,10 @@ def _measure_walls(polygon: shapely.Polygon, cells: list[NDArray]) -> tuple[Wall
     ribs = []
     for number, found in enumerate(between, start=1):
         if len(found) < _FEWEST:
-            raise JawFileError(f"between its cells {number} and {number + 1} there is no rib that could be measured")
+            raise JawFileError(
+                f"between its cells {number} and {number + 1} there is no rib that could be measured: leave out what "
+                "crosses, or take a closed solid as it is (--solid)"
+            )
         ribs.append(_string_rib(np.array(found), inner, outer))
     return inner, outer, ribs
 
