@@ -1,12 +1,12 @@
 """Claims about a replay through the real nodes, and about the stop of its processes."""
 
-import argparse
 import json
-import os
 import signal
 import subprocess
 import sys
+from contextlib import redirect_stdout
 from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 from time import monotonic, sleep
 from types import SimpleNamespace
@@ -20,7 +20,6 @@ from rclpy.signals import SignalHandlerOptions, get_current_signal_handlers_opti
 from finforce.ros.transport import free_domain
 from finforce.transforms import pose_from_quaternion, quaternion_from_pose
 from finforce_eval.cli.main import main
-from finforce_eval.evaluation.setup import make_setup
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.writer import write_recording
 from finforce_eval.replay import replay as replaying
@@ -30,21 +29,6 @@ from finforce_eval.replay.node import open_player
 SHIPPED = Path(replaying.__file__).parents[1] / "data" / "bench_cyl25_middle"
 MESH = SHIPPED.parent / "objects" / "cylinder_25.stl"
 SECOND = 1_000_000_000
-
-
-@pytest.fixture(scope="module")
-def short(tmp_path_factory):
-    """The first seconds of the shipped recording."""
-    recording = read_recording(SHIPPED)
-    start = recording.jaws["left"].keypoints.stamps[0]
-    folder = tmp_path_factory.mktemp("bags") / "short"
-    return write_recording(cut(recording, start, start + 4 * SECOND), folder)
-
-
-def run(*words, timeout=240):
-    environment = {**os.environ, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-    command = [sys.executable, "-m", "finforce_eval.cli.main", "replay", *map(str, words)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=timeout, env=environment, check=False)
 
 
 def solvers_of(domain):
@@ -60,19 +44,6 @@ def solvers_of(domain):
         if is_ours and f"ROS_DOMAIN_ID={domain}\0".encode() in variables:
             found.append(int(folder.name))
     return found
-
-
-def test_every_image_comes_back_as_a_wrench_with_its_stamp_its_contact_estimated_on_the_way(short, tmp_path):
-    out = tmp_path / "scores.json"
-    done = run(short, "--contact", "estimate", "--object", MESH, "--json", out)
-    assert done.returncode == 0, done.stderr
-    case = json.loads(out.read_text())["cases"]["short"]
-    # the first images are silent until the offsets of the key points are known
-    assert case["frames"] == 120 and case["solved"] > 60
-    assert case["step_ms"]["p50"] > 0.0
-    assert "grasp_wrench" in done.stdout
-    (said,) = [line for line in done.stdout.splitlines() if "left contact" in line]
-    assert "apart" in said or "touching" in said
 
 
 @pytest.mark.parametrize("ended", [True, False])
@@ -128,7 +99,10 @@ def test_what_cannot_be_played_ends_with_two_and_one_line(words, reason, capsys)
     assert reason in said and len(said.strip().splitlines()) == 1
 
 
-def test_estimated_contacts_without_a_mesh_are_refused(short, capsys):
+def test_estimated_contacts_without_a_mesh_are_refused(tmp_path, capsys):
+    recording = read_recording(SHIPPED)
+    start = recording.jaws["left"].keypoints.stamps[0]
+    short = write_recording(cut(recording, start, start + SECOND), tmp_path / "short")
     assert main(["replay", str(short), "--contact", "estimate"]) == 2 and "no object mesh" in capsys.readouterr().err
 
 
@@ -189,15 +163,41 @@ def matrices(track):
     return [pose_from_quaternion(*pair) for pair in zip(track.position, track.quaternion, strict=True)]
 
 
-def test_one_contact_estimator_serves_both_jaws_which_answer_alike_and_complete_the_grasp(tmp_path):
-    """A few seconds under load, seen on both jaws: the right one is the left one's mirror image."""
+@pytest.fixture(scope="module")
+def replayed(tmp_path_factory):
+    """What a replay of a few seconds under load, seen on both jaws, found, printed and wrote."""
+    folder = tmp_path_factory.mktemp("replay")
     recording = with_opposite_jaw(with_both_jaws(read_recording(SHIPPED), 5.0))
-    recording = read_recording(write_recording(recording, tmp_path / "both"))
-    names = argparse.Namespace(
-        jaw="bench", solver="default", mesh="default", contact=["estimate"], calibration=None, object=str(MESH)
-    )
+    both, out, found = write_recording(recording, folder / "both"), folder / "scores.json", []
     # at half speed a machine with other work keeps up as well
-    result = replaying.replay(recording, make_setup(names), playing=replaying.Playing(rate=0.5))
+    words = [both, "--contact", "estimate", "--object", MESH, "--rate", "0.5", "--json", out]
+    said = StringIO()
+
+    def replay(*given, **options):
+        found.append(replaying.replay(*given, **options))
+        return found[0]
+
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(said):
+        patch.setattr("finforce_eval.cli.replay.replay", replay)
+        assert main(["replay", *map(str, words)]) == 0
+    return found[0], said.getvalue(), json.loads(out.read_text())
+
+
+def test_every_image_comes_back_as_a_wrench_with_its_stamp_its_contact_estimated_on_the_way(replayed):
+    result, said, scores = replayed
+    for side in ("left", "right"):
+        case = scores["cases"][f"both/{side}"]
+        # the first images are silent until the offsets of the key points are known
+        assert case["frames"] == len(result.recording.jaws[side].keypoints.stamps) > 100 and case["solved"] > 60
+        assert case["step_ms"]["p50"] > 0.0
+    assert "grasp_wrench" in said
+    (line,) = [line for line in said.splitlines() if "left contact" in line]
+    assert "apart" in line or "touching" in line
+
+
+def test_one_contact_estimator_serves_both_jaws_which_answer_alike_and_complete_the_grasp(replayed):
+    """The right jaw is the left one's mirror image."""
+    result, _, _ = replayed
     left, right = (result.evaluation.results[f"both/{side}"] for side in ("left", "right"))
     held = left.solved & right.solved
     assert held.sum() > 0.5 * len(held)
