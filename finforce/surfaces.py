@@ -124,9 +124,16 @@ def _load_triangles(path: Path) -> tuple[NDArray, NDArray]:
         scene = import_trimesh().load_scene(io.BytesIO(content), file_type=kind, process=False, skip_materials=True)
         mesh = scene.to_mesh()
         vertices, triangles = np.array(mesh.vertices, dtype=float), np.array(mesh.faces, dtype=np.int64)
+    _check_numbers(triangles, len(vertices))
     if len(triangles) and not np.ptp(vertices, axis=0).any():
         raise FileError("has all its points in one place, as where they are compressed in a way that is not read")
     return vertices.reshape(-1, 3), triangles.reshape(-1, 3)
+
+
+def _check_numbers(triangles: NDArray, count: int) -> None:
+    """Refuse triangles (m, 3) that name none of so many vertices."""
+    if ((triangles < 0) | (triangles >= count)).any():
+        raise FileError(f"has triangles that name no vertex, expected numbers from 0 to {count - 1}: export it again")
 
 
 def _read_step(content: bytes) -> tuple[NDArray, NDArray]:
@@ -176,8 +183,9 @@ def _place_part(reference: Element, name: str, T: NDArray, models: dict[str, Ele
     part = models[name].find(f"{{*}}resources/{{*}}object[@id='{reference.get('objectid')}']")
     for mesh in part.iterfind("{*}mesh"):
         corners = [[one.get(axis) for axis in "xyz"] for one in mesh.iterfind("{*}vertices/{*}vertex")]
-        triangles = [[one.get(f"v{k}") for k in (1, 2, 3)] for one in mesh.iterfind("{*}triangles/{*}triangle")]
-        vertices = np.array(corners, float).reshape(-1, 3) @ T[:3] + T[3]
-        yield Surface(vertices=vertices, triangles=np.array(triangles, int).reshape(-1, 3))
+        numbers = [[one.get(f"v{k}") for k in (1, 2, 3)] for one in mesh.iterfind("{*}triangles/{*}triangle")]
+        triangles = np.array(numbers, int).reshape(-1, 3)
+        _check_numbers(triangles, len(corners))
+        yield Surface(vertices=np.array(corners, float).reshape(-1, 3) @ T[:3] + T[3], triangles=triangles)
     for component in part.iterfind("{*}components/{*}component"):
         yield from _place_part(component, name, T, models)

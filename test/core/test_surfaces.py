@@ -71,6 +71,12 @@ MESH = (
     '<mesh><vertices><vertex x="0" y="0" z="0"/><vertex x="1" y="0" z="0"/><vertex x="0" y="2" z="0"/></vertices>'
     '<triangles><triangle v1="0" v2="1" v3="2"/></triangles></mesh>'
 )
+AXES = "".join(f"property float {axis}\n" for axis in "xyz")
+PLY = (
+    f"ply\nformat ascii 1.0\nelement vertex 3\n{AXES}element face 1\nproperty list uchar int vertex_indices\n"
+    "end_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 9\n"
+).encode()
+BUILD = '<resources><object id="1">{}</object></resources><build><item objectid="1"/></build>'
 ITSELF = describe_object(1, '<components><component objectid="1"/></components>')
 ENTITIES = f'<!DOCTYPE m [<!ENTITY a "aaaaaaaa">]><model xmlns="{CORE}"><build>&a;</build></model>'
 
@@ -97,6 +103,9 @@ BAD = {
     "entities.3mf": (zip_models(a=ENTITIES), "declares entities"),
     "wide_entities.3mf": (zip_models(a=ENTITIES, encoding="utf-16"), "declares entities"),
     "nothing.3mf": (zip_models(a=f"<resources>{describe_object(1, MESH)}</resources><build/>"), "builds no object"),
+    "far.3mf": (zip_models(a=BUILD.format(MESH.replace('v1="0"', 'v1="3"'))), "name no vertex"),
+    "before.3mf": (zip_models(a=BUILD.format(MESH.replace('v1="0"', 'v1="-1"'))), "name no vertex"),
+    "far.ply": (PLY, "name no vertex"),
     "no_zip.3mf": (b"PK\3\4 no more", "made its reader fail"),
 }
 
