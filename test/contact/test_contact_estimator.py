@@ -426,7 +426,7 @@ def demo():
     track, seen = recording.jaw("left"), track_object(recording, "left")
     solver = ForceEstimator(load_jaw("bench"), calibration=load_calibration("bench"))
     estimator = ContactEstimator(solver.jaw, mesh=load_object_mesh(RECORDING.parent / recording.case["mesh"]))
-    stamps = track.keypoints.stamps[:300]
+    stamps = track.keypoints.stamps[:200]
     poses, wrench, estimates = iter(zip(seen.stamps, seen.poses, strict=True)), None, []
     coming = next(poses)
     for index, stamp in enumerate(stamps):
@@ -453,7 +453,7 @@ class TestDemo:
     def test_onset_is_seen_within_a_few_images(self, demo):
         touching = np.array([e.touching for e in demo.estimates])
         onset = int(demo.touched.argmax())
-        assert 30 < onset < 200
+        assert 30 < onset < 150
         # the surface is that of the image before, and the noise of the solver's rest one image of the ramp
         assert touching[onset + 4 :].all()
         assert touching[: onset - 1].mean() < 0.1
