@@ -91,6 +91,10 @@ class ContactSearch:
         self.state["x"][1:] += change
         self.average["count"] *= kept
 
+    def lead_traction(self, change: float) -> None:
+        """Take the averaged residuals along by a change of the traction ratio [-]."""
+        self.average["residual"] -= change * self.points["modes"][:, :, 3]
+
     def find(
         self, contact: RigidContact, traction: Traction, probe: Any, dt: float, *, iterations: int, is_sudden: bool
     ) -> bool:

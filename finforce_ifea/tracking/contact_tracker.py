@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from finforce_ifea.contact_mechanics.friction import FRICTIONLESS, constant_traction
 from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, SHAPE, OutlineIndenter, RoundIndenter, expect_object
-from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics, RigidContact
+from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics, RigidContact, limit_step
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE
 from finforce_ifea.observation import Contact, Observation
 from finforce_ifea.settings import EstimatorSettings
@@ -41,6 +41,8 @@ _BEYOND_STORED, _BACK = 1.0, 0.8
 # Iterations of the full mechanics in one image, each as long as a hundred others: a shape that asks for more is wrong,
 # or settles over the next images.
 _FULL_ITERATIONS = 3
+# Those that find the equilibrium of the full mechanics in the state at which they take over, and their last correction.
+_SETTLING, _SETTLED = 8, 2e-3
 # An object is apart from the jaw where its pose says so by this many standard deviations.
 _APART_SIGMAS = 3.0
 # Heights next to the clamp, as shares of the lowest at which key points show a force; objects farther off than this,
@@ -162,6 +164,7 @@ class ContactTracker:
             self._left = (self.q.copy(), pressed)
             q = self._contact.model.expand(self.q)
             self._use(1)
+            q = self._settle(q, state["x_model"])
         elif self._fidelity == 1 and pressed < _BACK * self._left[1]:
             self._use(0)
             # of the shape that was left and the unloaded jaw, the nearer one
@@ -170,6 +173,15 @@ class ContactTracker:
         else:
             return
         self._search.resume(q)
+
+    def _settle(self, q: NDArray, x: NDArray) -> NDArray:
+        """Return the shape (size,) of the jaw that is pressed in a state (3,), from one nearby."""
+        for _ in range(_SETTLING):
+            pressed = self._contact.linearize(q, x, self._traction)
+            if not pressed.touches or pressed.size < _SETTLED:
+                break
+            q = q + limit_step(self._contact.model, pressed.correction)
+        return q
 
     def vertices(self) -> NDArray:
         """Return the deformed mesh vertices (n, 3) [m], in mesh order."""
@@ -296,7 +308,12 @@ class ContactTracker:
             normal = max(hypot(search.state["pressing"][0], search.state["pressing"][2]), _LEAST_NORMAL)
             expected = Coefficient(wanted, self._find_held_stddev(normal)), self._find_friction()
             wanted = self._hold.update(evidence, search.state, expected, dt)
-        self._traction = constant_traction(min(max(wanted, -LARGEST_RATIO), LARGEST_RATIO))
+        self._take_traction(min(max(wanted, -LARGEST_RATIO), LARGEST_RATIO))
+
+    def _take_traction(self, ratio: float) -> None:
+        """Expect another traction ratio [-]; what the averaged residuals showed of it they show no longer."""
+        self._search.lead_traction(ratio - self._traction.ratio)
+        self._traction = constant_traction(ratio)
 
     def learn(self) -> None:
         """Learn what the last image tells of friction, which its force did not wait for."""
@@ -310,7 +327,7 @@ class ContactTracker:
         self.slips.follow(self.give_shape(), expected, sqrt(state["depth_variance"]), known)
         self.roughness.update(self._search.points, state, mean, self._search.expectation["variance"], before)
         if not self.settings.may_be_held:
-            self._traction = constant_traction(self._find_friction().mean)
+            self._take_traction(self._find_friction().mean)
 
     def resume(self, q: NDArray) -> None:
         """Start anew from the shape (size,) that another tracker has found."""
