@@ -20,6 +20,7 @@ from finforce_ifea.jaw.calibration import Calibration, load_calibration
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.observation import Contact, ObjectOutline, Observation
 from finforce_ifea.settings import EstimatorSettings
+from finforce_ifea.tracking.contact_tracker import ContactTracker
 from finforce_ifea.tracking.lateral_load import measure_torsion, turn_bent
 
 _DATA = Path(__file__).parents[1] / "data"
@@ -135,6 +136,20 @@ def test_an_upright_box_is_answered_where_no_stored_shape_is_near():
     assert answered.mean() > 0.98
     forces = np.array([np.linalg.norm(s.force) for s in solutions[-60:] if s.trusted])
     assert forces.mean() == pytest.approx(np.linalg.norm(true[-1]), rel=0.06)
+
+
+def test_the_full_mechanics_take_over_in_equilibrium(monkeypatch):
+    change, sizes = ContactTracker._change_fidelity, []
+
+    def watch(tracker, state):
+        before = tracker._fidelity
+        change(tracker, state)
+        if tracker._fidelity > before:
+            sizes.append(tracker._contact.linearize(tracker.q, state["x_model"], tracker._traction).size)
+
+    monkeypatch.setattr(ContactTracker, "_change_fidelity", watch)
+    play("box50_z42")
+    assert sizes and max(sizes) < 5e-3
 
 
 def test_going_back_the_stored_shapes_take_over_again():

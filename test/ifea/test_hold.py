@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from finforce_ifea.settings import EstimatorSettings
+from finforce_ifea.tracking.contact_search import ContactSearch
 from finforce_ifea.tracking.contact_state import AVERAGE, KEYPOINT, blank_contact_state
 from finforce_ifea.tracking.friction import Coefficient
 from finforce_ifea.tracking.hold import HoldHypotheses, measure_traction
@@ -38,6 +40,15 @@ def test_the_ratio_is_seen_whatever_is_counted_already_and_however_deep_the_obje
     asked, variance, _ = measure_traction(points, average, PRIOR)
     assert counted + asked == pytest.approx(0.3, abs=0.01)
     assert 0.0 < variance < 0.1**2
+
+
+def test_what_was_counted_is_not_asked_for_again():
+    points, average, _ = image(0.3)
+    search = ContactSearch(POINTS, EstimatorSettings())
+    search.points[:], search.average[:] = points, average
+    before = measure_traction(search.points, search.average, PRIOR)[0]
+    search.lead_traction(0.2)
+    assert measure_traction(search.points, search.average, PRIOR)[0] == pytest.approx(before - 0.2, abs=1e-9)
 
 
 def test_each_hypothesis_is_found_where_it_is_true():
