@@ -91,8 +91,8 @@ class ContactSearch:
         self.state["x"][1:] += change
         self.average["count"] *= kept
 
-    def lead_traction(self, change: float) -> None:
-        """Take the averaged residuals along by a change of the traction ratio [-]."""
+    def explain(self, change: float) -> None:
+        """Take what a traction ratio [-] that was learnt from the averaged residuals explains of them out of them."""
         self.average["residual"] -= change * self.points["modes"][:, :, 3]
 
     def find(

@@ -308,12 +308,8 @@ class ContactTracker:
             normal = max(hypot(search.state["pressing"][0], search.state["pressing"][2]), _LEAST_NORMAL)
             expected = Coefficient(wanted, self._find_held_stddev(normal)), self._find_friction()
             wanted = self._hold.update(evidence, search.state, expected, dt)
-        self._take_traction(min(max(wanted, -LARGEST_RATIO), LARGEST_RATIO))
-
-    def _take_traction(self, ratio: float) -> None:
-        """Expect another traction ratio [-]; what the averaged residuals showed of it they show no longer."""
-        self._search.lead_traction(ratio - self._traction.ratio)
-        self._traction = constant_traction(ratio)
+            search.explain(self._hold.learnt)
+        self._traction = constant_traction(min(max(wanted, -LARGEST_RATIO), LARGEST_RATIO))
 
     def learn(self) -> None:
         """Learn what the last image tells of friction, which its force did not wait for."""
@@ -327,7 +323,7 @@ class ContactTracker:
         self.slips.follow(self.give_shape(), expected, sqrt(state["depth_variance"]), known)
         self.roughness.update(self._search.points, state, mean, self._search.expectation["variance"], before)
         if not self.settings.may_be_held:
-            self._take_traction(self._find_friction().mean)
+            self._traction = constant_traction(self._find_friction().mean)
 
     def resume(self, q: NDArray) -> None:
         """Start anew from the shape (size,) that another tracker has found."""

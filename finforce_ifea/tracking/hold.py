@@ -38,6 +38,8 @@ class HoldHypotheses:
     Attributes:
         held: probability that only the jaws hold the object.
         ratio: expected traction ratio and its standard deviation.
+        learnt: what the last image changed of the ratio beyond what the hypotheses expected to change [-]. The averaged
+            residuals have asked for it, and show it no longer.
     """
 
     def __init__(self) -> None:
@@ -48,7 +50,8 @@ class HoldHypotheses:
         """Forget the grasp."""
         self._clearest = 0.0
         self.held = _HELD
-        self.ratio = Coefficient(0.0, inf)
+        self.ratio, self.learnt = Coefficient(0.0, inf), 0.0
+        self._expected: tuple[float, float] | None = None
 
     def update(
         self,
@@ -75,12 +78,19 @@ class HoldHypotheses:
             odds += sign * -0.5 * ((seen - each.mean) ** 2 / both + log(both))
             fitted.append(((each.mean * spread + seen * own) / both, own * spread / both))
         odds = min(max(odds, -_CERTAIN), _CERTAIN)
+        before = self.held
         self._clearest *= exp(-dt / _FADES)
         if abs(odds) > abs(self._clearest):
             self._clearest = odds
         self.held = 1.0 / (1.0 + exp(-self._clearest) * (1.0 - _HELD) / _HELD)
         (one, first), (two, second) = fitted
         mean = self.held * one + (1.0 - self.held) * two
+        means = (expected[0].mean, expected[1].mean)
+        self.learnt = 0.0
+        if self._expected is not None:
+            grasped, fixed = (now - then for now, then in zip(means, self._expected, strict=True))
+            self.learnt = mean - self.ratio.mean - before * grasped - (1.0 - before) * fixed
+        self._expected = means
         between = self.held * (1.0 - self.held) * (one - two) ** 2
         self.ratio = Coefficient(mean, sqrt(self.held * first + (1.0 - self.held) * second + between))
         return mean

@@ -47,7 +47,7 @@ def test_what_was_counted_is_not_asked_for_again():
     search = ContactSearch(POINTS, EstimatorSettings())
     search.points[:], search.average[:] = points, average
     before = measure_traction(search.points, search.average, PRIOR)[0]
-    search.lead_traction(0.2)
+    search.explain(0.2)
     assert measure_traction(search.points, search.average, PRIOR)[0] == pytest.approx(before - 0.2, abs=1e-9)
 
 
