@@ -134,6 +134,19 @@ def test_a_fork_below_the_clamp_is_held_and_one_above_it_refused(tmp_path, surfa
         make_jaw(tmp_path / "finger.stl", tmp_path / "jaw.yaml", name="fork", overrides=Overrides())
 
 
+@pytest.mark.parametrize("turn", [[0.0, 0.0, 0.0], [17.0, -41.0, 133.0], [84.0, 3.0, 11.0], [40.0, 40.0, 40.0]])
+def test_ribs_in_two_layers_are_refused_however_the_finger_is_turned(tmp_path, turn):
+    halves = [trimesh.creation.extrude_polygon(draw_polygon(ribs=ribs), 0.5 * WIDTH) for ribs in (4, 5)]
+    halves[1].apply_translation([0.0, 0.0, 0.5 * WIDTH])
+    mesh = trimesh.boolean.union(halves, engine="manifold")
+    frame = np.eye(4)
+    frame[:3, :3] = Rotation.from_euler("xyz", turn, degrees=True).as_matrix()
+    mesh.apply_transform(frame)
+    mesh.export(tmp_path / "finger.stl")
+    with pytest.raises(JawFileError, match="have another section"):
+        make_jaw(tmp_path / "finger.stl", tmp_path / "jaw.yaml", name="layers", overrides=Overrides())
+
+
 def test_a_floor_of_one_cell_is_no_base(tmp_path, surface):
     low, high = surface.bounds
     floor = boxes_joined(surface, ((20.0, 1.0, 8.0), [high[0] - 10.5, low[1] + 0.5, low[2] + 18.0]))
@@ -144,7 +157,7 @@ def test_a_floor_of_one_cell_is_no_base(tmp_path, surface):
 
 def test_marks_raised_on_a_side_are_left_out_and_a_rim_is_refused(tmp_path, surface):
     low, high = surface.bounds
-    places = [[high[0] - 0.8, high[1], z] for z in np.arange(low[2] + 4.0, high[2] - 4.0, 5.0)]
+    places = [[high[0] - 0.8, high[1], z] for z in np.arange(low[2] + 24.0, high[2] - 14.0, 5.0)]
     raw = read_mesh(tmp_path, boxes_joined(surface, *[((1.0, 2.0, 2.0), place) for place in places]))
     assert any("with raised marks, which are left out" in note for note in raw.notes)
     assert raw.width == pytest.approx(WIDTH * MILLIMETRE) and raw.base is None

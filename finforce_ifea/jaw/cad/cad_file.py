@@ -208,7 +208,7 @@ def _cut_surface(mesh: Surface, body: int | None, layered: bool, notes: list[str
             notes.append("its sections differ within the base, which the clamp has to hold")
         elif (beside := cuts.find_beside()) is not None:
             width, unlike = _measure_blade(mesh, axis, beside), ""
-            base = beside if cuts.is_short(beside, _SHORT) else None
+            base = None if cuts.is_mark else beside
             what = "raised marks, which are left out" if base is None else f"a base of {1e3 * cuts.width:.4g} mm"
             notes.append(f"a blade {1e3 * width:.4g} mm wide, {'on' if base is not None else 'with'} {what}")
         else:
@@ -285,17 +285,22 @@ class _Cuts:
     def find_local(self) -> shapely.Geometry | None:
         """Return where cuts differ from the section, if that is short: a fork, a bore or a void of the base."""
         seen = self.found[self.difference > _SEEN]
-        apart = shapely.union_all(shapely.symmetric_difference(seen, self.section))
+        apart = shapely.symmetric_difference(seen, self.section, grid_size=_GRID)
+        apart = shapely.union_all(apart, grid_size=_GRID)
         apart = apart.buffer(-_CHORD).buffer(_CHORD)  # without what rounding leaves along outlines
         return apart if self.is_short(apart, _LOCAL) else None
 
     def find_beside(self) -> shapely.Geometry | None:
         """Return the section of what stands out beside a blade: a base, or marks on it; None where it is neither."""
         is_other = self.difference > _OTHER
-        beside = shapely.union_all(self.found[is_other])
-        is_mark = self.areas[is_other].sum() <= _ALIKE * self.areas.sum()
-        is_beside = is_other.any() and (is_mark or self.is_short(beside, _SHORT))
+        beside = shapely.union_all(self.found[is_other], grid_size=_GRID)
+        is_beside = is_other.any() and (self.is_mark or self.is_short(beside, _SHORT))
         return beside if is_beside and self.are_alike(~is_other) else None
+
+    @property
+    def is_mark(self) -> bool:
+        """Whether what is another section is too little to matter, as raised letters."""
+        return bool(self.areas[self.difference > _OTHER].sum() <= _ALIKE * self.areas.sum())
 
     @property
     def is_one(self) -> bool:
@@ -305,8 +310,9 @@ class _Cuts:
     def are_alike(self, chosen: NDArray) -> bool:
         """Whether chosen ones, (n,) bool, are the section but for holes, rounded edges and the like, without floors."""
         seen = self.found[chosen & (self.difference > _SEEN)]
-        more = shapely.difference(seen, self.section)
-        floor = shapely.area(shapely.intersection(more, shapely.Polygon(self.section.exterior))).max(initial=0.0)
+        more = shapely.difference(seen, self.section, grid_size=_GRID)
+        inside = shapely.intersection(more, shapely.Polygon(self.section.exterior), grid_size=_GRID)
+        floor = shapely.area(inside).max(initial=0.0)
         is_little = self.difference[chosen].mean() <= _ALIKE and len(seen) <= _RARE * chosen.sum()
         return bool(is_little and floor <= _SEEN * self.section.area)
 
