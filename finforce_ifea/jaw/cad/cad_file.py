@@ -286,7 +286,7 @@ class _Cuts:
         """Return where cuts differ from the section, if that is short: a fork, a bore or a void of the base."""
         seen = self.found[self.difference > _SEEN]
         apart = shapely.symmetric_difference(seen, self.section, grid_size=_GRID)
-        apart = shapely.union_all(apart, grid_size=_GRID)
+        apart = shapely.union_all(shapely.buffer(apart, 0.0), grid_size=_GRID)  # lines among areas cannot be united
         apart = apart.buffer(-_CHORD).buffer(_CHORD)  # without what rounding leaves along outlines
         return apart if self.is_short(apart, _LOCAL) else None
 
@@ -311,7 +311,9 @@ class _Cuts:
         """Whether chosen ones, (n,) bool, are the section but for holes, rounded edges and the like, without floors."""
         seen = self.found[chosen & (self.difference > _SEEN)]
         more = shapely.difference(seen, self.section, grid_size=_GRID)
-        inside = shapely.intersection(more, shapely.Polygon(self.section.exterior), grid_size=_GRID)
+        inside = shapely.intersection(
+            shapely.buffer(more, 0.0), shapely.Polygon(self.section.exterior), grid_size=_GRID
+        )
         floor = shapely.area(inside).max(initial=0.0)
         is_little = self.difference[chosen].mean() <= _ALIKE and len(seen) <= _RARE * chosen.sum()
         return bool(is_little and floor <= _SEEN * self.section.area)
