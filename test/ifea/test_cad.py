@@ -2,6 +2,7 @@
 
 import json
 import re
+import zipfile
 from dataclasses import replace
 
 import cv2
@@ -82,8 +83,22 @@ def boxes_joined(surface, *boxes, cut=False):
     return (trimesh.boolean.difference if cut else trimesh.boolean.union)([surface, *solids], engine="manifold")
 
 
+def write_3mf(path, mesh):
+    """A 3MF file; trimesh would need networkx and lxml to write one."""
+    corners = "".join('<vertex x="{}" y="{}" z="{}"/>'.format(*map(float, one)) for one in mesh.vertices)
+    triangles = "".join('<triangle v1="{}" v2="{}" v3="{}"/>'.format(*one) for one in mesh.faces)
+    model = f"""<model xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02"><resources><object id="1"><mesh>
+        <vertices>{corners}</vertices><triangles>{triangles}</triangles>
+        </mesh></object></resources><build><item objectid="1"/></build></model>"""
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("3D/3dmodel.model", model)
+
+
 def read_mesh(tmp_path, mesh, name="finger.stl", **options):
-    mesh.export(tmp_path / name)
+    if name.endswith(".3mf"):
+        write_3mf(tmp_path / name, mesh)
+    else:
+        mesh.export(tmp_path / name)
     return read_section(tmp_path / name, **options)
 
 
