@@ -87,9 +87,9 @@ def write_3mf(path, mesh):
     """A 3MF file; trimesh would need networkx and lxml to write one."""
     corners = "".join('<vertex x="{}" y="{}" z="{}"/>'.format(*map(float, one)) for one in mesh.vertices)
     triangles = "".join('<triangle v1="{}" v2="{}" v3="{}"/>'.format(*one) for one in mesh.faces)
-    model = f"""<model xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02"><resources><object id="1"><mesh>
-        <vertices>{corners}</vertices><triangles>{triangles}</triangles>
-        </mesh></object></resources><build><item objectid="1"/></build></model>"""
+    mesh = f"<mesh><vertices>{corners}</vertices><triangles>{triangles}</triangles></mesh>"
+    model = f"""<model xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02">
+        <resources><object id="1">{mesh}</object></resources><build><item objectid="1"/></build></model>"""
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("3D/3dmodel.model", model)
 
