@@ -84,6 +84,12 @@ class StillReference:
         """Shifts (n + 1,) [m] of the key points in one image, as of `reach`, up to which noise explains them."""
         return np.maximum(LARGEST_SHIFT, SIGMA * self.errors)
 
+    def refine(self, found: JawKeypoints) -> StillReference:
+        """Return the reference with one more image in the mean of its key points, which thus never repeat for long."""
+        known = self.keypoints
+        change = np.where(found.valid[:, None] & known.valid[:, None], found.points - known.points, 0.0)
+        return replace(self, keypoints=replace(known, points=known.points + np.nan_to_num(change) / LEARNT))
+
     def reach(self, shifts: NDArray) -> NDArray:
         """Return how far shifts (4,) [m] move the key points along x, (n,), and all of them along z: (n + 1,) [m]."""
         return np.abs(np.append(self.powers @ shifts[:3], shifts[3]))
@@ -155,6 +161,7 @@ class StillWatch:
             if found.keys() == self.references.keys() and image.camera is self._camera and self._moved < 2:
                 known = {side: reference.keypoints for side, reference in self.references.items()}
                 if not have_moved(found, known):
+                    self.references = {side: each.refine(found[side]) for side, each in self.references.items()}
                     return found if self._moved else self._tell(image.stamp)
             self.references, self._moved = {}, 0
         self._learn(found, image)

@@ -53,6 +53,18 @@ def seen():
     return {(name, side): picture(100, move, side=side) for name, move in moves.items() for side in SIDES}
 
 
+def test_every_look_at_jaws_that_stand_still_refines_their_key_points(seen):
+    """To the bit the same key points for seconds are those of a camera that hangs."""
+    rng = np.random.default_rng(5)
+    watch = watch_of(rng=rng)
+    before = confirm(watch, seen["none", "left"])["left"].points
+    looked = found_at(SOON + LOOK_EVERY, rng)
+    watch.take(looked, shown(SOON + LOOK_EVERY, still(101)))
+    after = confirm(watch, picture(102), 2.0 * SOON + LOOK_EVERY)["left"].points
+    np.testing.assert_allclose(after - before, (looked["left"].points - before) / LEARNT, rtol=1e-6, atol=1e-12)
+    assert (after != before).any()
+
+
 def test_a_picture_of_jaws_that_stand_still_has_their_key_points_at_its_own_time(seen):
     found = confirm(watch_of(), seen["none", "left"])
     assert set(found) == set(SIDES)
