@@ -161,8 +161,10 @@ class StillWatch:
             if found.keys() == self.references.keys() and image.camera is self._camera and self._moved < 2:
                 known = {side: reference.keypoints for side, reference in self.references.items()}
                 if not have_moved(found, known):
+                    if self._moved:
+                        return found
                     self.references = {side: each.refine(found[side]) for side, each in self.references.items()}
-                    return found if self._moved else self._tell(image.stamp)
+                    return self._tell(image.stamp)
             self.references, self._moved = {}, 0
         self._learn(found, image)
         return self._tell(image.stamp) if self.references else found

@@ -139,10 +139,12 @@ def test_the_same_picture_to_the_bit_tells_nothing(seen):
 @pytest.mark.parametrize("name", ["tip", "jump"])
 def test_one_picture_that_looks_moved_forgets_nothing(seen, name):
     watch, moved = watch_of(), seen[name, "left"]
+    known = {side: reference.keypoints.points for side, reference in watch.references.items()}
     assert confirm(watch, moved) is None
-    found = found_at(SOON)
+    found = found_at(SOON, np.random.default_rng(6))
     assert watch.take(found, shown(SOON, moved)) is found
-    assert confirm(watch, seen["none", "left"]) is not None
+    told = confirm(watch, seen["none", "left"])
+    assert all((told[side].points == points).all() for side, points in known.items())
 
 
 def test_after_two_pictures_that_look_moved_the_new_place_is_learnt():
