@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -69,45 +68,15 @@ _ABOUT = b"finforce"
 _LISTS = {name for name, unit in UNITS.items() if "each" in unit}
 
 
-@dataclass(frozen=True, kw_only=True)
-class Snapshot:
-    """The jaw at one instant; all points in the jaw frame [m].
-
-    Attributes:
-        stamp: image time [ns].
-        surface0: (n, 3) undeformed vertices.
-        surface: (n, 3) deformed vertices.
-        triangles: (t, 3) vertex indices.
-        keypoints0: (K, 3) undeformed key points.
-        keypoints: (K, 3) key points as seen, NaN = none.
-        used: (K,) key points that the estimator used.
-        contact_point: (3,) on the deformed surface.
-        force: (3,) [N] on the jaw.
-        outline: of the object, polygons (n, 2) of x and z; none where it is not known.
-    """
-
-    stamp: int
-    surface0: NDArray[np.float64]
-    surface: NDArray[np.float64]
-    triangles: NDArray[np.integer]
-    keypoints0: NDArray[np.float64]
-    keypoints: NDArray[np.float64]
-    used: NDArray[np.bool_]
-    contact_point: NDArray[np.float64]
-    force: NDArray[np.float64]
-    outline: tuple[NDArray[np.float64], ...] = ()
-
-
 class ForceSeries:
     """The rows of one jaw of one recording, with its columns as arrays.
 
     Args:
         table: the rows, in the order of their stamps.
-        snapshot: the jaw at the largest trusted force of a scored image, which no file keeps; None without.
     """
 
-    def __init__(self, table: pd.DataFrame, snapshot: Snapshot | None = None) -> None:
-        self.table, self.snapshot = table, snapshot
+    def __init__(self, table: pd.DataFrame) -> None:
+        self.table = table
 
     @classmethod
     def build(cls, name: str, side: str, stamps: ArrayLike, **columns: Any) -> ForceSeries:
@@ -136,20 +105,16 @@ class ForceSeries:
                 known[name] = pd.Series(list(values), dtype=object)
             else:
                 known[name] = values
-        return ForceSeries(self.table.assign(**known), self.snapshot)
+        return ForceSeries(self.table.assign(**known))
 
     def at(self, rows: NDArray) -> ForceSeries:
         """Return some rows, by a mask (n,) or their numbers."""
         chosen = self.table[rows] if rows.dtype == bool else self.table.iloc[rows]
-        return ForceSeries(chosen.reset_index(drop=True), self.snapshot)
+        return ForceSeries(chosen.reset_index(drop=True))
 
     def renamed(self, name: str) -> ForceSeries:
         """Return the rows under another name of the case."""
         return self.with_columns(case=name)
-
-    def with_snapshot(self, snapshot: Snapshot | None) -> ForceSeries:
-        """Return the rows with a picture of the jaw."""
-        return ForceSeries(self.table, snapshot)
 
     def __len__(self) -> int:
         """Images."""

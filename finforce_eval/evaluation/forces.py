@@ -18,7 +18,7 @@ from finforce_eval.evaluation.gripper import with_distances
 from finforce_eval.evaluation.pressure_centre import InnerSurface, true_lines
 from finforce_eval.evaluation.scoring import ONSET_FORCE, compare_detection, match_samples, match_truth
 from finforce_eval.recordings.tracks import Recording
-from finforce_eval.table import AXES, ForceSeries, Snapshot
+from finforce_eval.table import AXES, ForceSeries
 from finforce_eval.tasks import progress_bar
 
 if TYPE_CHECKING:
@@ -209,7 +209,7 @@ def find_forces(
     columns |= recording.phases_at(stamps) | truth_columns(recording, side) | sight_columns(recording, side)
     if "detector_ms" in columns:
         columns["latency_ms"] = columns["step_ms"] + columns["detector_ms"]
-    series = ForceSeries.build(recording.name, side, stamps, **columns).with_snapshot(run.snapshot)
+    series = ForceSeries.build(recording.name, side, stamps, **columns)
     return series.at(~passed) if as_live else series
 
 
@@ -234,21 +234,15 @@ class _JawRun:
         jaw: the jaw of that side.
         loop: a fresh one.
         stills: whether nothing of one image is known in the next.
-
-    Attributes:
-        snapshot: the jaw under the largest force so far of an image that is scored.
     """
 
     def __init__(self, recording: Recording, side: str, jaw: Any, loop: ForceLoop, stills: bool = False) -> None:
         self._name, self._updates = recording.name, STILL_UPDATES if stills else 1
-        self._jaw, self._loop, self._track = jaw, loop, recording.jaw(side).keypoints
-        self._scored = recording.phases_at(self._track.stamps)["scored"]
-        self._surface0 = np.array(loop.force.surface())
+        self._loop, self._track = loop, recording.jaw(side).keypoints
         self._lines = None
         if recording.jaw(side).truth is not None:
-            self._face = InnerSurface(self._surface0, jaw.face)
+            self._face = InnerSurface(np.array(loop.force.surface()), jaw.face)
             self._lines = true_lines(recording, side, self._track.stamps, self._face.face_x)
-        self.snapshot: Snapshot | None = None
 
     def answer(self, index: int, strict: bool) -> dict[str, Any]:
         """Return what the loop makes of image `index`; one that is refused ends the run if `strict`; see `step`."""
@@ -284,8 +278,6 @@ class _JawRun:
             row["true_height"] = self._face.cut(loop.force.surface(), *line)
         if solution.trusted:
             row |= {name: getattr(solution, name) for name in (*_VECTORS, "magnitude_stddev")}
-            if self._scored[index]:
-                self._keep_largest(index, solution)
         return row
 
     def row(self, status: str, message: str) -> dict[str, Any]:
@@ -300,27 +292,6 @@ class _JawRun:
             if len(points):
                 row["contact_height"] = np.average(points[:, 2], weights=contact.weights)
         return row | {"status": status, "message": message}
-
-    def _keep_largest(self, index: int, solution: Any) -> None:
-        """Keep jaw and object as they are now where the force is the largest so far."""
-        largest = 0.0 if self.snapshot is None else float(np.linalg.norm(self.snapshot.force))
-        # two per cent: the surface is copied now and then, not on every image of a rising force
-        if float(np.linalg.norm(solution.force)) <= 1.02 * largest:
-            return
-        contact, estimator = self._loop.given, self._loop.force
-        known = contact is not None and contact.outline is not None
-        self.snapshot = Snapshot(
-            stamp=int(self._track.stamps[index]),
-            surface0=self._surface0,
-            surface=np.array(estimator.surface()),
-            triangles=np.asarray(estimator.surface_triangles),
-            keypoints0=np.asarray(self._jaw.keypoints),
-            keypoints=self._track.points[index],
-            used=np.array(solution.keypoints_used),
-            contact_point=np.array(solution.contact_point),
-            force=np.array(solution.force),
-            outline=contact.outline.placed() if known else (),
-        )
 
 
 def truth_columns(recording: Recording, side: str) -> dict[str, Any]:

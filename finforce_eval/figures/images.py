@@ -53,6 +53,13 @@ def choose_images(stamps: NDArray[np.int64], largest: int | None = None) -> NDAr
     return stamps[rows]
 
 
+def stamp_of_largest(results: Sequence[ForceSeries]) -> int | None:
+    """Return the time of the largest force of all jaws [ns] in the images that are to be scored; None without any."""
+    chosen = [each.at(each.scored & each.solved) for each in results]
+    known = [(each.magnitude.max(), each.stamps[each.magnitude.argmax()]) for each in chosen if len(each)]
+    return int(max(known)[1]) if known else None
+
+
 def find_region(pixels: NDArray[np.float64], width: int, height: int) -> Region:
     """Return the part of an image in which pixels (n, 2) lie, with a margin; the whole image without any."""
     seen = pixels[np.isfinite(pixels).all(axis=1)]
@@ -81,9 +88,8 @@ def draw_images(recording: Recording, results: Sequence[ForceSeries], skeleton: 
     Raises:
         RecordingError: an image is damaged.
     """
-    snapshots = [result.snapshot for result in results if result.snapshot is not None]
-    largest = max(snapshots, key=lambda taken: float(np.linalg.norm(taken.force)), default=None)
-    stamps = choose_images(recording.images.stamps, largest and largest.stamp)
+    largest = stamp_of_largest(results)
+    stamps = choose_images(recording.images.stamps, largest)
     camera = recording.images.camera
     region = find_region(known_pixels(recording, stamps), camera.width, camera.height)
     lines = -(-len(stamps) // COLUMNS)
@@ -99,8 +105,8 @@ def draw_images(recording: Recording, results: Sequence[ForceSeries], skeleton: 
             _draw_truth(axes, track, taken.stamp)
         axes.set_xlim(region.left - 0.5, region.left + region.width - 0.5)
         axes.set_ylim(region.top + region.height - 0.5, region.top - 0.5)
-        is_largest = largest is not None and taken.stamp == largest.stamp
-        axes.set_title(describe_image(recording, results, taken.stamp, is_largest), loc="left", fontsize=9)
+        title = describe_image(recording, results, taken.stamp, taken.stamp == largest)
+        axes.set_title(title, loc="left", fontsize=9)
     _explain(figure, reasons, has_truth=any(track.sight is not None for track in detected_jaws(recording).values()))
     return figure
 

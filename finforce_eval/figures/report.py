@@ -18,11 +18,7 @@ from finforce_eval.recordings.tracks import DIRECTIONS, Recording
 from finforce_eval.table import ForceSeries
 
 TITLE, PAGE = "Force from key points", "report.html"
-# Pictures of a recording or a case by the ends of their names, with what they show.
-PICTURES = {
-    "images": "Key points in the images",
-    "jaw": "The jaw at the largest force",
-}
+IMAGES = "Key points in the images"
 
 
 def draw_results(
@@ -32,10 +28,10 @@ def draw_results(
     keypoint_names: Sequence[str],
     recordings: Sequence[Recording] = (),
 ) -> None:
-    """Draw recordings and the series of their jaws.
+    """Draw some images of each recording, with what was found in them.
 
     Args:
-        results: of the jaws.
+        results: of the jaws, for the forces at these images.
         folder: of the report; made when missing, pictures of the same recordings are replaced.
         keypoint_names: K names of the key points of the jaw.
         recordings: where key points were found in their images, some of these are shown.
@@ -44,20 +40,11 @@ def draw_results(
         MissingDependencyError: matplotlib is not installed.
         RecordingError: an image is damaged.
     """
-    from finforce_eval.figures.figures import draw_jaw
-
     folder.mkdir(parents=True, exist_ok=True)
-    for name in {*(recording.name for recording in recordings), *(result.name for result in results)}:
-        for end in PICTURES:  # of an earlier report
-            _picture(folder, name, end).unlink(missing_ok=True)
     for recording in recordings:
+        _picture(folder, recording.name).unlink(missing_ok=True)  # of an earlier report
         own = [result for result in results if _recording_of(result) == recording.name]
         _draw_images(recording, own, folder, keypoint_names)
-    for result in results:
-        if result.snapshot is not None:
-            seconds = (result.snapshot.stamp - int(result.stamps[0])) * 1e-9
-            title = f"{result.name}, largest force, t = {seconds:.1f} s"
-            draw_jaw(result.snapshot, title).savefig(_picture(folder, result.name, "jaw"))
 
 
 def write_overview(evaluation: Evaluation, folder: str | Path, *, about: Mapping[str, str]) -> Path:
@@ -77,8 +64,8 @@ def write_overview(evaluation: Evaluation, folder: str | Path, *, about: Mapping
     folder.mkdir(parents=True, exist_ok=True)
     results = list(evaluation.results.values())
     draw_unity(results).savefig(folder / "unity.png")
-    names = dict.fromkeys([*map(_recording_of, results), *evaluation.results])
-    pictures = {f"{name}: {text}": _picture(folder, name, end) for end, text in PICTURES.items() for name in names}
+    names = dict.fromkeys(map(_recording_of, results))
+    pictures = {f"{name}: {IMAGES}": _picture(folder, name) for name in names}
     pictures = {caption: path for caption, path in pictures.items() if path.exists()}
     pictures["Estimated against measured force"] = folder / "unity.png"
     return write_page(evaluation, folder / PAGE, about=about, title=TITLE, pictures=pictures)
@@ -89,10 +76,10 @@ def _recording_of(result: ForceSeries) -> str:
     return result.name.removesuffix(f"/{result.side}")
 
 
-def _picture(folder: Path, name: str, end: str) -> Path:
-    """Return the file of a picture of a case or a recording."""
+def _picture(folder: Path, name: str) -> Path:
+    """Return the file of a recording's picture."""
     stem = re.sub(r"[^\w.-]+", "_", name)
-    return folder / f"{stem}_{end}.png"
+    return folder / f"{stem}_images.png"
 
 
 def write_page(
@@ -131,7 +118,7 @@ def _draw_images(
     from finforce_keypoints.diagnostics import build_skeleton
 
     figure = draw_images(recording, results, build_skeleton(keypoint_names))
-    figure.savefig(_picture(folder, recording.name, "images"))
+    figure.savefig(_picture(folder, recording.name))
 
 
 TEMPLATE = Path(__file__).parents[1] / "data" / "page" / "report.html"

@@ -15,8 +15,8 @@ from finforce_eval.evaluation.forces import sight_columns, truth_columns
 from finforce_eval.evaluation.keypoint_source import with_detections
 from finforce_eval.evaluation.pressure_centre import InnerSurface, true_lines
 from finforce_eval.recordings.tracks import Recording
-from finforce_eval.table import ForceSeries, Snapshot, stddev_along
-from finforce_ifea.messages import contact_from_cloud, outline_from_cloud
+from finforce_eval.table import ForceSeries, stddev_along
+from finforce_ifea.messages import contact_from_cloud
 from finforce_keypoints.geometry.jaw_localizer import REASONS, JawKeypoints
 
 
@@ -46,7 +46,6 @@ class ReplayLog:
         self.poses: dict[str, dict[int, NDArray]] = {side: {} for side in sides}
         self.clouds: dict[str, dict[int, tuple[Any, float]]] = {side: {} for side in sides}
         self.health: dict[str, Mapping[str, str]] = {}
-        self._outlines: dict[str, tuple[NDArray, ...]] = dict.fromkeys(sides, ())
         self._ended = False
 
     def end(self) -> None:
@@ -75,9 +74,8 @@ class ReplayLog:
         self.rows[side][self._stamp(message)]["force_stddev"] = _vector(message.wrench.force)
 
     def take_surface(self, side: str, message: Any) -> None:
-        """Keep a surface, and the object's outline with it."""
-        found = {"surface": decode_keypoints(message).points.astype(np.float32), "outline": self._outlines[side]}
-        self.rows[side][self._stamp(message)] |= found
+        """Keep a surface."""
+        self.rows[side][self._stamp(message)]["surface"] = decode_keypoints(message).points.astype(np.float32)
 
     def take_contact(self, side: str, message: Any) -> None:
         """Keep the reported contact."""
@@ -85,11 +83,6 @@ class ReplayLog:
         if len(contact.points):
             row["contact_height"] = float(np.average(contact.points[:, 2], weights=contact.weights))
         row |= {"touching": bool(contact.touching), "contact_status": "live"}
-
-    def take_outline(self, side: str, message: Any) -> None:
-        """Keep the newest outline of the object."""
-        outline = outline_from_cloud(message, f"{side}_jaw", None)
-        self._outlines[side] = () if outline is None else outline.placed()
 
     def take_pose(self, side: str, message: Any) -> None:
         """Keep the pose of a jaw that the detector found."""
@@ -156,7 +149,7 @@ def live_result(
         side: "left" or "right".
         log: the answers.
         likelihood_threshold: of the solver.
-        estimator: a fresh one of the same jaw, for the undeformed surface and its triangles.
+        estimator: a fresh one of the same jaw, for the undeformed surface.
     """
     track, nothing = recording.jaw(side).keypoints, np.full(3, np.nan)
     rows = [log.rows[side].get(stamp, {}) for stamp in track.stamps.tolist()]
@@ -177,7 +170,7 @@ def live_result(
         **(_contact_columns(recording, side, rows, estimator) if any("touching" in row for row in rows) else {}),
         true_force=truth_columns(recording, side)["true_force"],
         **sight_columns(recording, side),
-    ).with_snapshot(_snapshot(recording, side, rows, seen, estimator))
+    )
 
 
 def _contact_columns(recording: Recording, side: str, rows: list[dict[str, Any]], estimator: Any) -> dict[str, Any]:
@@ -195,54 +188,6 @@ def _contact_columns(recording: Recording, side: str, rows: list[dict[str, Any]]
         "touching": np.array([row.get("touching", False) for row in rows]),
         "contact_status": np.array([row.get("contact_status", "") for row in rows]),
     }
-
-
-def _snapshot(
-    recording: Recording, side: str, rows: list[dict[str, Any]], seen: NDArray[np.bool_], estimator: Any
-) -> Snapshot | None:
-    """Return the jaw under the largest force, None if no surface came."""
-    whole = [index for index, row in enumerate(rows) if "surface" in row and "force" in row]
-    if not whole:
-        return None
-    index = max(whole, key=lambda each: float(np.linalg.norm(rows[each]["force"])))
-    track, row = recording.jaw(side).keypoints, rows[index]
-    surface = row["surface"].astype(np.float64)
-    return Snapshot(
-        stamp=int(track.stamps[index]),
-        surface0=np.array(estimator.surface()),
-        surface=surface,
-        triangles=np.asarray(estimator.surface_triangles),
-        keypoints0=np.asarray(estimator.jaw.keypoints),
-        keypoints=track.points[index],
-        used=seen[index],
-        contact_point=point_of_application(row["force"], row["torque"], surface),
-        force=row["force"],
-        outline=row["outline"],
-    )
-
-
-def point_of_application(
-    force: NDArray[np.float64], torque: NDArray[np.float64], surface: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return the point of a surface through which a force acts, (3,) [m].
-
-    The line of action is x(s) = F x T / |F|^2 + s F; of the vertices the one counts that lies nearest to it,
-    and among equals the one that the force meets first.
-
-    Args:
-        force: F (3,) [N].
-        torque: T (3,) [N m] about the origin.
-        surface: (n, 3) [m].
-    """
-    square = float(force @ force)
-    if square == 0.0:
-        return np.full(3, np.nan)
-    foot = np.cross(force, torque) / square
-    along = (surface - foot) @ force / square
-    distance = np.linalg.norm(surface - foot - along[:, None] * force, axis=1)
-    near = np.flatnonzero(distance < distance.min() + 1e-3)
-    first = near[np.argmin(along[near])]
-    return foot + along[first] * force
 
 
 def _vector(xyz: Any) -> NDArray[np.float64]:

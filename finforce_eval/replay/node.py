@@ -151,7 +151,6 @@ class PlayerNode(Node):
             subscribe(WrenchStamped, f"{side}/wrench_stddev", lambda m, s=side: log.take_stddev(s, m))
             subscribe(PointCloud2, f"{side}/surface", lambda m, s=side: log.take_surface(s, m))
             subscribe(PointCloud2, f"{side}/contact", lambda m, s=side: log.take_contact(s, m))
-            subscribe(PointCloud2, f"{side}/object_outline", lambda m, s=side: log.take_outline(s, m))
             if detector:
                 subscribe(PoseStamped, f"{side}/jaw_pose", lambda m, s=side: log.take_pose(s, m))
                 subscribe(PointCloud2, f"{side}/keypoints", lambda m, s=side: log.take_keypoints(s, m, monotonic()))

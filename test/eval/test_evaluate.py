@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from eval_fakes import PERIOD, START, FakeContactEstimator, FakeEstimator, FakeJaw, evaluate_recording, make_recording
+from eval_fakes import PERIOD, FakeContactEstimator, FakeEstimator, FakeJaw, evaluate_recording, make_recording
 
 from finforce.errors import FinforceError, ObservationError
 from finforce_contact.loop import GivenContact
@@ -94,16 +94,6 @@ def test_untrusted_steps_are_skipped_and_keep_their_status():
     assert np.isnan(result.force[0]).all()
     assert result.column("status")[:2].tolist() == ["not_enough_points", "ok"]
     assert not result.column("used")[0].any()
-
-
-def test_snapshot_is_taken_near_the_largest_force():
-    recording = make_recording()
-    result, _ = run(recording, truth_of(recording))
-    largest = np.linalg.norm(truth_of(recording), axis=1)[result.scored].max()
-    assert np.linalg.norm(result.snapshot.force) > 0.98 * largest
-    frame = (result.snapshot.stamp - START) // PERIOD
-    # the fake's surface moves by 1 mm a step
-    np.testing.assert_allclose(result.snapshot.surface - result.snapshot.surface0, [[1e-3 * (frame + 1), 0, 0]] * 8)
 
 
 def test_truth_sampled_at_other_stamps_is_matched():

@@ -23,7 +23,7 @@ from finforce_eval.cli.main import main
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.writer import write_recording
 from finforce_eval.replay import replay as replaying
-from finforce_eval.replay.live import ReplayLog, live_result, point_of_application
+from finforce_eval.replay.live import ReplayLog, live_result
 from finforce_eval.replay.node import open_player
 
 SHIPPED = Path(replaying.__file__).parents[1] / "data" / "bench_cyl25_middle"
@@ -131,18 +131,6 @@ def test_the_time_series_has_a_gap_where_no_wrench_came():
     np.testing.assert_allclose(result.column("step_ms")[::2], 2.0)
     assert np.isnan(result.column("step_ms")[1::2]).all()
     assert result.scored.any() and not result.scored.all()
-
-
-def test_the_point_of_application_lies_on_the_line_of_action_where_it_enters_the_surface():
-    points = np.stack(np.meshgrid([0.0, 0.014], [0.0], np.linspace(0, 0.08, 81)), -1).reshape(-1, 3)
-    place = np.array([0.014, 0.0, 0.0413])
-    force = np.array([-3.0, 0.0, 0.2])
-    found = point_of_application(force, np.cross(place, force), points)
-    np.testing.assert_allclose(found, place, atol=6e-4)  # half a vertex distance
-
-
-def test_no_force_has_no_point_of_application():
-    assert np.isnan(point_of_application(np.zeros(3), np.zeros(3), np.zeros((4, 3)))).all()
 
 
 def with_opposite_jaw(recording):
