@@ -30,14 +30,7 @@ class NodeParameters(GripperParameters):
         1.0,
     )
     contact_free: bool = setting(False, "Whether the solver may move contacts from the topic")
-    contact_timeout: float = setting(
-        0.008,
-        "Maximum wait for the contact of an image",
-        "s",
-        0.0,
-        1.0,
-        alias="contact_patience",
-    )
+    contact_timeout: float = setting(0.008, "Maximum wait for the contact of an image", "s", 0.0, 1.0)
     peer: str = setting(
         "",
         "Other jaw, whose wrenches complete grasp_wrench and manipulation_wrench; empty: none",
