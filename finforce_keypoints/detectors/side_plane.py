@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.camera import CameraIntrinsics
-from finforce.gripper_frames import HALF_TURN, OpeningRange
+from finforce.gripper_frames import HALF_TURN, OpeningRange, jaw_in_camera
 from finforce.transforms import pose_numbers
 from finforce_keypoints.errors import GeometryError, ModelError
-from finforce_keypoints.geometry.jaw_pose import SLIP
+from finforce_keypoints.geometry.jaw_pose import COVERED_STDDEV, SLIP
 from finforce_keypoints.geometry.side_picture import PlaneGrid, find_side, map_picture, project_plane, take_picture
 from finforce_keypoints.geometry.template import draw_template, find_motions, find_shape, fit_grid, span_shapes
 from finforce_keypoints.images import PixelDetection
@@ -28,9 +28,13 @@ if TYPE_CHECKING:
 
 SAME_PLACE = 1e-3  # [m] by which a jaw may move before its picture is mapped anew; places are exact all the same
 SEARCH_STEP = 24.0  # [px] between the places where a lost jaw is looked for; the network finds one half as far away
-HELD_FINER = 2  # times as close together are those of a jaw in a holder, which may be bent where it is found
+HELD_FINER = 4  # times as close together are those of a jaw in a holder, which may be bent where it is found
 LEAST_SCORE = 0.35  # mean likelihood of a jaw's points that are not covered, below which it is not there
 LIKELY_SCORE = 0.6  # the same, below which a jaw in a holder is looked for beside its place, too
+# The same for one of two jaws in holders that was lost and whose mate is at no like opening: among many places one
+# looks like the few points that a holder leaves, but hardly two at the same opening.
+LONE_SCORE = 0.8
+UNLIKE = np.sqrt(2.0) * COVERED_STDDEV  # [m] standard deviation of what the openings of two such jaws differ by
 STRAIGHT = np.zeros((1, 2))  # pictures of a locator's own grid alone
 # [px] between the pictures of a jaw in a holder: a network is surer of a bent finger in one of them than in the next.
 AROUND = 6.0 * np.array([(x, z) for x in (0, -1, 1) for z in (0, -1, 1)])
@@ -101,11 +105,14 @@ class SidePlaneDetector:
         found: dict[str, PixelDetection] = {}
         again: list[_View] = []
         for side, number in self._choose(views, scores).items():
-            view, is_held = views[number], not self._seen[side][-1]
+            view, is_held = views[number], self._is_held(side)
             if expected[side] is None and scores[number] >= LEAST_SCORE:
                 # the jaw lay near the border of the picture it was found in
                 pose = self._centre(view, places, number)
-                again += [self._view(side, pose, shift) for shift in (AROUND if is_held else STRAIGHT)]
+                # points of a bent finger say little of its place: it may be where it was looked for, too
+                poses = [(side, pose), (side, view.T_camera_jaw), *self._mirror(side, pose, expected)]
+                poses, shifts = (poses, AROUND) if is_held else (poses[:1], STRAIGHT)
+                again += [self._view(jaw, each, shift) for jaw, each in poses for shift in shifts]
             elif is_held and expected[side] is not None and scores[number] < LIKELY_SCORE:
                 again += [self._view(side, view.T_camera_jaw, shift) for shift in AROUND]
             elif expected[side] is not None:
@@ -113,26 +120,52 @@ class SidePlaneDetector:
         if again:
             places = self._locate(image, again)
             scores = self._score(again, places)
-            for side in {view.side for view in again}:
-                number = max((n for n, view in enumerate(again) if view.side == side), key=scores.__getitem__)
-                found[side] = self._describe(again[number], places, number, scores[number])
+            chosen = self._choose(again, scores)
+            there = {each: pose for each, pose in expected.items() if pose is not None}
+            there |= {each: again[n].T_camera_jaw for each, n in chosen.items() if scores[n] >= LEAST_SCORE}
+            for side, number in chosen.items():
+                is_lone = expected[side] is None and scores[number] < LONE_SCORE and self._is_alone(side, there)
+                found[side] = self._describe(again[number], places, number, 0.0 if is_lone else scores[number])
                 if expected[side] is not None and scores[number] < LEAST_SCORE:
                     found |= self.detect(image, {side: None})
         return found
 
+    def _is_held(self, side: str) -> bool:
+        """Say whether a holder covers the reference point of a jaw."""
+        return not self._seen[side][-1]
+
+    def _opening_of(self, pose: NDArray) -> float:
+        """Return where a jaw of T_camera_jaw (4, 4) is on the closing axis [m]."""
+        return float((self._T_gripper_camera @ pose)[0, 3])
+
+    def _mirror(self, side: str, pose: NDArray, expected: Mapping[str, NDArray | None]) -> list[tuple[str, NDArray]]:
+        """Return the other jaw, if it is lost, too, and its pose where it is as open as this one."""
+        x, T = -self._opening_of(pose), self._T_gripper_camera
+        lost = [each for each, where in expected.items() if each != side and where is None]
+        return [(each, jaw_in_camera(T, each, x, self._mounts[each].turn)) for each in lost]
+
+    def _is_alone(self, side: str, there: Mapping[str, NDArray]) -> bool:
+        """Say whether the mate of a jaw in a holder is not there, or not as open, by poses (4, 4) of those that are."""
+        if len(self._planes) == 1 or not self._is_held(side):
+            return False
+        return len(there) == 1 or abs(sum(map(self._opening_of, there.values()))) > 3.0 * UNLIKE
+
     def _choose(self, views: Sequence[_View], scores: Sequence[float]) -> dict[str, int]:
-        """Return the number of the likeliest view of each jaw; two jaws in holders that are lost close alike."""
+        """Return the number of the likeliest view of each jaw.
+
+        Two jaws in holders open alike: the square of what they do not, in standard deviations, counts half as much as
+        one likely point.
+        """
         numbers = {side: [n for n, view in enumerate(views) if view.side == side] for side in self._planes}
         numbers = {side: each for side, each in numbers.items() if each}
         best = {side: max(each, key=scores.__getitem__) for side, each in numbers.items()}
-        if len(best) == 2 and not any(self._seen[side][-1] for side in best):
-            left, right = (np.array([scores[n] for n in numbers[side]]) for side in best)
-            if len(left) == len(right) > 1:
-                apart = np.abs(np.subtract.outer(np.arange(len(left)), np.arange(len(right))))
-                pair = np.unravel_index(
-                    np.argmax(np.where(apart <= HELD_FINER, np.add.outer(left, right), -1.0)), apart.shape
-                )
-                best = {side: numbers[side][n] for side, n in zip(best, pair, strict=True)}
+        if len(best) == 2 and all(self._is_held(side) and len(numbers[side]) > 1 for side in best):
+            sums = np.add.outer(*([scores[n] for n in each] for each in numbers.values()))
+            where = [[self._opening_of(views[n].T_camera_jaw) for n in each] for each in numbers.values()]
+            unlike = np.add.outer(*where) / UNLIKE
+            count = np.mean([np.count_nonzero(self._seen[side]) for side in best])
+            pair = np.unravel_index(np.argmax(sums - 0.5 * unlike**2 / count), sums.shape)
+            best = {side: numbers[side][n] for side, n in zip(best, pair, strict=True)}
         return best
 
     def _locate(self, image: RgbdImage, views: Sequence[_View]) -> Places:

@@ -153,6 +153,47 @@ def test_jaws_in_holders_that_are_lost_are_looked_for_at_like_openings(slope):
     assert abs(found[LOW] - rest).max() < 30.0 < abs(found[frozenset()] - rest).max()
 
 
+@pytest.mark.parametrize(
+    ("likelihood", "mate", "is_there"), [(0.7, None, False), (0.9, None, True), (0.5, 0.06, False)]
+)
+@pytest.mark.parametrize("is_tracked", [False, True])
+def test_of_two_jaws_in_holders_one_alone_has_to_be_likelier(slope, likelihood, mate, is_there, is_tracked):
+    image, level = slope
+    jaws = {side: load_jaw("bench", side) for side in ("left", "right")}
+
+    def likely(side, seen):
+        at = {"left": -0.035, "right": mate or 0.035}[side]
+        there = abs(seen - level(side, at)) < 12.0 and (side == "left" or mate or is_tracked)
+        return likelihood if there else 0.1
+
+    mounts = {side: JawMount(covered=LOW) for side in jaws}
+    detector = SidePlaneDetector(Sighted(jaws, likely), jaws, ROBOT_CAMERA, mounts=mounts)
+    expected = {"left": None, "right": jaw_in_camera(ROBOT_CAMERA, "right", mate or 0.035) if is_tracked else None}
+    found = detector.detect(image, expected)["left"].likelihood.max()
+    assert found == pytest.approx(likelihood if is_there or (is_tracked and not mate) else 0.0)
+
+
+def test_a_jaw_in_a_holder_is_looked_for_as_far_open_as_its_mate(slope):
+    image, level = slope
+    jaws = {side: load_jaw("bench", side) for side in ("left", "right")}
+
+    def likely(side, seen):  # the right jaw shows little at first
+        there = abs(seen - level(side, -0.035 if side == "left" else 0.035)) < 12.0
+        return (0.9 if side == "left" or len(locator.counts) > 1 else 0.3) if there else 0.1
+
+    class Counting(Sighted):
+        counts = ()
+
+        def locate(self, pictures, sides, starts=()):
+            self.counts = (*self.counts, len(pictures))
+            return super().locate(pictures, sides, starts)
+
+    locator = Counting(jaws, likely)
+    detector = SidePlaneDetector(locator, jaws, ROBOT_CAMERA, mounts={side: JawMount(covered=LOW) for side in jaws})
+    found = detector.detect(image, dict.fromkeys(jaws))
+    assert found["left"].likelihood.max() == found["right"].likelihood.max() == pytest.approx(0.9)
+
+
 def test_a_jaw_in_a_holder_that_is_not_where_it_is_expected_is_looked_for_at_once(slope):
     image, level = slope
     jaws, there = {"left": load_jaw("bench")}, jaw_in_camera(ROBOT_CAMERA, "left", -0.035)
