@@ -1,10 +1,9 @@
-"""A USB-CAN adapter that speaks SLCAN, with grippers on its bus."""
+"""A USB-CAN adapter that speaks SLCAN, with a gripper on its bus."""
 
 from __future__ import annotations
 
 import re
 from collections import Counter, deque
-from collections.abc import Iterable
 
 from finforce_driver.can.protocol import CanMessage
 from finforce_driver.can.slcan import BELL, END, EXTENDED, LONGEST_LINE, decode_line, encode_message
@@ -19,19 +18,16 @@ class EmulatedAdapter:
     """The adapter on its own clock: bytes of the host in, bytes for the host out.
 
     Attributes:
-        grippers: on the bus.
+        gripper: on the bus.
         latency: from a message on the bus to its line at the host [s].
-        plugged: whether the host sees the adapter; `unplug` and `replug` change it.
         counts: lines that were no command, messages sent, messages refused, messages lost to a wrong bit rate.
     """
 
-    def __init__(
-        self, grippers: EmulatedGripper | Iterable[EmulatedGripper], ack_mode: str = "none", latency: float = 0.0005
-    ) -> None:
-        """Make an adapter that is plugged in and closed.
+    def __init__(self, gripper: EmulatedGripper, ack_mode: str = "none", latency: float = 0.0005) -> None:
+        """Make an adapter whose channel is closed.
 
         Args:
-            grippers: on the bus.
+            gripper: on the bus.
             ack_mode: "none" stays silent as CANable does, "lawicel" answers every line.
             latency: from a message on the bus to its line at the host [s].
 
@@ -40,18 +36,12 @@ class EmulatedAdapter:
         """
         if ack_mode not in ACK_MODES:
             raise TargetError(f"ack_mode: got {ack_mode!r}, expected one of {', '.join(ACK_MODES)}")
-        self.grippers = [grippers] if isinstance(grippers, EmulatedGripper) else list(grippers)
-        self.latency = latency
-        self.plugged = True
+        self.gripper, self.latency = gripper, latency
         self.counts: Counter[str] = Counter()
         self.now = 0.0
         self._acknowledges = ack_mode == "lawicel"
-        self._lose_power()
-
-    @property
-    def gripper(self) -> EmulatedGripper:
-        """Return the first gripper."""
-        return self.grippers[0]
+        self._opened, self._rate, self._line = False, "", bytearray()
+        self._output: deque[tuple[float, bytes]] = deque()
 
     @property
     def joined(self) -> bool:
@@ -65,8 +55,6 @@ class EmulatedAdapter:
 
     def write(self, data: bytes) -> None:
         """Take bytes from the host."""
-        if not self.plugged:
-            return
         for byte in data:
             if byte == END[0]:
                 self._take_line(bytes(self._line).decode("latin-1"))
@@ -82,35 +70,14 @@ class EmulatedAdapter:
         return bytes(due)
 
     def step(self, dt: float) -> None:
-        """Let `dt` [s] pass for the adapter and the grippers."""
+        """Let `dt` [s] pass for the adapter and the gripper."""
         self.now += dt
-        for gripper in self.grippers:
-            gripper.step(dt)
-
-    def put_on_bus(self, message: CanMessage) -> None:
-        """Let another participant of the bus send a message: grippers answer it, the host sees it and the answers."""
-        self.deliver(message)
-        self._broadcast(message)
+        self.gripper.step(dt)
 
     def deliver(self, message: CanMessage) -> None:
         """Send a message from the bus to the host, if the channel is open."""
-        if self.plugged and self.joined:
+        if self.joined:
             self._output.append((self.now + self.latency, encode_message(message)))
-
-    def unplug(self) -> None:
-        """Take the adapter off the host; the grippers keep their own supply."""
-        self.plugged = False
-        self._lose_power()
-
-    def replug(self) -> None:
-        """Plug the adapter in again; it is closed."""
-        self.plugged = True
-
-    def _lose_power(self) -> None:
-        self._opened = False
-        self._rate = ""
-        self._line = bytearray()
-        self._output: deque[tuple[float, bytes]] = deque()
 
     def _take_line(self, line: str) -> None:
         if not line:
@@ -141,12 +108,8 @@ class EmulatedAdapter:
                 self.counts["wrong bit rate"] += 1
             else:
                 self.counts["messages"] += 1
-                self._broadcast(message)
-
-    def _broadcast(self, message: CanMessage) -> None:
-        for gripper in self.grippers:
-            for answer in gripper.handle(message):
-                self.deliver(answer)
+                for answer in self.gripper.handle(message):
+                    self.deliver(answer)
 
     def _obey(self, possible: bool) -> None:
         """Acknowledge a command, or refuse one that the channel's state does not allow."""

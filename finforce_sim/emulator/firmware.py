@@ -72,8 +72,7 @@ class EmulatedGripper:
         self._firmware = VARIANTS[variant]
         self._steps = self._deaf_until = 0
         self._rest = 0.0
-        self._blip_until = self._received = 0
-        self._blip_current = 0.0
+        self._received = 0
         self._power_up()
 
     @property
@@ -99,8 +98,7 @@ class EmulatedGripper:
     @property
     def reported_current(self) -> int:
         """Return the current as it is reported [mA]."""
-        current = self._blip_current if self._steps < self._blip_until else self.jaws.current
-        return max(min(int(current), 0x7FFF), -0x8000)
+        return max(min(int(self.jaws.current), 0x7FFF), -0x8000)
 
     def step(self, dt: float = STEP) -> None:
         """Go on for `dt` [s] in whole milliseconds, keeping the rest."""
@@ -137,12 +135,6 @@ class EmulatedGripper:
         self._power_up()
         self.jaws.reset_encoder()
         self._deaf_until = self._steps + round(_BOOT_TIME / STEP)
-
-    def blip(self, duration: float = 0.01) -> None:
-        """Report contact with a high current for some time [s], as can happen at the start of a move."""
-        closes = self.endpoints.target(self.order.position) < self.jaws.encoder
-        self._blip_current = (-0.9 if closes else 0.9) * abs(self.order.current_mA)
-        self._blip_until = self._steps + round(duration / STEP)
 
     def _answer(self, command: int) -> bytes | None:
         """Return the data that answers a remote message; None where nothing does."""
@@ -234,8 +226,6 @@ class EmulatedGripper:
 
     def _reply(self) -> bytes:
         code = self._control.object_code
-        if self._steps < self._blip_until:
-            code = self._firmware.closing_code if self._blip_current < 0.0 else self._firmware.opening_code
         status = (
             0x80 * self.order.activated
             | 0x40 * self.order.action

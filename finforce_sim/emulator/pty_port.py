@@ -8,7 +8,7 @@ import select
 import tty
 from contextlib import suppress
 from pathlib import Path
-from threading import Event, RLock, Thread
+from threading import Event, Lock, Thread
 from time import monotonic
 
 from finforce_driver.errors import LinkError
@@ -37,7 +37,7 @@ class PtyPort:
             link: path of a symbolic link to the port, whose own name changes each time; None: no link.
         """
         self.adapter = adapter
-        self.lock = RLock()
+        self.lock = Lock()
         self._link = Path(link) if link is not None else None
         self._master = self._slave = -1
         self._name = ""
@@ -46,7 +46,7 @@ class PtyPort:
 
     @property
     def path(self) -> str:
-        """Return what another program opens: the link, or without one the port itself ("" while unplugged)."""
+        """Return what another program opens: the link, or without one the port itself ("" while closed)."""
         return str(self._link) if self._link is not None else self._name
 
     def open(self) -> None:
@@ -71,31 +71,12 @@ class PtyPort:
         self._thread = None
         self._drop_port()
 
-    def unplug(self) -> None:
-        """Take the adapter away: the link is gone, who has the port open gets an error; the gripper lives on."""
-        with self.lock:
-            self.adapter.unplug()
-            self._follow_adapter()
-
-    def replug(self) -> None:
-        """Plug the adapter in again, closed, under the same link."""
-        with self.lock:
-            self.adapter.replug()
-            self._follow_adapter()
-
     def __enter__(self) -> PtyPort:
         self.open()
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-    def _follow_adapter(self) -> None:
-        """Let the port come and go with the adapter, which may unplug itself."""
-        if self.adapter.plugged and self._master < 0:
-            self._make_port()
-        elif not self.adapter.plugged:
-            self._drop_port()
 
     def _make_port(self) -> None:
         if self._link is not None and self._link.exists() and not self._link.is_symlink():
@@ -112,37 +93,24 @@ class PtyPort:
             temporary.replace(self._link)
 
     def _drop_port(self) -> None:
-        if self._master < 0:
-            return
         if self._link is not None and self._link.is_symlink() and os.readlink(self._link) == self._name:
             self._link.unlink()
         os.close(self._master)
         os.close(self._slave)
-        self._master = self._slave = -1
         self._name = ""
 
     def _serve(self) -> None:
         last = monotonic()
         while not self._stop.is_set():
-            self._await_input()
+            period = _BUSY_PERIOD if self.adapter.has_output else _IDLE_PERIOD
+            select.select([self._master], [], [], period)
             with self.lock:
                 now = monotonic()
                 self.adapter.step(now - last)
                 last = now
-                self._follow_adapter()
                 self._exchange()
 
-    def _await_input(self) -> None:
-        period = _BUSY_PERIOD if self.adapter.has_output else _IDLE_PERIOD
-        master = self._master
-        try:
-            select.select([master] if master >= 0 else [], [], [], period)
-        except OSError:  # unplugged just now
-            self._stop.wait(period)
-
     def _exchange(self) -> None:
-        if self._master < 0:
-            return
         with suppress(BlockingIOError):  # nothing came
             self.adapter.write(os.read(self._master, _LARGEST_READ))
         answer = self.adapter.read()

@@ -8,7 +8,6 @@ from typing import Any
 
 from finforce_driver.can.protocol import Bus, CanMessage
 from finforce_driver.can.slcan import SlcanParser, encode_message
-from finforce_driver.errors import LinkError
 from finforce_driver.gripper import Clock
 from finforce_sim.emulator.adapter import EmulatedAdapter
 
@@ -72,7 +71,7 @@ class VirtualBus(Bus):
         """Return the next message; time passes until it comes or `timeout` [s] is over.
 
         Raises:
-            LinkError: the bus is closed, or the adapter unplugged.
+            LinkError: the bus is closed.
         """
         end = self._clock.now() + timeout
         while True:
@@ -84,23 +83,14 @@ class VirtualBus(Bus):
                 return None
             self._clock.tick(min(left, _STEP))
 
-    def _opened(self) -> EmulatedAdapter:
-        adapter = super()._opened()
-        if not adapter.plugged:
-            raise LinkError(f"{self._name}: it was unplugged, expected it to stay; plug it in and open the bus")
-        return adapter
-
     def _connect(self) -> EmulatedAdapter:
-        if not self._adapter.plugged:
-            raise LinkError(f"{self._name}: it is unplugged, expected it to be there; plug it in")
         self._adapter.read()
         self._parser.discard()
         self._adapter.write(b"C\rS8\rO\r")
         return self._adapter
 
     def _disconnect(self, port: EmulatedAdapter) -> None:
-        if port.plugged:
-            port.write(b"C\r")
+        port.write(b"C\r")
 
     def _write(self, port: EmulatedAdapter, message: CanMessage) -> None:
         self.sent.append((self._clock.now(), message))

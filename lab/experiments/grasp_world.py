@@ -131,15 +131,12 @@ class World:
         sensor: Sensor,
         settings: GraspSettings | None = None,
         holding: float = HOLDING,
-        connect: Callable[[EmulatedGripper], EmulatedAdapter] = EmulatedAdapter,
     ) -> None:
         self._holding = holding
         self._case, self._sensor, self._settings = case, sensor, settings
         self.emulated = EmulatedGripper(case.variant, load=case.plant.force_at)
         self.clock = VirtualClock()
-        self.adapter = connect(self.emulated)
-        self.bus = VirtualBus(self.adapter, self.clock)
-        self.gripper = Gripper(self.bus, clock=self.clock)
+        self.gripper = Gripper(self._connect(), clock=self.clock)
         self._relaxation = Relaxation(case.plant.terms)
         self._random = np.random.default_rng([case.seed, 1])
         self._arrivals: list[tuple[float, int, ForceSample | TouchSample]] = []
@@ -147,6 +144,10 @@ class World:
         self._next_image = 0.0
         self.force = 0.0
         self.course = GraspTrace()
+
+    def _connect(self) -> VirtualBus:
+        """Return the bus to the gripper."""
+        return VirtualBus(EmulatedAdapter(self.emulated), self.clock)
 
     def step(self, dt: float) -> None:
         """Bend and relax the fingers, and take an image where one is due."""

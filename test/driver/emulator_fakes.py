@@ -8,7 +8,7 @@ from pathlib import Path
 from time import monotonic
 
 from driver_node_fakes import call, start_driver, wrench
-from emulator_faults import FaultyAdapter
+from emulator_faults import FaultyAdapter, FaultyBus
 from geometry_msgs.msg import WrenchStamped
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
@@ -21,7 +21,7 @@ from finforce_driver.state import Phase
 from finforce_sim.emulator.adapter import EmulatedAdapter
 from finforce_sim.emulator.firmware import EmulatedGripper
 from finforce_sim.emulator.pty_port import PtyPort
-from finforce_sim.emulator.virtual import VirtualBus, VirtualClock
+from finforce_sim.emulator.virtual import VirtualClock
 
 VARIANTS = ("new", "old")
 CLEAR, ESTOP, IDLE, RESET, CALIBRATE = "t0020", "t0000", "t0180", "t01C0", "t07C0"
@@ -87,8 +87,8 @@ def code_of(reply: bytes) -> int:
 class LineHost:
     """Bytes in, bytes out, through an emulated adapter."""
 
-    def __init__(self, *grippers, ack_mode="none", opened=True):
-        self.adapter = EmulatedAdapter(grippers or EmulatedGripper(), ack_mode, latency=0.0)
+    def __init__(self, ack_mode="none", opened=True):
+        self.adapter = FaultyAdapter(EmulatedGripper(), ack_mode=ack_mode, latency=0.0)
         if opened:
             self.say(b"C\rS8\rO\r")
 
@@ -189,7 +189,7 @@ class Rig:
         self.emulated = EmulatedGripper(variant, node_id=node_id)
         self.emulated.calibrated = calibrated
         self.adapter = FaultyAdapter(self.emulated, latency=latency)
-        self.bus = VirtualBus(self.adapter, self.clock)
+        self.bus = FaultyBus(self.adapter, self.clock)
         self.gripper = Gripper(self.bus, GripperSettings(**settings), self.clock)
         self.states = []
         self.gripper.listen(self.states.append)
@@ -272,7 +272,7 @@ class Bench:
         self.probe = probe
         self.gripper = EmulatedGripper(variant)
         self.gripper.calibrated = calibrated
-        self.port = PtyPort((GarbledAdapter if garbled else EmulatedAdapter)(self.gripper))
+        self.port = PtyPort((GarbledAdapter if garbled else FaultyAdapter)(self.gripper))
         if open_port:
             self.port.open()
         port = self.port.path or "/dev/no_such_port"

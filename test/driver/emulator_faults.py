@@ -5,15 +5,18 @@ from __future__ import annotations
 import math
 import re
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from enum import Enum
 from random import Random
 from typing import Any
 
-from finforce_driver.can.protocol import CanMessage
+from finforce_driver.can.protocol import CanMessage, Command
+from finforce_driver.errors import LinkError
 from finforce_sim.emulator.adapter import EmulatedAdapter
+from finforce_sim.emulator.control import VARIANTS
 from finforce_sim.emulator.firmware import EmulatedGripper, Fault
+from finforce_sim.emulator.virtual import VirtualBus
 
 Pieces = list[tuple[float, bytes]]  # delays after the piece before [s], and what then comes
 
@@ -155,7 +158,7 @@ class FaultyAdapter(EmulatedAdapter):
 
     def __init__(
         self,
-        grippers: EmulatedGripper | Iterable[EmulatedGripper],
+        gripper: EmulatedGripper,
         plan: Sequence[PlannedFault] = (),
         seed: int = 0,
         **options: Any,
@@ -163,23 +166,23 @@ class FaultyAdapter(EmulatedAdapter):
         """Make an adapter.
 
         Args:
-            grippers: on the bus.
+            gripper: on the bus.
             plan: faults to come.
             seed: of the details: where a line is cut, which digit flips.
             options: of `EmulatedAdapter`.
         """
         self._spoiled: deque[tuple[float, bytes]] = deque()
-        super().__init__(grippers, **options)
+        self.plugged, self._blip_until, self._blip_current = True, 0.0, 0
+        super().__init__(gripper, **options)
         self.injected: list[PlannedFault] = []
         self._plan = deque(sorted(plan, key=lambda fault: fault.time))
         self._random = Random(seed)
         self._armed: deque[FaultKind] = deque()
         self._requests_to_lose = 0
         self._lasting: dict[FaultKind, tuple[float, Callable[[], None]]] = {}
-        gripper = self.gripper
         self._happenings: dict[FaultKind, Callable[[PlannedFault], None]] = {
             FaultKind.REQUEST_LOST: self._lose_requests,
-            FaultKind.BLIP: lambda _fault: gripper.blip(),
+            FaultKind.BLIP: lambda _fault: self.blip(),
             FaultKind.REBOOT: lambda _fault: gripper.reboot(),
             FaultKind.OVERHEATED: lambda fault: self._hold(fault, gripper.protection, "temperature", 91.0),
             FaultKind.SUPPLY: lambda fault: self._hold(fault, gripper.protection, "voltage", 8.2),
@@ -218,12 +221,41 @@ class FaultyAdapter(EmulatedAdapter):
         self._end_lasting(math.inf)
 
     def unplug(self) -> None:
-        """Take the adapter off the host."""
+        """Take the adapter off the host; its channel is closed, and the gripper keeps its own supply."""
         self._spoiled.clear()
-        super().unplug()
+        self.plugged, self._opened, self._rate, self._line = False, False, "", bytearray()
+        self._output.clear()
+
+    def replug(self) -> None:
+        """Plug the adapter in again; it is closed."""
+        self.plugged = True
+
+    def put_on_bus(self, message: CanMessage) -> None:
+        """Let another participant of the bus send a message: the gripper answers it, the host sees both."""
+        for each in (message, *self.gripper.handle(message)):
+            self.deliver(each)
+
+    def blip(self, duration: float = 0.01) -> None:
+        """Report contact with a high current for some time [s], as can happen at the start of a move."""
+        gripper = self.gripper
+        closes = gripper.endpoints.target(gripper.order.position) < gripper.jaws.encoder
+        self._blip_current = int((-0.9 if closes else 0.9) * abs(gripper.order.current_mA))
+        self._blip_until = self.now + duration
+
+    def deliver(self, message: CanMessage) -> None:
+        """Send a message to the host; during a blip with its current, and a reply with its code of contact."""
+        if self.now < self._blip_until - 1e-9 and message.command in (Command.REPLY, Command.CURRENT):
+            data, variant = message.data, VARIANTS[self.gripper.variant]
+            code = variant.closing_code if self._blip_current < 0 else variant.opening_code
+            status = bytes(byte & ~0x30 | 0x20 * (code & 1) | 0x10 * (code >> 1) for byte in data[3:])
+            current = self._blip_current.to_bytes(2, "big", signed=True)
+            message = replace(message, data=data[: len(data) // 4] + current + status)
+        super().deliver(message)
 
     def write(self, data: bytes) -> None:
         """Take bytes from the host, whole lines of which may get lost."""
+        if not self.plugged:
+            return
         if not self._requests_to_lose:
             super().write(data)
             return
@@ -303,3 +335,18 @@ class FaultyAdapter(EmulatedAdapter):
             CanMessage(id=node | 0x7C),
         ]
         self.put_on_bus(self._random.choice(commands))
+
+
+class FaultyBus(VirtualBus):
+    """A virtual bus that notices when its adapter is unplugged."""
+
+    def _opened(self) -> FaultyAdapter:
+        adapter = super()._opened()
+        if not adapter.plugged:
+            raise LinkError(f"{self._name}: it was unplugged, expected it to stay; plug it in and open the bus")
+        return adapter
+
+    def _connect(self) -> FaultyAdapter:
+        if not self._adapter.plugged:
+            raise LinkError(f"{self._name}: it is unplugged, expected it to be there; plug it in")
+        return super()._connect()

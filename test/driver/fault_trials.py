@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 from random import Random
 from typing import Any
 
-from emulator_faults import LINE_FAULTS, FaultKind, FaultyAdapter, PlannedFault, draw_plan
+from emulator_faults import LINE_FAULTS, FaultKind, FaultyAdapter, FaultyBus, PlannedFault, draw_plan
 
 from finforce_driver.can.protocol import CanMessage, Command, Move, decode_move
 from finforce_driver.errors import DriverError
@@ -28,7 +28,7 @@ from finforce_driver.state import GripperState, MoveOutcome, Phase
 from finforce_sim.emulator.control import Mode
 from finforce_sim.emulator.firmware import EmulatedGripper, Fault
 from finforce_sim.emulator.mechanism import Jaws
-from finforce_sim.emulator.virtual import VirtualBus, VirtualClock
+from finforce_sim.emulator.virtual import VirtualClock
 
 PER_RUN = 100
 PERIOD = 0.4  # [s] in which one fault is injected
@@ -68,7 +68,7 @@ class FaultRun:
         ack_mode, latency = self._random.choice(("none", "lawicel")), self._random.choice(LATENCIES)
         plan = [replace(fault, time=fault.time + START) for fault in draw_plan(seed, count, PERIOD, kinds)]
         self.adapter = FaultyAdapter(self.emulated, plan, seed, ack_mode=ack_mode, latency=latency)
-        self.bus = VirtualBus(self.adapter, self.clock)
+        self.bus = FaultyBus(self.adapter, self.clock)
         self._send, self.bus.send = self.bus.send, self._watch_message
         self.tape = Tape(self.emulated)
         self.clock.attach(self.tape)

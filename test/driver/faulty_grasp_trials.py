@@ -19,12 +19,11 @@ import math
 from collections import Counter
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import partial
 from random import Random
 from typing import Any
 
 import numpy as np
-from emulator_faults import FaultKind, FaultyAdapter, PlannedFault
+from emulator_faults import FaultKind, FaultyAdapter, FaultyBus, PlannedFault
 from fault_trials import Tally
 from grasp_fakes import build_spring
 
@@ -139,8 +138,8 @@ class FaultyGrasp(World):
         case = GraspCase(plant=plant, force=goal, speed=speed, latency=latency, seed=seed, variant=variant)
         start = draw.uniform(0.0, 3.0)
         camera = FaultyCamera(draw.choice(CAMERA), (start, start + draw.uniform(0.1, 3.0)), seed)
-        connect = partial(FaultyAdapter, plan=self._plan(draw), seed=seed)
-        super().__init__(case, camera, connect=connect)
+        self._faults = self._plan(draw)
+        super().__init__(case, camera)
         self.tally = GraspTally(cases=1)
         self._camera, self._seed = camera, seed
         self._act = draw.choice(("stop", "stop", "estop", "none", "none", "none"))
@@ -150,6 +149,10 @@ class FaultyGrasp(World):
         self._unlinked = -math.inf  # when the link was last seen to be lost [s]
         self._ready_at, self._ready_opening, self._outcome = math.inf, math.inf, MoveOutcome.NONE
         self.gripper.listen(self._check_state)
+
+    def _connect(self) -> FaultyBus:
+        self.adapter = FaultyAdapter(self.emulated, self._faults, self._case.seed)
+        return FaultyBus(self.adapter, self.clock)
 
     def play(self) -> GraspTally:
         """Play the grasp and return what came of it."""

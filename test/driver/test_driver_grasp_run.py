@@ -5,6 +5,7 @@ from itertools import count
 
 import numpy as np
 import pytest
+from emulator_faults import FaultyAdapter, FaultyBus
 
 from finforce_driver.errors import GraspError
 from finforce_driver.grasp.load_watch import ForceSample
@@ -29,7 +30,8 @@ class Lab:
     def __init__(self, variant):
         self.emulated = EmulatedGripper(variant)
         self.clock = VirtualClock()
-        self.bus = VirtualBus(EmulatedAdapter(self.emulated), self.clock)
+        self.adapter = FaultyAdapter(self.emulated)
+        self.bus = FaultyBus(self.adapter, self.clock)
         self.gripper = Gripper(self.bus, clock=self.clock)
         self.gripper.wait(lambda state: state.phase is Phase.UNCALIBRATED, 5.0)
         self.gripper.calibrate()
@@ -120,7 +122,7 @@ def test_emergency_stop_ends_the_call(lab):
 
 
 def test_unplugged_adapter_ends_the_call(lab):
-    lab.actions[1.0] = lambda lab: lab.bus._adapter.unplug()
+    lab.actions[1.0] = lambda lab: lab.adapter.unplug()
     with pytest.raises(GraspError, match="gripper|no reply"):
         lab.grasp()
     assert lab.clock.now() - lab.begin < 1.6

@@ -73,7 +73,7 @@ def test_an_unexpected_error_of_the_bus_does_not_end_the_driver():
 @both_variants
 def test_silence_is_told_within_a_third_of_a_second_and_the_port_opened_anew(rig):
     rig.live(1.0)
-    rig.adapter.grippers.clear()
+    rig.emulated.handle = lambda message: []
     begin = rig.clock.now()
     state = rig.wait_for(Phase.DISCONNECTED)
     assert rig.clock.now() - begin < 0.35
@@ -86,7 +86,7 @@ def test_silence_is_told_within_a_third_of_a_second_and_the_port_opened_anew(rig
 
 def test_a_gripper_that_never_answered_is_told_after_a_second():
     rig = Rig(found=False)
-    rig.adapter.grippers.clear()
+    rig.emulated.handle = lambda message: []
     rig.live(0.5)
     assert rig.state.phase is Phase.PROBING
     rig.live(1.0)

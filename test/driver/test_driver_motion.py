@@ -126,7 +126,7 @@ def test_a_blip_of_contact_is_no_grasp(rig):
     rig.gripper.move(0.0, 0.02)
     rig.live(0.1)
     for _ in range(20):
-        rig.emulated.blip(0.02)
+        rig.adapter.blip(0.02)
         rig.live(0.08)
         assert (rig.state.phase, rig.state.contact) == (Phase.MOVING, "")
 

@@ -101,13 +101,15 @@ def test_an_emergency_stop_stops_a_motion_and_clearing_it_lets_the_next_one_go(b
 def test_a_port_that_is_unplugged_is_an_error_until_it_is_back(bench):
     bench = bench()
     bench.wait_for_joints()
-    bench.port.unplug()
+    bench.port.close()
+    bench.port.adapter.unplug()
     bench.diagnosis(Level.ERROR, "")
     have = len(bench.joints)
     bench.move(0.02)
     bench.probe.spin(0.3)
     assert len(bench.joints) <= have + 1  # one may have been on its way
-    bench.port.replug()
+    bench.port.adapter.replug()
+    bench.port.open()
     bench.wait_for_joints(3)
     assert bench.gripper.jaws.opening == pytest.approx(0.048, abs=STEP)
     bench.diagnosis(Level.OK, "")
@@ -125,8 +127,7 @@ def test_a_port_that_does_not_exist_is_named_and_waited_for(bench):
 
 def test_a_gripper_without_power_is_named_with_what_to_check(bench):
     bench = bench(**HASTY)
-    with bench.port.lock:
-        bench.port.adapter.grippers.clear()
+    bench.gripper.handle = lambda message: []
     bench.diagnosis(Level.ERROR, "check its 24 V")
 
 

@@ -61,12 +61,6 @@ def test_long_identifiers_are_noted_and_not_answered():
     assert host.adapter.gripper.violations["long identifier"] == 2
 
 
-def test_two_grippers_share_the_bus():
-    host = LineHost(EmulatedGripper(node_id=0), EmulatedGripper(node_id=6))
-    assert host.say(b"t37A0\r") == b"t378400000030\r"
-    assert host.say(POLL) == REPLY
-
-
 def test_traffic_of_another_master_is_seen_and_obeyed():
     host = LineHost()
     host.adapter.put_on_bus(CanMessage(id=0x07A, data=bytes.fromhex("80 1E 01 F4 80")))

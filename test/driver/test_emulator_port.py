@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 import serial
-from emulator_faults import FaultKind, FaultyAdapter
 from process_fakes import running
 
 from finforce_driver.errors import LinkError
@@ -75,32 +74,23 @@ def test_time_passes_by_itself():
     assert adapter.gripper.now == after
 
 
-def test_unplugging_is_an_error_for_who_has_it_open_and_replugging_restores_the_link(link):
+def test_closing_is_an_error_for_who_has_it_open_and_opening_restores_the_link(link):
     with PtyPort(make_adapter(), link) as port:
         device = open_serial(port)
         device.write(b"S8\rO\r")
         assert ask(device) == REPLY
-        port.unplug()
+        port.close()
         assert not os.path.lexists(link)
         with pytest.raises((OSError, termios.error)):
             device.write(POLL)
             device.read(1)
             raise AssertionError("the port should be gone")
         device.close()
-        port.unplug()
-        port.replug()
+        port.close()
+        port.open()
         with open_serial(port) as device:
             device.write(b"S8\rO\r")
             assert ask(device) == REPLY
-
-
-def test_adapter_that_unplugs_itself_takes_the_port_along(link):
-    adapter = FaultyAdapter(EmulatedGripper(), latency=0.0)
-    with PtyPort(adapter, link) as port:
-        with port.lock:
-            adapter.inject(FaultKind.UNPLUGGED, duration=0.1)
-        assert wait_for(lambda: not os.path.lexists(link))
-        assert wait_for(lambda: link.exists())
 
 
 def test_a_file_in_place_of_the_link_is_not_overwritten(tmp_path):

@@ -2,12 +2,12 @@ from threading import Event
 
 import pytest
 from emulator_fakes import VARIANTS
-from emulator_faults import FaultKind, FaultyAdapter
+from emulator_faults import FaultKind, FaultyAdapter, FaultyBus
 
 from finforce_driver.can.protocol import CanMessage
 from finforce_driver.errors import LinkError
 from finforce_sim.emulator.firmware import EmulatedGripper
-from finforce_sim.emulator.virtual import VirtualBus, VirtualClock
+from finforce_sim.emulator.virtual import VirtualClock
 
 POLL = CanMessage(id=0x07A)
 REPLY = CanMessage(id=0x078, data=bytes.fromhex("00000030"))
@@ -18,7 +18,7 @@ class Setup:
         self.gripper = EmulatedGripper(variant)
         self.adapter = FaultyAdapter(self.gripper, **named)
         self.clock = VirtualClock()
-        self.bus = VirtualBus(self.adapter, self.clock)
+        self.bus = FaultyBus(self.adapter, self.clock)
 
 
 @pytest.fixture(params=VARIANTS)
