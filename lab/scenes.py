@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 SCRIPT_SLOTS = 6  # slots from one state of a script to the next
 EVERY_RATE = (0, 2, 3, 4)  # slots of those six that a camera of 30, 60 or 90 Hz sees
 SIZE = "640x480"
-FARTHEST = 0.4  # [m]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +34,6 @@ class TwinScene:
         changes: numbers of the scenario that differ.
         slots: of six, those that are rendered; (0,) is a camera of 30 Hz.
         size: of the images, WIDTHxHEIGHT.
-        farthest: depth beyond it is left away, which makes a recording smaller [m].
     """
 
     scenario: str
@@ -43,7 +41,6 @@ class TwinScene:
     changes: Mapping[str, Any] = field(default_factory=dict)
     slots: tuple[int, ...] = (0,)
     size: str = SIZE
-    farthest: float = FARTHEST
 
     def build(self) -> Scenario:
         """Return the scenario.
@@ -131,7 +128,7 @@ def fingerprint(scene: TwinScene) -> str:
 
 def _render(scene: TwinScene, path: Path) -> None:
     """Render a scene into a new folder."""
-    from finforce_eval.cli.twin import RecordingForm, record_footage
+    from finforce_eval.cli.twin import record_footage
     from finforce_sim.footage import FINGER, Footage, parse_size
     from finforce_sim.gripper import TwinGripper
     from finforce_sim.photographer import Photographer
@@ -140,4 +137,4 @@ def _render(scene: TwinScene, path: Path) -> None:
     gripper = TwinGripper(scenario, FINGER)
     smooth = SmoothGripper(gripper, scene.slots)
     footage = Footage(smooth, Photographer(gripper, parse_size(scene.size), scene.seed), scene.seed)
-    record_footage(footage, scenario, scene.seed, path, form=RecordingForm(farthest=scene.farthest))
+    record_footage(footage, scenario, scene.seed, path)

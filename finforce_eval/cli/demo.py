@@ -15,16 +15,16 @@ from finforce.systems.launch import find_share
 from finforce_eval.annotation.bag import new_folder
 from finforce_eval.cli.main import parse
 from finforce_eval.cli.parser import CONTACT_HELP, CommandResult
-from finforce_eval.cli.twin import RecordingForm, record_scene
+from finforce_eval.cli.twin import record_footage
 from finforce_eval.errors import RecordingError, SilentReplayError
 from finforce_eval.evaluation.keypoint_source import IMAGES
 from finforce_eval.recordings.recording import DEMO, read_recording
-from finforce_sim.footage import parse_size
+from finforce_sim.footage import FINGER, build_footage, parse_size
 from finforce_sim.scenarios import build_scenario
 
 CALIBRATION = "bench"
 # the synthetic scene of a run from images, and the calibration of its finger
-SCENE, SEED, FINGER, SCENE_CALIBRATION = "grasp_cylinder", 4, 0, "twin"
+SCENE, SEED, SCENE_CALIBRATION = "grasp_cylinder", 4, "twin"
 SIZE = "640x480"
 SLOWER = 0.25  # than the speed at which no force came
 
@@ -94,5 +94,6 @@ def prepare_recording(folder: Path) -> Path:
         rmtree(folder)
     print(f"Rendering the scene {SCENE} into {folder}, once ...", flush=True)
     with new_folder(folder) as new:
-        record_scene(build_scenario(SCENE), SEED, new, camera=parse_size(SIZE), form=RecordingForm(), finger=FINGER)
+        scenario = build_scenario(SCENE)
+        record_footage(build_footage(scenario, SEED, parse_size(SIZE)), scenario, SEED, new)
     return folder

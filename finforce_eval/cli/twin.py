@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
 from shutil import rmtree
 from typing import Any
@@ -112,9 +111,9 @@ def run_record(options: argparse.Namespace) -> CommandResult:
     folder = Path(options.output)
     check_new(folder)
     scenario = scenario_from_options(options)
-    camera = parse_size(options.size, options.lens)
-    form = RecordingForm(compressed=not options.raw, depth_step=1e-3 * options.depth_step)
-    record_scene(scenario, options.seed, folder, camera=camera, form=form, finger=options.finger)
+    camera, step = parse_size(options.size, options.lens), 1e-3 * options.depth_step
+    footage = build_footage(scenario, options.seed, camera, finger=options.finger, depth_step=step)
+    record_footage(footage, scenario, options.seed, folder, compressed=not options.raw, finger=options.finger)
     size = sum(path.stat().st_size for path in folder.iterdir()) / 1e6
     print(f"Recording: {folder} ({size:.1f} MB)")
     print(f"Score it with: finforce evaluate {folder} --from images")
@@ -156,26 +155,11 @@ FRAME = "camera_color_optical_frame"
 MESH = "object.stl"
 
 
-@dataclass(frozen=True, kw_only=True)
-class RecordingForm:
-    """How a recording is written.
-
-    Attributes:
-        compressed: jpeg colour and png depth; else plain images.
-        farthest: depth beyond it is left out, which makes a recording smaller [m].
-        depth_step: of the depth image [m], that of the footage.
-    """
-
-    compressed: bool = True
-    farthest: float = math.inf
-    depth_step: float = 1e-3
-
-
 def write_footage(
     footage: Footage,
     folder: str | Path,
     *,
-    form: RecordingForm | None = None,
+    compressed: bool = True,
     case: Mapping[str, Any] | None = None,
     seen: Callable[[TwinFrame], Any] = lambda frame: None,
 ) -> Path:
@@ -184,7 +168,7 @@ def write_footage(
     Args:
         footage: what is written; one image after the other, never all of them in memory.
         folder: the new folder, which must not exist.
-        form: how it is written.
+        compressed: jpeg colour and png depth; else plain images.
         case: further content of the `case.json`.
         seen: called with every image when it has been written.
 
@@ -195,11 +179,11 @@ def write_footage(
         RecordingError: the folder exists.
         FinforceError: the footage cannot be made.
     """
-    form, folder = form or RecordingForm(), Path(folder)
+    folder = Path(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
     is_new = not folder.exists()
     try:
-        write_entries(footage_entries(footage, form, seen), folder)
+        write_entries(footage_entries(footage, compressed, seen), folder)
     except BaseException:
         if is_new:  # half a recording would look like a whole one
             rmtree(folder, ignore_errors=True)
@@ -216,7 +200,7 @@ def write_footage(
 
 
 def footage_entries(
-    footage: Footage, form: RecordingForm, seen: Callable[[TwinFrame], Any] = lambda frame: None
+    footage: Footage, compressed: bool, seen: Callable[[TwinFrame], Any] = lambda frame: None
 ) -> Iterator[Entry]:
     """Yield every message of the footage in the order of its stamps."""
     phase = None
@@ -228,7 +212,7 @@ def footage_entries(
             yield from _truth_entries(frame.stamp, side, jaw)
         if frame.T_camera_object is not None:
             yield Entry(frame.stamp, "/object_pose", _pose(frame.stamp, frame.T_camera_object))
-        yield from _image_entries(frame, footage, form)
+        yield from _image_entries(frame, footage, compressed)
         seen(frame)
 
 
@@ -244,12 +228,12 @@ def _pose(stamp: int, pose: NDArray) -> Any:
     return pose_message(stamp, FRAME, pose[:3, 3], quaternion_from_pose(pose))
 
 
-def _image_entries(frame: TwinFrame, footage: Footage, form: RecordingForm) -> Iterator[Entry]:
+def _image_entries(frame: TwinFrame, footage: Footage, compressed: bool) -> Iterator[Entry]:
     """Yield colour, depth and intrinsics of an image."""
     stamp, told = frame.stamp, {"header": header(frame.stamp, FRAME)}
     yield Entry(stamp, INFO_TOPIC, make_message(CAMERA_INFO, **told, **info_fields(footage.camera)))
-    steps = encode_depth(np.where(frame.depth <= form.farthest, frame.depth, np.nan), footage.depth_step)
-    if form.compressed:
+    steps = encode_depth(frame.depth, footage.depth_step)
+    if compressed:
         color = encode_color(frame.color)
         yield Entry(stamp, f"{COLOR_TOPIC}/compressed", _packed(told, "rgb8; jpeg compressed bgr8", color))
         yield Entry(stamp, f"{DEPTH_TOPIC}/compressedDepth", _packed(told, DEPTH_FORMAT, compress_depth(steps)))
@@ -269,16 +253,8 @@ def _plain(told: Mapping[str, Any], encoding: str, pixels: NDArray) -> Any:
     return make_message(IMAGE, **told, **size, encoding=encoding, data=pixels.reshape(-1).view(np.uint8))
 
 
-def record_scene(
-    scenario: Scenario, seed: int, folder: Path, *, camera: Any, form: RecordingForm, finger: int = FINGER
-) -> None:
-    """Render a scene of a finger into a new folder, under a progress bar."""
-    footage = build_footage(scenario, seed, camera, finger=finger, depth_step=form.depth_step)
-    record_footage(footage, scenario, seed, folder, form=form, finger=finger)
-
-
 def record_footage(
-    footage: Footage, scenario: Scenario, seed: int, folder: Path, *, form: RecordingForm, finger: int = FINGER
+    footage: Footage, scenario: Scenario, seed: int, folder: Path, *, compressed: bool = True, finger: int = FINGER
 ) -> None:
     """Render the footage of a scene into a new folder, under a progress bar."""
     case = {
@@ -289,4 +265,4 @@ def record_footage(
         "object": {"kind": scenario.object},
     }
     with progress_bar(len(footage), "image", scenario.name) as bar:
-        write_footage(footage, folder, form=form, case=case, seen=lambda _: bar.update())
+        write_footage(footage, folder, compressed=compressed, case=case, seen=lambda _: bar.update())

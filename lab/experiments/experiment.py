@@ -37,7 +37,6 @@ from lab.harness import Figures, figures_json, format_figures
 from lab.scenes import TwinScene, find_scene
 
 RECORDINGS = "recordings"
-FARTHEST = 0.3  # [m] of depth that is kept; jaws are nearer
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,7 +132,7 @@ class RunOptions:
 def build_scene(settings: Mapping[str, Any]) -> TwinScene:
     """Return the scene of the twin that a case's settings name."""
     about = {name: settings[name] for name in ("changes", "seed", "size")}
-    return TwinScene(scenario=settings["scene"], farthest=FARTHEST, **about)
+    return TwinScene(scenario=settings["scene"], **about)
 
 
 def list_missing(recording: Recording, needed: Sequence[str]) -> list[str]:

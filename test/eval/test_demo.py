@@ -24,11 +24,11 @@ def rendered(monkeypatch):
     """What was asked of the renderer, which answers with footage by rule."""
     calls = []
 
-    def build(scenario, seed, camera, *, finger, depth_step):
-        calls.append((scenario.name, seed, finger))
+    def build(scenario, seed, camera):
+        calls.append((scenario.name, seed))
         return make_footage(seed=seed)
 
-    monkeypatch.setattr("finforce_eval.cli.twin.build_footage", build)
+    monkeypatch.setattr("finforce_eval.cli.demo.build_footage", build)
     return calls
 
 
@@ -37,7 +37,7 @@ def folder(rendered, tmp_path):
     """The demo's recording, rendered once."""
     folder = tmp_path / "report" / "recording"
     assert demo.prepare_recording(folder) == folder
-    assert rendered == [("grasp_cylinder", 4, 0)]
+    assert rendered == [("grasp_cylinder", 4)]
     return folder
 
 

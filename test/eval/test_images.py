@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from finforce.camera import ImageError
 from finforce.camera_topics import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 from finforce.messages import DEPTH_HEADER, depth_from_message, depth_steps
-from finforce_eval.cli.twin import RecordingForm, footage_entries, write_footage
+from finforce_eval.cli.twin import footage_entries, write_footage
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.images import ImageChoice, compress_depth
 from finforce_eval.recordings.objects import find_mesh
@@ -21,7 +21,7 @@ from finforce_eval.recordings.writer import write_entries
 from finforce_eval.replay.playback import Playback
 from finforce_sim.footage import encode_depth
 
-FORMS = {"jpeg": RecordingForm(), "raw": RecordingForm(compressed=False)}
+FORMS = {"jpeg": True, "raw": False}
 
 
 class Message:
@@ -32,7 +32,7 @@ class Message:
 @pytest.fixture(scope="module", params=FORMS)
 def written(request, tmp_path_factory):
     folder = tmp_path_factory.mktemp("bags") / "twin"
-    return request.param, write_footage(make_footage(), folder, form=FORMS[request.param], case={"scene": "fake"})
+    return request.param, write_footage(make_footage(), folder, compressed=FORMS[request.param], case={"scene": "fake"})
 
 
 def write_without(folder, *topics, footage=None, edit=lambda entry: entry):
@@ -104,7 +104,7 @@ def test_the_mesh_is_found_and_found_again_when_the_folder_was_renamed(tmp_path)
 
 
 def test_reading_holds_few_images_at_a_time(tmp_path):
-    folder = write_footage(make_footage(FakeGripper(count=900)), tmp_path / "long", form=FORMS["raw"])
+    folder = write_footage(make_footage(FakeGripper(count=900)), tmp_path / "long", compressed=FORMS["raw"])
     whole = 900 * (64 * 48 * 5)
     images = read_recording(folder).images
     tracemalloc.start()

@@ -12,7 +12,7 @@ from rgbd_fakes import CAMERA, FakeDetector, FakeGripper, make_footage
 from finforce.camera_topics import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 from finforce_contact.loop import GivenContact
 from finforce_eval.cli.main import main
-from finforce_eval.cli.twin import RecordingForm, footage_entries, write_footage
+from finforce_eval.cli.twin import footage_entries, write_footage
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.comparison import compare_evaluations
 from finforce_eval.evaluation.forces import check_solved, find_forces, why_unanswered
@@ -76,7 +76,7 @@ def test_pictures_too_few_for_a_tare_are_told_to_be_taken_as_stills(estimator, h
 
 def write_renamed(folder, names, **options):
     """Footage whose camera topics have other names, and no topic of a jaw."""
-    entries = footage_entries(make_footage(), RecordingForm(compressed=False))
+    entries = footage_entries(make_footage(), False)
     kept = [each._replace(topic=names[each.topic]) for each in entries if each.topic in names]
     return write_entries(kept, folder, **options)
 
@@ -93,7 +93,7 @@ def test_the_only_camera_of_a_bag_is_found_whatever_its_topics_are_called(names,
 
 
 def two_cameras(folder):
-    entries = footage_entries(make_footage(), RecordingForm(compressed=False))
+    entries = footage_entries(make_footage(), False)
     kept = [each for each in entries if each.topic in ZED]
     right = {name: topic.replace("left", "right") for name, topic in ZED.items() if name != DEPTH_TOPIC}
     both = [each._replace(topic=names[each.topic]) for names in (ZED, right) for each in kept if each.topic in names]
@@ -122,7 +122,7 @@ def test_depth_in_another_frame_is_not_taken_for_aligned_depth(tmp_path):
             return entry._replace(message=replace(entry.message, header=header))
         return entry
 
-    entries = [elsewhere(each) for each in footage_entries(make_footage(), RecordingForm(compressed=False))]
+    entries = [elsewhere(each) for each in footage_entries(make_footage(), False)]
     kept = [each._replace(topic=ZED[each.topic]) for each in entries if each.topic in ZED]
     bag = write_entries(kept, tmp_path / "bag")
     assert not read_recording(bag).images.has_depth
