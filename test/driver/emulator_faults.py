@@ -242,6 +242,11 @@ class FaultyAdapter(EmulatedAdapter):
         self._blip_current = int((-0.9 if closes else 0.9) * abs(gripper.order.current_mA))
         self._blip_until = self.now + duration
 
+    @property
+    def reported_current(self) -> int:
+        """The current as it is reported [mA]."""
+        return self._blip_current if self.now < self._blip_until - 1e-9 else self.gripper.reported_current
+
     def deliver(self, message: CanMessage) -> None:
         """Send a message to the host; during a blip with its current, and a reply with its code of contact."""
         if self.now < self._blip_until - 1e-9 and message.command in (Command.REPLY, Command.CURRENT):

@@ -70,7 +70,7 @@ class FaultRun:
         self.adapter = FaultyAdapter(self.emulated, plan, seed, ack_mode=ack_mode, latency=latency)
         self.bus = FaultyBus(self.adapter, self.clock)
         self._send, self.bus.send = self.bus.send, self._watch_message
-        self.tape = Tape(self.emulated)
+        self.tape = Tape(self.adapter)
         self.clock.attach(self.tape)
         settings = GripperSettings(poll_rate=self._random.choice((50.0, 100.0, 200.0)), telemetry_period=0.3)
         self.gripper = Gripper(self.bus, settings, self.clock)
@@ -267,8 +267,8 @@ class TrueGripper:
 class Tape:
     """Keeps the last truths of a gripper; to be attached to its clock after it."""
 
-    def __init__(self, gripper: EmulatedGripper, length: int = 6000) -> None:
-        self.gripper = gripper
+    def __init__(self, adapter: FaultyAdapter, length: int = 6000) -> None:
+        self.adapter, self.gripper = adapter, adapter.gripper
         self.truths: deque[TrueGripper] = deque(maxlen=length)
         self.now = 0.0
 
@@ -282,7 +282,7 @@ class Tape:
             TrueGripper(
                 time=self.now,
                 position=(jaws.encoder - ends.open) * 255.0 / span if span else math.nan,
-                current=1e-3 * gripper.reported_current,
+                current=1e-3 * self.adapter.reported_current,
                 calibrated=gripper.calibrated,
                 configured=gripper.configured,
                 faults=frozenset(gripper.faults),
