@@ -99,7 +99,7 @@ def build_skeleton(names: Sequence[str]) -> list[list[int]]:
     return pairs
 
 
-RADIUS = 4.0  # px
+RADIUS, FREE = 4, 1  # [px] of a disc, and of what it leaves free in its middle
 COLORS = {  # by the reason why a key point is not used
     "": (40, 220, 60),
     "likelihood": (230, 60, 50),
@@ -115,13 +115,10 @@ def draw_keypoints(
     color: NDArray[np.uint8],
     jaws: Iterable[JawKeypoints],
     skeleton: Sequence[Sequence[int]] = (),
-    *,
-    radius: float = RADIUS,
 ) -> NDArray[np.uint8]:
     """Return a copy of a picture (h, w, 3) with a disc per key point, and lines between used neighbours.
 
     Green is used; red, blue, orange and grey say why not: likelihood, depth, workspace, outside the image.
-    `radius` is that of the discs [px]; a quarter of it stays free.
     """
     cv2, picture = import_cv2(), color.copy()
 
@@ -134,9 +131,9 @@ def draw_keypoints(
                 cv2.line(picture, place(jaw.pixels[one]), place(jaw.pixels[other]), LINE)
         for pixel, reason in zip(jaw.pixels, jaw.reasons, strict=True):
             if np.isfinite(pixel).all():
-                centre, free = place(pixel), int(0.25 * radius)
-                cv2.circle(picture, centre, round(radius), (0, 0, 0), cv2.FILLED)
-                cv2.circle(picture, centre, round(radius) - 1, COLORS.get(str(reason), COLORS["image"]), cv2.FILLED)
-                seen = tuple(slice(max(middle - free, 0), max(middle + free + 1, 0)) for middle in reversed(centre))
+                centre = place(pixel)
+                cv2.circle(picture, centre, RADIUS, (0, 0, 0), cv2.FILLED)
+                cv2.circle(picture, centre, RADIUS - 1, COLORS.get(str(reason), COLORS["image"]), cv2.FILLED)
+                seen = tuple(slice(max(middle - FREE, 0), max(middle + FREE + 1, 0)) for middle in reversed(centre))
                 picture[seen] = color[seen]
     return picture

@@ -129,7 +129,7 @@ def _fill_forms(ends, chord, bend_s, bend_a, forms):
 
 
 @njit(**_OPTIONS)
-def add_beams(beams: Beams, q: NDArray, with_tangent: bool, force: NDArray, storage: NDArray) -> tuple[float, float]:
+def add_beams(beams: Beams, q: NDArray, force: NDArray, storage: NDArray) -> tuple[float, float]:
     """Add internal forces to force (n + 1,) and tangents to lower banded storage.
 
     With the chord's length l, the rotations p_1 and p_2 of the ends from the chord, s = (p_1 - p_2) / 2 and
@@ -141,7 +141,6 @@ def add_beams(beams: Beams, q: NDArray, with_tangent: bool, force: NDArray, stor
     Args:
         beams: the beams.
         q: unknowns (n,) [m or rad].
-        with_tangent: whether to fill the storage.
         force: internal forces [N or N m]; its last entry collects what is held.
         storage: tangent stiffness (width + 1, n).
 
@@ -169,10 +168,9 @@ def add_beams(beams: Beams, q: NDArray, with_tangent: bool, force: NDArray, stor
         f[7] -= 0.5 * K_s * s
         for i in range(8):
             force[beams.dof[e, i // 4, i % 4]] += f[i]
-        if with_tangent:
-            weights[:] = k_n, K_s, K_a, N / chord, K_a * a / (chord * chord)
-            _fill_tangent(forms, weights, f, ends, H)
-            _add_block(beams.dof[e], H, storage)
+        weights[:] = k_n, K_s, K_a, N / chord, K_a * a / (chord * chord)
+        _fill_tangent(forms, weights, f, ends, H)
+        _add_block(beams.dof[e], H, storage)
     return energy, smallest
 
 
@@ -362,11 +360,10 @@ class FrameModel:
         self.reach = np.where(self.rotations, LARGEST_TURN, LARGEST_MOVE)
         self._vertices = None if mesh is None else self.attach(mesh.nodes)
 
-    def linearize(self, q: NDArray, *, tangent: bool = True) -> Linearization:
-        """Evaluate internal force, energy and, unless `tangent` is False, the tangent stiffness at q."""
+    def linearize(self, q: NDArray) -> Linearization:
+        """Evaluate internal force, energy and tangent stiffness at q."""
         force, storage = np.zeros(self.size + 1), np.zeros((self.bandwidth + 1, self.size), order="F")
-        energy, smallest = add_beams(self.beams, q, tangent, force, storage)
-        storage = storage if tangent else None
+        energy, smallest = add_beams(self.beams, q, force, storage)
         return Linearization(force=force[:-1], energy=energy, smallest_det=smallest, tangent=storage)
 
     def factorise(self, tangent: NDArray) -> Factor:

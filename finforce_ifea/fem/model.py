@@ -265,7 +265,7 @@ class Linearization:
         force: internal force of the unknowns (n,) [N].
         energy: elastic energy [J].
         smallest_det: smallest det F of all elements [-]; at or below zero the mesh has turned inside out.
-        tangent: stored tangent stiffness, to be passed to `stiffen` and `factorise`; None when not asked for.
+        tangent: stored tangent stiffness, to be passed to `stiffen` and `factorise`.
     """
 
     force: NDArray
@@ -290,8 +290,8 @@ class JawModel(Protocol):
     rotations: NDArray | None
     reach: NDArray | float
 
-    def linearize(self, q: NDArray, *, tangent: bool = True) -> Linearization:
-        """Evaluate internal force, energy and, unless `tangent` is False, the tangent stiffness at q."""
+    def linearize(self, q: NDArray) -> Linearization:
+        """Evaluate internal force, energy and tangent stiffness at q."""
         ...
 
     def attach(self, points: NDArray, max_distance: float) -> Any:

@@ -67,8 +67,8 @@ class PlaneModel(SolidModel):
         self._plan_assembly()
         self._moves = self.dof[standing][:, ::2]
 
-    def linearize(self, q: NDArray, *, tangent: bool = True) -> Linearization:
-        """Evaluate internal force, energy and, unless `tangent` is False, the tangent stiffness at q (size,) [m]."""
+    def linearize(self, q: NDArray) -> Linearization:
+        """Evaluate internal force, energy and tangent stiffness at q (size,) [m]."""
         f = np.zeros(self._moves.shape)
         energy, smallest = _add_triangles(
             np.append(q, 0.0)[self._moves],
@@ -77,14 +77,11 @@ class PlaneModel(SolidModel):
             self._volumes,
             self._lame,
             self._shear,
-            tangent,
             f,
             self._Ke,
         )
         force = np.bincount(self._moves.ravel(), f.ravel(), self.size + 1)[: self.size]
-        return Linearization(
-            force=force, energy=energy, smallest_det=smallest, tangent=self._assemble() if tangent else None
-        )
+        return Linearization(force=force, energy=energy, smallest_det=smallest, tangent=self._assemble())
 
 
 def _place_points(corners: NDArray) -> NDArray:
@@ -107,7 +104,7 @@ def _differentiate(corners: NDArray) -> tuple[NDArray, NDArray]:
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz", "arcp"})
-def _add_triangles(u, elements, gradients, volumes, lame, shear, with_tangent, force, K):
+def _add_triangles(u, elements, gradients, volumes, lame, shear, force, K):
     """Add nodal forces (n, 3) and fill lower blocks of stiffnesses K (t, 18, 18).
 
     Returns:
@@ -116,8 +113,7 @@ def _add_triangles(u, elements, gradients, volumes, lame, shear, with_tangent, f
     energy, smallest = 0.0, 1e300
     a = np.empty((6, 2))
     for e in range(len(elements)):
-        if with_tangent:
-            K[e] = 0.0
+        K[e] = 0.0
         for p in range(3):
             g, weight = gradients[e, p], volumes[e, p]
             xx, xz, zx, zz = 1.0, 0.0, 0.0, 1.0
@@ -137,8 +133,6 @@ def _add_triangles(u, elements, gradients, volumes, lame, shear, with_tangent, f
                 sx, sz = s_xx * g[i, 0] + s_xz * g[i, 1], s_xz * g[i, 0] + s_zz * g[i, 1]
                 force[elements[e, i], 0] += weight * (xx * sx + xz * sz)
                 force[elements[e, i], 1] += weight * (zx * sx + zz * sz)
-            if not with_tangent:
-                continue
             k, m = weight * lame, weight * shear
             f_xx, f_xz, f_zz = xx * xx + xz * xz, xx * zx + xz * zz, zx * zx + zz * zz
             for i in range(6):

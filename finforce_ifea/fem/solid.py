@@ -129,15 +129,12 @@ class SolidModel:
         """Return the deformed mesh vertices (v, 3) [m], in mesh order."""
         return self.mesh.nodes + self.expand(q)
 
-    def linearize(self, q: NDArray, *, tangent: bool = True) -> Linearization:
-        """Evaluate internal force, energy and, unless `tangent` is False, the tangent stiffness at q (size,) [m]."""
+    def linearize(self, q: NDArray) -> Linearization:
+        """Evaluate internal force, energy and tangent stiffness at q (size,) [m]."""
         f = np.zeros_like(self.mesh.nodes)
-        energy, smallest = _add_elements(
-            self.expand(q), self._elements, self._X, self._K0, self._g, tangent, f, self._Ke
-        )
+        energy, smallest = _add_elements(self.expand(q), self._elements, self._X, self._K0, self._g, f, self._Ke)
         force = np.bincount(self.dof.ravel(), f.ravel(), self.size + 1)[: self.size]
-        stored = self._assemble() if tangent else None
-        return Linearization(force=force, energy=energy, smallest_det=smallest, tangent=stored)
+        return Linearization(force=force, energy=energy, smallest_det=smallest, tangent=self._assemble())
 
     def _assemble(self) -> NDArray:
         return np.bincount(self._slot, self._Ke.ravel()[self._source], len(self._index))
@@ -367,7 +364,7 @@ def _tangent(K0, G, L, B, R, T, scratch, Ke):
 
 @njit(**_OPTIONS)
 def _add_elements(
-    u: NDArray, conn: NDArray, X: NDArray, K0: NDArray, g: NDArray, with_tangent: bool, f: NDArray, Ke: NDArray
+    u: NDArray, conn: NDArray, X: NDArray, K0: NDArray, g: NDArray, f: NDArray, Ke: NDArray
 ) -> tuple[float, float]:
     """Add internal forces to f and write element tangents.
 
@@ -377,7 +374,6 @@ def _add_elements(
         X: element node coordinates about their centroid (m, k, 3) [m].
         K0: element stiffness (m, 3 k, 3 k) [N/m].
         g: shape function gradients at the centre (m, k, 3) [1/m].
-        with_tangent: whether to fill Ke.
         f: internal forces (n, 3) [N], added to.
         Ke: element tangents (m, 3 k, 3 k) [N/m], overwritten (lower 3 x 3 blocks only).
 
@@ -398,10 +394,9 @@ def _add_elements(
         for i in range(k):
             for a in range(3):
                 f[conn[e, i], a] += R[a, 0] * p[3 * i] + R[a, 1] * p[3 * i + 1] + R[a, 2] * p[3 * i + 2]
-        if with_tangent:
-            _spins(g[e], H, G)
-            _couplings(K0[e], x, d, fl, p, L, B)
-            _tangent(K0[e], G, L, B, R, T, scratch, Ke[e])
+        _spins(g[e], H, G)
+        _couplings(K0[e], x, d, fl, p, L, B)
+        _tangent(K0[e], G, L, B, R, T, scratch, Ke[e])
     return energy, smallest
 
 

@@ -115,7 +115,7 @@ class ReducedModel:
         stiffness = LARGEST_MOVE / np.abs(np.diagonal(self.compliance[0, 0]))
         self.reach = np.r_[stiffness, LARGEST_GRID_STEP, manifold.loads.shape[1]]
 
-    def linearize(self, q: NDArray, *, tangent: bool = True) -> Linearization:
+    def linearize(self, q: NDArray) -> Linearization:
         """Return the loads that q (size,) holds, and how far its grid coordinates are from the nearest equilibrium."""
         moves = self.moves(q)
         step = find_grid_step(self.manifold.moves, moves, q[-2:])[:2]

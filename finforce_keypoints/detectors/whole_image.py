@@ -65,7 +65,6 @@ class WholeImageDetector:
         names: NameMap,
         jaws: Mapping[str, Jaw],
         allow_resize: bool = False,
-        crop: bool = True,
     ) -> None:
         """Take a network and its names.
 
@@ -74,12 +73,10 @@ class WholeImageDetector:
             names: its body parts.
             jaws: side -> jaw.
             allow_resize: whether images of another size than the training's are scaled uniformly, less accurate.
-            crop: whether the jaws are cut out at the training's scale while they are tracked, where the network takes
-                any size.
         """
         self.name, self.sha256 = f"frame {model.path.stem}", model.sha256
         self._model, self._names = model, names
-        self._allow_resize, self._crop = allow_resize, crop
+        self._allow_resize = allow_resize
         self._is_frozen = model.frozen_size != (None, None)
         self._points = {side: np.vstack((jaw.keypoints, jaw.reference_point)) for side, jaw in jaws.items()}
 
@@ -142,8 +139,8 @@ class WholeImageDetector:
         ]
 
     def _expect(self, camera: CameraIntrinsics, side: str, T_camera_jaw: NDArray | None) -> Crop | None:
-        """Return the part of the image where a jaw is expected, None where that is unknown or not wanted."""
-        if T_camera_jaw is None or not self._crop:
+        """Return the part of the image where a jaw is expected, None where that is unknown."""
+        if T_camera_jaw is None:
             return None
         T = np.asarray(T_camera_jaw, dtype=float)
         pixels = project(self._points[side] @ T[:3, :3].T + T[:3, 3], camera)

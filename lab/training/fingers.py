@@ -337,7 +337,7 @@ class BentFinger:
 
     def _linearize(self, q: NDArray) -> tuple[NDArray, NDArray]:
         force, storage = np.zeros(self._count + 1), np.zeros((self._band + 1, self._count), order="F")
-        add_beams(self._beams, q, True, force, storage)
+        add_beams(self._beams, q, force, storage)
         return force[:-1], storage
 
     def _solve(self, q: NDArray, load: NDArray) -> NDArray | None:

@@ -31,7 +31,7 @@ def straight_beams(length, count, *, EA, EI, GA=np.inf):
 
 def evaluate_beams(beams, size, q, width=5):
     force, storage = np.zeros(size + 1), np.zeros((width + 1, size), order="F")
-    energy, _ = add_beams(beams, q, True, force, storage)
+    energy, _ = add_beams(beams, q, force, storage)
     return energy, force[:-1], storage
 
 
@@ -99,7 +99,7 @@ def test_stretch_falls_to_zero_as_an_end_stands_upright():
     beams, size = straight_beams(0.01, 1, EA=1e5, EI=1e-3)
     for angle, stretch in ((0.0, 1.0), (1.0, np.cos(1.0)), (0.5 * np.pi, 0.0), (2.0, np.cos(2.0))):
         force, storage = np.zeros(size + 1), np.zeros((6, size), order="F")
-        _, smallest = add_beams(beams, np.array([0.0, 0.0, angle]), False, force, storage)
+        _, smallest = add_beams(beams, np.array([0.0, 0.0, angle]), force, storage)
         assert smallest == pytest.approx(stretch, abs=1e-12)
 
 

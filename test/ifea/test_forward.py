@@ -60,7 +60,7 @@ def test_elastic_forces_balance_the_contact_forces():
     result = bench_press("coarse", "solid", 25, 40, DEEP)[-1]
     points = model.positions(surface.probe, result.q)
     forces = RigidCylinder(radius=0.0125).press(points, surface.stiffness, FACE, result.depth, 0.040).forces
-    left = model.linearize(result.q, tangent=False).force - model.load(surface.probe, result.q, forces)
+    left = model.linearize(result.q).force - model.load(surface.probe, result.q, forces)
     assert np.abs(left).max() < 1e-6 * np.linalg.norm(result.force)
     np.testing.assert_allclose(forces.sum(0), result.force, atol=1e-12)
 

@@ -168,9 +168,7 @@ def test_state_is_in_equilibrium_with_the_force():
     loaded = load_finger("solid", [0.040], lambda normals: -0.5 * 2.0 * normals, weights=equal_weights(1))
     targets = loaded.problem.targets + 3e-4 * np.random.default_rng(0).normal(size=(15, 3))
     result = recover(loaded, targets=targets)
-    left = loaded.model.linearize(result.q, tangent=False).force - loaded.model.load(
-        loaded.problem.contacts, result.q, result.forces
-    )
+    left = loaded.model.linearize(result.q).force - loaded.model.load(loaded.problem.contacts, result.q, result.forces)
     assert np.abs(left).max() < 1e-6
     assert result.residual == pytest.approx(
         np.sqrt(((loaded.model.positions(loaded.problem.effectors, result.q) - targets) ** 2).sum(1).mean())

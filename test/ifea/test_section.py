@@ -109,7 +109,7 @@ def test_tangent_is_the_derivative_of_the_force_and_force_that_of_the_energy():
     rng = np.random.default_rng(0)
     q, v = 2e-5 * rng.normal(size=model.size), 1e-9 * rng.normal(size=model.size)
     state = model.linearize(q)
-    ahead, behind = (model.linearize(q + s * v, tangent=False) for s in (1.0, -1.0))
+    ahead, behind = (model.linearize(q + s * v) for s in (1.0, -1.0))
     change = 0.5 * (ahead.force - behind.force)
     np.testing.assert_allclose(model.sparse_tangent(state.tangent) @ v, change, atol=1e-6 * np.abs(change).max())
     assert 0.5 * (ahead.energy - behind.energy) == pytest.approx(state.force @ v, rel=1e-6)
@@ -126,7 +126,7 @@ def test_a_turn_costs_nothing():
 
     triangles = model.plane.triangles
     energy, smallest = _add_triangles(
-        moved, triangles, model._gradients, model._volumes, model._lame, model._shear, False, force, model._Ke
+        moved, triangles, model._gradients, model._volumes, model._lame, model._shear, force, model._Ke
     )
     assert energy < 1e-20 and smallest == pytest.approx(1.0)
     assert np.abs(force).max() < 1e-9

@@ -40,12 +40,6 @@ def test_a_key_point_is_a_disc_at_its_column_and_row_with_a_free_centre():
     assert (GREY == 128).all()
 
 
-def test_a_disc_is_as_large_as_it_is_told_to_be():
-    picture = draw_keypoints(GREY, [keypoints((40.0, 30.0))], radius=12.0)
-    assert is_color(picture, (50, 30), COLORS[""]) and is_color(picture, (42, 30), (128, 128, 128))
-    assert is_color(picture, (53, 30), (128, 128, 128))
-
-
 def test_the_colour_says_why_a_key_point_is_not_used():
     reasons = ["likelihood", "depth", "workspace"]
     picture = draw_keypoints(GREY, [keypoints((10, 10), (30, 10), (50, 10), reasons=reasons)], [[0, 1]])

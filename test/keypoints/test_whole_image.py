@@ -88,13 +88,6 @@ def test_a_pose_behind_the_camera_or_beside_the_image_counts_as_lost(tmp_path, m
     assert shapes == [(1, 480, 640, 3)] * 2
 
 
-def test_without_cropping_the_network_sees_the_whole_image(tmp_path, monkeypatch):
-    pixel_detector = detector_of(tmp_path, both_jaws(), crop=False)
-    shapes = shown_shapes(pixel_detector, monkeypatch)
-    pixel_detector.detect(image_of(SQUARES), expected_poses())
-    assert shapes == [(1, 480, 640, 3)]
-
-
 @pytest.mark.parametrize("size", [(None, None), (480, 640)])
 @pytest.mark.parametrize("poses", [LOST, expected_poses()])
 def test_a_network_of_one_jaw_finds_each_jaw_on_its_side(tmp_path, size, poses):
