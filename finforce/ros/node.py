@@ -39,7 +39,6 @@ from finforce.health import Health, Level, Outcome, Report
 from finforce.messages import NANOSECONDS
 from finforce.processors import free_caller
 from finforce.ros.frames import Frames  # noqa: F401 - for those with frames
-from finforce.ros.image_topics import subscribe_to_images  # noqa: F401 - for those with images
 from finforce.ros.messages import (  # noqa: F401 - for those who publish
     cloud_message,
     force_stddev,
@@ -67,7 +66,9 @@ from finforce.ros.topics import (  # noqa: F401 - for those with topics
     Pipeline,
     Stage,
     is_wanted,
+    listen,
     send_cloud,
+    subscribe_to_images,
 )
 from finforce.ros.tracing import write_trace
 from finforce.ros.transport import CHOICES, PROFILES, TRANSPORT, provide_transport  # noqa: F401 - for tests

@@ -7,20 +7,26 @@ import traceback
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
+from importlib import import_module
 from statistics import median
-from time import perf_counter
-from typing import Any
+from time import monotonic, perf_counter
+from typing import Any, NamedTuple
 
+import rclpy
 from numpy.typing import NDArray
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
+from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Header
 
+from finforce.camera_topics import COMPRESSED, COMPRESSED_COLOR, ENDS, RAW
 from finforce.health import UNHEARD, Skips
 from finforce.messages import CloudColumns
 from finforce.ros.messages import pack
@@ -364,3 +370,91 @@ def is_wanted(publisher: Outlet, skips: Skips) -> bool:
 def send_cloud(publisher: Outlet, header: Header, columns: Mapping[str, NDArray]) -> None:
     """Publish a cloud of columns (n,), which is packed only where it leaves the process."""
     publisher.publish(CloudColumns(header, columns))
+
+
+_LOOKED_FOR = 0.5  # [s] between looks at who publishes
+
+
+def subscribe_to_images(
+    stage: Stage,
+    topic: str,
+    take: Callable[[str, Any], Any],
+    transport: str,
+    end: str = COMPRESSED_COLOR,
+    **options: Any,
+) -> None:
+    """Subscribe to the images of a topic.
+
+    Args:
+        stage: of the node.
+        topic: of raw images; one that ends as compressed images do is subscribed to whatever the transport.
+        take: takes the name of the topic and a message.
+        transport: raw, compressed, or auto: raw, and compressed where nobody publishes raw ones.
+        end: of the topic of compressed images.
+        options: of the subscription, as its callback group.
+    """
+    node = stage.node
+    packed = topic if topic.endswith(ENDS) else node.resolve_topic_name(topic) + end
+
+    def subscribe(kind: type, name: str) -> None:
+        stage.large_subscription(kind, name, partial(take, name), **options)
+
+    if topic.endswith(ENDS) or transport == COMPRESSED:
+        subscribe(CompressedImage, packed)
+        return
+    subscribe(Image, topic)
+    if transport == RAW:
+        return
+
+    def look() -> None:
+        if node.count_publishers(topic):
+            timer.cancel()
+        elif node.count_publishers(packed):
+            timer.cancel()
+            node.get_logger().info(f"no publisher on {topic}: using {packed}")
+            subscribe(CompressedImage, packed)
+
+    timer = node.create_timer(_LOOKED_FOR, look, clock=STEADY_CLOCK)
+
+
+Heard = Mapping[str, list[bytes]]
+
+
+class Listening(NamedTuple):
+    """Serialised messages by topic, and the types of all topics that somebody published meanwhile."""
+
+    heard: Heard
+    published: Mapping[str, tuple[str, ...]]
+
+
+def listen(
+    types: Mapping[str, str], enough: Callable[[Heard], bool], patience: float, domain: int | None = None
+) -> Listening:
+    """Listen to topics until enough has come, or for some time.
+
+    Args:
+        types: of the topics, as `sensor_msgs/msg/Image`.
+        enough: says whether what came is enough.
+        patience: the longest time [s].
+        domain: ROS_DOMAIN_ID; None for that of the environment.
+    """
+    heard: dict[str, list[bytes]] = {topic: [] for topic in types}
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=domain)
+    try:
+        node, executor = rclpy.create_node("listening", context=context), SingleThreadedExecutor(context=context)
+        executor.add_node(node)
+        for topic, name in types.items():
+            package, _, kind = name.split("/")
+            node.create_subscription(
+                getattr(import_module(f"{package}.msg"), kind), topic, heard[topic].append, SENSOR, raw=True
+            )
+        deadline = monotonic() + patience
+        while not enough(heard) and monotonic() < deadline:
+            executor.spin_once(timeout_sec=0.1)
+        there = {name: tuple(kinds) for name, kinds in node.get_topic_names_and_types() if node.count_publishers(name)}
+        executor.shutdown()
+        node.destroy_node()
+    finally:
+        rclpy.try_shutdown(context=context)
+    return Listening(heard, there)
