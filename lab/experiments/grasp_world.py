@@ -28,7 +28,7 @@ from finforce_driver.settings import GraspGoal, GraspSettings
 from finforce_driver.state import GraspPhase, GraspStatus, Phase
 from finforce_ifea.estimator import ForceEstimator
 from finforce_ifea.jaw.calibration import load_calibration
-from finforce_ifea.observation import Observation, Solution
+from finforce_ifea.observation import Observation
 from finforce_ifea.relaxation import Relaxation, RelaxationTerm
 from finforce_ifea.settings import EstimatorSettings
 from finforce_keypoints.build import build_detector
@@ -255,31 +255,15 @@ def observe_found(stamp: float, keypoints: JawKeypoints) -> Observation:
     return Observation(stamp=stamp, points=points, likelihood=keypoints.likelihood, stddev=keypoints.stddev)
 
 
-class JawSensor:
-    """The loop of contact and force of one jaw, with the object's poses in the gripper's frame."""
-
-    def __init__(self, pressed: PressedGrasp, side: str) -> None:
-        self._side = side
-        solver = ForceEstimator(
-            pressed.jaws[side],
-            settings=EstimatorSettings(held="yes"),  # as the nodes have it for two jaws
-            calibration=load_calibration("twin"),
-        )
-        solver.warm_up()
-        self._loop = ForceLoop(ContactEstimator(solver.jaw, mesh=pressed.object_mesh), solver)
-
-    @property
-    def touching(self) -> bool:
-        """Whether the solver was told of a touch in the last image."""
-        return self._loop.contact.estimate.touching
-
-    def take_pose(self, stamp: float, T_gripper_object: NDArray, origin_x: float) -> None:
-        """Take a pose of the object in the gripper's frame, where the jaw's origin is at x [m]."""
-        self._loop.take_pose(stamp, invert_pose(jaw_in_gripper(self._side, origin_x)) @ T_gripper_object)
-
-    def solve(self, observation: Observation) -> Solution:
-        """Return what the solver says of key points."""
-        return self._loop.update(observation)
+def build_loop(pressed: PressedGrasp, side: str) -> ForceLoop:
+    """Return the loop of contact and force of one jaw."""
+    solver = ForceEstimator(
+        pressed.jaws[side],
+        settings=EstimatorSettings(held="yes"),  # as the nodes have it for two jaws
+        calibration=load_calibration("twin"),
+    )
+    solver.warm_up()
+    return ForceLoop(ContactEstimator(solver.jaw, mesh=pressed.object_mesh), solver)
 
 
 class EstimatorSensor:
@@ -294,7 +278,7 @@ class EstimatorSensor:
 
     def __init__(self, pressed: PressedGrasp, seed: int) -> None:
         self._pressed, self._random = pressed, np.random.default_rng(seed)
-        self._jaws = {side: JawSensor(pressed, side) for side in pressed.jaws}
+        self._loops = {side: build_loop(pressed, side) for side in pressed.jaws}
         self._next_pose = 0.0
         self.touching: bool | None = None
         self.stddev = 0.0
@@ -307,13 +291,13 @@ class EstimatorSensor:
         if stamp >= self._next_pose:
             self._next_pose = stamp + POSE_PERIOD
             pose = disturb_pose(state.T_gripper_object, self._random)
-            for side, jaw in self._jaws.items():
-                jaw.take_pose(stamp, pose, state.jaws[side].origin_x)
+            for side, loop in self._loops.items():
+                loop.take_pose(stamp, invert_pose(jaw_in_gripper(side, state.jaws[side].origin_x)) @ pose)
         seen = self._look(state)
-        solutions = {side: jaw.solve(seen[side]) for side, jaw in self._jaws.items() if side in seen}
-        silent = {side: "not found in the image" for side in self._jaws if side not in solutions}
+        solutions = {side: loop.update(seen[side]) for side, loop in self._loops.items() if side in seen}
+        silent = {side: "not found in the image" for side in self._loops if side not in solutions}
         if not silent:
-            self.touching = any(jaw.touching for jaw in self._jaws.values())
+            self.touching = any(loop.contact.estimate.touching for loop in self._loops.values())
         silent |= {side: f"{one.status}: {one.message}" for side, one in solutions.items() if not one.trusted}
         if silent:
             if self.told:

@@ -241,12 +241,10 @@ class ScriptedJaw:
     """A jaw that says of its images what it is told to."""
 
     def __init__(self, pressed, side):
-        self._words, self.touching = iter(pressed.script[side]), True
+        self._words = iter(pressed.script[side])
+        self.contact = SimpleNamespace(estimate=SimpleNamespace(touching=True))
 
-    def take_pose(self, stamp, pose, origin_x):
-        pass
-
-    def solve(self, observation):
+    def update(self, observation):
         status, message = next(self._words)
         force = np.array([3.0, 0.0, 0.0])
         return SimpleNamespace(
@@ -255,7 +253,7 @@ class ScriptedJaw:
 
 
 def test_images_without_a_force_are_told_with_what_the_jaws_said(monkeypatch):
-    monkeypatch.setattr(grasp_world, "JawSensor", ScriptedJaw)
+    monkeypatch.setattr(grasp_world, "build_loop", ScriptedJaw)
     fine, doubt, start = ("ok", ""), ("unobservable", "they do not fit"), ("waiting", "for the tare")
     script = {"left": [start, fine, fine, fine], "right": [start, fine, doubt]}
     seen = SimpleNamespace(origin_x=0.0, keypoints=np.zeros((8, 3)))
