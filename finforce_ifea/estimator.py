@@ -47,7 +47,7 @@ _TOLERANCE = 1e-3
 # A detector may repeat the key points of a jaw that stands still, and looks again every 4 s; longer is stale [s].
 _STALE = 5.0
 _UNTARED = "no tare: the jaw was loaded from the start; key point offsets are unknown"
-# Relative standard deviation of forces without a calibration, at least: a material known by name has its own.
+# Relative standard deviation of forces without a calibration, in magnitude and direction, beside that of the modulus.
 _UNCALIBRATED = 0.1
 # Relative error of forces at the distance from stored shapes that those are good for.
 _EXTRAPOLATED = 0.015
@@ -101,8 +101,8 @@ class ForceEstimator:
         self._gate = KeypointGate(self.jaw, self.settings)
         self._relaxation = Relaxation(calibration.relaxation if calibration else ())
         solver = self.settings.solver
-        uncalibrated = max(_UNCALIBRATED, self.jaw.material.spread)
-        known = calibration.expect_error(self.jaw, solver) if calibration else uncalibrated
+        known = calibration.expect_error(self.jaw, solver) if calibration else _UNCALIBRATED
+        self._modulus_error = 0.0 if calibration else self.jaw.material.spread
         self._force_error = float(np.hypot(known, _LINEAR)) if solver == "linear" else known
         self._taring = TareKeeper(
             self.jaw.keypoints, self.settings, lambda *chance: self._tracker.significance(*chance)
@@ -231,10 +231,15 @@ class ForceEstimator:
         return self._taring.take()
 
     def _find_beyond(self, contact: Contact) -> str:
-        """Return what to say of a contact at heights where key points tell no force, empty for any other."""
+        """Return what to say of a contact at heights where key points tell no force, empty for any other.
+
+        An object that is drawn may be near such heights as long as it does not touch.
+        """
         low, high = self.jaw.contact_range
+        if contact.outline is not None:
+            low, high = (-np.inf, np.inf) if contact.touching is False else self._surface_range[:, 1]
         heights = contact.points[:, 2]
-        if contact.outline is not None or ((heights >= low) & (heights <= high)).all():
+        if ((heights >= low) & (heights <= high)).all():
             return ""
         found = np.round(1e3 * heights, 1).tolist()
         where = f"contact at heights {found} mm, expected {1e3 * low:g} to {1e3 * high:g} mm"
@@ -265,12 +270,18 @@ class ForceEstimator:
             self._tracker = chosen
         chosen.follow(contact)
 
-    def _check_on_surface(self, contact: Contact) -> None:
-        """Refuse contacts outside of the inner surface."""
+    @property
+    def _surface_range(self) -> NDArray:
+        """The least and the greatest y and z [m] of contacts on the inner surface (2, 2)."""
         surface = self.mechanics.contact.surface
-        low, high = surface.low - _TOLERANCE, surface.high + _TOLERANCE
+        return np.stack([surface.low - _TOLERANCE, surface.high + _TOLERANCE])
+
+    def _check_on_surface(self, contact: Contact) -> None:
+        """Refuse contacts beside the inner surface; a drawn object may reach below and above it."""
+        low, high = self._surface_range
         places = contact.points[:, 1:]
-        if ((places < low) | (places > high)).any():
+        off = (places < low) | (places > high)
+        if (off[:, 0] if contact.outline is not None else off).any():
             raise ContactError(
                 f"contact at y, z = {np.round(1e3 * places, 1).tolist()} mm, expected on the inner surface from "
                 f"{np.round(1e3 * low, 1).tolist()} to {np.round(1e3 * high, 1).tolist()} mm"
@@ -335,7 +346,7 @@ class ForceEstimator:
         """Return the force that belongs to a contact, and how good it is."""
         error = hypot(self._force_error, state["location_error"], _EXTRAPOLATED * state["extrapolation"])
         vectors, dt = np.empty((7, 3)), self._pass_time()
-        magnitude, stddev = compute_force(state, self._relaxation.packed, dt, error, vectors)
+        magnitude, stddev = compute_force(state, self._relaxation.packed, dt, error, self._modulus_error, vectors)
         force, torque, force_stddev, torque_stddev, point, location, normal = vectors
         return Solution(
             stamp=self._stamp,

@@ -27,10 +27,11 @@ from estimator_fakes import (
 )
 from mechanics_fakes import BENCH, bench_press
 
-from finforce_ifea.estimator import warm_up
+from finforce_ifea.estimator import ForceEstimator, warm_up
 from finforce_ifea.jaw.attachment import attach_points
 from finforce_ifea.observation import Contact
 from finforce_ifea.relaxation import RelaxationTerm, apply_relaxation
+from finforce_ifea.settings import EstimatorSettings
 
 # --- accuracy
 
@@ -102,6 +103,19 @@ def test_standard_deviation_is_honest():
             ratios.append((errors(recording, solutions) / announced)[loaded_frames(recording)])
     assert 0.5 < rms(np.concatenate(ratios)) < 1.6
     assert np.nanmax(np.abs(np.concatenate(ratios))) < 6.0
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.3])
+def test_modulus_that_is_not_known_leaves_the_direction_as_it_is(spread):
+    """A finger that is a third stiffer gives a third more of the same force."""
+    jaw = replace(BENCH, material=BENCH.material.model_copy(update={"spread": spread}))
+    recording = pressed()
+    estimator = ForceEstimator(jaw, settings=EstimatorSettings(solver="frame", friction=0.0))
+    for observation in recording.observations[: HELD_5 + 10]:
+        solution = estimator.update(observation, recording.contact)
+    along, _, across = solution.force_stddev / np.linalg.norm(solution.force)
+    assert along == pytest.approx(np.hypot(spread, 0.1), abs=0.03)
+    assert across < 0.15
 
 
 def test_standard_deviation_grows_with_the_noise_and_with_hidden_points():

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from box_fakes import RigidBox
 from estimator_fakes import (
+    PERIOD,
     SHAPES,
     STDDEV,
     WEDGE,
@@ -31,7 +32,9 @@ from finforce_ifea.contact_mechanics.indenter import (
     flat_profile,
 )
 from finforce_ifea.errors import ContactError
-from finforce_ifea.observation import ObjectOutline
+from finforce_ifea.estimator import ForceEstimator
+from finforce_ifea.observation import Contact, ObjectOutline, Observation
+from finforce_ifea.settings import EstimatorSettings
 from lab.presses import RigidCylinder, RigidOutline, press_jaw
 
 FACE = BENCH.inner_face_x
@@ -273,3 +276,37 @@ def test_wrong_first_outline_is_forgotten_when_the_right_one_comes(polygons, hei
             errors.append(np.linalg.norm(solution.force) - force if solution.trusted else force)
     assert len(errors) == 30
     assert np.mean(np.abs(errors)) < 0.1
+
+
+def hold_bar(half_z, height, tilt, seen_at, *, touching):
+    """Hold a bar of a half length [m] against a jaw whose clamped base has a face, too; returns the last solution.
+
+    The bar is clear of the jaw for the tare, and then where it just touches it; the jaw does not bend. The contact
+    estimator sees it at a height [m].
+    """
+    estimator = ForceEstimator("ssg48_fin_ray_1", settings=EstimatorSettings(solver="plane", mesh="coarse"))
+    jaw, bar, random = estimator.jaw, box(0.010, half_z), np.random.default_rng(3)
+    touch = OutlineIndenter(bar).find_touch(np.array([0.0, tilt, height]), flat_profile(0.0, 0.0555))
+    for i in range(90):
+        x = jaw.inner_face_x + 0.010 - touch + (0.010 if i < 60 else 0.0)
+        contact = Contact(
+            points=np.array([[jaw.face.read(seen_at), 0.0, seen_at]]),
+            weights=np.ones(1),
+            outline=outline(bar, height, tilt, x),
+            touching=touching and i >= 60,
+        )
+        points = jaw.keypoints + 3e-5 * random.normal(size=jaw.keypoints.shape)
+        observation = Observation(stamp=(i + 1) * PERIOD, points=points, likelihood=np.full(len(points), 0.9))
+        solution = estimator.update(observation, contact)
+    return solution
+
+
+@pytest.mark.parametrize(
+    ("tilt", "seen_at", "touching", "status"),
+    [(-0.2, 0.012, True, "unobservable"), (-0.2, 0.012, False, "unobservable"), (0.2, 0.050, True, "ok")],
+)
+def test_what_touches_the_rigid_base_below_the_face_is_not_told(tilt, seen_at, touching, status):
+    """A bar that leans on the base presses where no key point shows it; near it, it may do so."""
+    solution = hold_bar(0.018, 0.030, tilt, seen_at, touching=touching)
+    assert solution.status == status
+    assert np.abs(solution.force).max() < 0.1
