@@ -34,7 +34,7 @@ class Observation:
         stddev: (K, 3) [m] of each point along the axes of the jaw frame, above zero where there is a point; None when
             the detector states none.
         shared: standard deviation [m] of a shift, beyond `stddev`, that all points of the image share because the jaw's
-            place is not known better; they may then turn together by a degree, too.
+            place is not known better; they may then turn together by a few degrees, too.
         gravity: unit vector (3,) along which things fall, jaw frame; None where unknown. Who gives it says that
             next to nothing but its weight, 0.1 N, acts along and across the fingers on what they hold.
     """
