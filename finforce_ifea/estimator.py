@@ -365,7 +365,6 @@ class ForceEstimator:
             keypoints_used=used,
             iterations=int(state["iterations"]),
             converged=bool(state["converged"]),
-            condition=float(state["condition"]),
         )
 
 

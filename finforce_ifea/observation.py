@@ -113,7 +113,6 @@ class Solution(NamedTuple):
         keypoints_used: (K,) bool.
         iterations: Newton iterations of this frame.
         converged: whether the last iteration changed nothing that matters.
-        condition: condition number of what was solved, its unknowns scaled; NaN where nothing was.
     """
 
     stamp: float
@@ -132,7 +131,6 @@ class Solution(NamedTuple):
     keypoints_used: NDArray
     iterations: int
     converged: bool
-    condition: float = float("nan")
 
     @property
     def trusted(self) -> bool:

@@ -67,7 +67,6 @@ class InverseResult:
         directions: total force per unit multiplier (3, m).
         residual: root mean square distance of active key points from their targets [m].
         kkt: largest violation of the program's optimality conditions, scaled by its largest term.
-        condition: condition number of the program's matrix.
         iterations: Newton iterations.
         converged: whether the last one changed nothing that matters.
         smallest_det: smallest det F of all elements [-]; at or below zero the mesh has turned inside out.
@@ -80,7 +79,6 @@ class InverseResult:
     directions: NDArray
     residual: float
     kkt: float
-    condition: float
     iterations: int
     converged: bool
     smallest_det: float
@@ -120,7 +118,6 @@ def solve_inverse(
         directions=step.directions.sum(0),
         residual=float(np.sqrt((miss**2).sum(1).mean())),
         kkt=kkt,
-        condition=float(np.linalg.cond(step.hessian)),
         iterations=iteration,
         converged=settled,
         smallest_det=step.smallest_det,

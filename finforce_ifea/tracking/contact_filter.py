@@ -349,7 +349,6 @@ def update_state(points, average, extended, forecast, expectation, state):
     for i in range(3):
         state.moved[i] = state.x_asked[i] - forecast.x[i]
     state.residual = _move_residuals(points, extended, state.moved, state.x_asked[0] - depth)
-    state.condition = _measure_condition(covariance)
     covariance[2, 2] += height_doubt
     state.misfit = _measure_misfit(points, extended)
     state.speed = forecast.speed + gain_speed * innovation
@@ -606,23 +605,6 @@ def _move_residuals(points, average, moved, deeper):
                     mean.residual[a] -= mean.modes[a, i] * moved[i]
             total += point.weight * left * left
     return np.sqrt(total / (2.0 * weight))
-
-
-@njit(**_OPTIONS)
-def _measure_condition(covariance):
-    """Return the condition number of a covariance (3, 3) scaled to a unit diagonal, by its eigenvalues in closed form.
-
-    With C = 1 + O, O without diagonal: l = 1 + 2 p cos(t + 2 k pi / 3), p = sqrt(|O|^2 / 6), cos 3 t = det O / (2 p^3).
-    """
-    sx, sy = np.sqrt(max(covariance[0, 0], 1e-300)), np.sqrt(max(covariance[1, 1], 1e-300))
-    sz = np.sqrt(max(covariance[2, 2], 1e-300))
-    a, b, c = covariance[0, 1] / sx / sy, covariance[0, 2] / sx / sz, covariance[1, 2] / sy / sz
-    p = np.sqrt((a * a + b * b + c * c) / 3.0)
-    if not p > 1e-12:
-        return 1.0
-    angle = np.arccos(min(max(a * b * c / p**3, -1.0), 1.0)) / 3.0
-    largest, least = 1.0 + 2.0 * p * np.cos(angle), 1.0 + 2.0 * p * np.cos(angle + 2.0 * np.pi / 3.0)
-    return largest / max(least, 1e-16)
 
 
 @njit(**_OPTIONS)

@@ -45,7 +45,6 @@ CONTACT_STATE = np.dtype(
         ("residual", float),  # weighted root mean square [m]
         ("misfit", float),  # averaged residuals over their standard deviations, about 1 where the model fits
         ("kkt", float),  # what is left of the objective's gradient, relative to its parts
-        ("condition", float),  # of what was solved, scaled
         ("offset", float),  # contact location that the key points alone ask for, from the stated one [m]
         ("mistaken", float),  # probability that the stated location is wrong
         ("location_error", float),  # relative standard deviation of the force that the location leaves
@@ -105,8 +104,7 @@ MIDDLE_STDDEV = 3e-3
 def blank_contact_state() -> ContactState:
     """Return a contact state in which nothing was estimated and nothing is wrong."""
     state = np.zeros((), CONTACT_STATE)
-    for name in ("stiffening", "condition"):
-        state[name] = 1.0
+    state["stiffening"] = 1.0
     state["ambiguity"] = state["bearable"] = np.inf
     state["used"] = state["known"] = state["agreed"] = 1
     return state

@@ -197,7 +197,7 @@ class GivenContactTracker:
         state["stddev"] = measure_along(force, state["force_modes"].copy(), state["covariance"].copy())
         state["pressure_point"] = share @ model.positions(load.contacts, result.q)
         state["pressure_location"] = share @ load.points
-        for name in ("residual", "condition", "kkt", "iterations", "converged"):
+        for name in ("residual", "kkt", "iterations", "converged"):
             state[name] = getattr(result, name)
         state["misfit"] = self._misfit
         if result.converged and not self.paper:
