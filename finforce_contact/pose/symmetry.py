@@ -32,13 +32,11 @@ class Symmetry:
     """The turns of an object about axes of its mesh's frame, through the middle of its bounding box.
 
     Attributes:
-        names: as `x_180` and `z_full`.
         turns: (n, 3, 3), the first of which is none.
         axis: unit vector (3,) about which every turn is one of them; None without.
         middle: of the bounding box (3,) [m].
     """
 
-    names: tuple[str, ...]
     turns: NDArray
     axis: NDArray | None
     middle: NDArray
@@ -88,7 +86,7 @@ def read_symmetry(text: str, mesh: ObjectMesh) -> Symmetry:
         names = (f"{axes[0]}_{FULL}", *(f"{letter}_90" for letter in AXES if letter != axes[0]))
     axis = np.eye(3)[AXES[axes[0]]] if axes else None
     steps = [_step(name) for name in names if not name.endswith(FULL)]
-    return Symmetry(names=tuple(names), turns=_close(steps), axis=axis, middle=mesh.middle)
+    return Symmetry(turns=_close(steps), axis=axis, middle=mesh.middle)
 
 
 def parse_symmetry(text: str) -> tuple[str, ...] | None:

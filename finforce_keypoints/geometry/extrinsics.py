@@ -133,14 +133,12 @@ class GridCamera:
         camera: intrinsics.
         T_camera_table: (4, 4); x and y of the table along its rows and columns of holes, z away from the camera.
         holes: (n, 2) column and row of the holes used [px].
-        cells: (n, 2) which hole of the grid each is.
         residual: root mean square distance of the holes from where they should be [px].
     """
 
     camera: CameraIntrinsics
     T_camera_table: NDArray
     holes: NDArray
-    cells: NDArray
     residual: float
 
 
@@ -261,6 +259,5 @@ def fit_grid_camera(holes: NDArray, size: tuple[int, int], pitch: float) -> Grid
         camera=camera,
         T_camera_table=T,
         holes=seen,
-        cells=cells,
         residual=float(np.sqrt((away[away < 3.0 * _HOLE_OUTLIER] ** 2).mean())),
     )

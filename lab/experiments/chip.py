@@ -55,7 +55,7 @@ def run(options: RunOptions, case: Case, folder: Path) -> dict[str, Any]:
     """Return the figures of a grasp."""
     way, seed, told, untold = case.settings["way"], case.settings["seed"], [], []
     pressed = _lay(seed)
-    grasp = GraspCase(plant=build_plant(OBJECT, pressed), force=BEARS, speed=SPEED, latency=LATENCY, seed=seed)
+    grasp = GraspCase(plant=build_plant(pressed), force=BEARS, speed=SPEED, latency=LATENCY, seed=seed)
     if way == "force":
         make = ImageSensor if case.settings["source"] == "images" else EstimatorSensor
         more = {"size": case.settings["size"]} if make is ImageSensor else {}

@@ -59,7 +59,6 @@ POSE_PERIOD = 0.1  # [s] of the object's tracker
 class Plant:
     """Fingers about an object: elastic force [N] at an opening [m], first touch [m], relaxation."""
 
-    name: str
     force_at: Callable[[float], float]
     touch_opening: float = WIDTH
     terms: Sequence[RelaxationTerm] = TERMS
@@ -239,14 +238,9 @@ class World:
         return now > self.course.held_at + self._holding
 
 
-def build_plant(name: str, pressed: PressedGrasp) -> Plant:
+def build_plant(pressed: PressedGrasp) -> Plant:
     """Return the twin's fingers as a plant."""
-    return Plant(
-        name=name,
-        force_at=pressed.elastic_force,
-        touch_opening=pressed.touch_opening,
-        terms=pressed.material.terms,
-    )
+    return Plant(force_at=pressed.elastic_force, touch_opening=pressed.touch_opening, terms=pressed.material.terms)
 
 
 def observe_found(stamp: float, keypoints: JawKeypoints) -> Observation:

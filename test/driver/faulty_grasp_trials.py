@@ -133,7 +133,7 @@ class FaultyGrasp(World):
         self._draw = draw = Random(seed)
         stiffness, rise = draw.choice(((300.0, 1.0), (700.0, 1.0), (1300.0, 1.0), (400.0, 3.0)))
         goal, variant = draw.uniform(1.0, 5.0), draw.choice(("new", "old"))
-        plant = Plant(name="spring", force_at=build_spring(stiffness, rise))
+        plant = Plant(force_at=build_spring(stiffness, rise))
         speed, latency = draw.choice((0.004, 0.008, 0.04)), draw.choice((0.03, 0.06, 0.1))
         case = GraspCase(plant=plant, force=goal, speed=speed, latency=latency, seed=seed, variant=variant)
         start = draw.uniform(0.0, 3.0)

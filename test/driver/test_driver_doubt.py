@@ -107,7 +107,7 @@ def test_a_deviation_that_cannot_be_is_refused(bad):
 
 def press(stiffness, variant, *, force=3.0, speed=0.04, largest=None, latency=0.06):
     settings = GraspSettings() if largest is None else GraspSettings(largest_stiffness=largest)
-    plant = Plant(name="spring", force_at=build_spring(stiffness))
+    plant = Plant(force_at=build_spring(stiffness))
     case = GraspCase(plant=plant, force=force, speed=speed, latency=latency, seed=1, variant=variant)
     world = World(case, NoisySensor(0.05, 1), settings)
     return world, world.run()
@@ -144,7 +144,7 @@ def test_an_object_that_bottoms_out_stalls_the_motor_within_the_bound_that_is_sh
         way, soft = max(0.0, 0.025 - opening), 0.5e-3 * force
         return 1000.0 * (min(way, soft) + rise * max(0.0, way - soft))
 
-    plant = Plant(name="bottoms out", force_at=force_at)
+    plant = Plant(force_at=force_at)
     world = World(
         GraspCase(plant=plant, force=force, speed=speed, latency=0.06, seed=1, variant=variant), NoisySensor(0.05, 1)
     )

@@ -30,7 +30,7 @@ class FrozenSensor:
 
 def grasp(sensor, *, stiffness, force, variant, speed=0.004):
     """The world after a grasp and what came of it; a moment later, when the jaws have done what they were told."""
-    plant = Plant(name="spring", force_at=build_spring(stiffness))
+    plant = Plant(force_at=build_spring(stiffness))
     world = World(GraspCase(plant=plant, force=force, speed=speed, latency=0.06, seed=1, variant=variant), sensor)
     course = world.run()
     with np.errstate(all="ignore"):
@@ -92,7 +92,7 @@ def test_a_camera_that_freezes_on_the_way_crushes_nothing(variant):
 )
 def test_a_grasp_that_is_seen_is_held(variant, stiffness, force, speed):
     sensor = NoisySensor(0.05, 3)
-    plant = Plant(name="spring", force_at=build_spring(stiffness))
+    plant = Plant(force_at=build_spring(stiffness))
     course = World(
         GraspCase(plant=plant, force=force, speed=speed, latency=0.08, seed=2, variant=variant), sensor
     ).run()
