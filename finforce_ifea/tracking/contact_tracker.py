@@ -398,10 +398,13 @@ class ContactTracker:
         """Return the standard deviation of a force [N] where the jaw is clamped, by an object that may reach there.
 
         Within the uncertainty of its state, as by rocking, an object that is clear of the base may press there, and one
-        that seems to press there may be clear of it.
+        that seems to press there may be clear of it. A force whose centre is there is not known at all.
         """
         if self._is_apart:
             return 0.0
+        lowest, _ = self._base[-1]
+        if state["pressure_location"][2] < lowest:
+            return float(hypot(state["force"][0], state["force"][2]))
         x, indenter, surface = state["x"], self._contact.indenter, self._contact.surface
         clearances = [indenter.find_clearance(x, 0.0, height) for height, _ in self._base]
         if not any(abs(clearance) < _WELL_CLEAR for clearance in clearances):

@@ -33,6 +33,7 @@ from finforce_ifea.contact_mechanics.indenter import (
 )
 from finforce_ifea.errors import ContactError
 from finforce_ifea.estimator import ForceEstimator
+from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE
 from finforce_ifea.observation import Contact, ObjectOutline, Observation
 from finforce_ifea.settings import EstimatorSettings
 from lab.presses import RigidCylinder, RigidOutline, press_jaw
@@ -276,6 +277,27 @@ def test_wrong_first_outline_is_forgotten_when_the_right_one_comes(polygons, hei
             errors.append(np.linalg.norm(solution.force) - force if solution.trusted else force)
     assert len(errors) == 30
     assert np.mean(np.abs(errors)) < 0.1
+
+
+@pytest.mark.parametrize(("height", "is_told"), [(0.0205, False), (0.030, True)])
+def test_force_below_the_heights_at_which_key_points_tell_one_is_not_told(height, is_told):
+    """Next to the clamp a hundredth of a millimetre is a newton."""
+    estimator = ForceEstimator("ssg48_fin_ray_1", settings=EstimatorSettings(solver="plane", mesh="coarse"))
+    jaw, mechanics, random = estimator.jaw, estimator.mechanics, np.random.default_rng(3)
+    surface, round_object = mechanics.contact.surface, circle(0.008)
+    shape = RigidOutline(round_object, float(surface.high[1]))
+    [pressed] = press_jaw(mechanics.model, surface, jaw.inner_face_x, shape, height, [0.2e-3])
+    bent = mechanics.model.positions(mechanics.model.attach(jaw.keypoints, KEYPOINT_DISTANCE), pressed.q)
+    point = np.array([[jaw.face.read(height), 0.0, height]])
+    for i in range(90):
+        is_clear = i < 60
+        pose = outline(round_object, height, x=jaw.inner_face_x + (0.018 if is_clear else 0.0078))
+        contact = Contact(points=point, weights=np.ones(1), outline=pose, touching=not is_clear)
+        points = (jaw.keypoints if is_clear else bent) + 2e-6 * random.normal(size=bent.shape)
+        observation = Observation(stamp=(i + 1) * PERIOD, points=points, likelihood=np.full(len(points), 0.9))
+        solution = estimator.update(observation, contact)
+    assert solution.trusted == is_told
+    assert is_told or "next to the clamp" in solution.message
 
 
 def hold_bar(half_z, height, tilt, seen_at, *, touching):
