@@ -351,7 +351,7 @@ class ContactTracker:
             self._lateral.expect(*contact.outline.across)
         expected = expect_object(contact, self.settings, self._outline)
         self._expect(expected.mean, expected.variance)
-        self._lead()
+        self._lead(contact.outline.stddev[[2, 1]])
         self._outline = after = expected.indenter
         self._press(after)
         pressed_by_pose = self._contact.face_x + after.pressed.front - contact.outline.origin[0]
@@ -369,12 +369,12 @@ class ContactTracker:
             self._search.shift(change)
             self.slips.shift(change)
 
-    def _lead(self) -> None:
+    def _lead(self, chance: NDArray) -> None:
         """Take the contact along where the object slides or tilts, beyond what its pose may be off by chance.
 
         The averaged residuals are those of an object that stays where it is, and would hold the contact back.
         """
-        chance, moved = np.sqrt(self._search.expectation["variance"]), self._mean - self._led
+        moved = self._mean - self._led
         change = np.array([leave_play(moved[0], chance[0]), leave_play(moved[1], chance[1])])
         if change.any():
             self._led += change

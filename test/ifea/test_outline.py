@@ -279,6 +279,30 @@ def test_wrong_first_outline_is_forgotten_when_the_right_one_comes(polygons, hei
     assert np.mean(np.abs(errors)) < 0.1
 
 
+def test_bar_that_is_rocked_against_the_face_is_followed():
+    """It tilts by hardly more than a pose may be off, but each image says how it goes on: 0.08 N are left of 0.14."""
+    mechanics, bar, height = bench_mechanics("default", "solid"), box(0.010, 0.025), 0.044
+    probe = mechanics.model.attach(BENCH.keypoints, KEYPOINT_DISTANCE)
+    rocked = []
+    for tilt in np.linspace(0.040, 0.0, 19):
+        shape = RigidOutline(bar, 0.08, float(tilt))
+        pressed = press_jaw(mechanics.model, mechanics.contact.surface, FACE, shape, height, (0.001, 0.002, 0.003))[-1]
+        rocked += [(mechanics.model.positions(probe, pressed.q), tilt, pressed.force)] * 2
+    first = rocked[0][0] - BENCH.keypoints
+    course = [(BENCH.keypoints + min(max(0.0, i / 15), 1.0) * first, 0.040, None) for i in range(-60, 35)] + rocked
+    errors = []
+    for seed in range(4):
+        estimator, random = make_estimator(), np.random.default_rng(seed)
+        for i, (points, tilt, force) in enumerate(course):
+            seen = points + 3e-5 * random.normal(size=points.shape)
+            observation = Observation(stamp=(i + 1) * PERIOD, points=seen, likelihood=np.full(len(seen), 0.9))
+            solution = estimator.update(observation, contact_with(bar, height, tilt + 1e-3 * random.normal()))
+            if force is not None:
+                assert solution.trusted and (np.abs(solution.force - force) < 3.0 * solution.force_stddev).all()
+                errors.append(np.linalg.norm(solution.force - force))
+    assert np.sqrt(np.mean(np.square(errors))) < 0.11
+
+
 @pytest.mark.parametrize(("height", "is_told"), [(0.0205, False), (0.030, True)])
 def test_force_below_the_heights_at_which_key_points_tell_one_is_not_told(height, is_told):
     """Next to the clamp a hundredth of a millimetre is a newton."""
