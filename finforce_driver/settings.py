@@ -220,7 +220,12 @@ class GraspSettings(_Bounded):
     reaction: float = setting(0.05, "Delay from a command to the motion of the gripper", "s", 0.0, 1.0)
     stale_after: float = setting(0.25, "Maximum age of the newest force; a grasp ends beyond it", "s", 0.05, 2.0)
     force_timeout: float = setting(
-        1.0, "Maximum wait for a force after contact; doubled before contact", "s", 0.1, 10.0
+        1.0,
+        "Maximum wait for a force after contact; doubled before contact",
+        "s",
+        0.1,
+        10.0,
+        alias="touch_timeout",
     )
     motor_force: float = setting(
         7.5, "Motor limit as grip force by the vendor's curve, at least 1.5 times the set force", "N", 7.0, 62.0

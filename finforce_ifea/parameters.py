@@ -30,7 +30,14 @@ class NodeParameters(GripperParameters):
         1.0,
     )
     contact_free: bool = setting(False, "Whether the solver may move contacts from the topic")
-    contact_timeout: float = setting(0.008, "Maximum wait for the contact of an image", "s", 0.0, 1.0)
+    contact_timeout: float = setting(
+        0.008,
+        "Maximum wait for the contact of an image",
+        "s",
+        0.0,
+        1.0,
+        alias="contact_patience",
+    )
     peer: str = setting(
         "",
         "Other jaw, whose wrenches complete grasp_wrench and manipulation_wrench; empty: none",

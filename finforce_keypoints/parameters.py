@@ -76,6 +76,7 @@ class DetectorParameters(GripperParameters):
         "Pixel detector: network (on rectified side planes), frame (a DeepLabCut network on the whole image), dots "
         "(printed dots, no network)",
         choices=("network", "frame", "dots"),
+        alias="finder",
     )
     model: str = setting("", "Folder of the network; empty: the included one for the finger")
     names: tuple[str, ...] = setting(
@@ -203,7 +204,12 @@ class DetectorSettings:
         5e-3, "Maximum distance of a reference point from its line of motion", "m", 1e-4, 0.1
     )
     largest_offset: float = setting(
-        0.015, "Maximum distance of the middle between two jaws from the gripper's", "m", 1e-3, 1.0
+        0.015,
+        "Maximum distance of the middle between two jaws from the gripper's",
+        "m",
+        1e-3,
+        1.0,
+        alias="largest_beside",
     )
     rest_tolerance: float = setting(
         1.1e-3,

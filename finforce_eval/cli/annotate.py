@@ -30,6 +30,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", default="annotated", metavar="DIR", help=text)
     text = "bags only: write the new messages without a copy of the recording"
     parser.add_argument("--side-file", action="store_true", help=text)
+    parser.add_argument("--images", dest="color", help=argparse.SUPPRESS)
     text = "datasets only: prefix of the new features (observation)"
     parser.add_argument("--prefix", default="observation", metavar="NAME", help=text)
     add_run_options(parser)

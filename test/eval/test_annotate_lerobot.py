@@ -233,7 +233,7 @@ def test_a_dataset_that_does_not_fit_itself_is_refused(damage, words, broken, sc
 def test_a_camera_has_to_be_described_and_chosen(small, scene, tmp_path, capsys):
     assert main(["annotate", str(small), "--out", str(tmp_path)]) == 2
     assert "--intrinsics" in capsys.readouterr().err
-    assert annotate(tmp_path, small, scene, "--color", "observation.images.front") == 2
+    assert annotate(tmp_path, small, scene, "--images", "observation.images.front") == 2
     assert CAMERA in capsys.readouterr().err
 
 
