@@ -8,7 +8,7 @@ image, it tells ten times as exactly how far it has slid since the first ones.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import sqrt
 
 import numpy as np
@@ -31,6 +31,7 @@ _ORIGIN_STDDEV = 0.6e-3  # [m] a jaw whose place is less well known is not found
 COVERED_STDDEV = 3e-3  # [m] the same of a jaw whose rigid part is covered: how sure its place is goes into the force
 SLIP = 1.5e-3  # [m] standard deviation of how far holder and camera give under load, along the jaw
 _ROUNDS = 6  # of reweighting
+_LEAST_NOISE = 0.05e-3  # [m] of a place by points near the base, from image to image
 _LEAST_BENT = 5  # points that tell the place of a jaw that may be bent
 _ORIGIN_GATE = 3.0  # standard deviations of an origin off the forecast, which mean that the speed has changed
 _ACCELERATION = 2e-3  # [m/s^1.5] random walk of the closing speed; what is more is noticed and followed
@@ -56,12 +57,14 @@ class Origin:
         x: of the jaw's origin in the gripper base [m].
         stddev: [m].
         shared: the part of it that images in a row have in common [m].
+        noise: what an image errs by alone [m], where that is known apart; such a place is followed at once.
         slip: by which a jaw in a holder that gives has moved along its own z [m].
     """
 
     x: float
     stddev: float
     shared: float = 0.0
+    noise: float | None = None
     slip: float = 0.0
 
 
@@ -145,7 +148,9 @@ class OriginEstimator:
         weights = 1.0 / (error**2 + bent**2 + (x - np.median(x)) ** 2)
         # bent points do not err independently: what they share is no smaller than the least bending
         spread = np.sqrt(1.0 / weights.sum() + bent.min() ** 2)
-        return Origin(x=float(weights @ x / weights.sum()), stddev=float(spread), shared=float(bent.min()))
+        noise = max(1.0 / np.sqrt((1.0 / error**2).sum()), _LEAST_NOISE)
+        place = float(weights @ x / weights.sum())
+        return Origin(x=place, stddev=float(spread), shared=float(bent.min()), noise=float(noise))
 
     def _measure_bent(self, rays: NDArray, stddev: NDArray) -> Origin | None:
         """Return the origin by all points that are seen; None where they are too few or no jaw within the range.
@@ -316,6 +321,9 @@ class OriginTrack:
 
     Constant speed under white acceleration, P' = F P F^T + Q. An origin farther off the forecast than the gate means
     that the speed has changed: position and speed are opened to what was seen.
+
+    What images in a row err by alike does not hold the place back: it is in what is stated, and what it changes by
+    from one image to the next is in the noise of this one, or in P where the last one was worse.
     """
 
     def __init__(self, settings: DetectorSettings, largest_stddev: float = _ORIGIN_STDDEV) -> None:
@@ -328,7 +336,7 @@ class OriginTrack:
         self._stamp: float | None = None
         self._state, self._P = np.zeros(2), np.zeros((2, 2))
         self._aside: list[tuple[float, float]] = []
-        self._missed = 0
+        self._missed, self._last, self._bias = 0, Origin(x=0.0, stddev=0.0), 0.0
 
     @property
     def is_lost(self) -> bool:
@@ -349,8 +357,7 @@ class OriginTrack:
         """Return where the jaw should be at a time [s]; None when it is lost."""
         if self._stamp is None or stamp - self._stamp > _LONGEST_STEP:
             return None
-        state, P = self._predict(stamp)
-        return Origin(x=float(state[0]), stddev=float(np.sqrt(P[0, 0])))
+        return self._tell(*self._predict(stamp))
 
     def update(self, stamp: float, origin: Origin | None) -> Origin | None:
         """Take the origin seen in an image, None when it was not; return the best estimate, None when lost."""
@@ -360,20 +367,38 @@ class OriginTrack:
         if forecast is None:
             return self._begin(stamp, origin)
         state, P = self._predict(stamp)
+        origin = self._take_bias(origin, forecast)
         error, dt = origin.x - state[0], stamp - self._stamp
-        spread = np.sqrt(P[0, 0] + origin.stddev**2)
+        variance = origin.stddev**2
+        if origin.noise is not None or self._last.noise is not None:
+            worse = origin.stddev - self._last.stddev
+            variance = (origin.noise or origin.stddev) ** 2 + max(worse, 0.0) ** 2
+            P = P + np.diag([min(worse, 0.0) ** 2, 0.0])
+        self._last = origin
+        spread = np.sqrt(P[0, 0] + variance)
         if abs(error) > self._settings.largest_speed * dt + _ORIGIN_GATE * spread:
             return self._set_aside(stamp, origin, forecast)
         self._missed, self._aside = 0, []
         if abs(error) > _ORIGIN_GATE * spread:
             P = P + np.diag([error**2, (error / dt) ** 2])
-        gain = P[:, 0] / (P[0, 0] + origin.stddev**2)
+        gain = P[:, 0] / (P[0, 0] + variance)
         self._stamp, self._state = stamp, state + gain * error
-        least = min(P[0, 0], origin.shared**2)
+        least = min(P[0, 0], origin.shared**2) if origin.noise is None else 0.0
         self._P = P - np.outer(gain, P[0])
         # a finger stays bent from image to image: no average of its points knows better where its base is
         self._P[0, 0] = max(self._P[0, 0], least)
-        return self._estimate() if np.sqrt(self._P[0, 0]) <= self._largest_stddev else None
+        found = self._tell(self._state, self._P)
+        return found if found.stddev <= self._largest_stddev else None
+
+    def _take_bias(self, origin: Origin, forecast: Origin) -> Origin:
+        """Return an origin by points that may be bent less what it was off when the reference point was last seen."""
+        if origin.noise is None:
+            self._bias = 0.0
+            return origin
+        if self._last.noise is None:
+            off = origin.x - forecast.x
+            self._bias = off if abs(off) <= _ORIGIN_GATE * np.hypot(forecast.stddev, origin.stddev) else 0.0
+        return replace(origin, x=origin.x - self._bias)
 
     def rest(self, stamp: float) -> None:
         """Take it that the jaw has not moved since the last image."""
@@ -383,9 +408,9 @@ class OriginTrack:
     def _begin(self, stamp: float, origin: Origin, speed: float = 0.0) -> Origin:
         """Start the course at an origin."""
         self._stamp, self._state = stamp, np.array([origin.x, speed])
-        self._P = np.diag([origin.stddev**2, 0.01**2])
-        self._aside, self._missed = [], 0
-        return self._estimate() if origin.stddev <= self._largest_stddev else None
+        self._P = np.diag([(origin.noise or origin.stddev) ** 2, 0.01**2])
+        self._aside, self._missed, self._last = [], 0, origin
+        return self._tell(self._state, self._P) if origin.stddev <= self._largest_stddev else None
 
     def _miss(self, stamp: float, forecast: Origin | None) -> Origin | None:
         """Go on without an origin for a few images."""
@@ -416,6 +441,7 @@ class OriginTrack:
         Q = power * np.array([[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]])
         return F @ self._state, F @ self._P @ F.T + Q
 
-    def _estimate(self) -> Origin:
-        """Return the jaw's place now."""
-        return Origin(x=float(self._state[0]), stddev=float(np.sqrt(self._P[0, 0])))
+    def _tell(self, state: NDArray, P: NDArray) -> Origin:
+        """Return the jaw's place by a state (2,) and its covariance (2, 2)."""
+        shared = 0.0 if self._last.noise is None else self._last.shared
+        return Origin(x=float(state[0]), stddev=float(np.hypot(np.sqrt(P[0, 0]), shared)))
