@@ -374,11 +374,10 @@ class OriginTrack:
             worse = origin.stddev - self._last.stddev
             variance = (origin.noise or origin.stddev) ** 2 + max(worse, 0.0) ** 2
             P = P + np.diag([min(worse, 0.0) ** 2, 0.0])
-        self._last = origin
         spread = np.sqrt(P[0, 0] + variance)
         if abs(error) > self._settings.largest_speed * dt + _ORIGIN_GATE * spread:
             return self._set_aside(stamp, origin, forecast)
-        self._missed, self._aside = 0, []
+        self._missed, self._aside, self._last = 0, [], origin
         if abs(error) > _ORIGIN_GATE * spread:
             P = P + np.diag([error**2, (error / dt) ** 2])
         gain = P[:, 0] / (P[0, 0] + variance)
