@@ -87,6 +87,9 @@ class ForceEstimator:
         self.jaw = calibration.apply(jaw) if calibration else jaw
         self.mechanics: Mechanics = build_chosen(self.jaw, self.settings)
         torsion = measure_torsion(self.jaw, self.mechanics.mesh)
+        surface = self.mechanics.contact.surface
+        # the least and the greatest y and z of contacts on the inner surface [m]
+        self._surface_range = np.stack([surface.low - _TOLERANCE, surface.high + _TOLERANCE])
         smooth = Coefficient(calibration.friction, calibration.friction_stddev) if calibration else SMOOTH
         self._tracked = ContactTracker(
             self.mechanics,
@@ -269,12 +272,6 @@ class ForceEstimator:
             chosen.resume(self._tracker.give_shape())
             self._tracker = chosen
         chosen.follow(contact)
-
-    @property
-    def _surface_range(self) -> NDArray:
-        """The least and the greatest y and z [m] of contacts on the inner surface (2, 2)."""
-        surface = self.mechanics.contact.surface
-        return np.stack([surface.low - _TOLERANCE, surface.high + _TOLERANCE])
 
     def _check_on_surface(self, contact: Contact) -> None:
         """Refuse contacts beside the inner surface; a drawn object may reach below and above it."""

@@ -391,10 +391,10 @@ class ContactTracker:
             load, traction = self._find_lateral(normal), self._find_traction(normal)
         state["y"], state["y_stddev"], state["lateral_force"], state["lateral_stddev"] = load
         state["traction_stddev"] = traction
-        state["hidden"] = self._find_hidden(state)
+        state["hidden"] = self._find_hidden(state, normal)
         state["bearable"] = self._fidelities[0].contact.bearable
 
-    def _find_hidden(self, state: ContactState) -> float:
+    def _find_hidden(self, state: ContactState, normal: float) -> float:
         """Return the standard deviation of a force [N] where the jaw is clamped, by an object that may reach there.
 
         Within the uncertainty of its state, as by rocking, an object that is clear of the base may press there, and one
@@ -404,7 +404,7 @@ class ContactTracker:
             return 0.0
         lowest, _ = self._base[-1]
         if state["pressure_location"][2] < lowest:
-            return float(hypot(state["force"][0], state["force"][2]))
+            return normal
         x, indenter, surface = state["x"], self._contact.indenter, self._contact.surface
         clearances = [indenter.find_clearance(x, 0.0, height) for height, _ in self._base]
         if not any(abs(clearance) < _WELL_CLEAR for clearance in clearances):

@@ -279,6 +279,14 @@ def test_wrong_first_outline_is_forgotten_when_the_right_one_comes(polygons, hei
     assert np.mean(np.abs(errors)) < 0.1
 
 
+def watch(estimator, course, noise, random):
+    """Yield the solutions of images of key points (K, 3) [m], seen with some noise [m], each with its contact."""
+    for i, (points, contact) in enumerate(course):
+        seen = points + noise * random.normal(size=points.shape)
+        observation = Observation(stamp=(i + 1) * PERIOD, points=seen, likelihood=np.full(len(seen), 0.9))
+        yield estimator.update(observation, contact)
+
+
 def test_bar_that_is_rocked_against_the_face_is_followed():
     """It tilts by hardly more than a pose may be off, but each image says how it goes on: 0.08 N are left of 0.14."""
     mechanics, bar, height = bench_mechanics("default", "solid"), box(0.010, 0.025), 0.044
@@ -292,11 +300,9 @@ def test_bar_that_is_rocked_against_the_face_is_followed():
     course = [(BENCH.keypoints + min(max(0.0, i / 15), 1.0) * first, 0.040, None) for i in range(-60, 35)] + rocked
     errors = []
     for seed in range(4):
-        estimator, random = make_estimator(), np.random.default_rng(seed)
-        for i, (points, tilt, force) in enumerate(course):
-            seen = points + 3e-5 * random.normal(size=points.shape)
-            observation = Observation(stamp=(i + 1) * PERIOD, points=seen, likelihood=np.full(len(seen), 0.9))
-            solution = estimator.update(observation, contact_with(bar, height, tilt + 1e-3 * random.normal()))
+        random = np.random.default_rng(seed)
+        images = [(points, contact_with(bar, height, tilt + 1e-3 * random.normal())) for points, tilt, _ in course]
+        for (_, _, force), solution in zip(course, watch(make_estimator(), images, 3e-5, random), strict=True):
             if force is not None:
                 assert solution.trusted and (np.abs(solution.force - force) < 3.0 * solution.force_stddev).all()
                 errors.append(np.linalg.norm(solution.force - force))
@@ -313,13 +319,11 @@ def test_force_below_the_heights_at_which_key_points_tell_one_is_not_told(height
     [pressed] = press_jaw(mechanics.model, surface, jaw.inner_face_x, shape, height, [0.2e-3])
     bent = mechanics.model.positions(mechanics.model.attach(jaw.keypoints, KEYPOINT_DISTANCE), pressed.q)
     point = np.array([[jaw.face.read(height), 0.0, height]])
-    for i in range(90):
-        is_clear = i < 60
-        pose = outline(round_object, height, x=jaw.inner_face_x + (0.018 if is_clear else 0.0078))
-        contact = Contact(points=point, weights=np.ones(1), outline=pose, touching=not is_clear)
-        points = (jaw.keypoints if is_clear else bent) + 2e-6 * random.normal(size=bent.shape)
-        observation = Observation(stamp=(i + 1) * PERIOD, points=points, likelihood=np.full(len(points), 0.9))
-        solution = estimator.update(observation, contact)
+    clear, touching = (
+        Contact(points=point, weights=np.ones(1), outline=outline(round_object, height, x=x), touching=is_seen)
+        for x, is_seen in ((jaw.inner_face_x + 0.018, False), (jaw.inner_face_x + 0.0078, True))
+    )
+    *_, solution = watch(estimator, 60 * [(jaw.keypoints, clear)] + 30 * [(bent, touching)], 2e-6, random)
     assert solution.trusted == is_told
     assert is_told or "next to the clamp" in solution.message
 
@@ -333,17 +337,12 @@ def hold_bar(half_z, height, tilt, seen_at, *, touching):
     estimator = ForceEstimator("ssg48_fin_ray_1", settings=EstimatorSettings(solver="plane", mesh="coarse"))
     jaw, bar, random = estimator.jaw, box(0.010, half_z), np.random.default_rng(3)
     touch = OutlineIndenter(bar).find_touch(np.array([0.0, tilt, height]), flat_profile(0.0, 0.0555))
-    for i in range(90):
-        x = jaw.inner_face_x + 0.010 - touch + (0.010 if i < 60 else 0.0)
-        contact = Contact(
-            points=np.array([[jaw.face.read(seen_at), 0.0, seen_at]]),
-            weights=np.ones(1),
-            outline=outline(bar, height, tilt, x),
-            touching=touching and i >= 60,
-        )
-        points = jaw.keypoints + 3e-5 * random.normal(size=jaw.keypoints.shape)
-        observation = Observation(stamp=(i + 1) * PERIOD, points=points, likelihood=np.full(len(points), 0.9))
-        solution = estimator.update(observation, contact)
+    point, x = np.array([[jaw.face.read(seen_at), 0.0, seen_at]]), jaw.inner_face_x + 0.010 - touch
+    clear, held = (
+        Contact(points=point, weights=np.ones(1), outline=outline(bar, height, tilt, x + away), touching=is_seen)
+        for away, is_seen in ((0.010, False), (0.0, touching))
+    )
+    *_, solution = watch(estimator, 60 * [(jaw.keypoints, clear)] + 30 * [(jaw.keypoints, held)], 3e-5, random)
     return solution
 
 
