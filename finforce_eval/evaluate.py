@@ -46,8 +46,7 @@ def evaluate_many(
     Raises:
         FinforceError: not one could be evaluated.
     """
-    # pictures are drawn with each recording: where they are missing, it is not done
-    settings = describe_options(options) | {"report": options.report}
+    settings = describe_options(options)
     manifest, tasks = Manifest(folder, options.shard), []
     for name, path in choose_shard(name_recordings(options.bags, "/"), options.shard):
         target = str(folder / f"{name.replace('/', '_')}.parquet")
@@ -101,10 +100,6 @@ def evaluate_task(name: str, path: str, target: str, options: argparse.Namespace
         text = str(error)
         raise RecordingError(text if name in text or path in text else f"{name}: {text}") from error
     names = list(setup.jaw.keypoint_names)
-    if options.report:
-        from finforce_eval.figures.report import draw_results
-
-        draw_results(results, Path(options.report), keypoint_names=names, recordings=[recording])
     cases = {case: asdict(score) for case, score in score_results(results, [recording]).scores.items()}
     about = {"about": dict(setup.about), "path": path, "true_range_N": true_range(recording), "keypoint_names": names}
     write_table(Path(target), results, about | {"cases": cases})

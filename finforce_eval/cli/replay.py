@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import math
 from dataclasses import asdict
-from pathlib import Path
 
 from finforce_eval.cli.parser import BAG_HELP, CommandResult, add_run_options
 from finforce_eval.errors import OptionError
@@ -78,10 +77,8 @@ def run(options: argparse.Namespace) -> CommandResult:
     result = replay(recording, setup, calibration_file=calibration, playing=playing, keypoints=keypoints)
     print(format_replay(result))
     if options.report:
-        from finforce_eval.figures.report import draw_results, write_overview
+        from finforce_eval.figures.report import write_overview
 
-        series, names = list(result.evaluation.results.values()), setup.jaw.keypoint_names
-        draw_results(series, Path(options.report), keypoint_names=names, recordings=[result.recording])
         print(f"Report: {write_overview(result.evaluation, options.report, about=setup.about)}")
     score = result.grasp_score
     grasp = {"grasp": asdict(score.error), "grasp_delay": score.delay}

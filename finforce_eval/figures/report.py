@@ -1,9 +1,8 @@
-"""A report of an evaluation: one page with its scores, pictures, and plots that zoom."""
+"""A report of an evaluation: one page with its scores, a picture, and plots that zoom."""
 
 from __future__ import annotations
 
 import json
-import re
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,72 +13,32 @@ from numpy.typing import ArrayLike, NDArray
 
 from finforce_eval.evaluation.scoring import Evaluation, rms
 from finforce_eval.evaluation.tables import score_table
-from finforce_eval.recordings.tracks import DIRECTIONS, Recording
+from finforce_eval.recordings.tracks import DIRECTIONS
 from finforce_eval.table import ForceSeries
 
 TITLE, PAGE = "Force from key points", "report.html"
-IMAGES = "Key points in the images"
-
-
-def draw_results(
-    results: Sequence[ForceSeries],
-    folder: Path,
-    *,
-    keypoint_names: Sequence[str],
-    recordings: Sequence[Recording] = (),
-) -> None:
-    """Draw some images of each recording, with what was found in them.
-
-    Args:
-        results: of the jaws, for the forces at these images.
-        folder: of the report; made when missing, pictures of the same recordings are replaced.
-        keypoint_names: K names of the key points of the jaw.
-        recordings: where key points were found in their images, some of these are shown.
-
-    Raises:
-        MissingDependencyError: matplotlib is not installed.
-        RecordingError: an image is damaged.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    for recording in recordings:
-        _picture(folder, recording.name).unlink(missing_ok=True)  # of an earlier report
-        own = [result for result in results if _recording_of(result) == recording.name]
-        _draw_images(recording, own, folder, keypoint_names)
 
 
 def write_overview(evaluation: Evaluation, folder: str | Path, *, about: Mapping[str, str]) -> Path:
-    """Write the page of a report, and the picture of all cases together; those of each are there already.
+    """Write the page of a report, with the picture of all cases together.
 
     Args:
         evaluation: scores and time series.
-        folder: where `draw_results` has drawn.
+        folder: of the report; made when missing.
         about: what was run: solver, jaw, contact, ...
 
     Returns:
         The page.
+
+    Raises:
+        MissingDependencyError: matplotlib is not installed.
     """
     from finforce_eval.figures.figures import draw_unity
 
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    results = list(evaluation.results.values())
-    draw_unity(results).savefig(folder / "unity.png")
-    names = dict.fromkeys(map(_recording_of, results))
-    pictures = {f"{name}: {IMAGES}": _picture(folder, name) for name in names}
-    pictures = {caption: path for caption, path in pictures.items() if path.exists()}
-    pictures["Estimated against measured force"] = folder / "unity.png"
-    return write_page(evaluation, folder / PAGE, about=about, title=TITLE, pictures=pictures)
-
-
-def _recording_of(result: ForceSeries) -> str:
-    """Return the name of the recording of a series."""
-    return result.name.removesuffix(f"/{result.side}")
-
-
-def _picture(folder: Path, name: str) -> Path:
-    """Return the file of a recording's picture."""
-    stem = re.sub(r"[^\w.-]+", "_", name)
-    return folder / f"{stem}_images.png"
+    draw_unity(list(evaluation.results.values())).savefig(folder / "unity.png")
+    return write_page(evaluation, folder / PAGE, about=about, title=TITLE, picture=folder / "unity.png")
 
 
 def write_page(
@@ -88,7 +47,7 @@ def write_page(
     *,
     about: Mapping[str, str],
     title: str,
-    pictures: Mapping[str, Path] | None = None,
+    picture: Path | None = None,
 ) -> Path:
     """Write one HTML page with the scores and plots that zoom; it needs no other file.
 
@@ -97,7 +56,7 @@ def write_page(
         path: of the page.
         about: what was run: solver, jaw, contact, ...
         title: heading of the page.
-        pictures: PNG files by what they show, the first of them on top.
+        picture: PNG file of estimated against measured force.
 
     Raises:
         OSError: it cannot be written.
@@ -105,20 +64,7 @@ def write_page(
     table, results = score_table(evaluation), list(evaluation.results.values())
     columns = ["case", *(" ".join(filter(None, names)) for names in table.columns)]
     rows = [[name, *row] for name, row in zip(table.index, table.to_numpy().tolist(), strict=True)]
-    return write_html(results, path, title=title, about=about, columns=columns, rows=rows, pictures=pictures)
-
-
-def _draw_images(
-    recording: Recording, results: Sequence[ForceSeries], folder: Path, keypoint_names: Sequence[str]
-) -> None:
-    """Draw what the detector made of a recording's images, where it did."""
-    if recording.images is None or all(track.detection is None for track in recording.jaws.values()):
-        return
-    from finforce_eval.figures.images import draw_images
-    from finforce_keypoints.diagnostics import build_skeleton
-
-    figure = draw_images(recording, results, build_skeleton(keypoint_names))
-    figure.savefig(_picture(folder, recording.name))
+    return write_html(results, path, title=title, about=about, columns=columns, rows=rows, picture=picture)
 
 
 TEMPLATE = Path(__file__).parents[1] / "data" / "page" / "report.html"
@@ -135,7 +81,7 @@ def write_html(
     about: Mapping[str, str],
     columns: Sequence[str] = (),
     rows: Sequence[Sequence[str]] = (),
-    pictures: Mapping[str, Path] | None = None,
+    picture: Path | None = None,
 ) -> Path:
     """Write the page.
 
@@ -146,7 +92,7 @@ def write_html(
         about: what was run, name by name.
         columns: of a table above the plots; the first holds names.
         rows: of the table: one for each series, in their order, and any after them; without one, images and answers.
-        pictures: PNG files by what they show, the first of them on top.
+        picture: PNG file of estimated against measured force.
 
     Returns:
         The page.
@@ -159,10 +105,7 @@ def write_html(
     content = {
         "title": title,
         "headline": describe_series(series),
-        "pictures": [
-            [caption, "data:image/png;base64," + b64encode(path.read_bytes()).decode()]
-            for caption, path in (pictures or {}).items()
-        ],
+        "picture": picture and "data:image/png;base64," + b64encode(picture.read_bytes()).decode(),
         "about": dict(about),
         "columns": list(columns),
         "rows": [list(row) for row in rows],

@@ -288,11 +288,3 @@ def evaluate_recording(recording, jaw, source, estimator, side="left"):
     result = find_forces(recording, jaw, source, estimator, side)
     check_solved(result, recording)
     return result
-
-
-def write_report(evaluation, folder, *, keypoint_names, about, recordings=()):
-    """Write pictures and page of an evaluation and return the page."""
-    from finforce_eval.figures.report import draw_results, write_overview
-
-    draw_results(list(evaluation.results.values()), folder, keypoint_names=keypoint_names, recordings=recordings)
-    return write_overview(evaluation, folder, about=about)

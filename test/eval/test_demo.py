@@ -149,15 +149,10 @@ def test_the_demo_plays_its_recording_and_ends_with_figures_and_report(rendered,
         asked.update(recording=recording, calibration=calibration_file, source=keypoints.source, about=setup.about)
         return replay_of(played)
 
-    def draw(results, folder, **given):
-        asked.update(given)
-
     monkeypatch.setattr(replay, "replay", play)
-    monkeypatch.setattr("finforce_eval.figures.report.draw_results", draw)
     demo.run(Namespace(source="images", contact=[], rate="1", report=str(tmp_path / "report")))
     assert asked["recording"].path == tmp_path / "report" / demo.SCENE
     assert (asked["calibration"], asked["source"], asked["about"]["contact"]) == ("twin", "images", "estimate")
-    assert asked["recordings"] == [played]
     lines = capsys.readouterr().out.splitlines()
     assert lines[-2] == f"Report: {tmp_path / 'report' / 'report.html'}" and "launch" in lines[-1]
     assert [line.split(":")[0] for line in lines[-5:-2]] == ["Grasp force", "Key points", "Delay"]
