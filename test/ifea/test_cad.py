@@ -406,6 +406,28 @@ def test_a_rib_that_ends_on_the_base_is_a_rib_without_a_key_point_there():
     assert apart.min() > 2e-3
 
 
+def test_fillets_beside_ribs_hide_no_key_points():
+    drawn = draw_triangle(0.0, LEVEL[:3])
+    room = shapely.union_all([shapely.Polygon(hole) for hole in drawn.interiors]).buffer(-2.5e-3).buffer(2.5e-3)
+    filleted = shapely.Polygon(drawn.exterior).difference(room)
+    assert choose_keypoints(recognize(filleted, 0.02, Overrides())).keys() == choose_keypoints(
+        recognize(drawn, 0.02, Overrides())
+    ).keys()
+
+
+@pytest.mark.parametrize("step", [5.0, 8.0])
+def test_a_finger_with_a_short_nose_has_its_tip_there(step):
+    outline = shapely.Polygon([(0.0, 0.0), (16.0, 0.0), (16.0, 50.0), (14.0, 55.0), (0.0, 44.0)])
+    room = outline.buffer(-1.0, join_style="mitre").intersection(shapely.box(-50.0, 10.0, 50.0, 90.0))
+    levels = np.arange(13.0, 48.0, step)
+    for z in levels:
+        room = room.difference(shapely.box(-50.0, z, 50.0, z + 1.0))
+    drawn = outline.difference(room)
+    finger = recognize(shapely.affinity.scale(drawn, 1e-3, 1e-3, origin=(0, 0)), 0.02, Overrides())
+    assert len(finger.ribs) == len(levels)
+    assert np.ptp(finger.rings[0][finger.rings[0][:, 1] < 1e-6, 0]) == pytest.approx(16e-3, abs=1e-5)  # the base
+
+
 def test_sides_that_are_alike_are_told_and_a_step_of_the_base_bends_no_face():
     step = draw_triangle(0.0, LEVEL).union(shapely.box(4e-3, -10e-3, 14e-3, -1e-3))
     finger = recognize(step, 0.02, Overrides())

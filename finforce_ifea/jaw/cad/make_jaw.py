@@ -205,9 +205,10 @@ def choose_keypoints(finger: RecognizedFinger) -> dict[str, NDArray]:
     places = {}
     for band in BANDS:
         wall = getattr(finger, band)
+        line = shapely.LineString(wall.line)
         for number, rib in enumerate(finger.ribs, start=1):
             x, z = getattr(rib, band)
-            is_there = np.hypot(*(wall.line - (x, z)).T).min() < wall.usual  # else it ends elsewhere, as on the base
+            is_there = line.distance(shapely.Point(x, z)) < wall.usual  # else it ends elsewhere, as on the base
             if is_there and z > finger.clamp_height(x) + _ABOVE and not finger.find_clamped(np.array([[x, z]])).any():
                 places[f"{band}_{number}"] = (x, z)
     top = finger.polygon.intersection(shapely.box(-1.0, finger.length - _TIP, 1.0, 1.0)).centroid

@@ -380,10 +380,9 @@ def _find_direction(polygon: shapely.Polygon, middles: NDArray, overrides: Overr
             "holes, expected at least two cells: ribs that come from a slicer's infill are not in the file; model "
             "them, or describe the finger as a drawing"
         )
-    direction = np.linalg.svd(middles - middles.mean(axis=0))[2][0]
-    narrow = _measure_widths(polygon, direction)
-    if narrow[0] < narrow[1]:
-        direction, narrow = -direction, narrow[::-1]
+    along = np.linalg.svd(middles - middles.mean(axis=0))[2][0]
+    found = [(_measure_widths(polygon, direction), direction) for direction in (along, -along)]
+    narrow, direction = min(found, key=lambda end: end[0][1] / end[0][0])
     sizes = f"its section is {1e3 * narrow[0]:.3g} mm wide at one end and {1e3 * narrow[1]:.3g} mm at the other"
     is_sure = narrow[1] <= _NARROWER * narrow[0]
     if not is_sure and overrides.flip is None:
