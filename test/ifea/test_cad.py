@@ -288,7 +288,7 @@ def test_ribs_that_cross_are_taken_as_a_solid(tmp_path):
             rib = shapely.LineString([(20.0, start), (-20.0, end)]).buffer(0.6)
             polygon = polygon.union(rib.intersection(shapely.Polygon(polygon.exterior)))
     trimesh.creation.extrude_polygon(polygon, WIDTH).export(tmp_path / "finger.stl")
-    with pytest.raises(JawFileError, match="no rib that could be measured: .*take a closed solid as it is"):
+    with pytest.raises(JawFileError, match="ribs cross next to its cells .*take a closed solid as it is"):
         make_jaw(tmp_path / "finger.stl", tmp_path / "jaw.yaml", name="lattice", overrides=Overrides())
     jaw, notes = make_layered(tmp_path)
     assert "no ribs found: key points stand at even heights, as if there were some" in notes
@@ -415,17 +415,37 @@ def test_fillets_beside_ribs_hide_no_key_points():
     ).keys()
 
 
+NOSE = [(0.0, 0.0), (16.0, 0.0), (16.0, 50.0), (14.0, 55.0), (0.0, 40.0)]
+
+
 @pytest.mark.parametrize("step", [5.0, 8.0])
 def test_a_finger_with_a_short_nose_has_its_tip_there(step):
-    outline = shapely.Polygon([(0.0, 0.0), (16.0, 0.0), (16.0, 50.0), (14.0, 55.0), (0.0, 44.0)])
-    room = outline.buffer(-1.0, join_style="mitre").intersection(shapely.box(-50.0, 10.0, 50.0, 90.0))
+    room = shapely.Polygon(NOSE).buffer(-1.0, join_style="mitre").intersection(shapely.box(-50.0, 10.0, 50.0, 90.0))
     levels = np.arange(13.0, 48.0, step)
     for z in levels:
         room = room.difference(shapely.box(-50.0, z, 50.0, z + 1.0))
-    drawn = outline.difference(room)
+    drawn = shapely.Polygon(NOSE).difference(room)
     finger = recognize(shapely.affinity.scale(drawn, 1e-3, 1e-3, origin=(0, 0)), 0.02, Overrides())
     assert len(finger.ribs) == len(levels)
     assert np.ptp(finger.rings[0][finger.rings[0][:, 1] < 1e-6, 0]) == pytest.approx(16e-3, abs=1e-5)  # the base
+
+
+@pytest.mark.parametrize(("slope", "step"), [(0.0, 1.7), (0.18, 1.7), (0.36, 2.5), (0.58, 1.7), (0.84, 1.7)])
+def test_slanted_ribs_that_end_on_base_and_notch_are_ribs(slope, step):
+    """Corners that they leave are small cells, or none, and of no chain; none is a slot in a band."""
+    outline = shapely.Polygon([*NOSE[:3], (13.0, 54.0), (10.5, 43.5), (2.0, 45.0), (0.0, 40.0)])
+    room = outline.buffer(-0.6, join_style="mitre").intersection(shapely.box(-50.0, 10.7, 50.0, 90.0))
+    for z in np.arange(-5.0, 60.0, step):
+        rib = shapely.LineString([(-20.0, z - 28.0 * slope), (36.0, z + 28.0 * slope)])
+        room = room.difference(rib.buffer(0.2, cap_style="flat"))
+    drawn = outline.difference(room)
+    finger = recognize(shapely.affinity.scale(drawn, 1e-3, 1e-3, origin=(0, 0)), 0.02, Overrides())
+    cells = [hole for hole in drawn.interiors if hole.length > 3.0]
+    assert len(finger.ribs) == len(cells) - 1 > 15
+    assert not any("slot" in note for note in finger.notes)
+    heights = [rib.wall.line[:, 1].mean() for rib in finger.ribs]
+    assert min(heights[:3]) == min(heights) and 40e-3 < max(heights[-5:]) == max(heights)
+    assert all(rib.wall.usual == pytest.approx(0.4e-3, abs=2e-5) for rib in finger.ribs)
 
 
 def test_sides_that_are_alike_are_told_and_a_step_of_the_base_bends_no_face():

@@ -37,11 +37,14 @@ _NARROWER = 0.75
 _GRIP, _WASHER, _LARGEST, _UNLIKE = 3.0, 2.0, 0.125, 2.0
 # So is what lies below all cells, where it is so many times as far from the outline as they are.
 _APART = 2.0
-# A slot in a band fills so much of the rectangle around it, and is narrower than this share of the cell beside it.
-_OBLONG, _NARROW = 0.75, 0.5
+# A slot in a band fills so much of the rectangle around it, and is narrower than this share of the cell beside it; its
+# distance from the outline changes by less than this share of its length.
+_OBLONG, _NARROW, _ALONG = 0.75, 0.5, 0.15
 # Least cosine between a cell's side and the face of the band beyond it.
 _FACES = 0.7
 _NEIGHBOURS, _LONGER = 3e-3, 1.4
+# Cells that see each other through so many times the thickness of ribs do so where several ribs end side by side.
+_MERGED = 2.0
 _FEWEST, _FLAT = 5, 1e-4
 # Lines are tried through pairs of so many points, which are on them within so much [m].
 _CHORDS, _SIDE = 24, 5e-5
@@ -304,30 +307,42 @@ def _fit_bolts(holes: list[NDArray]) -> NDArray:
 
 
 def _drop_windows(polygon: shapely.Polygon, cells: list[NDArray], notes: list[str]) -> list[NDArray]:
-    """Return the cells, lowest first, without windows in the base, whose walls are no bands, and slots in bands."""
+    """Return the cells, lowest first, without windows in the base, whose walls are no bands, and slots in bands.
+
+    And without holes around which no rib could be measured, as the corners that slanted ribs leave.
+    """
     cells = sorted(cells, key=lambda cell: shapely.Polygon(cell).centroid.y)
     shapes = [shapely.Polygon(cell) for cell in cells]
+    is_corner = [shape.length < 2.0 * _FEWEST * _SPACING for shape in shapes]
+    cells, shapes = ([item for item, out in zip(items, is_corner, strict=True) if not out] for items in (cells, shapes))
     walls = [shape.distance(polygon.exterior) for shape in shapes]
     is_window = [
         wall > max(_APART * np.median(walls), _ALONE * np.sqrt(shape.area))
         for wall, shape in zip(walls, shapes, strict=True)
     ]
     count = is_window.index(False)
-    kept = [not _is_slot(shape, shapes) for shape in shapes[count:]]
-    for number, name, where in ((count, "window", "base"), (kept.count(False), "slot", "bands")):
+    kept = [not _is_slot(shape, shapes, polygon.exterior) for shape in shapes[count:]]
+    left_out = ((count, "window", "in its base"), (kept.count(False), "slot", "in its bands"))
+    for number, name, where in (*left_out, (sum(is_corner), "hole", f"less than {2e3 * _FEWEST * _SPACING:g} mm around")):
         if number:
-            notes.append(f"{number} {name}{'s' * (number > 1)} in its {where}: no cell")
+            notes.append(f"{number} {name}{'s' * (number > 1)} {where}: no cell")
     return [cell for cell, is_kept in zip(cells[count:], kept, strict=True) if is_kept]
 
 
-def _is_slot(shape: shapely.Polygon, cells: list[shapely.Polygon]) -> bool:
-    """Whether a hole is an oblong beside which there is a cell that is much wider; a rib may be beside its middle."""
+def _is_slot(shape: shapely.Polygon, cells: list[shapely.Polygon], outline: shapely.LinearRing) -> bool:
+    """Whether a hole is an oblong along the outline, with a much wider cell beside it, or a rib beside its middle."""
     left, _, right, _ = shapely.MultiPolygon(cells).bounds
     _, low, _, high = shape.bounds
     levels = [shapely.LineString([(left, z), (right, z)]) for z in low + np.array([0.25, 0.5, 0.75]) * (high - low)]
     widest = shapely.length(shapely.intersection(np.array(cells)[:, None], levels)).max()
-    is_oblong = shape.area > _OBLONG * shape.minimum_rotated_rectangle.area
-    return bool(is_oblong and shape.intersection(levels[1]).length < _NARROW * widest)
+    around = shape.minimum_rotated_rectangle
+    is_oblong = shape.area > _OBLONG * around.area
+    sides = shapely.get_coordinates(around)
+    longest = max(zip(sides[:2], sides[1:3], strict=True), key=lambda ends: np.hypot(*(ends[1] - ends[0])))
+    line = shapely.LineString(longest)
+    wall = [outline.distance(line.interpolate(share, normalized=True)) for share in (0.1, 0.5, 0.9)]
+    is_along = np.ptp(wall) < _ALONG * line.length
+    return bool(is_oblong and is_along and shape.intersection(levels[1]).length < _NARROW * widest)
 
 
 def _turn_upright(polygon: shapely.Polygon, overrides: Overrides, notes: list[str]) -> tuple[shapely.Polygon, NDArray]:
@@ -380,8 +395,13 @@ def _find_direction(polygon: shapely.Polygon, middles: NDArray, overrides: Overr
             "holes, expected at least two cells: ribs that come from a slicer's infill are not in the file; model "
             "them, or describe the finger as a drawing"
         )
-    along = np.linalg.svd(middles - middles.mean(axis=0))[2][0]
-    found = [(_measure_widths(polygon, direction), direction) for direction in (along, -along)]
+    along = np.linalg.svd(middles - middles.mean(axis=0), full_matrices=False)[2][0]
+    # widths are those of the box around the finger: of a chain of slanted cells the middles lean
+    sides = np.diff(shapely.get_coordinates(polygon.minimum_rotated_rectangle)[:3], axis=0)
+    sides /= np.linalg.norm(sides, axis=1, keepdims=True)
+    axis = max(sides, key=lambda side: abs(side @ along))
+    axis = axis if axis @ along > 0.0 else -axis
+    found = [(_measure_widths(polygon, sense * axis), sense * along) for sense in (1.0, -1.0)]
     narrow, direction = min(found, key=lambda end: end[0][1] / end[0][0])
     sizes = f"its section is {1e3 * narrow[0]:.3g} mm wide at one end and {1e3 * narrow[1]:.3g} mm at the other"
     is_sure = narrow[1] <= _NARROWER * narrow[0]
@@ -573,12 +593,11 @@ def _measure_walls(polygon: shapely.Polygon, cells: list[NDArray]) -> tuple[Wall
     """
     middles = np.array([shapely.Polygon(cell).centroid.coords[0] for cell in cells])
     bands: dict[str, list] = {"inner": [], "outer": []}
-    between: list[list] = [[] for _ in cells[1:]]
+    between: dict[tuple[int, int], list] = {}
     for number, place, normal, far, other in _shoot(polygon, cells):
         found = (*(place + 0.5 * far * normal), far)
         if other >= 0:
-            if abs(other - number) == 1:
-                between[min(other, number)].append(found)
+            between.setdefault((min(number, other), max(number, other)), []).append(found)
             continue
         x, z = place + far * normal
         is_inner = x > np.interp(z, middles[:, 1], middles[:, 0])
@@ -587,15 +606,38 @@ def _measure_walls(polygon: shapely.Polygon, cells: list[NDArray]) -> tuple[Wall
         elif not is_inner and normal[0] < 0.5 * _FACES and normal[1] > -_FACES:
             bands["outer"].append(found)
     inner, outer = (_string_up(np.array(bands[name]).reshape(-1, 3), name) for name in ("inner", "outer"))
-    ribs = []
-    for number, found in enumerate(between, start=1):
-        if len(found) < _FEWEST:
-            raise JawFileError(
-                f"between its cells {number} and {number + 1} there is no rib that could be measured: leave out what "
-                "crosses, or take a closed solid as it is (--solid)"
-            )
-        ribs.append(_string_rib(np.array(found), inner, outer))
-    return inner, outer, ribs
+    walls = {pair: np.array(found) for pair, found in between.items() if len(found) >= _FEWEST}
+    return inner, outer, [_string_rib(walls[pair], inner, outer) for pair in _find_ribs(walls, polygon, cells)]
+
+
+def _find_ribs(
+    walls: dict[tuple[int, int], NDArray], polygon: shapely.Polygon, cells: list[NDArray]
+) -> list[tuple[int, int]]:
+    """Return the pairs of cells between which there are ribs, base to tip: those that join all cells without a round.
+
+    Args:
+        walls: between pairs of cells, points of their centre lines with thickness (n, 3) [m].
+        polygon: the section, whose picture numbers its holes.
+        cells: lowest first.
+
+    Raises:
+        JawFileError: No rib joins a cell to the others, or ribs cross.
+    """
+    number_of = {shapely.Polygon(hole).bounds: number for number, hole in enumerate(polygon.interiors, start=1)}
+    numbers = [number_of[shapely.Polygon(cell).bounds] for cell in cells]
+    advice = "leave out what crosses, or take a closed solid as it is (--solid)"
+    group, ribs = np.arange(len(cells)), []
+    thickness = {pair: float(np.median(found[:, 2])) for pair, found in walls.items()}
+    for one, two in sorted(walls, key=thickness.__getitem__):
+        if group[one] != group[two]:
+            group[group == group[two]] = group[one]
+            ribs.append((one, two))
+        elif thickness[one, two] < _MERGED * np.median([thickness[pair] for pair in ribs]):
+            raise JawFileError(f"ribs cross next to its cells {numbers[one]} and {numbers[two]}: {advice}")
+    if len(ribs) < len(cells) - 1:
+        lost = int(np.flatnonzero(group != group[0])[0])
+        raise JawFileError(f"between its cell {numbers[lost]} and the others there is no rib to be measured: {advice}")
+    return sorted(ribs, key=sum)
 
 
 def _shoot(polygon: shapely.Polygon, cells: list[NDArray]) -> Iterator[tuple[int, NDArray, NDArray, float, int]]:
