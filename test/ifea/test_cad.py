@@ -134,19 +134,47 @@ def test_a_floor_and_a_slot_are_named_with_their_place(tmp_path, surface):
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["jaw.png"]
 
 
-@pytest.mark.parametrize(("top", "is_held"), [(8.0, True), (10.5, False), (22.0, False)])  # the clamp: 9.5 mm
-def test_a_fork_below_the_clamp_is_held_and_one_above_it_refused(tmp_path, surface, top, is_held):
+def cut_fork(surface, top, share=0.6):
     low, high = surface.bounds
-    slot = ((0.6 * (high[0] - low[0]), 0.4 * WIDTH, 2.0 * top), [*0.5 * (low + high)[:2], low[2]])
-    fork = boxes_joined(surface, slot, cut=True)
-    if is_held:
-        raw = read_mesh(tmp_path, fork)
-        assert "its sections differ within the base, which the clamp has to hold" in raw.notes
-        check_found(recognize(raw.polygon, raw.width, Overrides(), base=raw.base, unlike=raw.unlike))
-        return
-    fork.export(tmp_path / "finger.stl")
+    slot = ((share * (high[0] - low[0]), 0.4 * WIDTH, 2.0 * top), [*0.5 * (low + high)[:2], low[2]])
+    return boxes_joined(surface, slot, cut=True)
+
+
+@pytest.mark.parametrize("top", [8.0, 11.5])  # below the clamp of 9.5 mm, and above it next to the first cell
+def test_a_fork_in_the_base_is_held(tmp_path, surface, top):
+    raw = read_mesh(tmp_path, cut_fork(surface, top))
+    assert "its sections differ within the base, which the clamp has to hold" in raw.notes
+    finger = recognize(raw.polygon, raw.width, Overrides(), base=raw.base, unlike=raw.unlike)
+    assert finger.clamped_z == pytest.approx(max(top, 9.5) * MILLIMETRE, abs=3e-4)
+    assert ("clamped up to z = 11.5 mm, as far as its sections differ" in finger.notes) == (top > 9.5)
+    check_found(replace(finger, clamped_z=9.5e-3))
+
+
+def test_a_fork_that_reaches_beside_cells_is_refused(tmp_path, surface):
+    cut_fork(surface, 22.0).export(tmp_path / "finger.stl")
     with pytest.raises(JawFileError, match="is not prismatic along.*have another section.*section is drawn in"):
         make_jaw(tmp_path / "finger.stl", tmp_path / "jaw.yaml", name="fork", overrides=Overrides())
+
+
+def test_a_fork_across_half_of_the_base_leaves_its_whole_edge(tmp_path, surface):
+    low, high = surface.bounds
+    half = ((0.5 * (high[0] - low[0]), 0.6 * WIDTH, 16.0), [high[0], 0.5 * (low + high)[1], low[2]])
+    raw = read_mesh(tmp_path, boxes_joined(surface, half, cut=True))
+    assert raw.polygon.symmetric_difference(read_mesh(tmp_path, surface).polygon).area < 1e-6 * raw.polygon.area
+
+
+def test_a_small_hole_across_is_left_out_beside_a_fork_and_a_small_floor_is_not(tmp_path, surface):
+    low, high = surface.bounds
+    drill = trimesh.creation.cylinder(0.5, 200.0)
+    drill.apply_transform(trimesh.transformations.rotation_matrix(0.5 * np.pi, [0, 1, 0]))
+    drill.apply_translation([0.0, 0.0, low[2] + 0.75 * (high[2] - low[2])])
+    drilled = trimesh.boolean.difference([cut_fork(surface, 8.0), drill], engine="manifold")
+    raw = read_mesh(tmp_path, drilled)
+    assert any("hole across it is left out" in note for note in raw.notes)
+    check_found(recognize(raw.polygon, raw.width, Overrides(), base=raw.base, unlike=raw.unlike))
+    floor = ((6.0, 1.0, 10.0), [high[0] - 3.5, low[1] + 0.5, low[2] + 60.0])
+    with pytest.raises(JawFileError, match="have another section"):
+        read_mesh(tmp_path, boxes_joined(drilled, floor))
 
 
 @pytest.mark.parametrize("turn", [[0.0, 0.0, 0.0], [17.0, -41.0, 133.0], [84.0, 3.0, 11.0], [40.0, 40.0, 40.0]])
@@ -410,9 +438,10 @@ def test_fillets_beside_ribs_hide_no_key_points():
     drawn = draw_triangle(0.0, LEVEL[:3])
     room = shapely.union_all([shapely.Polygon(hole) for hole in drawn.interiors]).buffer(-2.5e-3).buffer(2.5e-3)
     filleted = shapely.Polygon(drawn.exterior).difference(room)
-    assert choose_keypoints(recognize(filleted, 0.02, Overrides())).keys() == choose_keypoints(
-        recognize(drawn, 0.02, Overrides())
-    ).keys()
+    assert (
+        choose_keypoints(recognize(filleted, 0.02, Overrides())).keys()
+        == choose_keypoints(recognize(drawn, 0.02, Overrides())).keys()
+    )
 
 
 NOSE = [(0.0, 0.0), (16.0, 0.0), (16.0, 50.0), (14.0, 55.0), (0.0, 40.0)]

@@ -37,8 +37,8 @@ _UPRIGHT, _PRISMATIC = 0.02, 0.97
 # within so much [m].
 _ASIDE, _SIDE, _RULINGS = 0.5, 1e-4, 4
 # Cuts across it, evenly over the width: they may differ from the usual one by so much of its area on average, and few
-# of them by what is seen; what differs by more is another section.
-_CUTS, _ALIKE, _SEEN, _RARE, _OTHER = 25, 0.02, 0.01, 0.2, 0.1
+# of them by what is seen; what differs by more is another section, by less the same. A small hole is one on average.
+_CUTS, _ALIKE, _SEEN, _RARE, _OTHER, _ROUNDING, _SMALL = 25, 0.02, 0.01, 0.2, 0.1, 1e-4, 5e-3
 # Cuts of the same walls are one where these move by less than this [m] over the width.
 _ALONG = 2e-6
 # A base fits into a circle of this share of that around the blade on it, and what is in it into one of this share.
@@ -201,24 +201,25 @@ def _cut_surface(mesh: Surface, body: int | None, layered: bool, notes: list[str
     if share < _PRISMATIC and not cuts.is_one:
         return _cut_tapered(mesh, axis, notes)
     letters = np.round(axis, 3).tolist()
-    base, width, unlike = None, cuts.width, ""
+    base, width, unlike, section = None, cuts.width, "", cuts.section
     if not cuts.is_one:
         unlike = f"is not prismatic along {letters}: {cuts.describe()}"
         if (base := cuts.find_local()) is not None:
             notes.append("its sections differ within the base, which the clamp has to hold")
+            section = cuts.fill(base)
         elif (beside := cuts.find_beside()) is not None:
             width, unlike = _measure_blade(mesh, axis, beside), ""
             base = None if cuts.is_mark else beside
             what = "raised marks, which are left out" if base is None else f"a base of {1e3 * cuts.width:.4g} mm"
             notes.append(f"a blade {1e3 * width:.4g} mm wide, {'on' if base is not None else 'with'} {what}")
         else:
-            raise UnlikeSectionsError(unlike, cuts.section)
+            raise UnlikeSectionsError(unlike, section)
     notes.append(f"prismatic along {letters} of the file, {1e3 * width:.4g} mm wide")
     if share < _PRISMATIC:
         notes.append(f"edges that are chamfered or rounded are left out: {1.0 - share:.0%} of its surface")
     if pieces := int((shapely.get_num_geometries(cuts.found) > 1).sum()):
         notes.append(f"a hole across it is left out: it parts {pieces} of {_CUTS} cuts")
-    return RawSection(polygon=cuts.section, width=width, notes=notes, base=base, unlike=unlike)
+    return RawSection(polygon=section, width=width, notes=notes, base=base, unlike=unlike)
 
 
 def _cut_layers(mesh: Surface, axis: NDArray, notes: list[str]) -> RawSection:
@@ -283,12 +284,26 @@ class _Cuts:
         return shapely.minimum_bounding_radius(area) < share * shapely.minimum_bounding_radius(self.section)
 
     def find_local(self) -> shapely.Geometry | None:
-        """Return where cuts differ from the section, if that is short: a fork, a bore or a void of the base."""
+        """Return where cuts differ from the section, if that is short: a fork, a bore or a void of the base.
+
+        Small holes across a few of the cuts are left out.
+        """
         seen = self.found[self.difference > _SEEN]
-        apart = shapely.symmetric_difference(seen, self.section, grid_size=_GRID)
-        apart = shapely.union_all(shapely.buffer(apart, 0.0), grid_size=_GRID)  # lines among areas cannot be united
-        apart = apart.buffer(-_CHORD).buffer(_CHORD)  # without what rounding leaves along outlines
-        return apart if self.is_short(apart, _LOCAL) else None
+        differing = shapely.symmetric_difference(seen, self.section, grid_size=_GRID)
+        differing = shapely.buffer(differing, 0.0)
+        apart = shapely.union_all(differing, grid_size=_GRID)  # lines among areas cannot be united
+        parts = shapely.get_parts(apart.buffer(-_CHORD).buffer(_CHORD))  # without what rounding leaves along outlines
+        shares = shapely.area(shapely.intersection(parts[:, None], differing, grid_size=_GRID)) / self.section.area
+        is_rare = (shares > _ROUNDING).sum(axis=1) <= _RARE * len(self.found)
+        added = shapely.area(shapely.difference(parts, self.section.buffer(_CHORD)))
+        is_hole = is_rare & (shares.sum(axis=1) <= _SMALL * len(self.found)) & (added <= _SEEN * self.section.area)
+        apart = shapely.union_all(parts[~is_hole])
+        return apart if not apart.is_empty and self.is_short(apart, _LOCAL) else None
+
+    def fill(self, base: shapely.Geometry) -> shapely.Polygon:
+        """Return the section with all that any cut has within a base, which is held and thus as good as solid."""
+        within = shapely.buffer(shapely.intersection(self.found, base.buffer(2.0 * _CHORD), grid_size=_GRID), 0.0)
+        return _one_piece(shapely.union_all([self.section, *within], grid_size=_GRID))
 
     def find_beside(self) -> shapely.Geometry | None:
         """Return the section of what stands out beside a blade: a base, or marks on it; None where it is neither."""

@@ -185,11 +185,12 @@ def recognize(
     bolts, cells = _split_holes(turned)
     bolts, cells = _fit_bolts(bolts), _drop_windows(turned, cells, notes)
     inner, outer, ribs = _measure_walls(turned, cells)
-    slope, floor = _find_floor(turned, (inner, outer))
-    clamped_z, circles = _propose_clamp(cells, bolts, (inner, outer), (slope, floor), overrides, notes)
+    slope, edge = _find_floor(turned, (inner, outer))
+    clamped_z, circles = _propose_clamp(cells, bolts, (inner, outer), (slope, edge), overrides, notes)
     if base is not None:
         heights = (shapely.get_coordinates(base) @ frame[:, :2].T + frame[:, 2]) @ [-slope, 1.0]
-        clamped_z = _raise_clamp(clamped_z, heights, turned.bounds[3], unlike, notes)
+        floor = min(float((cell @ [-slope, 1.0]).min()) for cell in cells)
+        clamped_z = _raise_clamp(clamped_z, heights, (floor, turned.bounds[3]), unlike, notes)
     face_x, deviation = _measure_face(turned, cells, clamped_z, slope, notes)
     taper = np.zeros(2) if taper is None else frame[:, :2] @ taper
     finger = RecognizedFinger(
@@ -224,23 +225,32 @@ def _describe_walls(finger: RecognizedFinger) -> str:
     )
 
 
-def _raise_clamp(clamped_z: float, base: NDArray, length: float, unlike: str, notes: list[str]) -> float:
-    """Return the height of a clamp [m] that holds a base, given by heights (n,) [m], of a finger of a length [m].
+def _raise_clamp(clamped_z: float, base: NDArray, ends: tuple[float, float], unlike: str, notes: list[str]) -> float:
+    """Return the height of a clamp [m] that holds a base, given by heights (n,) [m].
+
+    Args:
+        clamped_z: height of the clamp without it [m].
+        base: heights (n,) [m] of what has to be held.
+        ends: of the finger [m]: the lowest point of its cells, and its length.
+        unlike: what the base is, if no wider than the blade.
+        notes: what was found, a line each.
 
     Raises:
-        JawFileError: No clamp holds that, as it is far up; or it is unlike the blade, and no wider, above the clamp.
+        JawFileError: No clamp holds that, as it is far up; or it is unlike the blade, and no wider, beside its cells.
     """
+    floor, length = ends
     top = float(base.max())
     if top <= clamped_z + _SIDE:
         return max(top, clamped_z)
-    if unlike:
+    if unlike and top > floor + _SIDE:
         raise JawFileError(unlike)
     if top > _LOW * length:
         raise JawFileError(
             f"it is wider than its blade up to z = {1e3 * top:.3g} of {1e3 * length:.3g} mm: more than a base; export "
             "the blade alone, or use a volume mesh (`mesh:` in the jaw file)"
         )
-    notes.append(f"clamped up to z = {1e3 * top:.4g} mm, as far as it is wider than the blade")
+    what = "its sections differ" if unlike else "it is wider than the blade"
+    notes.append(f"clamped up to z = {1e3 * top:.4g} mm, as far as {what}")
     return top
 
 
@@ -323,7 +333,10 @@ def _drop_windows(polygon: shapely.Polygon, cells: list[NDArray], notes: list[st
     count = is_window.index(False)
     kept = [not _is_slot(shape, shapes, polygon.exterior) for shape in shapes[count:]]
     left_out = ((count, "window", "in its base"), (kept.count(False), "slot", "in its bands"))
-    for number, name, where in (*left_out, (sum(is_corner), "hole", f"less than {2e3 * _FEWEST * _SPACING:g} mm around")):
+    for number, name, where in (
+        *left_out,
+        (sum(is_corner), "hole", f"less than {2e3 * _FEWEST * _SPACING:g} mm around"),
+    ):
         if number:
             notes.append(f"{number} {name}{'s' * (number > 1)} {where}: no cell")
     return [cell for cell, is_kept in zip(cells[count:], kept, strict=True) if is_kept]
