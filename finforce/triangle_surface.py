@@ -176,6 +176,14 @@ class Surface:
         """Return the surface without triangles that were there before."""
         return self.take(np.sort(np.unique(np.sort(self.triangles, axis=1), axis=0, return_index=True)[1]))
 
+    def drop_flaps(self: SurfaceT) -> SurfaceT:
+        """Return the surface without triangles that are there in either sense, and bound nothing; of others one each."""
+        order = np.argsort(self.triangles, axis=1)
+        sense = np.where(np.isin(order[:, 0] + 3 * order[:, 1], (3, 7, 2)), 1, -1)  # 0 1 2, 1 2 0 and 2 0 1
+        _, place = np.unique(np.sort(self.triangles, axis=1), axis=0, return_inverse=True)
+        surplus = np.bincount(place.ravel(), weights=sense)[place.ravel()]
+        return self.take(sense * surplus > 0.0).drop_doubles()
+
     def orient(self: SurfaceT) -> SurfaceT | None:
         """Return the surface with neighbours in one sense, that of most of them; None where it has one side only.
 

@@ -225,9 +225,9 @@ def test_shells_that_overlap_are_printed_as_one_and_those_that_touch_are_not(tmp
         read_mesh(tmp_path, trimesh.util.concatenate([*whole, pad]))
 
 
-def make_layered(folder):
+def make_layered(folder, **stated):
     """The jaw of a folder's finger.stl, taken as a solid, and what was found."""
-    options = {"name": "layered", "overrides": Overrides(), "solid": True, "measure_warping": measure_warping}
+    options = {"name": "layered", "overrides": Overrides(**stated), "solid": True, "measure_warping": measure_warping}
     _, notes = make_jaw(folder / "finger.stl", folder / "jaw.yaml", **options)
     return load_jaw(folder / "jaw.yaml"), notes
 
@@ -307,6 +307,21 @@ def test_a_finger_without_ribs_is_taken_as_a_solid(tmp_path):
     jaw, _ = make_layered(tmp_path)
     assert jaw.section.polygon.area == pytest.approx(wedge.area * MILLIMETRE**2, rel=1e-3)
     assert len(jaw.keypoints) > 10
+
+
+def test_a_slotted_block_is_extruded_along_its_slot_and_has_no_cells_or_bolts_beside_it(tmp_path):
+    outline = shapely.box(0.0, 0.0, 40.0, 12.0).difference(shapely.box(0.0, 4.0, 8.0, 9.0))
+    trimesh.creation.extrude_polygon(outline, 11.0).export(tmp_path / "finger.stl")
+    found = []
+    for flip in (True, False):
+        jaw, notes = make_layered(tmp_path, flip=flip)
+        assert jaw.section.width == pytest.approx(11e-3) and "1 layer along [0.0, 0.0, 1.0]" in " ".join(notes)
+        assert len(jaw.keypoints) > 10 and len(jaw.section.clamped_circles) == 0
+        assert not any("bolts" in note for note in notes)
+        tip = jaw.keypoints[jaw.keypoint_names.index("tip")]
+        assert jaw.section.polygon.contains(shapely.Point(tip[[0, 2]]))
+        found.append(jaw.section.clamped_z)
+    assert max(found) == pytest.approx(8e-3, abs=5e-4)  # all of the slot, where that is the base
 
 
 def test_ribs_that_cross_are_taken_as_a_solid(tmp_path):
@@ -533,8 +548,11 @@ def test_a_void_is_no_body(tmp_path, surface):
 def test_a_missing_triangle_and_doubled_faces_are_mended_with_a_word(tmp_path, surface):
     lacking = surface.copy()
     lacking.update_faces(np.arange(len(lacking.faces)) != 7)
-    double = trimesh.Trimesh(surface.vertices, np.vstack([surface.faces, surface.faces[:5]]), process=False)
-    for mesh in (lacking, double):
+    far = surface.vertices[:, 2].argmax()
+    flap = np.append(surface.faces[surface.faces[:, 0] != far][0, :2], far)  # from an edge to another place and back
+    more = (surface.faces[:5], surface.faces[:, ::-1], [flap, flap[::-1]])
+    doubled = [trimesh.Trimesh(surface.vertices, np.vstack([surface.faces, faces]), process=False) for faces in more]
+    for mesh in (lacking, *doubled):
         raw = read_mesh(tmp_path, mesh)
         assert any(note.startswith("mended") for note in raw.notes)
         check_found(recognize(raw.polygon, raw.width, Overrides()))

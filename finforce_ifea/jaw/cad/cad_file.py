@@ -199,7 +199,11 @@ def _cut_surface(mesh: Surface, body: int | None, layered: bool, notes: list[str
         return _cut_layers(mesh, axis, notes)
     cuts = _cut_often(mesh, axis)
     if share < _PRISMATIC and not cuts.is_one:
-        return _cut_tapered(mesh, axis, notes)
+        try:
+            return _cut_tapered(mesh, axis, notes)
+        except JawFileError as error:
+            advice = "take the solid as it is (--solid); of a finger with its holder, export the finger alone"
+            raise UnlikeSectionsError(f"{error}: {advice}", cuts.section) from error
     letters = np.round(axis, 3).tolist()
     base, width, unlike, section = None, cuts.width, "", cuts.section
     if not cuts.is_one:
@@ -244,6 +248,8 @@ def _measure_blade(mesh: Surface, axis: NDArray, base: shapely.Geometry) -> floa
 def _mend(mesh: Surface, notes: list[str]) -> Surface:
     """Return a surface without doubled faces, in one sense, its cracks and small holes closed."""
     single = mesh.drop_doubles()
+    if not single.edges.is_balanced and (solid := mesh.drop_flaps()).edges.is_balanced:
+        single = solid
     if single.edges.is_balanced:
         mended, filled = single, 0
     else:
@@ -414,7 +420,7 @@ def _find_axis(mesh: Surface) -> tuple[NDArray, float]:
     _, number = np.unique(np.round(turned, 2), axis=0, return_inverse=True)
     number = number.ravel()
     weight = np.bincount(number, areas)
-    best, most = np.array([0.0, 0.0, 1.0]), -1.0
+    found: list[tuple[float, float, NDArray]] = [(-1.0, 0.0, np.array([0.0, 0.0, 1.0]))]
     for cluster in np.argsort(-weight)[:20]:
         axis = (turned * (areas * (number == cluster))[:, None]).sum(axis=0)
         length = np.linalg.norm(axis)
@@ -422,11 +428,14 @@ def _find_axis(mesh: Surface) -> tuple[NDArray, float]:
             break
         axis = axis / length
         along = np.abs(normals @ axis)
-        share = float(areas[(along < _UPRIGHT) | (along > 1.0 - _UPRIGHT**2)].sum() / areas.sum())
-        # a box goes with all three of its directions: the one with the smallest end faces has been extruded least
-        if share > most + 1e-3:
-            best, most = axis, share
-    return best, most
+        across = along > 1.0 - _UPRIGHT**2
+        height = (mesh.vertices @ axis)[mesh.triangles].mean(axis=1)
+        is_step = across & (np.minimum(height - height.min(), height.max() - height) > _SIDE)
+        found.append((float(areas[(along < _UPRIGHT) | across].sum() / areas.sum()), float(areas[is_step].sum()), axis))
+    # what stands on a box goes with all three of its directions: it was extruded along the one without steps
+    most = max(share for share, _, _ in found)
+    share, _, axis = min((item for item in found if item[0] > most - 1e-3), key=lambda item: item[1])
+    return axis, share
 
 
 def _cut_tapered(mesh: Surface, axis: NDArray, notes: list[str]) -> RawSection:
@@ -515,7 +524,9 @@ def _cut(mesh: Surface, axis: NDArray, height: float) -> shapely.Geometry:
 def _one_piece(area: shapely.Geometry) -> shapely.Polygon:
     """Return a polygon; raises JawFileError for several separate ones."""
     if area.geom_type != "Polygon":
-        raise JawFileError(f"its section has {len(area.geoms)} separate areas, expected one finger")
+        raise JawFileError(
+            f"its section has {len(area.geoms)} separate areas, expected one finger: export it alone, without its holder"
+        )
     return area
 
 

@@ -28,8 +28,9 @@ _TIP = 2.5e-3
 FEW = 12
 BANDS = ("inner", "outer")
 # A finger without ribs is given so many cells between these shares of its length, apart by twice this share, under a
-# skin of this share of its width.
+# skin of this share of its width; slots reach so far into its ends.
 _CELLS, _CELLS_FROM, _GAP, _SKIN = 8, (0.08, 0.95), 0.008, 0.06
+_SLOT, _LEVELS = 0.3, 200
 # Layers that warp by more than this share need a solid, whose elements are of this size [m].
 _WARPING, _SIZE = 0.25, 0.002
 # Walls in a photograph are so many pixels across at least. They are uncertain by this share of the width of its edges
@@ -161,7 +162,12 @@ def _recognize(raw: RawSection, width: float, overrides: Overrides) -> Recognize
         is_prism = len(raw.layers) == 1 and has_cells(raw.polygon)
         return finger if is_prism else _layer(finger, raw)
     except JawFileError:
-        finger = _layer(recognize(_open_cells(raw.polygon), width, overrides), raw)
+        try:
+            finger = _layer(recognize(_open_cells(raw.polygon), width, overrides), raw)
+        except JawFileError as error:
+            if "--solid" not in str(error):
+                raise
+            raise JawFileError("its outline is no finger's: export the finger alone, without its holder") from error
     finger.notes[-1] = "no ribs found: key points stand at even heights, as if there were some"
     return finger
 
@@ -174,11 +180,27 @@ def _open_cells(polygon: shapely.Polygon) -> shapely.Polygon:
     start, size = corners.mean(axis=0) - 0.5 * along, np.hypot(*along)
     room = polygon.buffer(-_SKIN * np.hypot(*across))
     cells = []
-    for low, high in pairwise(np.linspace(*_CELLS_FROM, _CELLS + 1)):
+    for low, high in pairwise(np.linspace(*_find_whole(room, start, along, across), _CELLS + 1)):
         middle = shapely.LineString([start + (low + _GAP) * along, start + (high - _GAP) * along])
         parts = shapely.get_parts(room.intersection(middle.buffer(size, cap_style="flat")))
         cells.append(max(parts, key=lambda part: part.area, default=shapely.Polygon()))
     return polygon.difference(shapely.union_all(cells))
+
+
+def _find_whole(room: shapely.Geometry, start: NDArray, along: NDArray, across: NDArray) -> tuple[float, float]:
+    """Return between which shares of an outline's length cells lie: not beside a slot in either end, as of a base.
+
+    Args:
+        room: what is left for cells [m].
+        start: the middle of one end of the box around the outline (2,) [m].
+        along: from there to the other end (2,) [m].
+        across: from side to side (2,) [m].
+    """
+    shares = np.linspace(0.0, 1.0, _LEVELS)
+    ends = start + shares[:, None, None] * along + np.array([[-1.0], [1.0]]) * across
+    is_apart = shapely.get_num_geometries(shapely.intersection(room, shapely.linestrings(ends))) > 1
+    lower, upper = (shares[is_apart & side].tolist() for side in (shares < _SLOT, shares > 1.0 - _SLOT))
+    return max([_CELLS_FROM[0], *lower]), min([_CELLS_FROM[1], *upper])
 
 
 def _layer(finger: RecognizedFinger, raw: RawSection) -> RecognizedFinger:
@@ -211,7 +233,8 @@ def choose_keypoints(finger: RecognizedFinger) -> dict[str, NDArray]:
             is_there = line.distance(shapely.Point(x, z)) < wall.usual  # else it ends elsewhere, as on the base
             if is_there and z > finger.clamp_height(x) + _ABOVE and not finger.find_clamped(np.array([[x, z]])).any():
                 places[f"{band}_{number}"] = (x, z)
-    top = finger.polygon.intersection(shapely.box(-1.0, finger.length - _TIP, 1.0, 1.0)).centroid
+    tips = shapely.get_parts(finger.polygon.intersection(shapely.box(-1.0, finger.length - _TIP, 1.0, 1.0)))
+    top = max(tips, key=lambda part: part.area).centroid
     places["tip"] = (top.x, top.y)
     if len(places) < FEW:
         places |= _find_middles(finger, places)

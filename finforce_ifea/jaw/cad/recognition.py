@@ -406,7 +406,7 @@ def _find_direction(polygon: shapely.Polygon, middles: NDArray, overrides: Overr
         raise JawFileError(
             f"its section has {len(middles)} cells between ribs and {len(polygon.interiors) - len(middles)} round "
             "holes, expected at least two cells: ribs that come from a slicer's infill are not in the file; model "
-            "them, or describe the finger as a drawing"
+            "them, take a closed solid as it is (--solid) and calibrate its modulus, or describe it as a drawing"
         )
     along = np.linalg.svd(middles - middles.mean(axis=0), full_matrices=False)[2][0]
     # widths are those of the box around the finger: of a chain of slanted cells the middles lean
