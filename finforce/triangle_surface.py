@@ -177,7 +177,7 @@ class Surface:
         return self.take(np.sort(np.unique(np.sort(self.triangles, axis=1), axis=0, return_index=True)[1]))
 
     def drop_flaps(self: SurfaceT) -> SurfaceT:
-        """Return the surface without triangles that are there in either sense, and bound nothing; of others one each."""
+        """Return the surface without triangles that are there in both senses and bound nothing; of others one each."""
         order = np.argsort(self.triangles, axis=1)
         sense = np.where(np.isin(order[:, 0] + 3 * order[:, 1], (3, 7, 2)), 1, -1)  # 0 1 2, 1 2 0 and 2 0 1
         _, place = np.unique(np.sort(self.triangles, axis=1), axis=0, return_inverse=True)

@@ -68,7 +68,8 @@ def mesh_section(section: Section, share: float = 1.0) -> PlaneMesh:
     edges = np.concatenate([e if closed else e[:-1] for e, (_, closed) in zip(edges, section.lines, strict=True)])
     if section.layers:  # whose lines share their ends
         points, number = np.unique(points, axis=0, return_inverse=True)
-        edges, polygon = number.ravel()[edges], section.polygon
+        # lines that are closer than elements may be one
+        edges, polygon = np.unique(np.sort(number.ravel()[edges], axis=1), axis=0), section.polygon
     else:
         polygon = shapely.Polygon(rings[0], rings[1:])
     inside = _fill(polygon, points, field)

@@ -632,6 +632,48 @@ def test_a_side_that_is_no_plane_and_walls_that_run_apart_are_refused(tmp_path, 
         read_section(tmp_path / "cone.stl")
 
 
+def test_a_finger_with_its_holder_is_refused_with_a_picture_and_taken_as_a_solid(tmp_path, surface):
+    low, high = surface.bounds
+    middle = 0.5 * (low + high)
+    # a bracket of two plates beside the finger, on a bridge across its base that leans
+    plates = [((60.0, 4.0, 50.0), [middle[0], y, low[2] - 27.0]) for y in (low[1] - 14.0, high[1] + 14.0)]
+    bridge = trimesh.creation.cone(20.0, 24.0, sections=24)
+    bridge.apply_translation([middle[0], middle[1], low[2] - 12.0])
+    sides = [((30.0, 16.0, 6.0), [middle[0], y, low[2] - 3.0]) for y in (low[1] - 6.0, high[1] + 6.0)]
+    held = trimesh.boolean.union([boxes_joined(surface, *plates, *sides), bridge], engine="manifold")
+    held.export(tmp_path / "finger.stl")
+    with pytest.raises(JawFileError, match=r"not prismatic.*--solid.*export the finger alone.*drawn in .*jaw\.png"):
+        make_jaw(tmp_path / "finger.stl", tmp_path / "jaw.yaml", name="held", overrides=Overrides())
+    assert (tmp_path / "jaw.png").exists()
+    raw = read_section(tmp_path / "finger.stl", layered=True)
+    finger = recognize(raw.polygon, raw.width, Overrides())
+    assert len(finger.ribs) == RIBS and len(finger.bolts) == 2
+    volume = sum((layer.high - layer.low) * layer.area.area for layer in raw.layers)
+    assert volume == pytest.approx(held.volume * MILLIMETRE**3, rel=0.06)
+
+
+def test_layers_of_a_body_that_changes_everywhere_have_ribs_where_it_has_some(tmp_path):
+    """A lens of 40 mm has ribs over half of its width: thinner than outlines may move, they are no outline."""
+    lens = trimesh.creation.icosphere(4)
+    lens.apply_scale([25.0, LENGTH, 20.0])
+    parts = []
+    for ribs, width in ((0, 40.0), (RIBS, 20.0)):
+        prism = trimesh.creation.extrude_polygon(draw_polygon(ribs=ribs), width)
+        prism.apply_translation([0.0, 0.0, -0.5 * width])
+        parts.append(trimesh.boolean.intersection([prism, lens], engine="manifold"))
+    body = trimesh.boolean.union(parts, engine="manifold")
+    body.export(tmp_path / "finger.stl")
+    layers = read_section(tmp_path / "finger.stl", layered=True).layers
+    assert sum((layer.high - layer.low) * layer.area.area for layer in layers) == pytest.approx(
+        body.volume * MILLIMETRE**3, rel=0.02
+    )
+    for layer in layers:
+        middle = 0.5 * (layer.low + layer.high) / MILLIMETRE
+        if abs(middle) < 17.0:  # beyond, one cut says little of a layer
+            cut = body.section(UP, middle * UP).to_2D()[0]
+            assert layer.area.area == pytest.approx(cut.area * MILLIMETRE**2, rel=0.05)
+
+
 def test_a_surface_that_is_inside_out_is_turned(tmp_path, surface):
     mesh = surface.copy()
     mesh.invert()

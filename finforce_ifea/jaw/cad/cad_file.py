@@ -17,6 +17,7 @@ from finforce.triangle_surface import Surface, join_surfaces, unite
 from finforce_ifea.errors import JawFileError
 from finforce_ifea.jaw.cad.curves import read_dxf, read_svg
 from finforce_ifea.jaw.cad.layers import find_layers
+from finforce_ifea.jaw.cad.recognition import count_cells
 from finforce_ifea.jaw.cad.photo import PHOTOS, SCALE, Photo, read_photo
 from finforce_ifea.jaw.section import UNITS, Layer, SectionFile, check_loops, join_loops, read_section_file
 
@@ -136,7 +137,7 @@ def _take_section(content: SectionFile) -> RawSection:
 
 
 def _find_usual(layers: Sequence[Layer]) -> shapely.Polygon:
-    """Return the area of the thickest layer in one piece.
+    """Return the area of the layer in one piece with most cells, of several that of which most is solid.
 
     Raises:
         JawFileError: none is, or all together are not.
@@ -145,7 +146,7 @@ def _find_usual(layers: Sequence[Layer]) -> shapely.Polygon:
     if not whole:
         raise JawFileError("none of its layers is in one piece, expected one finger")
     _one_piece(shapely.union_all([layer.area for layer in layers]))
-    return max(whole, key=lambda layer: layer.high - layer.low).area
+    return max(whole, key=lambda layer: (count_cells(layer.area), (layer.high - layer.low) * layer.area.area)).area
 
 
 def _choose_unit(extent: float, unit: str | None) -> tuple[float, str]:
@@ -199,11 +200,7 @@ def _cut_surface(mesh: Surface, body: int | None, layered: bool, notes: list[str
         return _cut_layers(mesh, axis, notes)
     cuts = _cut_often(mesh, axis)
     if share < _PRISMATIC and not cuts.is_one:
-        try:
-            return _cut_tapered(mesh, axis, notes)
-        except JawFileError as error:
-            advice = "take the solid as it is (--solid); of a finger with its holder, export the finger alone"
-            raise UnlikeSectionsError(f"{error}: {advice}", cuts.section) from error
+        return _try_tapered(mesh, axis, cuts.section, notes)
     letters = np.round(axis, 3).tolist()
     base, width, unlike, section = None, cuts.width, "", cuts.section
     if not cuts.is_one:
@@ -438,6 +435,15 @@ def _find_axis(mesh: Surface) -> tuple[NDArray, float]:
     return axis, share
 
 
+def _try_tapered(mesh: Surface, axis: NDArray, section: shapely.Polygon, notes: list[str]) -> RawSection:
+    """Return the section of a tapered body; raises UnlikeSectionsError with its usual section where it is none."""
+    try:
+        return _cut_tapered(mesh, axis, notes)
+    except JawFileError as error:
+        advice = "take the solid as it is (--solid); of a finger with its holder, export the finger alone"
+        raise UnlikeSectionsError(f"{error}: {advice}", section) from error
+
+
 def _cut_tapered(mesh: Surface, axis: NDArray, notes: list[str]) -> RawSection:
     """Return the section of a body whose walls all run in one direction between two sides that are any planes.
 
@@ -525,7 +531,7 @@ def _one_piece(area: shapely.Geometry) -> shapely.Polygon:
     """Return a polygon; raises JawFileError for several separate ones."""
     if area.geom_type != "Polygon":
         raise JawFileError(
-            f"its section has {len(area.geoms)} separate areas, expected one finger: export it alone, without its holder"
+            f"its section has {len(area.geoms)} separate areas, expected one finger: export it without its holder"
         )
     return area
 

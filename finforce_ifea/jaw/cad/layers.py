@@ -13,6 +13,10 @@ from finforce_ifea.jaw.section import Layer
 _CUTS, _MOST, _ALIKE = 64, 24, (0.1e-3, 0.2e-3, 0.4e-3, 0.8e-3)
 _EVEN = 16  # layers of a finger that changes everywhere
 _SHARE, _LARGEST = 0.1, 5.0
+# Half as far is tried as long as outlines change a layer by more than this share of its area.
+_LOST = 0.02
+# Of the edge of what an outline leaves as it moves half is along the rest, of a wall the ends are, within so much [m].
+_ALONG, _AT = 0.4, 1e-6
 # Areas are compared on a grid of this size [m], which keeps them valid.
 _GRID = 1e-8
 # Steps closer to each other than this [m] are one.
@@ -47,7 +51,12 @@ def find_layers(cut: Callable[[float], shapely.Geometry], ends: tuple[float, flo
         begin, end = runs[number]
         share = (grid[end] - grid[begin]) / (high - low)
         cut = cuts[(begin + end - 1) // 2]
-        areas[number] = _share_lines(cut, list(areas.values()), apart * np.clip(_SHARE / share, 1.0, _LARGEST))
+        near = apart * np.clip(_SHARE / share, 1.0, _LARGEST)
+        while near > _STEP:
+            areas[number] = _share_lines(cut, list(areas.values()), near)
+            if _compare(areas[number], cut).area <= _LOST * cut.area:  # else walls are there or gone that are thinner
+                break
+            near *= 0.5
     layers: list[Layer] = []
     for number, (begin, end) in enumerate(runs):
         bottom, area = float(grid[begin] - 0.5 * (low + high)), areas[number]
@@ -73,17 +82,29 @@ def _thick(area: shapely.Geometry, apart: float) -> shapely.Geometry:
     return shapely.intersection(kept, area, grid_size=_GRID).buffer(0.0)
 
 
+def _find_other(area: shapely.Geometry, beside: shapely.Geometry, apart: float) -> shapely.Geometry:
+    """Return what of an area is no outline moved by less than a distance [m]: what is thicker, and walls of their own.
+
+    Those have less than a share of their edge along what is beside them.
+    """
+    parts = shapely.get_parts(area.buffer(0.0))
+    parts = parts[~shapely.is_empty(parts)]
+    edges = shapely.boundary(parts)
+    along = shapely.length(shapely.intersection(edges, beside.buffer(_AT))) / shapely.length(edges)
+    return shapely.union_all([_thick(area, apart), *parts[along < _ALONG]], grid_size=_GRID)
+
+
 def _share_lines(cut: shapely.Geometry, others: list[shapely.Geometry], apart: float) -> shapely.Geometry:
     """Return a cut whose outline is that of another one wherever both are closer to each other than a distance [m]."""
     if not others:
         return cut.buffer(0.0)
     like = min(others, key=lambda other: _compare(cut, other).area)
     pairs = ((cut, like), (like, cut))
-    added, gone = (_thick(shapely.difference(one, two, grid_size=_GRID), apart) for one, two in pairs)
+    added, gone = (_find_other(shapely.difference(one, two, grid_size=_GRID), two, apart) for one, two in pairs)
     if added.is_empty and gone.is_empty:
         return like
-    more = shapely.union(like, added, grid_size=_GRID)
-    return shapely.difference(more, gone, grid_size=_GRID).buffer(0.0)  # without what has no area
+    more = shapely.union(like, added, grid_size=_GRID).buffer(0.0)  # without what has no area
+    return shapely.difference(more, gone, grid_size=_GRID).buffer(0.0)
 
 
 def _compare(one: shapely.Geometry, two: shapely.Geometry) -> shapely.Geometry:

@@ -15,7 +15,7 @@ from finforce_ifea.errors import JawFileError
 from finforce_ifea.jaw.cad.cad_file import RawSection, UnlikeSectionsError, read_section
 from finforce_ifea.jaw.cad.photo import Photo
 from finforce_ifea.jaw.cad.picture import draw_finger, draw_refused
-from finforce_ifea.jaw.cad.recognition import Overrides, RecognizedFinger, has_cells, recognize
+from finforce_ifea.jaw.cad.recognition import Overrides, RecognizedFinger, count_cells, recognize
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_ifea.jaw.jaw_file import MATERIALS
 from finforce_ifea.jaw.section import cut_below, find_reach, order_rings
@@ -159,7 +159,7 @@ def _recognize(raw: RawSection, width: float, overrides: Overrides) -> Recognize
         return recognize(raw.polygon, width, overrides, raw.taper, raw.base, raw.unlike)
     try:
         finger = recognize(raw.polygon, width, overrides)
-        is_prism = len(raw.layers) == 1 and has_cells(raw.polygon)
+        is_prism = len(raw.layers) == 1 and count_cells(raw.polygon) > 1
         return finger if is_prism else _layer(finger, raw)
     except JawFileError:
         try:

@@ -288,9 +288,9 @@ def _split_holes(polygon: shapely.Polygon) -> tuple[list[NDArray], list[NDArray]
     return kinds[True], kinds[False]
 
 
-def has_cells(polygon: shapely.Polygon) -> bool:
-    """Whether a section has cells between ribs."""
-    return len(_split_holes(polygon)[1]) > 1
+def count_cells(polygon: shapely.Polygon) -> int:
+    """Return how many holes a section has that are no bolts': cells between ribs, if there are some."""
+    return len(_split_holes(polygon)[1])
 
 
 def _is_round(hole: NDArray, polygon: shapely.Polygon) -> bool:
