@@ -17,8 +17,8 @@ from finforce.triangle_surface import Surface, join_surfaces, unite
 from finforce_ifea.errors import JawFileError
 from finforce_ifea.jaw.cad.curves import read_dxf, read_svg
 from finforce_ifea.jaw.cad.layers import find_layers
-from finforce_ifea.jaw.cad.recognition import count_cells
 from finforce_ifea.jaw.cad.photo import PHOTOS, SCALE, Photo, read_photo
+from finforce_ifea.jaw.cad.recognition import count_cells
 from finforce_ifea.jaw.section import UNITS, Layer, SectionFile, check_loops, join_loops, read_section_file
 
 SURFACES = (".stl", ".obj", ".ply", ".off", ".3mf", ".glb")
