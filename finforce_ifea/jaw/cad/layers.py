@@ -5,14 +5,17 @@ from itertools import pairwise
 
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 
 from finforce_ifea.jaw.section import Layer
 
 # Cuts over the width beside the heights at which it steps; layers at most; and how far outlines of one layer may be
 # apart [m], tried in turn: so far where it is this share of the width, more where it is less, up to so many times.
 _CUTS, _MOST, _ALIKE = 64, 24, (0.1e-3, 0.2e-3, 0.4e-3, 0.8e-3)
-_EVEN = 16  # layers of a finger that changes everywhere
+_RUN, _JUMP = 4, 0.2  # cuts in a layer of a finger that changes everywhere, where that is by less than this share
 _SHARE, _LARGEST = 0.1, 5.0
+# Cuts that differ by less than this share of their area make two halves alike.
+_SAME = 2e-3
 # Half as far is tried as long as outlines change a layer by more than this share of its area.
 _LOST = 0.02
 # Of the edge of what an outline leaves as it moves half is along the rest, of a wall the ends are, within so much [m].
@@ -39,17 +42,34 @@ def find_layers(cut: Callable[[float], shapely.Geometry], ends: tuple[float, flo
     grid = grid[np.r_[True, np.diff(grid) > _STEP]]
     grid[-1] = high
     cuts = [cut(middle) for middle in 0.5 * (grid[1:] + grid[:-1])]
+    grid -= 0.5 * (low + high)
+    if not _is_even(grid, cuts):
+        return _stack(grid, cuts)
+    half = (len(cuts) + 1) // 2
+    *sides, core = _stack(np.append(grid[:half], 0.0), cuts[:half])
+    upper = [Layer(low=-layer.high, high=-layer.low, area=layer.area) for layer in reversed(sides)]
+    return [*sides, Layer(low=core.low, high=-core.low, area=core.area), *upper]
+
+
+def _is_even(grid: NDArray, cuts: list[shapely.Geometry]) -> bool:
+    """Whether cuts between places (n + 1,) are alike on both sides of the middle: then layers mirror each other."""
+    pairs = zip(cuts, reversed(cuts), strict=True)
+    are_alike = all(_compare(one, two).area <= _SAME * one.area for one, two in pairs)
+    return are_alike and np.abs(grid + grid[::-1]).max() < _STEP
+
+
+def _stack(grid: NDArray, cuts: list[shapely.Geometry]) -> list[Layer]:
+    """Return the layers, lowest first, of cuts between places (n + 1,) [m]."""
     for apart in _ALIKE:
         runs = _find_runs(cuts, apart)
-        if len(runs) <= _MOST:
+        if len(runs) <= _MOST * len(cuts) / _CUTS:
             break
     else:  # everywhere, as that of a finger with slanted sides
-        ends_of = np.linspace(0, len(cuts), _EVEN + 1).astype(int).tolist()
-        runs = list(pairwise(ends_of))
+        runs = _split_evenly(cuts)
     areas: dict[int, shapely.Geometry] = {}
     for number in np.argsort([grid[begin] - grid[end] for begin, end in runs], kind="stable").tolist():
         begin, end = runs[number]
-        share = (grid[end] - grid[begin]) / (high - low)
+        share = (grid[end] - grid[begin]) / np.ptp(grid)
         cut = cuts[(begin + end - 1) // 2]
         near = apart * np.clip(_SHARE / share, 1.0, _LARGEST)
         while near > _STEP:
@@ -59,11 +79,18 @@ def find_layers(cut: Callable[[float], shapely.Geometry], ends: tuple[float, flo
             near *= 0.5
     layers: list[Layer] = []
     for number, (begin, end) in enumerate(runs):
-        bottom, area = float(grid[begin] - 0.5 * (low + high)), areas[number]
+        bottom, area = float(grid[begin]), areas[number]
         if layers and layers[-1].area is area:
             bottom = layers.pop().low
-        layers.append(Layer(low=bottom, high=float(grid[end] - 0.5 * (low + high)), area=area))
+        layers.append(Layer(low=bottom, high=float(grid[end]), area=area))
     return layers
+
+
+def _split_evenly(cuts: list[shapely.Geometry]) -> list[tuple[int, int]]:
+    """Return first and last but one of runs of cuts that are about as long, and end where the section steps."""
+    steps = {k for k in range(1, len(cuts)) if _compare(cuts[k - 1], cuts[k]).area > _JUMP * cuts[k].area}
+    even = set(range(0, len(cuts), _RUN)) - {step + shift for step in steps for shift in (-1, 1)}
+    return list(pairwise(sorted(steps | even | {0, len(cuts)})))
 
 
 def _find_runs(cuts: list[shapely.Geometry], apart: float) -> list[tuple[int, int]]:

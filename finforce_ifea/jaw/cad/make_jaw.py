@@ -85,7 +85,7 @@ def make_jaw(
     lines = [heading, f"name: {name}", *_describe_finger(finger, section.name, material, doubt)]
     lines.append(f"reference_point: {_list(_put_on_side(finger, *reference))}  # {place}")
     jaw = _write_jaw(output, lines)
-    if finger.layers and measure_warping and (warping := measure_warping(jaw)) > _WARPING:
+    if len(finger.layers) > 1 and measure_warping and (warping := measure_warping(jaw)) > _WARPING:
         raw.notes.append(f"its layers move apart (stiffness {warping:.0%} off), thus `model: solid`, which is slow")
         lines[lines.index("section:")] += f"\n  size: {_SIZE}"
         jaw = _write_jaw(output, [*lines, "model: solid"])
