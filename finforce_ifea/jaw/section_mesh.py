@@ -20,7 +20,7 @@ _LEAST, _GROWTH = 2e-4, 0.35
 # What is clamped, so many elements below the edge of the clamp, may be so much coarser.
 _EDGE, _COARSER = 3.0, 2.5
 _FLAT = 1e-3
-_PASSES = 20
+_PASSES = 200
 _EDGES = ((0, 1), (1, 2), (2, 0))
 _EQUILATERAL = 0.433
 _MOST_POINTS = 8_000
@@ -194,7 +194,7 @@ def _triangulate(points: NDArray, edges: NDArray, inside: NDArray) -> tuple[NDAr
         points = np.vstack([points, 0.5 * (points[begin] + points[end])])
         halves = np.concatenate([np.stack([begin, middle], axis=1), np.stack([middle, end], axis=1)])
         edges = np.concatenate([edges[~missing], halves])
-    x, z = 1e3 * points[edges[0, 0]]
+    x, z = 1e3 * points[begin[0]]
     raise MeshError(f"the section cannot be divided near ({x:.3f}, {z:.3f}) mm: its outline folds onto itself there")
 
 

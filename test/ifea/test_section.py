@@ -61,6 +61,17 @@ def test_every_edge_of_the_outline_is_an_edge_of_the_mesh():
     assert length == pytest.approx(make_section(draw_polygon(bolts=())).polygon.length, rel=5e-4)
 
 
+def test_many_thin_ribs_are_divided_one_after_another():
+    """Points that halve the edges of one rib are too close to those of the next, up to the tip."""
+    whole, room = shapely.box(0.0, 0.0, 16.0, 60.0), shapely.box(0.6, 10.0, 15.4, 59.4)
+    for z in np.arange(-10.0, 78.0, 1.2):
+        room = room.difference(shapely.LineString([(-10.0, z - 2.0), (26.0, z + 5.0)]).buffer(0.19, cap_style="flat"))
+    holes = [part for part in shapely.get_parts(room) if part.length > 3.0]
+    section = make_section(shapely.Polygon(whole.exterior, [hole.exterior for hole in holes]))
+    areas = triangle_areas(mesh_section(section, 2.0))
+    assert len(holes) > 40 and areas.sum() == pytest.approx(section.polygon.area, rel=5e-3)
+
+
 def test_extruded_finger_has_its_volume_and_mirrors_itself():
     section = make_section(draw_polygon(bolts=()))
     mesh = extrude_section(section, 2.0)
