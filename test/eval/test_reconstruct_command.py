@@ -71,9 +71,9 @@ def test_mesh_pose_and_picture_are_written(files, capsys):
     assert mesh.watertight and pose["watertight"]
     assert distance_mm(make_case("cylinder"), mesh, np.array(pose["T_camera_object"])) < 0.6
     picture = np.array(Image.open(files / "picture.png"))
-    # the mesh is drawn in orange
+    # the outline of the mesh is drawn in orange
     orange = (picture[..., 0] > 150) & (picture[..., 2] < 100)
-    assert orange.sum() > 1000
+    assert orange.sum() > 500
 
 
 def test_another_ending_holds_the_same_mesh(files):
