@@ -43,8 +43,13 @@ def compare(indenter, shape, height, depths=DEPTHS, mechanics=None):
     return np.linalg.norm(others, axis=1) / np.linalg.norm(forces, axis=1) - 1.0, np.array(shapes)
 
 
-@pytest.mark.parametrize("height", [0.0205, 0.0333, 0.0418, 0.0571, 0.0689])
-@pytest.mark.parametrize("radius", [0.004, 0.0125, 0.0175])
+@pytest.mark.parametrize(
+    ("radius", "height"),
+    [
+        *((0.0125, height) for height in (0.0205, 0.0333, 0.0418, 0.0571, 0.0689)),
+        *((radius, height) for radius in (0.004, 0.0175) for height in (0.0205, 0.0689)),
+    ],
+)
 def test_forces_and_shapes_are_those_of_the_full_mechanics_between_the_stored_heights(radius, height):
     force, shape = compare(RoundIndenter, np.log(radius), height)
     assert np.abs(force).max() < 0.003
