@@ -556,20 +556,16 @@ class Synchronizer:
 
     def __init__(self, streams: dict[str, int | None], tolerance: int = 0) -> None:
         self._streams: dict[str, deque[Stamped]] = {name: deque(maxlen=depth) for name, depth in streams.items()}
-        self._tolerance = tolerance
+        self.tolerance = tolerance
 
     def reset(self, *streams: str) -> None:
         """Forget the entries of some streams, of all without a name."""
         for name in streams or self._streams:
             self._streams[name].clear()
 
-    def tolerate(self, tolerance: int) -> None:
-        """Change the greatest distance between stamps that belong together [ns]."""
-        self._tolerance = tolerance
-
     def belong(self, one: int, other: int) -> bool:
         """Return whether two stamps [ns] are those of one image."""
-        return abs(one - other) <= self._tolerance
+        return abs(one - other) <= self.tolerance
 
     def add(self, stream: str, stamp: int, value: Any) -> None:
         """Keep an entry of a stream, and forget its oldest where there are too many."""

@@ -107,18 +107,14 @@ class ContactLoop:
         """
         self.estimator.set_object(mesh)
         self._posed = None
-        if mesh is not None:
-            self._warm_up()
-
-    def _warm_up(self) -> None:
-        """Let what is compiled on first use be compiled before the first image waits for it."""
-        T = np.eye(4)
-        for stamp, candidate in enumerate(self.estimator.jaw.candidates[[0, -1]]):
-            T[:3, 3] = candidate
-            with suppress(FinforceError):
-                self.estimator.take_pose(float(stamp), T, camera=-candidate)
-                self.estimator.update(float(stamp))
-        self.estimator.reset()
+        if mesh is not None:  # what is compiled on first use is so before the first image waits for it
+            T = np.eye(4)
+            for stamp, candidate in enumerate(self.estimator.jaw.candidates[[0, -1]]):
+                T[:3, 3] = candidate
+                with suppress(FinforceError):
+                    self.estimator.take_pose(float(stamp), T, camera=-candidate)
+                    self.estimator.update(float(stamp))
+            self.estimator.reset()
 
     @property
     def is_out_of_reach(self) -> bool:

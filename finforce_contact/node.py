@@ -10,7 +10,6 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 
 from finforce.camera_topics import COMPRESSED_DEPTH
@@ -55,7 +54,13 @@ class _ContactOutputs:
         if ros.is_wanted(self.outline[side], self._skips):
             ros.send_cloud(self.outline[side], header, columns_from_outline(timed.estimate.outline))
         if ros.is_wanted(self.contact[side], self._skips):
-            ros.send_cloud(self.contact[side], header, contact_columns(timed.estimate))
+            estimate = timed.estimate
+            columns = ros.xyz_columns(estimate.points) | {
+                "candidate": np.asarray(estimate.candidates, dtype=np.uint16),
+                "touching": np.full(len(estimate.weights), estimate.touching, dtype=np.uint8),
+                "weight": np.asarray(estimate.weights, dtype=np.float32),
+            }
+            ros.send_cloud(self.contact[side], header, columns)
         self._send_slip(side, timed.estimate.slip)
 
     def _send_slip(self, side: str, slip: Slip | None) -> None:
@@ -73,17 +78,6 @@ class _ContactOutputs:
         if self.pose is not None and ros.is_wanted(self.pose, self._skips):
             header = ros.Header(stamp=ros.stamp_message(found.stamp), frame_id=self._camera.frame)
             self.pose.publish(ros.pose_message(header, pose_numbers(found.pose.T_camera_object)))
-
-
-def contact_columns(estimate: ContactEstimate) -> dict[str, NDArray]:
-    """Return the columns of a contact cloud, one row per contact, none without an object."""
-    points = np.asarray(estimate.points, dtype=np.float32).reshape(-1, 3)
-    return {
-        **dict(zip("xyz", points.T, strict=True)),
-        "candidate": np.asarray(estimate.candidates, dtype=np.uint16),
-        "touching": np.full(len(points), estimate.touching, dtype=np.uint8),
-        "weight": np.asarray(estimate.weights, dtype=np.float32),
-    }
 
 
 class ContactEstimatorNode(ros.ImageNode):
@@ -141,7 +135,12 @@ class ContactEstimatorNode(ros.ImageNode):
         stage, session, source = self.stage, self.session, self.parameters.pose_source
         self.objects = None
         if self.parameters.tracks:
-            self._subscribe_camera()
+            camera, group = self.session.camera, MutuallyExclusiveCallbackGroup()
+            info, transport = partial(self._on_image, camera.take_camera, ""), self.parameters.image_transport
+            self.stage.subscription(ros.CameraInfo, self.parameters.info_topic, info, ros.SENSOR, callback_group=group)
+            images = partial(ros.subscribe_to_images, self.stage, transport=transport, callback_group=group)
+            images("object_mask", partial(self._on_image, camera.take_mask))
+            images(self.parameters.depth_topic, partial(self._on_image, camera.take_depth), end=COMPRESSED_DEPTH)
         elif source == "topic":
             self.objects = stage.subscription(ros.PoseStamped, "object_pose", self._on_object, ros.SENSOR)
         else:
@@ -155,15 +154,6 @@ class ContactEstimatorNode(ros.ImageNode):
                 stage.subscription(kind, f"{side}/{name}", keep, ros.SENSOR)
             find = partial(self._on_jaw_pose, side)
             stage.subscription(ros.PoseStamped, f"{side}/jaw_pose", find, ros.BUFFERED, can_wait=True)
-
-    def _subscribe_camera(self) -> None:
-        """Subscribe to the images in which the object is found; they wait for each other."""
-        camera, group = self.session.camera, MutuallyExclusiveCallbackGroup()
-        info, transport = partial(self._on_image, camera.take_camera, ""), self.parameters.image_transport
-        self.stage.subscription(ros.CameraInfo, self.parameters.info_topic, info, ros.SENSOR, callback_group=group)
-        images = partial(ros.subscribe_to_images, self.stage, transport=transport, callback_group=group)
-        images("object_mask", partial(self._on_image, camera.take_mask))
-        images(self.parameters.depth_topic, partial(self._on_image, camera.take_depth), end=COMPRESSED_DEPTH)
 
     def _take_changes(self, changed: ContactParameters) -> None:
         """Take parameters that were set at run time."""
@@ -244,7 +234,9 @@ class ContactEstimatorNode(ros.ImageNode):
     def _report(self, side: str, alarms: list[Outcome]) -> Report:
         """Return how one jaw's contact is doing."""
         values = describe(self.session, side) | self.skips.describe()
-        return self.health[side].report([*alarms, *object_alarms(self.session)], values)
+        if self.session.trouble:  # the object's mesh cannot be used
+            alarms = [*alarms, Outcome(level=Level.ERROR, reason="object", text=self.session.trouble)]
+        return self.health[side].report(alarms, values)
 
 
 LEVELS = {"touching": Level.OK, "apart": Level.OK}  # any other status: WARN
@@ -256,11 +248,6 @@ def outcome_of_estimate(estimate: ContactEstimate) -> Outcome:
         return Outcome(level=Level.WARN, reason="slip", text=f"the object slides: {describe_slip(estimate.slip)}")
     level = LEVELS.get(estimate.status, Level.WARN)
     return Outcome(level=level, reason=estimate.status, text=estimate.message or estimate.status)
-
-
-def object_alarms(session: ContactSession) -> list[Outcome]:
-    """Return the alarm of an object mesh that cannot be used."""
-    return [Outcome(level=Level.ERROR, reason="object", text=session.trouble)] if session.trouble else []
 
 
 def describe(session: ContactSession, side: str) -> dict[str, str]:

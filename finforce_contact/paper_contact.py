@@ -66,7 +66,10 @@ class IntersectionLocalizer(Localizer):
         centre = intersect(self._object, T, scene.surface, self._mesh.surface)
         self._status = centre is not None
         if centre is not None:
-            self._last = self._candidate_of(centre, scene.surface)
+            nearest = int(((scene.surface - centre) ** 2).sum(axis=1).argmin())
+            projected = self._mesh.nodes[nearest, 1:]
+            chosen = int(((self._candidates - projected) ** 2).sum(axis=1).argmin())
+            self._last = ContactPatch(heights=self._candidates[chosen, 1:], weights=np.ones(1))
         if self._last is None:
             return None
         height = float(self._last.heights[0])
@@ -80,13 +83,6 @@ class IntersectionLocalizer(Localizer):
         turned = self._vertices @ T[0, :3]
         low, high = turned.min(), turned.max()
         return float(self._face.front - OFFSET + 0.5 * (high - low) - 0.5 * (high + low))
-
-    def _candidate_of(self, centre: NDArray, surface: NDArray) -> ContactPatch:
-        """Return the candidate of an intersection's centre (3,) [m]."""
-        nearest = int(((surface - centre) ** 2).sum(axis=1).argmin())
-        projected = self._mesh.nodes[nearest, 1:]
-        chosen = int(((self._candidates - projected) ** 2).sum(axis=1).argmin())
-        return ContactPatch(heights=self._candidates[chosen, 1:], weights=np.ones(1))
 
 
 def intersect(solid: "Manifold", T: NDArray, surface: NDArray, triangles: NDArray) -> NDArray | None:

@@ -248,18 +248,14 @@ class GripperDriverNode(Node):
                 self.published = state.stamp
                 self.health.take(state, self.gripper.clock.now())
                 with self._rejections("joint state"):
-                    self._send_joints(state)
+                    stamp = self.times.to_stamp(state.stamp, self._now())
+                    if self.joints is not None:
+                        message = JointState(header=ros.Header(stamp=ros.stamp_message(stamp)))
+                        fill_joint_state(message, self.parameters.joint_names, state, self._effort(state))
+                        self.joints.publish(message)
             if self.health.is_news("gripper", text := news_of_state(state)):
                 self._log(outcome_of_state(state).level, text)
         self._tell_grasp()
-
-    def _send_joints(self, state: GripperState) -> None:
-        """Send the joints as a reply shows them; what is not known stays empty."""
-        stamp = self.times.to_stamp(state.stamp, self._now())
-        if self.joints is not None:
-            message = JointState(header=ros.Header(stamp=ros.stamp_message(stamp)))
-            fill_joint_state(message, self.parameters.joint_names, state, self._effort(state))
-            self.joints.publish(message)
 
     def _fill_joints(self, message: Any, state: GripperState) -> None:
         """Write a state into a result or feedback of control_msgs/ParallelGripperCommand."""
@@ -310,21 +306,17 @@ class GripperDriverNode(Node):
     def _on_wrench(self, message: WrenchStamped) -> None:
         """Hand the force of an image to the grasp."""
         with self._rejections("force", told=self.session.reject):
-            self._check_source()
+            topic = self.resolve_topic_name("grasp_wrench")
+            if self.count_publishers(topic) > 1:  # they may contradict each other
+                ends = self.get_publishers_info_by_topic(topic)
+                names = sorted({f"{end.node_namespace.rstrip('/')}/{end.node_name}" for end in ends})
+                if len(names) > 1:
+                    raise TargetError(f"{topic} is published by {' and '.join(names)}; expected one: stop the others")
             force, stamp = ros.grasp_force(message, self.parameters.base_frame), self._enter("force", message)
             sample = ForceSample(stamp=stamp, arrived=self.gripper.clock.now(), force=force)
             self.session.take_force(sample)
             self.seen = sample
             self._tell_grasp()
-
-    def _check_source(self) -> None:
-        """Reject forces that several nodes publish, by raising TargetError: they may contradict each other."""
-        topic = self.resolve_topic_name("grasp_wrench")
-        if self.count_publishers(topic) > 1:
-            ends = self.get_publishers_info_by_topic(topic)
-            names = sorted({f"{end.node_namespace.rstrip('/')}/{end.node_name}" for end in ends})
-            if len(names) > 1:
-                raise TargetError(f"{topic} is published by {' and '.join(names)}; expected one: stop the others")
 
     def _on_stddev(self, side: str, message: WrenchStamped) -> None:
         """Keep how sure a jaw's force is."""

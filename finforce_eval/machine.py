@@ -7,7 +7,7 @@ import json
 import os
 import platform
 import subprocess
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from functools import cache
 from importlib.metadata import PackageNotFoundError
@@ -20,12 +20,19 @@ import numpy as np
 
 def describe_machine() -> dict[str, Any]:
     """Return processor, cores, versions of what is installed, and commit."""
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text(encoding="utf-8").splitlines() if info.exists() else []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    versions = {}
+    for name in LIBRARIES:
+        with suppress(PackageNotFoundError):
+            versions[name] = installed(name)
     return {
-        "processor": _processor(),
+        "processor": names[0] if names else platform.processor(),
         "cores": os.cpu_count(),
         "system": platform.platform(),
         "python": platform.python_version(),
-        **dict(_find_versions()),
+        **versions,
         "commit": commit(),
     }
 
@@ -43,14 +50,6 @@ def write_figures(path: Path | str, figures: Mapping[str, Any]) -> None:
     text = json.dumps({"machine": describe_machine(), **without_nan(figures)}, indent=2, allow_nan=False)
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     Path(path).write_text(text + "\n", encoding="utf-8")
-
-
-def _processor() -> str:
-    """Return the name of the processor."""
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text(encoding="utf-8").splitlines() if info.exists() else []
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor()
 
 
 @cache
@@ -85,13 +84,6 @@ def without_nan(content: Any) -> Any:
     if isinstance(content, list | tuple):
         return [without_nan(value) for value in content]
     return None if isinstance(content, float) and not np.isfinite(content) else content
-
-
-def _find_versions() -> Iterator[tuple[str, str]]:
-    """Yield the installed libraries with their versions."""
-    for name in LIBRARIES:
-        with suppress(PackageNotFoundError):
-            yield name, installed(name)
 
 
 LIBRARIES = ("numpy", "scipy", "numba", "open3d", "manifold3d", "trimesh")

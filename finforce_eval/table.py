@@ -222,7 +222,8 @@ def write_table(path: Path, series: Sequence[ForceSeries], about: Mapping[str, A
         OSError: it cannot be written.
     """
     table = pa.Table.from_pandas(pd.concat([each.table for each in series], ignore_index=True), preserve_index=False)
-    fields = [field.with_metadata({"unit": _unit(field.name)}) for field in table.schema]
+    units = {name: UNITS.get(name, VECTORS.get(name[:-2], "")) for name in table.schema.names}
+    fields = [field.with_metadata({"unit": units[field.name]}) for field in table.schema]
     metadata = {**(table.schema.metadata or {}), _ABOUT: json.dumps(dict(about)).encode()}
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
@@ -253,8 +254,3 @@ def _drop_unknown(rows: pd.DataFrame) -> pd.DataFrame:
     unknown = [name for name in rows if name not in ("case", "stamp") and rows[name].isna().all()]
     kept = [name for name in unknown if name[:-2] in ("force", "true_force")]
     return rows.drop(columns=[name for name in unknown if name not in kept]).reset_index(drop=True)
-
-
-def _unit(name: str) -> str:
-    """Return the unit of a column."""
-    return UNITS.get(name, VECTORS.get(name[:-2], ""))

@@ -164,10 +164,9 @@ def run_tasks(tasks: Sequence[Task], options: EngineOptions, manifest: Manifest,
     before = manifest.read()
     lines = {task.name: before[task.name] for task in tasks if task.is_done(before.get(task.name))}
     left = [task for task in tasks if task.name not in lines]
-    run = _run_here if options.workers == 1 else _run_in_processes
     with progress_bar(len(tasks), unit) as bar:
         bar.update(len(lines))
-        for line in run(left, options):
+        for line in map(Task.run, left) if options.workers == 1 else _run_in_processes(left, options):
             manifest.append(line)
             lines[line["name"]] = line
             bar.set_postfix_str(f"{sum(each['status'] == FAILED for each in lines.values())} failed")
@@ -205,10 +204,6 @@ def choose_shard(items: Sequence[T], shard: str) -> list[T]:
     if not 1 <= number <= count:
         raise OptionError(f"--shard {shard}: expected i/n with 1 <= i <= n, as 3/16")
     return list(items[number - 1 :: count])
-
-
-def _run_here(tasks: Sequence[Task], options: EngineOptions) -> Iterator[Line]:
-    yield from map(Task.run, tasks)
 
 
 def _run_limited(task: Task, gigabytes: float) -> Line:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from math import hypot
 from pathlib import Path
@@ -265,16 +265,6 @@ class ForceEstimator:
         """Hand a contact to the tracker that it is for."""
         if not len(contact.points):
             return
-        self._check_on_surface(contact)
-        free = (contact.free or contact.outline is not None) and self.settings.solver != "paper"
-        chosen = self._tracked if free else self._given
-        if chosen is not self._tracker:
-            chosen.resume(self._tracker.give_shape())
-            self._tracker = chosen
-        chosen.follow(contact)
-
-    def _check_on_surface(self, contact: Contact) -> None:
-        """Refuse contacts beside the inner surface; a drawn object may reach below and above it."""
         low, high = self._surface_range
         places = contact.points[:, 1:]
         off = (places < low) | (places > high)
@@ -283,6 +273,12 @@ class ForceEstimator:
                 f"contact at y, z = {np.round(1e3 * places, 1).tolist()} mm, expected on the inner surface from "
                 f"{np.round(1e3 * low, 1).tolist()} to {np.round(1e3 * high, 1).tolist()} mm"
             )
+        free = (contact.free or contact.outline is not None) and self.settings.solver != "paper"
+        chosen = self._tracked if free else self._given
+        if chosen is not self._tracker:
+            chosen.resume(self._tracker.give_shape())
+            self._tracker = chosen
+        chosen.follow(contact)
 
     def _without_contact(self, points: NDArray, used: NDArray) -> Solution:
         """Tell what can be said without an object: nothing presses, or it cannot be known where."""
@@ -385,28 +381,17 @@ def warm_up(jaw: Jaw, tare_frames: int, update: Update, reset: Callable[[], None
     random = np.random.default_rng(0)
     for stddev in (None, np.full(jaw.keypoints.shape, _STDDEV)):
         reset()
-        contacts = list(_imagine_contacts(jaw))
+        fixed = Contact.fixed(jaw, float(np.median(jaw.candidates[:, 2])))
+        contacts = [fixed, replace(fixed, free=False), sketch_contact(jaw)]
         sequence = [contacts[0]] * tare_frames + [contact for contact in contacts for _ in range(_EACH)]
         bends = [0.0] * len(sequence) + _BENDS
         for count, bend in enumerate(bends):
             contact = sequence[min(count, len(sequence) - 1)]
-            update(_imagine_image(jaw, count / 30.0, bend, stddev, random), contact)
+            points = jaw.keypoints + _NOISE * random.standard_normal(jaw.keypoints.shape)
+            points[:, 0] -= bend * (points[:, 2] / jaw.keypoints[:, 2].max()) ** 2
+            seen = np.ones(len(points))
+            update(Observation(stamp=count / 30.0, points=points, likelihood=seen, stddev=stddev), contact)
     reset()
-
-
-def _imagine_contacts(jaw: Jaw) -> Iterator[Contact]:
-    """Yield a contact by its height, one by its points, and one by an outline."""
-    fixed = Contact.fixed(jaw, float(np.median(jaw.candidates[:, 2])))
-    yield from (fixed, replace(fixed, free=False), sketch_contact(jaw))
-
-
-def _imagine_image(
-    jaw: Jaw, stamp: float, bend: float, stddev: NDArray | None, random: np.random.Generator
-) -> Observation:
-    """Return the key points of a jaw whose tip is bent by so much [m]."""
-    points = jaw.keypoints + _NOISE * random.standard_normal(jaw.keypoints.shape)
-    points[:, 0] -= bend * (points[:, 2] / jaw.keypoints[:, 2].max()) ** 2
-    return Observation(stamp=stamp, points=points, likelihood=np.ones(len(points)), stddev=stddev)
 
 
 _PRESENCE_GAIN = 0.1

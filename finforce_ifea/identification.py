@@ -151,6 +151,7 @@ class _Fit:
         self.jaw, self.cases, self.settings, self.progress = jaw, cases, settings, progress
         self.plateaus = find_plateaus(cases, jaw, settings, per_case=_PER_CASE)
         self._starts: list[_PlateauShape | None] = [None] * len(self.plateaus)
+        self.forces = [np.linalg.norm(case.forces_true, axis=1) for case in cases]
         self.objects = [expect_object(case.contact, settings) for case in cases]
         indenters = [item.indenter for item in self.objects]
         self.mean = np.r_[_PRIOR, [item.mean[0] for item in self.objects]]
@@ -158,14 +159,14 @@ class _Fit:
         self.low = np.r_[_LOW, [indenter.lowest for indenter in indenters]]
         self.high = np.r_[_HIGH, [indenter.highest for indenter in indenters]]
         self.difference = np.r_[_DIFFERENCE, [indenter.largest_change / 15 for indenter in indenters]]
-        self.stills = all(_starts_loaded(case) for case in cases)
+        # stills begin with a load
+        self.stills = all(len(force) and force[0] > _UNLOADED for force in self.forces)
         # only a drawing can be thickened, and only what has a course of time relaxes
         self.frozen = set() if jaw.drawing is not None else set(range(*_GEOMETRY.indices(len(_NAMES))))
         if self.stills:
             self.frozen |= set(range(*_BRANCHES.indices(len(_NAMES))))
             self.mean[list(_SHARES)], self.high[list(_SHARES)] = 0.0, 1e-9
         self.start = self.mean.copy()
-        self.forces = [np.linalg.norm(case.forces_true, axis=1) for case in cases]
         self._shapes: dict[bytes, tuple[NDArray, NDArray]] = {}
 
     def calibration(self, x: NDArray) -> Calibration:
@@ -186,13 +187,11 @@ class _Fit:
         shapes, forces = self._solve_shapes(x)
         elastic = self._elastic_forces(x)
         model = np.exp(x[0]) * forces
-        rows = [((target - value) / self._force_stddev(value)) for target, value in zip(elastic, model, strict=True)]
+        stddev = np.sqrt(INSTANTS) * (_FORCE_ERROR * model + _FORCE_FLOOR)
+        rows = [(target - value) / error for target, value, error in zip(elastic, model, stddev, strict=True)]
         total = np.concatenate([shapes, *rows, (x - self.mean) / self.stddev])
         self.progress(float(total @ total))
         return total
-
-    def _force_stddev(self, force: float) -> float:
-        return np.sqrt(INSTANTS) * (_FORCE_ERROR * force + _FORCE_FLOOR)
 
     def _elastic_forces(self, x: NDArray) -> list[NDArray]:
         """Return the elastic forces [N] behind the true ones at the instants of each plateau."""
@@ -389,11 +388,6 @@ def find_plateaus(
         chosen = np.unique(np.linspace(0, len(found) - 1, per_case).round().astype(int))
         plateaus += [found[i] for i in chosen]
     return plateaus
-
-
-def _starts_loaded(case: CalibrationCase) -> bool:
-    """Whether a case begins with a load, as stills do."""
-    return bool(len(case.forces_true) and np.linalg.norm(case.forces_true[0]) > _UNLOADED)
 
 
 def _plateaus_of_case(number: int, case: CalibrationCase, jaw: Jaw, settings: EstimatorSettings) -> list[Plateau]:

@@ -109,13 +109,6 @@ def measure_warping(jaw: Jaw) -> float:
     return float(np.ptp(held / solid) / (held / solid).min())
 
 
-def choose_solver(settings: EstimatorSettings) -> EstimatorSettings:
-    """Return settings in which "default" has become "reduced", unless forces in three axes are asked for."""
-    if settings.solver == "default" and settings.force_axes == "normal":
-        return replace(settings, solver="reduced")
-    return settings
-
-
 def build_chosen(jaw: Jaw, settings: EstimatorSettings) -> Mechanics:
     """Build the mechanics of an estimator; a jaw of which no equilibria can be stored is described in full by default.
 
@@ -124,7 +117,9 @@ def build_chosen(jaw: Jaw, settings: EstimatorSettings) -> Mechanics:
         MeshError: The mesh cannot be built.
         ContactError: The jaw cannot be pressed, and "reduced" was asked for.
     """
-    chosen = choose_solver(settings)
+    chosen = settings
+    if settings.solver == "default" and settings.force_axes == "normal":
+        chosen = replace(settings, solver="reduced")
     try:
         return build_mechanics(jaw, chosen)
     except ContactError as error:

@@ -144,20 +144,15 @@ def outline_from_columns(columns: Mapping[str, NDArray], previous: ObjectOutline
     turn = np.array([[math.cos(tilt), -math.sin(tilt)], [math.sin(tilt), math.cos(tilt)]])
     if not np.abs(about_now - turn @ about_cut).max() < _RIGID:
         raise ContactError("the corners of the outline are no turned and shifted copy of the outline as it was cut")
-    polygons = np.split(np.ascontiguousarray(cut.T), 1 + np.flatnonzero(np.diff(polygon)))
+    polygons = tuple(np.split(np.ascontiguousarray(cut.T), 1 + np.flatnonzero(np.diff(polygon))))
+    known = previous.polygons if previous else ()
     return ObjectOutline(
-        polygons=_known_polygons(tuple(polygons), previous),
+        polygons=known if are_same_polygons(known, polygons) else polygons,  # what was computed from them still holds
         origin=middle_now - turn @ middle_cut,
         tilt=tilt,
         stddev=values[5:, 0].copy(),
         across=np.array([columns[name][0] for name in ACROSS], float) if set(ACROSS) <= set(columns) else None,
     )
-
-
-def _known_polygons(polygons: tuple[NDArray, ...], previous: ObjectOutline | None) -> tuple[NDArray, ...]:
-    """Return the previous polygons when they are equal: what was computed from them still holds."""
-    known = previous.polygons if previous else ()
-    return known if are_same_polygons(known, polygons) else polygons
 
 
 # Rows with which an image is still solved in time; a contact has a row every few millimetres, an outline some hundred.

@@ -64,14 +64,6 @@ class _SolverOutputs:
             self.manipulation = stage.publisher(ros.WrenchStamped, "manipulation_wrench", ros.RESULT)
         self._markers_sent = -float("inf")
 
-    def send_wrench(self, header: Any, solution: Solution) -> None:
-        """Send what the object does to the jaw.
-
-        Raises:
-            ObservationError: a component is not finite.
-        """
-        self.wrench.publish(ros.wrench_message(header, solution.force, solution.torque))
-
     def send_stddev(self, header: Any, solution: Solution) -> None:
         """Send one standard deviation of the wrench.
 
@@ -148,12 +140,6 @@ def outcome_of_solution(solution: Solution) -> Outcome:
     """Return the level of a solution's status and its sentence."""
     level = _LEVELS.get(solution.status, Level.WARN)
     return Outcome(level=level, reason=solution.status, text=solution.message or solution.status)
-
-
-def describe_friction(estimator: ForceEstimator) -> str:
-    """Return the object's coefficient of friction as far as it is known, and how full the cone is."""
-    mean, stddev = estimator.friction
-    return f"{mean:.2f} ± {stddev:.2f}, cone used to {100.0 * abs(estimator.mobilised):.0f} %"
 
 
 def describe_solution(solution: Solution | None) -> dict[str, str]:
@@ -297,11 +283,11 @@ class IfeaSolverNode(ros.ImageNode):
                 self._restart("the stamps went back: a new recording")
             self.last = solution = self.estimator.update(observation, self.contacts.at(stamp))
             self.gate.check_age(stamp, self.now())
-            self._note_idle(stamp)
+            self.idling.note(stamp, self.estimator.is_idle and self.skips.allows(IDLE))
             if not solution.trusted:
                 self.reject(outcome_of_solution(solution))
                 return
-            self.out.send_wrench(header, solution)
+            self.out.wrench.publish(ros.wrench_message(header, solution.force, solution.torque))
             wrench = Wrench(solution.force, solution.torque)
             if self.parameters.peer:
                 self.out.send_grasp(header, self.pairing.add(stamp, wrench, own=True))
@@ -325,10 +311,6 @@ class IfeaSolverNode(ros.ImageNode):
         """Do what no force waits for."""
         self.out.send_shape(header, observation, solution, self.estimator)
         self.estimator.learn()
-
-    def _note_idle(self, stamp: int) -> None:
-        """Note whether the jaw was left alone in this image, and the next ones may be passed over."""
-        self.idling.note(stamp, self.estimator.is_idle and self.skips.allows(IDLE))
 
     def _on_contact(self, cloud: PointCloud2) -> None:
         """Keep the newest contact."""
@@ -370,7 +352,9 @@ class IfeaSolverNode(ros.ImageNode):
         """Return how this node is doing."""
         limit = max(1.0, self.parameters.max_age)
         alarms = [*alarms, *peer_alarms(self.parameters.peer, self.pairing.silence, limit)]
-        tared = {"tared": str(self.estimator.tared), "friction": describe_friction(self.estimator)}
+        mean, stddev = self.estimator.friction
+        friction = f"{mean:.2f} ± {stddev:.2f}, cone used to {100.0 * abs(self.estimator.mobilised):.0f} %"
+        tared = {"tared": str(self.estimator.tared), "friction": friction}
         health = self.health[self.parameters.jaw_name]
         return health.report(alarms, describe_solution(self.last) | tared | self.skips.describe())
 

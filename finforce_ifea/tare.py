@@ -344,7 +344,8 @@ class TareKeeper:
         if tare is None or (tare.counts > 0).sum() < _LEAST_NEAR * seen.sum():
             raise UnderLoadError("cannot tare: the key points lie millimetres from where the unloaded jaw has them")
         if not self.tared:
-            self._check_unloaded(tare)
+            if (sigma := self._significance(tare, OFFSET_STDDEV)) > _LOADED_SIGMA:
+                raise UnderLoadError(f"cannot tare: the key points look loaded ({sigma:.1f} standard deviations)")
             self._check_steady(frames)
         self.tare = tare
         largest, noise = np.linalg.norm(tare.offsets, axis=1).max(), np.sqrt(np.trace(tare.noise) / 3.0)
@@ -352,11 +353,6 @@ class TareKeeper:
             f"tared {int((tare.counts > 0).sum())} key points over {count} frames: largest offset "
             f"{1e3 * largest:.2f} mm, noise {1e3 * noise:.2f} mm"
         )
-
-    def _check_unloaded(self, tare: Tare) -> None:
-        sigma = self._significance(tare, OFFSET_STDDEV)
-        if sigma > _LOADED_SIGMA:
-            raise UnderLoadError(f"cannot tare: the key points look loaded ({sigma:.1f} standard deviations)")
 
     def _check_steady(self, frames: list[NDArray]) -> None:
         half = len(frames) // 2

@@ -305,7 +305,9 @@ class RgbdFeed:
         """
         if not self.listens(topic):
             return []
-        taken = Stamped(stamp_of(message), self._read_color(message))
+        camera, stamp = self.stream.known_camera(self._parameters.info_topic), stamp_of(message)
+        color = self.stream.read_color(message)
+        taken = Stamped(stamp, RgbdImage(stamp=SECOND * stamp, color=color, depth=None, camera=camera))
         self._learn_period(taken.stamp)
         if self._alone:
             self.alone += 1
@@ -344,7 +346,7 @@ class RgbdFeed:
         self._stamps.append(stamp)
         if math.isnan(self._parameters.sync_tolerance) and len(self._stamps) > _KNOWN:
             self._tolerance = pairing_tolerance(self._stamps)
-            self._images.tolerate(self._tolerance)
+            self._images.tolerance = self._tolerance
 
     def _has_waited(self, first: int, newest: int) -> bool:
         """Say whether the first colour image that waits has waited long enough, given the newest [ns]."""
@@ -368,12 +370,6 @@ class RgbdFeed:
         self.alone += len(alone) + (depth.value is None)
         delay = SECOND * (depth.stamp - color.stamp)
         return [*alone, Stamped(color.stamp, replace(color.value, depth=depth.value, depth_delay=delay))]
-
-    def _read_color(self, message: Any) -> RgbdImage:
-        """Return the image of a colour image alone."""
-        camera = self.stream.known_camera(self._parameters.info_topic)
-        color = self.stream.read_color(message)
-        return RgbdImage(stamp=SECOND * stamp_of(message), color=color, depth=None, camera=camera)
 
     def _missing_depth(self, stamp: int) -> SyncError:
         """Return the error of a colour image [ns] that has waited long enough."""

@@ -108,21 +108,18 @@ def keypoint_columns(found: JawKeypoints) -> dict[str, NDArray]:
     """Return the columns of a cloud of key points, one row (K,) per key point of the jaw file."""
     u, v = np.asarray(found.pixels, dtype=np.float32).T
     stddev = np.asarray(found.stddev, dtype=np.float32).T
+    # 0 for a key point that is used, else the place of the reason why not in `REASONS`, from 1
+    codes = np.select([found.reasons == reason for reason in REASONS], range(1, len(REASONS) + 1), default=0)
     return {
         **ros.xyz_columns(found.points),
         "likelihood": np.asarray(found.likelihood, dtype=np.float32),
         "u": u,
         "v": v,
         "valid": np.asarray(found.valid, dtype=np.uint8),
-        "reason": reason_codes(found.reasons),
+        "reason": codes.astype(np.uint8),
         **dict(zip(("stddev_x", "stddev_y", "stddev_z"), stddev, strict=True)),
         "shared": np.full(len(u), found.shared, dtype=np.float32),
     }
-
-
-def reason_codes(reasons: NDArray) -> NDArray[np.uint8]:
-    """Return why key points (K,) are refused as numbers: 0 for one that is used, else its place in `REASONS` from 1."""
-    return np.select([reasons == reason for reason in REASONS], range(1, len(REASONS) + 1), default=0).astype(np.uint8)
 
 
 class KeypointDetectorNode(ros.ImageNode):
@@ -210,22 +207,17 @@ class KeypointDetectorNode(ros.ImageNode):
             return
         with self.rejections():
             whole = self.feed.take_color(topic, message)
-            if not whole:
-                self._look_ahead()
+            waiting = self.feed.waiting
+            if not whole and waiting is not None:  # its pixels are found while its depth is on its way
+                with suppress(FinforceError):  # what is wrong with it is said after that
+                    self.gate.check_age(waiting.stamp, self.now())
+                    self.detector.look(waiting.value)
             self._answer(whole)
 
     def _on_depth(self, _topic: str, message: Any) -> None:
         """Take a depth image."""
         with self.rejections():
             self._answer(self.feed.take_depth(message))
-
-    def _look_ahead(self) -> None:
-        """Find the pixels of a colour image while its depth is on its way; what is wrong with it is said after that."""
-        waiting = self.feed.waiting
-        if waiting is not None:
-            with suppress(FinforceError):
-                self.gate.check_age(waiting.stamp, self.now())
-                self.detector.look(waiting.value)
 
     def _answer(self, images: Sequence[Stamped]) -> None:
         """Find the key points of all jaws in images that are whole."""

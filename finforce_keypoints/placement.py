@@ -426,7 +426,10 @@ class _Refinement:
         (T, turns, origins), contrast = self._split(self._x), self.contrast()
         first = next(iter(self._jaws))
         usual = np.array([np.median(each, axis=0) for each in self._likelihood.values()]).mean(axis=0)
-        typical = self._find_typical(usual, self._points[first][:, ::2])
+        # a typical point is one that neither the edge of a holder nor that of the image covers
+        _, across, edge = next(iter(self._outlines.values())).edges[self._edge]
+        there = usual[(self._points[first][:, ::2] @ across > edge) & (usual > 0.0)]
+        typical = float(np.clip(np.median(there), 1e-6, TYPICAL)) if there.size else 1e-6
         mount = JawMount(odds=float(np.clip(TYPICAL / (1.0 - TYPICAL) * (1.0 - typical) / typical, 1.0, MOST_ODDS)))
         visible = ~find_covered(mount.believe(usual), self._points[first][:, ::2])
         sure = {s: visible & (mount.believe(each) >= 0.5) for s, each in self._likelihood.items()}
@@ -451,9 +454,3 @@ class _Refinement:
             residual=residual,
             seen={side: np.where(sure[side][:, :, None], seen, np.nan) for side, seen in self._seen.items()},
         )
-
-    def _find_typical(self, usual: NDArray, places: NDArray) -> float:
-        """Return the likelihood of a typical point that neither the edge of a holder nor that of the image covers."""
-        _, across, edge = next(iter(self._outlines.values())).edges[self._edge]
-        there = usual[(places @ across > edge) & (usual > 0.0)]
-        return float(np.clip(np.median(there), 1e-6, TYPICAL)) if there.size else 1e-6

@@ -62,7 +62,10 @@ class TwinState:
         """Return the state at a share of the way to another: x = (1 - s) x + s x_other; turns the short way."""
         pose = self.T_gripper_object
         if pose is not None:
-            pose = _blend_poses(pose, other.T_gripper_object, share)
+            turn = Rotation.from_matrix(pose[:3, :3].T @ other.T_gripper_object[:3, :3]).as_rotvec()
+            blended = _blend(pose, other.T_gripper_object, share)
+            blended[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec(share * turn).as_matrix()
+            pose = blended
         return replace(
             self,
             stamp=_blend(self.stamp, other.stamp, share),
@@ -74,14 +77,6 @@ class TwinState:
 
 def _blend(value: Any, other: Any, share: float) -> Any:
     return (1.0 - share) * value + share * other
-
-
-def _blend_poses(pose: NDArray, other: NDArray, share: float) -> NDArray:
-    """Return a pose (4, 4) between two."""
-    turn = Rotation.from_matrix(pose[:3, :3].T @ other[:3, :3]).as_rotvec()
-    blended = _blend(pose, other, share)
-    blended[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec(share * turn).as_matrix()
-    return blended
 
 
 class TwinGripper(Assembly):

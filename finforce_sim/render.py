@@ -370,7 +370,10 @@ class RenderedScene:
         answer = self._scene.cast_rays(self._tensor(packed), nthreads=1)
         depth = answer["t_hit"].numpy().astype(float)
         missed = np.flatnonzero(np.isinf(depth))
-        depth[missed] = self._background_depth(rays[missed])
+        normal = self._R[:, 2]
+        with np.errstate(divide="ignore"):  # the background's plane, FAR above its horizon
+            behind = (normal @ self._base + self._look.background_distance) / (rays[missed] @ normal)
+        depth[missed] = np.where((behind > 0.0) & (behind < FAR), behind, FAR)
         surface = np.minimum(answer["primitive_ids"].numpy(), len(self._triangles))
         return _Hits(
             depth=depth,
@@ -379,13 +382,6 @@ class RenderedScene:
             weights=answer["primitive_uvs"].numpy(),
             normals=answer["primitive_normals"].numpy(),
         )
-
-    def _background_depth(self, rays: NDArray) -> NDArray:
-        """Return the depth (n,) [m] at which rays (n, 3) meet the background's plane, FAR above its horizon."""
-        normal = self._R[:, 2]
-        with np.errstate(divide="ignore"):
-            depth = (normal @ self._base + self._look.background_distance) / (rays @ normal)
-        return np.where((depth > 0.0) & (depth < FAR), depth, FAR)
 
     def _shade(self, rays: NDArray, hits: _Hits) -> NDArray:
         """Return the linear colours (n, 3) that come along rays."""
@@ -402,7 +398,9 @@ class RenderedScene:
         color = np.empty((len(rays), 3))
         _light_up(on, rays, normals, self._paint(hits.owner[on], places), gloss, light, lamps, lit, color)
         off = np.flatnonzero(hits.owner < 0)
-        color[off] = self._look_at_background(rays[off] * hits.depth[off, None])
+        across = self._R[:, :2].T @ (rays[off] * hits.depth[off, None] - self._base).T
+        column, row = np.floor(across / TEXTURE_SPAN * TEXTURE_SIZE).astype(np.int32) % TEXTURE_SIZE
+        color[off] = self._look.backdrop[row * TEXTURE_SIZE + column]
         return color
 
     def _paint(self, owner: NDArray, places: NDArray) -> NDArray:
@@ -422,12 +420,6 @@ class RenderedScene:
         packed = np.empty((len(facing), 6), dtype=np.float32)
         packed[:, :3], packed[:, 3:] = starts[facing], towards
         return facing[self._scene.test_occlusions(self._tensor(packed), nthreads=1).numpy()]
-
-    def _look_at_background(self, points: NDArray) -> NDArray:
-        """Return the light (n, 3) of the background at points (n, 3) [m], camera frame."""
-        across = self._R[:, :2].T @ (points - self._base).T
-        column, row = np.floor(across / TEXTURE_SPAN * TEXTURE_SIZE).astype(np.int32) % TEXTURE_SIZE
-        return self._look.backdrop[row * TEXTURE_SIZE + column]
 
 
 @njit(**_OPTIONS)

@@ -39,24 +39,16 @@ def expose(light: NDArray, exposure: Exposure, rng: np.random.Generator, smear: 
     scene *= _vignette(scene.shape[:2], exposure.vignetting)
     columns, rows = np.hypot(exposure.blur, np.zeros(2) if smear is None else smear)
     scene = _filter(scene, *(cv2.getGaussianKernel(2 * int(3.0 * width + 0.5) + 1, width) for width in (rows, columns)))
-    wanted = min(EXPOSURE_TARGET / max(float(scene.mean()), 1e-6), BRIGHTEST / max(_bright_end(scene), 1e-6))
+    bright = float(np.quantile(scene[::8, ::8].max(axis=2), 0.95))  # a twentieth of the image exceeds it
+    wanted = min(EXPOSURE_TARGET / max(float(scene.mean()), 1e-6), BRIGHTEST / max(bright, 1e-6))
     gain = float(np.clip(wanted, 0.2, exposure.largest_gain))
     electrons = scene * exposure.full_well
     noise = np.sqrt(np.maximum(electrons, 0.0) + exposure.read_noise**2)
-    electrons += noise * _sensor_noise(scene.shape, rng)
+    # of unit variance; interpolating the colour filter makes neighbours alike
+    white = rng.standard_normal(scene.shape, dtype=np.float32)
+    electrons += noise * (0.6 * white + 1.7 * _filter(white, *[np.array([0.25, 0.5, 0.25])] * 2))
     level = np.clip(gain * electrons / exposure.full_well, 0.0, 1.0) ** np.float32(1.0 / GAMMA)
     return np.round(255.0 * level).astype(np.uint8)
-
-
-def _bright_end(scene: NDArray) -> float:
-    """Return the brightness that a twentieth of an image exceeds, from every eighth pixel of both axes."""
-    return float(np.quantile(scene[::8, ::8].max(axis=2), 0.95))
-
-
-def _sensor_noise(shape: tuple[int, ...], rng: np.random.Generator) -> NDArray:
-    """Return noise (h, w, 3) of unit variance; interpolating the colour filter makes neighbours alike."""
-    white = rng.standard_normal(shape, dtype=np.float32)
-    return 0.6 * white + 1.7 * _filter(white, *[np.array([0.25, 0.5, 0.25])] * 2)
 
 
 def _filter(image: NDArray, rows: NDArray, columns: NDArray) -> NDArray:
@@ -94,22 +86,19 @@ def measure_depth(
     """
     noise = noise or D405_NOISE
     measured = disturb_depth(depth, camera, rng, replace(noise, hole_fraction=0.0))
-    chance = noise.hole_fraction + HOLES_IN_FLAT * (noise.hole_fraction > 0.0) * _is_hard_to_match(color)
+    # pixels whose surroundings are flat and dark are hard to match
+    red, green, blue = np.moveaxis(color, 2, 0)  # a tenth of the time of a mean along so short an axis
+    grey = (np.add(red, green, dtype=np.float32) + blue) / np.float32(3.0) / np.float32(255.0)
+    mean = uniform_filter(grey, 7)
+    spread = np.sqrt(np.maximum(uniform_filter(grey * grey, 7) - mean * mean, 0.0))
+    hard = np.clip(1.0 - spread / FLAT_CONTRAST, 0.0, 1.0) * np.clip(2.0 - mean / DARK_LEVEL, 0.0, 1.0)
+    chance = noise.hole_fraction + HOLES_IN_FLAT * (noise.hole_fraction > 0.0) * hard
     field = smooth_field(measured.shape, HOLE_SIZE, rng)
     chance = np.clip(chance, 1e-6, 0.99)
     low = field < ndtri(np.max(chance))
     low[low] = field[low] < ndtri(np.broadcast_to(chance, low.shape)[low])
     measured[low] = np.nan
     return measured
-
-
-def _is_hard_to_match(color: NDArray) -> NDArray:
-    """Return from 0 to 1 how flat and dark (h, w) the surroundings of the pixels are."""
-    red, green, blue = np.moveaxis(color, 2, 0)  # a tenth of the time of a mean along so short an axis
-    grey = (np.add(red, green, dtype=np.float32) + blue) / np.float32(3.0) / np.float32(255.0)
-    mean = uniform_filter(grey, 7)
-    spread = np.sqrt(np.maximum(uniform_filter(grey * grey, 7) - mean * mean, 0.0))
-    return np.clip(1.0 - spread / FLAT_CONTRAST, 0.0, 1.0) * np.clip(2.0 - mean / DARK_LEVEL, 0.0, 1.0)
 
 
 DENSITY = 0.005  # share of the numbers that differ by one

@@ -94,7 +94,8 @@ def find_scene(scene: TwinScene, folder: Path | None = None) -> Path:
     Raises:
         FinforceError: the scene cannot be rendered, or a library is missing.
     """
-    folder = folder or scene_folder()
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    folder = folder or cache / "finforce" / "scenes"
     path = folder / f"{scene.scenario}_{scene.seed}_{fingerprint(scene)}"
     if path.exists():
         return path
@@ -109,11 +110,6 @@ def find_scene(scene: TwinScene, folder: Path | None = None) -> Path:
     finally:
         rmtree(unfinished, ignore_errors=True)
     return path
-
-
-def scene_folder() -> Path:
-    """Return where rendered scenes are kept: `finforce/scenes` in XDG_CACHE_HOME, or in ~/.cache."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "finforce" / "scenes"
 
 
 def fingerprint(scene: TwinScene) -> str:

@@ -29,18 +29,13 @@ def list_commands(page: Path) -> list[str]:
     return [re.sub(r"\s+#\s.*", "", line) for line in lines]
 
 
-def write_finger(path: Path) -> None:
-    """Write the section of the finger `umi`, extruded, in millimetres."""
-    section = json.loads((JAWS / "umi.section.json").read_text(encoding="utf-8"))
-    outline, *holes = sorted((np.array(loop) for loop in section["loops"]), key=lambda loop: -np.ptp(loop[:, 1]))
-    trimesh.creation.extrude_polygon(Polygon(outline, holes), 25.8).export(path)
-
-
 def main() -> None:
     """Run the commands of a page."""
     page = Path(sys.argv[1]).resolve()
     with TemporaryDirectory() as folder:
-        write_finger(Path(folder) / FINGER)
+        section = json.loads((JAWS / "umi.section.json").read_text(encoding="utf-8"))
+        outline, *holes = sorted((np.array(loop) for loop in section["loops"]), key=lambda loop: -np.ptp(loop[:, 1]))
+        trimesh.creation.extrude_polygon(Polygon(outline, holes), 25.8).export(Path(folder) / FINGER)
         for command in list_commands(page):
             began = perf_counter()
             print(f"$ {command}", flush=True)

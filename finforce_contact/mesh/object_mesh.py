@@ -69,15 +69,12 @@ def surrounds(mesh: ObjectMesh, point: NDArray) -> bool:
     low, high = mesh.bounds
     if ((point <= low) | (point >= high)).any():
         return False
-    return abs(_sum_solid_angles(mesh.vertices[mesh.triangles] - point)) / (4.0 * np.pi) > _INSIDE
-
-
-def _sum_solid_angles(corners: NDArray) -> float:
-    """Return the sum of the solid angles of triangles (m, 3, 3) seen from the origin (Van Oosterom, Strackee 1983)."""
+    # the sum of the solid angles of the triangles (Van Oosterom, Strackee 1983)
+    corners = mesh.vertices[mesh.triangles] - point
     (a, b, c), (la, lb, lc) = corners.transpose(1, 0, 2), np.linalg.norm(corners, axis=2).T
     volume = (a * np.cross(b, c)).sum(axis=1)
     below = la * lb * lc + (a * b).sum(axis=1) * lc + (b * c).sum(axis=1) * la + (c * a).sum(axis=1) * lb
-    return float(2.0 * np.arctan2(volume, below).sum())
+    return bool(abs(2.0 * np.arctan2(volume, below).sum()) / (4.0 * np.pi) > _INSIDE)
 
 
 def load_object_mesh(path: Path | str | ObjectMesh, *, unit: str = "m", triangle_limit: int = 20000) -> ObjectMesh:
@@ -149,7 +146,12 @@ def prepare_object_mesh(
     _check_triangles(vertices, triangles, name)
     _check_size(vertices, triangles, name, unit)
     vertices = vertices * UNITS[unit]
-    _check_origin(vertices, triangles, name)
+    away = float(np.linalg.norm(vertices[triangles], axis=-1).max())
+    if away > FARTHEST:
+        raise ObjectMeshError(
+            f"{name}: got vertices up to {away:.3g} m from the origin of their frame, expected {FARTHEST:g} m at most; "
+            "move the origin into the object, and give its poses for that origin"
+        )
     if not triangle_limit >= 100:
         raise ObjectMeshError(f"{name}: got triangle_limit {triangle_limit}, expected 100 at least; 20000 is usual")
     mesh = repair(ObjectMesh(vertices=vertices, triangles=triangles, watertight=False, name=name))
@@ -193,16 +195,6 @@ def _check_size(vertices: NDArray, triangles: NDArray, name: str, unit: str) -> 
         f"{name}: got a largest extent of {extent * UNITS[unit] * 1e3:.6g} mm in unit {unit!r}, "
         f"expected {SMALLEST * 1e3:g} to {LARGEST * 1e3:g} mm for a graspable object; {advice}"
     )
-
-
-def _check_origin(vertices: NDArray, triangles: NDArray, name: str) -> None:
-    """Refuse an object that lies far from the origin of its own frame [m]."""
-    away = float(np.linalg.norm(vertices[triangles], axis=-1).max())
-    if away > FARTHEST:
-        raise ObjectMeshError(
-            f"{name}: got vertices up to {away:.3g} m from the origin of their frame, expected {FARTHEST:g} m at most; "
-            "move the origin into the object, and give its poses for that origin"
-        )
 
 
 def _check_body(mesh: ObjectMesh) -> None:
@@ -285,7 +277,14 @@ def turn_outward(mesh: ObjectMesh) -> ObjectMesh:
     if body.max() >= _MOST_BODIES:
         body = np.zeros_like(body)
     volumes = np.bincount(body, weights=mesh.volumes)
-    turned = (volumes[_find_containers(mesh, body, len(volumes))] < 0.0)[body]
+    # around each body the one whose box is the largest around its own, or itself
+    low, high = np.full((len(volumes), 3), np.inf), np.full((len(volumes), 3), -np.inf)
+    corners = mesh.vertices[mesh.triangles]
+    np.minimum.at(low, body, corners.min(axis=1))
+    np.maximum.at(high, body, corners.max(axis=1))
+    contains = (low[:, None] <= low[None]).all(axis=2) & (high[:, None] >= high[None]).all(axis=2)
+    containers = np.argmax(contains * np.linalg.norm(high - low, axis=1)[:, None], axis=0)
+    turned = (volumes[containers] < 0.0)[body]
     if not turned.any():
         return mesh
     return mesh.turn(turned).noted(f"{turned.sum()} of {len(turned)} triangles were inside-out and were turned.")
@@ -304,16 +303,6 @@ def unite_bodies(mesh: ObjectMesh, solid: Manifold) -> ObjectMesh:
     if union.volume() > (1.0 - 1e-6) * solid.volume():
         return mesh
     return mesh.with_triangles(*triangles_of_solid(union)).noted("Bodies that overlap were united.")
-
-
-def _find_containers(mesh: ObjectMesh, body: NDArray, count: int) -> NDArray:
-    """Return for each body the one (count,) whose box is the largest around its own, or itself."""
-    low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
-    corners = mesh.vertices[mesh.triangles]
-    np.minimum.at(low, body, corners.min(axis=1))
-    np.maximum.at(high, body, corners.max(axis=1))
-    contains = (low[:, None] <= low[None]).all(axis=2) & (high[:, None] >= high[None]).all(axis=2)
-    return np.argmax(contains * np.linalg.norm(high - low, axis=1)[:, None], axis=0)
 
 
 def decimate(mesh: ObjectMesh, triangle_limit: int) -> ObjectMesh:

@@ -347,7 +347,6 @@ class Alignment:
         T_camera_object: pose (4, 4).
         information: (6, 6) inverse covariance of x, y, z [m] and rotation [rad], camera axes, about the origin;
             of the determined directions alone.
-        determined: how many of the six directions the image tells by more than a few stray points.
         fitness: points where they should be, as a share of those that nothing hides, 0 to 1.
         visible: points where they should be, as a share of those in view, 0 to 1.
         seen: points where they should be.
@@ -357,7 +356,6 @@ class Alignment:
 
     T_camera_object: NDArray
     information: NDArray
-    determined: int
     fitness: float
     visible: float
     seen: int
@@ -533,7 +531,6 @@ class MeshAligner:
         return Alignment(
             T_camera_object=T,
             information=known.T @ (basis.T @ normal.information @ basis) @ known / alike,
-            determined=basis.shape[1],
             fitness=float(counts[Visibility.SEEN] / max(counts[Visibility.SEEN] + counts[Visibility.ABSENT], 1)),
             visible=float(counts[Visibility.SEEN] / max(counts.sum(), 1)),
             seen=int(counts[Visibility.SEEN]),

@@ -77,7 +77,8 @@ def collect_evidence(depth: NDArray, mask: NDArray, camera: CameraIntrinsics) ->
             f"{LARGEST:g} m: does a step of its depth mean so much? TUM's is 0.2 mm (--depth-scale 0.0002), that of "
             "many BOP sets 0.1 mm; are mask and intrinsics of this image?"
         )
-    distance = _edge_distance(mask)
+    inside, outside = distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1], distance_transform_edt(~mask)
+    distance = np.where(mask, 0.5 - inside, outside - 0.5)
     return ImageEvidence(
         camera=camera,
         depth=depth,
@@ -118,13 +119,6 @@ def _estimate_normals(points: NDArray, neighbours: int = 16) -> NDArray:
     around = points[nearest] - points[nearest].mean(axis=1, keepdims=True)
     normals = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))[1][:, :, 0]
     return np.where(np.einsum("ij,ij->i", normals, points)[:, None] > 0.0, -normals, normals)
-
-
-def _edge_distance(mask: NDArray) -> NDArray:
-    """Return the signed distance (h, w) of pixel centres to the mask's outline [px], negative inside."""
-    inside = distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1]
-    outside = distance_transform_edt(~mask)
-    return np.where(mask, 0.5 - inside, outside - 0.5)
 
 
 def _weigh_edges(depth: NDArray, mask: NDArray) -> NDArray:
@@ -177,8 +171,9 @@ def score_shape(view: MeshView, affine: NDArray, evidence: ImageEvidence, step: 
     # the mesh may go on where something nearer is, and nowhere else: that nothing was measured there hides nothing
     excess = covered & ~mask & ~is_hidden
     both = covered & mask
-    offsets = (depth - seen.depth)[covered] * _normal_shares(seen.points, seen.normals)
-    offsets = offsets[both[covered]]
+    # |n . ray|, for the ray with z = 1, is what of a difference in depth counts across the surface
+    shares = np.abs(np.einsum("ij,ij->i", seen.normals, seen.points) / seen.points[:, 2])
+    offsets = ((depth - seen.depth)[covered] * shares)[both[covered]]
     known = np.abs(offsets[np.isfinite(offsets)])
     missed = int((mask & ~covered).sum() + excess.sum())
     squares = np.minimum(known, MISFIT_BOUND) ** 2
@@ -187,11 +182,6 @@ def score_shape(view: MeshView, affine: NDArray, evidence: ImageEvidence, step: 
     misfit = np.sqrt((squares.sum() + missed * MISFIT_BOUND**2) / count) if count else MISFIT_BOUND
     residual = float(np.median(known)) if len(known) else np.inf
     return ShapeScore(misfit=float(misfit), residual=residual, overlap=float(overlap))
-
-
-def _normal_shares(points: NDArray, normals: NDArray) -> NDArray:
-    """Return what (n,) of a difference in depth counts across the surface: |n . ray|, for the ray with z = 1."""
-    return np.abs(np.einsum("ij,ij->i", normals, points) / points[:, 2])
 
 
 Report = Callable[[str, float], None]  # the name of a stage, and the share of it that is done

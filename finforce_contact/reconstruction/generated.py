@@ -164,7 +164,9 @@ def scale_coarsely(mesh: ObjectMesh, affine: NDArray, cloud: NDArray) -> NDArray
     placed = mesh.vertices @ affine[:3, :3].T + affine[:3, 3]
     factor = np.ptp(cloud[:, 0]) / np.ptp(placed[:, 0])
     middle = 0.5 * (placed.min(axis=0) + placed.max(axis=0))
-    return _similarity(factor * np.eye(3), middle - factor * middle) @ affine
+    scaling = np.diag([factor, factor, factor, 1.0])
+    scaling[:3, 3] = middle - factor * middle
+    return scaling @ affine
 
 
 def align_as_paper(mesh: ObjectMesh, affine: NDArray, evidence: ImageEvidence) -> NDArray:
@@ -202,13 +204,6 @@ def _register(source: NDArray, target: NDArray, with_scale: bool) -> NDArray:
         registration.ICPConvergenceCriteria(max_iteration=ITERATIONS),
     )
     return np.array(result.transformation)
-
-
-def _similarity(linear: NDArray, translation: NDArray) -> NDArray:
-    """Return the map (4, 4) x -> linear x + translation."""
-    A = np.eye(4)
-    A[:3, :3], A[:3, 3] = linear, translation
-    return A
 
 
 # p_canonical = C p_glb, (x, y, z) of the GLB being (x, z, -y) of the canonical frame

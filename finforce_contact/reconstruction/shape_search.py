@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from finforce_contact.mesh.object_mesh import ObjectMesh
-from finforce_contact.mesh.views import MeshView, RenderedMesh
+from finforce_contact.mesh.views import MeshView
 from finforce_contact.reconstruction.evidence import ImageEvidence, Reconstruction, Report, ShapeScore, score_shape
 
 
@@ -186,7 +186,10 @@ class _StageFit:
         H[6:, 6:] += stiff * basis.T @ common @ basis
         gradient[6:] -= stiff * basis.T @ common @ stretched
         H[np.diag_indices_from(H)] += DAMPING * np.diag(H) + 1e-12
-        return _limit_step(np.linalg.solve(H, gradient))
+        step = np.linalg.solve(H, gradient)
+        parts = (np.linalg.norm(step[:3]) / LARGEST_TURN, np.linalg.norm(step[3:6]) / LARGEST_MOVE)
+        stretch = np.abs(step[6:]).max(initial=0.0) / LARGEST_STRETCH
+        return step / max(1.0, *parts, stretch)
 
     def _pull_surface(self, affine: NDArray) -> _Pull:
         """Return the pull of the measured points on the nearest points of the mesh, along the distance's gradient."""
@@ -206,7 +209,8 @@ class _StageFit:
         """Return the pull of the mask's outline on the rim of the mesh, across the outline."""
         step, evidence = self._stage.step, self._evidence
         view = self._view.render(affine, evidence.camera, step)
-        rim = _find_rim(view)
+        hit = np.isfinite(view.depth)
+        rim = np.flatnonzero(~binary_erosion(hit, border_value=0)[hit])
         points, (columns, rows) = view.points[rim], view.pixels[rim].T
         z = points[:, 2]
         weights = evidence.edge_weight[rows, columns]
@@ -218,23 +222,9 @@ class _StageFit:
         return _Pull(points=points, directions=directions, residuals=residuals, weights=weights)
 
 
-def _find_rim(view: RenderedMesh) -> NDArray:
-    """Return which points of a view lie at its outline, holes included."""
-    hit = np.isfinite(view.depth)
-    rim = hit & ~binary_erosion(hit, border_value=0)
-    return np.flatnonzero(rim[hit])
-
-
 def _weigh(residuals: NDArray, width: float) -> NDArray:
     """Return the Geman-McClure weights w = (c^2 / (c^2 + r^2))^2."""
     return (width**2 / (width**2 + residuals**2)) ** 2
-
-
-def _limit_step(step: NDArray) -> NDArray:
-    """Return a step (6 + k,) shortened so that none of its parts is too long."""
-    parts = (np.linalg.norm(step[:3]) / LARGEST_TURN, np.linalg.norm(step[3:6]) / LARGEST_MOVE)
-    stretch = np.abs(step[6:]).max(initial=0.0) / LARGEST_STRETCH
-    return step / max(1.0, *parts, stretch)
 
 
 def scale_mesh(mesh: ObjectMesh, log_scale: NDArray) -> ObjectMesh:
@@ -410,13 +400,9 @@ def compare_primitives(evidence: ImageEvidence, report: Report) -> Mapping[str, 
     for name in HANDICAP:
         primitive = build_primitive(name)
         freedom = SearchFreedom(early=primitive.freedom, late=primitive.freedom)
-        fits[name] = search_shape(primitive.mesh, primitive.starts, evidence, freedom, _prefix(report, name))
+        told = lambda stage, share, name=name: report(f"{name}: {stage}", share)  # noqa: E731
+        fits[name] = search_shape(primitive.mesh, primitive.starts, evidence, freedom, told)
     return fits
-
-
-def _prefix(report: Report, name: str) -> Report:
-    """Return a report that says which shape a stage is of."""
-    return lambda stage, share: report(f"{name}: {stage}", share)
 
 
 def build_primitive(name: str) -> Primitive:

@@ -123,7 +123,11 @@ class ForceGrasp:
             return move
         except GraspError as error:
             self.phase, self._reason, self._failure = GraspPhase.STOPPED, str(error), type(error)
-            return self._back_off(state, now) if isinstance(error, BackOffError) else None
+            if not isinstance(error, BackOffError):
+                return None
+            # back to where the grasp began: how soft what the motor presses on is, nobody knows
+            target = self._plan.nearest(min(max(self._start, state.opening), self._plan.widest))
+            return self._move(target, self.goal.speed, state, now)
 
     def _drain(self, state: GripperState, now: float, opening_at: Callable[[float], float]) -> bool:
         """Take what is pending and return whether the jaws may be planned for anew.
@@ -206,11 +210,6 @@ class ForceGrasp:
                 f"the motor presses with {state.force:.1f} N by its current, the camera says {seen:.2f} N: "
                 "is the estimator blind, frozen or looking at something else? The jaws back off"
             )
-
-    def _back_off(self, state: GripperState, now: float) -> MoveRequest:
-        """Return the move to where the grasp began: how soft what the motor presses on is, nobody knows."""
-        target = self._plan.nearest(min(max(self._start, state.opening), self._plan.widest))
-        return self._move(target, self.goal.speed, state, now)
 
     def _check_limits(self, state: GripperState, now: float) -> None:
         """Refuse to go on beyond a limit.

@@ -439,7 +439,9 @@ class ForceModel:
         mixed += travel * stiffnesses
         stiffnesses += _GROWTH**2 * abs(travel)
         innovation = force - (self.force + self.stiffness * travel)
-        self._learn_noise(innovation, forces)
+        # what the innovation leaves beyond its expected variance
+        seen = min(max(innovation**2 - forces, _LEAST_NOISE**2), _LARGEST_NOISE**2)
+        self._noise_variance += _NOISE_MEMORY * (seen - self._noise_variance)
         total = forces + self._noise_variance
         self.force += self.stiffness * travel + forces / total * innovation
         self.stiffness = max(LEAST_STIFFNESS, self.stiffness + mixed / total * innovation)
@@ -447,8 +449,3 @@ class ForceModel:
         self._covariance = mixed * (1.0 - forces / total)
         self._force_variance = forces * (1.0 - forces / total)
         self.opening, self.stamp = opening, stamp
-
-    def _learn_noise(self, innovation: float, expected: float) -> None:
-        """Move the noise towards what an innovation [N] leaves beyond its expected variance [N^2]."""
-        seen = min(max(innovation**2 - expected, _LEAST_NOISE**2), _LARGEST_NOISE**2)
-        self._noise_variance += _NOISE_MEMORY * (seen - self._noise_variance)

@@ -416,17 +416,13 @@ class Drive:
         if self._busy:
             return None
         may_drive = self.may_drive and now - self.known.stamp <= self._freshness
-        if may_drive:
-            self._advance_move(now)
+        has_job = self.job is not None and self.orders.wanted is not None
+        if may_drive and has_job and not (self.job.sent and self.orders.pending):  # the target of a slow move goes on
+            self.job.advance(now, self.known.position, self.known.stamp)
+            self.want_position()
         if not self.orders.pending or (self.orders.wanted.drives and not may_drive) or self.known.reply is None:
             return None
         return self._request(self.orders.wanted)
-
-    def _advance_move(self, now: float) -> None:
-        """Let the target of a slow move go on when it is due."""
-        if self.job is not None and self.orders.wanted is not None and not (self.job.sent and self.orders.pending):
-            self.job.advance(now, self.known.position, self.known.stamp)
-            self.want_position()
 
     def _wants_reply(self) -> bool:
         return self.known.filter.wants_reply or self.hold_wanted

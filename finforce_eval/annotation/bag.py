@@ -152,16 +152,15 @@ class ForceMessages:
         message = status_message(stamp, level, f"finforce: {side} jaw", text, values)
         yield Entry(stamp, f"/{side}/wrench_status", message)
         if row["points_x"] is not None:
-            yield Entry(stamp, f"/{side}/contact", cloud_message(stamp, frame, _contact_cloud(row)))
-        if self._is_drawn(side, force):
-            markers = force_markers(stamp, frame, _vector(row, "contact_point"), force)
-            yield Entry(stamp, f"/{side}/markers", markers)
-
-    def _is_drawn(self, side: str, force: NDArray[np.float64]) -> bool:
-        """Say whether an image has another picture than the one before: there is a force, or one has gone."""
+            columns = {axis: np.asarray(row[f"points_{axis}"], np.float32) for axis in (*AXES, "weight")}
+            columns["touching"] = np.full(len(columns["x"]), row["points_touching"], np.uint8)
+            yield Entry(stamp, f"/{side}/contact", cloud_message(stamp, frame, columns))
+        # an image has another picture than the one before where there is a force, or one has gone
         pressed = bool(np.isfinite(force).all() and force.any())
         before, self._drawn[side] = self._drawn.get(side, False), pressed
-        return pressed or before
+        if pressed or before:
+            markers = force_markers(stamp, frame, _vector(row, "contact_point"), force)
+            yield Entry(stamp, f"/{side}/markers", markers)
 
 
 def _rows(forces: ForceSeries, more: Mapping[str, Any] | None = None) -> dict[int, dict[str, Any]]:
@@ -172,12 +171,6 @@ def _rows(forces: ForceSeries, more: Mapping[str, Any] | None = None) -> dict[in
 def _vector(row: Mapping[str, Any], name: str) -> NDArray[np.float64]:
     """Return a vector (3,) of a row."""
     return np.array([row[f"{name}_{axis}"] for axis in AXES])
-
-
-def _contact_cloud(row: Mapping[str, Any]) -> dict[str, NDArray]:
-    """Return the columns of the cloud of a contact."""
-    columns = {axis: np.asarray(row[f"points_{axis}"], np.float32) for axis in (*AXES, "weight")}
-    return columns | {"touching": np.full(len(columns["x"]), row["points_touching"], np.uint8)}
 
 
 def write_annotated(
@@ -222,7 +215,9 @@ def _write(bag: BagReader, recording: Recording, forces: ForceMessages, folder: 
     """Copy the bag into a folder that does not exist yet, the forces of an image behind it."""
     from rosbags.rosbag2 import StoragePlugin, Writer
 
-    types, triggers = typestore(), _triggers(recording, bag)
+    types, colors = typestore(), {recording.images.topics[0]} if recording.images is not None else set()
+    # the topics whose messages have the stamps of the forces
+    triggers = (colors | {f"/{side}/keypoints" for side in recording.jaws}) & bag.types.keys()
     plugin = StoragePlugin.SQLITE3 if _is_sqlite(recording.path) else StoragePlugin.MCAP
     with Writer(folder, version=9, storage_plugin=plugin) as writer:
         known = {} if side_file else {each.id: _copy_connection(writer, each) for each in bag.connections}
@@ -235,12 +230,6 @@ def _write(bag: BagReader, recording: Recording, forces: ForceMessages, folder: 
                 if entry.topic not in added:
                     added[entry.topic] = writer.add_connection(entry.topic, kind, typestore=types)
                 writer.write(added[entry.topic], time, types.serialize_cdr(entry.message, kind))
-
-
-def _triggers(recording: Recording, bag: BagReader) -> set[str]:
-    """Return the topics whose messages have the stamps of the forces."""
-    colors = {recording.images.topics[0]} if recording.images is not None else set()
-    return (colors | {f"/{side}/keypoints" for side in recording.jaws}) & bag.types.keys()
 
 
 def _is_sqlite(path: Path) -> bool:

@@ -45,7 +45,9 @@ def run(options: argparse.Namespace) -> CommandResult:
         _set_unless_given(options, "threads=1")  # a core for each recording, whatever the engine
     datasets = {name: path for name, path in named if is_dataset(path)}
     if datasets:
-        _check_dataset_options(options)
+        if options.shard:
+            raise OptionError(f"--shard {options.shard}: a dataset is written as one; give its folder to one job")
+        options.jaws = options.jaws or "both"
     bags = choose_shard([(name, path) for name, path in named if name not in datasets], options.shard)
     settings = describe_options(options)
     with manifest.alone():
@@ -80,13 +82,6 @@ def _tasks_of(name: str, path: Path, options: argparse.Namespace, settings: Mapp
 def _has_force(line: Line) -> bool:
     """Say whether a task found forces."""
     return line["status"] == OK and not line["figures"].get("without_force")
-
-
-def _check_dataset_options(options: argparse.Namespace) -> None:
-    """Complete the options of datasets; raises OptionError where part of one is asked for."""
-    if options.shard:
-        raise OptionError(f"--shard {options.shard}: a dataset is written as one; give its folder to one job")
-    options.jaws = options.jaws or "both"
 
 
 def _set_unless_given(options: argparse.Namespace, change: str) -> None:

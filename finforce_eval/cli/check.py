@@ -44,21 +44,16 @@ def run(options: argparse.Namespace) -> CommandResult:
     """
     with TemporaryDirectory() as scratch:
         if options.topics is not None:
-            options.bags += [str(_listen(options, Path(scratch) / "camera"))]
+            if options.bags or len(options.topics) not in (0, 2, 3):
+                raise OptionError(
+                    f"--topics {' '.join(options.topics)}: expected none, or those of colour, camera_info and perhaps "
+                    "depth; and no BAG"
+                )
+            topics = options.topics or (COLOR_TOPIC, INFO_TOPIC, DEPTH_TOPIC)
+            options.bags += [str(record_camera(topics, options.images, Path(scratch) / "camera"))]
         if len(options.bags) != 1:
             raise OptionError(f"got {' '.join(options.bags) or 'nothing'}; expected one BAG, or --topics")
         return _check(options)
-
-
-def _listen(options: argparse.Namespace, folder: Path) -> Path:
-    """Record what a running camera publishes."""
-    if options.bags or len(options.topics) not in (0, 2, 3):
-        raise OptionError(
-            f"--topics {' '.join(options.topics)}: expected none, or those of colour, camera_info and perhaps depth; "
-            "and no BAG"
-        )
-    topics = options.topics or (COLOR_TOPIC, INFO_TOPIC, DEPTH_TOPIC)
-    return record_camera(topics, options.images, folder)
 
 
 def record_camera(topics: Sequence[str], count: int, folder: Path, domain: int | None = None) -> Path:

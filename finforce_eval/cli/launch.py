@@ -67,16 +67,12 @@ def list_parts(system: str, words: Sequence[str]) -> list[Process | Include]:
         OptionError: a word names no argument, or its value cannot be used.
     """
     record, describe_parts = SYSTEMS[system]
+    checkout, installed = Path(__file__).parents[2], Path(sys.prefix, "share", "finforce")
+    share = checkout if (checkout / "config").is_dir() else installed
     try:
-        return describe_parts(options_from_words(record, words), share_folder())
+        return describe_parts(options_from_words(record, words), share)
     except ValueError as error:
         raise OptionError(str(error)) from error
-
-
-def share_folder() -> Path:
-    """Return the folder with the configuration files: that of the checkout, or of the installed package."""
-    checkout = Path(__file__).parents[2]
-    return checkout if (checkout / "config").is_dir() else Path(sys.prefix, "share", "finforce")
 
 
 def startable(parts: Sequence[Process | Include]) -> list[Process]:

@@ -71,11 +71,6 @@ def build_commands() -> Parser:
     return parser
 
 
-def read_command(words: Sequence[str]) -> str:
-    """Return the subcommand that the words of a command line begin with; without one, print what there is and exit."""
-    return build_commands().parse_args(words[:1]).command
-
-
 def build_parser(command: str) -> Parser:
     """Return the parser of a subcommand's options."""
     module = load_command(command)
@@ -88,7 +83,7 @@ def build_parser(command: str) -> Parser:
 
 def parse(words: Sequence[str]) -> argparse.Namespace:
     """Return the options of a command line, with `run`, the function that carries it out."""
-    return build_parser(read_command(words)).parse_args(words[1:])
+    return build_parser(build_commands().parse_args(words[:1]).command).parse_args(words[1:])
 
 
 def complete(words: Sequence[str]) -> None:

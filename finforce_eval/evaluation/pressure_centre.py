@@ -52,10 +52,6 @@ class InnerSurface:
         """Return the mean over the width of a value per vertex."""
         return np.bincount(self._group, weights=values[self._rows], minlength=len(self._count)) / self._count
 
-    def middle_line(self, surface: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return x and z (h, 2) [m] of each height, averaged over the width, of vertices (n, 3) [m]."""
-        return np.stack([self._average(surface[:, 0]), self._average(surface[:, 2])], axis=1)
-
     def cut(self, surface: NDArray[np.float64], point: NDArray[np.float64], direction: NDArray[np.float64]) -> float:
         """Return the height on the undeformed surface [m] of the point where a line first meets the deformed one.
 
@@ -69,7 +65,7 @@ class InnerSurface:
         """
         if not np.isfinite([*point, *direction]).all():
             return float("nan")
-        offset = self.middle_line(surface) - point
+        offset = np.stack([self._average(surface[:, axis]) for axis in (0, 2)], axis=1) - point
         side = direction[0] * offset[:, 1] - direction[1] * offset[:, 0]
         crossed = np.flatnonzero((side[:-1] <= 0) != (side[1:] <= 0))
         if not crossed.size:

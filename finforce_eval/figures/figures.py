@@ -59,12 +59,7 @@ def draw_unity(results: Sequence[ForceSeries]) -> Figure:
         axes.set_visible(False)
     figure.supxlabel("measured force [N]", fontsize=10)
     figure.supylabel("estimated force [N]", fontsize=10)
-    _phase_legend(figure, results)
-    return figure
-
-
-def _phase_legend(figure: Figure, results: Sequence[ForceSeries]) -> None:
-    """Explain the colours of loading and unloading, if there are any."""
     if any((result.column("direction") != "").any() for result in results):
         patches = [Patch(color=colour, label=LABELS[key]) for key, colour in COLOURS.items()]
         figure.legend(handles=patches, loc="outside upper right", ncols=2, frameon=False, fontsize=9)
+    return figure

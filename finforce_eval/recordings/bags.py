@@ -399,10 +399,6 @@ def damage_reported(name: str) -> Iterator[None]:
 def restamp(data: bytes | memoryview, stamp: int) -> bytes:
     """Return CDR bytes that begin with a std_msgs/Header with another stamp [ns]."""
     changed = bytearray(data)
-    struct.pack_into(_stamp_layout(data), changed, 4, *divmod(stamp, NANOSECONDS))
+    # int32 sec, uint32 nanosec in the byte order that the encapsulation names
+    struct.pack_into("<iI" if data[1] & 1 else ">iI", changed, 4, *divmod(stamp, NANOSECONDS))
     return bytes(changed)
-
-
-def _stamp_layout(data: bytes | memoryview) -> str:
-    """Return int32 sec, uint32 nanosec in the byte order that the encapsulation names."""
-    return "<iI" if data[1] & 1 else ">iI"

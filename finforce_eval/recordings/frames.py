@@ -161,7 +161,11 @@ def read_frames(path: Path, choice: ImageChoice, sides: Sequence[str] = ()) -> R
         fps, count, shape = STILL_RATE, len(paths), read_picture(paths[0]).shape[:2]
         read = partial(map, read_picture, paths)
     else:
-        fps, count, shape = _look_at_video(path, name)
+        with _open_video(path, name) as (container, stream):
+            count = stream.frames or sum(bool(packet.size) for packet in container.demux(stream))
+            fps, shape = float(stream.average_rate or 0.0), (stream.height, stream.width)
+        if not (count and fps > 0.0):
+            raise RecordingError(f"{name}: {path.name}: {count} frames at {fps:g} Hz; expected a video")
         read = partial(decode_video, path, name)
     camera = choose_camera(choice, shape, name)
     return FrameImages(name=name, fps=fps, camera=camera, count=count, read=read).make_recording(path, sides)
@@ -186,13 +190,3 @@ def choose_camera(choice: ImageChoice, shape: tuple[int, int], name: str) -> Cam
             "fx fy cx cy or a file"
         )
     return read_intrinsics(choice.intrinsics, shape, is_cut=choice.is_cut)
-
-
-def _look_at_video(path: Path, name: str) -> tuple[float, int, tuple[int, int]]:
-    """Return frames per second, number of frames, and height and width of a video."""
-    with _open_video(path, name) as (container, stream):
-        count = stream.frames or sum(bool(packet.size) for packet in container.demux(stream))
-        rate, shape = float(stream.average_rate or 0.0), (stream.height, stream.width)
-    if not (count and rate > 0.0):
-        raise RecordingError(f"{name}: {path.name}: {count} frames at {rate:g} Hz; expected a video")
-    return rate, count, shape

@@ -13,7 +13,7 @@ import numpy as np
 from finforce.messages import NANOSECONDS, STDDEV_COLUMNS, encode_cloud
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.recording import CLOUD, POSE, STRING, WRENCH
-from finforce_eval.recordings.tracks import KeypointTrack, PhaseTrack, PoseTrack, Recording, WrenchTrack
+from finforce_eval.recordings.tracks import KeypointTrack, PhaseTrack, PoseTrack, Recording
 from finforce_ifea.messages import ARROW, CONTACT, CONTACT_DIAMETER, FORCE, NEWTONS_PER_METRE
 
 MARKERS = "visualization_msgs/msg/MarkerArray"
@@ -184,7 +184,9 @@ def recording_entries(recording: Recording) -> Iterator[Entry]:
         if not track.is_awaited:
             yield from _keypoint_entries(track.keypoints, side)
         if track.truth is not None:
-            yield from _wrench_entries(track.truth, side)
+            for stamp, force, torque in zip(track.truth.stamps, track.truth.force, track.truth.torque, strict=True):
+                wrench = wrench_message(stamp, f"{side}_jaw", force, torque)
+                yield Entry(int(stamp), f"/{side}/ground_truth_wrench", wrench)
         if track.pose is not None:
             yield from _pose_entries(track.pose, f"/{side}/jaw_pose")
     if recording.object_pose is not None:
@@ -203,12 +205,6 @@ def _keypoint_entries(track: KeypointTrack, side: str) -> Iterator[Entry]:
             columns["shared"] = np.full(track.count, track.shared[index])
         cloud = cloud_message(stamp, f"{side}_jaw", {name: value.astype(np.float32) for name, value in columns.items()})
         yield Entry(int(stamp), f"/{side}/keypoints", cloud)
-
-
-def _wrench_entries(track: WrenchTrack, side: str) -> Iterator[Entry]:
-    for stamp, force, torque in zip(track.stamps, track.force, track.torque, strict=True):
-        wrench = wrench_message(stamp, f"{side}_jaw", force, torque)
-        yield Entry(int(stamp), f"/{side}/ground_truth_wrench", wrench)
 
 
 def _pose_entries(track: PoseTrack, topic: str) -> Iterator[Entry]:

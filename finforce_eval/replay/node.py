@@ -116,8 +116,11 @@ class PlayerNode(Node):
             sent: called just before each message leaves.
         """
         first = messages.begin
-        if offset is None:
-            self._start_clock(first)
+        if offset is None:  # whoever waits for /clock is given the time before the first message needs it
+            self._clock_out = self._clock_out or self.create_publisher(Clock, "/clock", ros.RESULT)
+            self.wait_for(lambda: self._clock_out.get_subscription_count() > 0, 2.0)
+            self._clock_out.publish(Clock(clock=ros.stamp_message(first)))
+            self.spin_until(monotonic() + 0.2)
         began = monotonic()
         for time, due in self._coming:
             self.spin_until(began + (time - first) / (rate * ros.NANOSECONDS))
@@ -132,13 +135,6 @@ class PlayerNode(Node):
             sent(message)
             data = message.data if offset is None else message.restamped(message.stamp + offset)
             self._outputs[message.topic].publish(data)
-
-    def _start_clock(self, time: int) -> None:
-        """Give the time [ns] to whoever waits for /clock, before the first message needs it."""
-        self._clock_out = self._clock_out or self.create_publisher(Clock, "/clock", ros.RESULT)
-        self.wait_for(lambda: self._clock_out.get_subscription_count() > 0, 2.0)
-        self._clock_out.publish(Clock(clock=ros.stamp_message(time)))
-        self.spin_until(monotonic() + 0.2)
 
     def listen(self, sides: Iterable[str], log: ReplayLog, *, detector: bool = False) -> None:
         """Hand results to a log, with the time of their arrival; with those of the key point detector, if it runs."""

@@ -138,7 +138,10 @@ def play_to_nodes(
         images = recording.images if from_images else None
         if images is not None and not images.info:
             raise RecordingError(f"{recording.name}: replay needs a bag with camera_info; evaluate does without")
-        messages = Playback(recording.source, _results_of(sides) | _unplayed(sides, from_images), images)
+        # a recording of a live run holds what the nodes write, too
+        written = {f"/{side}/{name}" for side in sides for name in RESULTS}
+        written |= {"/grasp_wrench", "/manipulation_wrench", "/diagnostics", "/clock", "/rosout"}
+        messages = Playback(recording.source, written | _unplayed(sides, from_images), images)
         options = _graph_options(recording, setup, calibration_file, playing)
         processes = replay_processes(replace(options, images=from_images, composed=False), Path())
         processes = _for_scores(processes, recording, setup, keypoints)
@@ -202,12 +205,6 @@ def _for_scores(
     if any(each.executable == "keypoint_detector" for each in processes):
         more["keypoint_detector"] |= keypoints.node_parameters(recording)
     return [replace(each, parameters={**each.parameters, **more.get(each.executable, {})}) for each in processes]
-
-
-def _results_of(sides: Sequence[str]) -> set[str]:
-    """Return the topics that the nodes write; a recording of a live run holds them, too."""
-    own = {f"/{side}/{name}" for side in sides for name in RESULTS}
-    return own | {"/grasp_wrench", "/manipulation_wrench", "/diagnostics", "/clock", "/rosout"}
 
 
 def _graph_options(

@@ -86,10 +86,6 @@ class Friction:
         self._shear = np.zeros(self._count)
         self._before: tuple[NDArray, NDArray] | None = None
 
-    def set_coefficient(self, coefficient: float) -> None:
-        """Take another coefficient from now on."""
-        self.coefficient = coefficient
-
     def shift(self, change: float) -> None:
         """Count the object's x from another origin, `change` [m] more."""
         if self._before is not None:

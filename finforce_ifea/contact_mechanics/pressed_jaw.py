@@ -25,11 +25,6 @@ from finforce_ifea.jaw.section import FaceLine
 _HEIGHTS = (0.25, 0.5, 0.75)
 
 
-def measure_stiffness(model: JawModel, surface: ContactSurface) -> float:
-    """Return one over the mean of `measure_compliances` [N/m]."""
-    return float(1.0 / measure_compliances(model, surface).mean())
-
-
 def measure_compliances(model: JawModel, surface: ContactSurface) -> NDArray:
     """Return the compliances (3,) [m/N] against line loads along -x, one at a time.
 
@@ -98,9 +93,8 @@ class RigidContact:
         vanish in the object, and a soft one does not meet a wall.
         """
         self.model = model
-        self.surface = replace(
-            surface, stiffness=surface.stiffness * (measure_stiffness(model, surface) / _MEANT_STIFFNESS)
-        )
+        stiffness = float(1.0 / measure_compliances(model, surface).mean())
+        self.surface = replace(surface, stiffness=surface.stiffness * (stiffness / _MEANT_STIFFNESS))
         self.face, self.face_x = face, face.plane
         self.indenter: Indenter = RoundIndenter()
 

@@ -23,7 +23,7 @@ from finforce_ifea.fem.model import (
     sparse_from_banded,
 )
 from finforce_ifea.jaw.attachment import check_distances
-from finforce_ifea.jaw.drawing import Drawing, Rib
+from finforce_ifea.jaw.drawing import Drawing
 from finforce_ifea.jaw.jaw_file import Material
 from finforce_ifea.jaw.mesh import VolumeMesh
 
@@ -472,17 +472,15 @@ class _Sketch:
         heights = (drawing.clamped_z, top, 0.0, drawing.length)
         base, top, start, end = (np.array([band.centre_x(z), z]) for z in heights)
         joint, beams = _Joint(base, np.full(3, -1)), []
+        # so far from a junction a band does not bend; the foot of a rigid bar clamps it
+        share = 1.0 if drawing.bars == "rigid" else _OVERLAP * (drawing.joints == "stiff")
         for rib, upper, point in zip(drawing.ribs, joints, drawing.junctions[side], strict=True):
-            half = self._rigid_half(rib, side) * (end - start) / np.linalg.norm(end - start)
+            rigid = 0.5 * share * float(np.linalg.norm(np.ptp(drawing.rib_edges(rib)[:, side], axis=0)))
+            half = rigid * (end - start) / np.linalg.norm(end - start)
             beams.append(self._add_chain((joint, upper), (base, point - half), thickness, count))
             joint, base = upper, point + half
         beams.append(self._add_chain((joint, self._tip), (base, top), thickness, count))
         self.parts.append(_Part(np.stack([start, end]), thickness, np.concatenate(beams)))
-
-    def _rigid_half(self, rib: Rib, side: int) -> float:
-        """Return how far from a junction a band does not bend [m]; the foot of a rigid bar clamps it."""
-        share = 1.0 if self.drawing.bars == "rigid" else _OVERLAP * (self.drawing.joints == "stiff")
-        return 0.5 * share * float(np.linalg.norm(np.ptp(self.drawing.rib_edges(rib)[:, side], axis=0)))
 
     def _add_rib(self, number: int, joints: tuple[_Joint, _Joint]) -> None:
         """Add a rib from back to back of the bands, or the bar that stands for it."""

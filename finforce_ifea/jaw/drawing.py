@@ -340,7 +340,7 @@ def _mesh_section(drawing: Drawing, density: MeshDensity) -> tuple[NDArray, NDAr
     step = density.between_ribs
     first = step + (drawing.clamped_z > 0.0)
     for rib in drawing.ribs:
-        count = _rib_rows(rib, density)
+        count = density.through_rib if rib.thickness > 0.0 else 0
         rows = slice(first, first + count + 1)
         if count > 0:
             section.bridge(outer[rows, -1], inner[rows, 0], density.along_rib)
@@ -349,11 +349,6 @@ def _mesh_section(drawing: Drawing, density: MeshDensity) -> tuple[NDArray, NDAr
         rows = slice(-density.tip - 1, None)
         section.bridge(outer[rows, -1], inner[rows, 0], density.tip)
     return section.points, section.quads
-
-
-def _rib_rows(rib: Rib, density: MeshDensity) -> int:
-    """Return how many elements lie through the thickness of a rib; none in a bar without thickness."""
-    return density.through_rib if rib.thickness > 0.0 else 0
 
 
 def _heights(drawing: Drawing, band: Band, density: MeshDensity) -> NDArray:

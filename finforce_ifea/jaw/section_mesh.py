@@ -77,7 +77,9 @@ def mesh_section(section: Section, share: float = 1.0) -> PlaneMesh:
     centres = points[triangles].mean(axis=1)
     areas = [layer.area for layer in section.layers] or [polygon]
     there = np.any([shapely.contains_xy(area, centres) for area in areas], axis=0)
-    triangles = triangles[there & (_measure_quality(points[triangles]) > _FLAT)]
+    corners = points[triangles]
+    longest = np.max([np.linalg.norm(corners[:, a] - corners[:, b], axis=1) for a, b in _EDGES], axis=0)
+    triangles = triangles[there & (np.abs(_measure_area(corners)) * 2.0 / longest**2 > _FLAT)]
     used, triangles = np.unique(triangles, return_inverse=True)
     return _add_middles(points[used], _turn(points[used], triangles.reshape(-1, 3)))
 
@@ -196,12 +198,6 @@ def _triangulate(points: NDArray, edges: NDArray, inside: NDArray) -> tuple[NDAr
         edges = np.concatenate([edges[~missing], halves])
     x, z = 1e3 * points[begin[0]]
     raise MeshError(f"the section cannot be divided near ({x:.3f}, {z:.3f}) mm: its outline folds onto itself there")
-
-
-def _measure_quality(corners: NDArray) -> NDArray:
-    """Return twice the area over the square of the longest edge (t,) [-] of triangles (t, 3, 2)."""
-    longest = np.max([np.linalg.norm(corners[:, a] - corners[:, b], axis=1) for a, b in _EDGES], axis=0)
-    return np.abs(_measure_area(corners)) * 2.0 / longest**2
 
 
 def _measure_area(corners: NDArray) -> NDArray:

@@ -292,7 +292,7 @@ class SlipHistory:
             stddev: of the depth [m].
             coefficient: of friction.
         """
-        self._friction.set_coefficient(max(coefficient, _LEAST_COEFFICIENT))
+        self._friction.coefficient = max(coefficient, _LEAST_COEFFICIENT)
         if self._x is None or abs(x[DEPTH] - self._x[DEPTH]) > _LEAP:
             self.reset()
             self._q, self._x = q.copy(), x.copy()

@@ -94,7 +94,8 @@ class WholeImageDetector:
         detections = {}
         for number, view in enumerate(views):
             pixels = _map_back(peaks.pixels[number], view, scale)
-            is_known = _contains(view.canvas, pixels)
+            places, box = pixels - (view.canvas.x, view.canvas.y), view.canvas
+            is_known = ((places >= -0.5) & (places <= (box.width - 0.5, box.height - 0.5))).all(axis=1)
             likelihood = np.where(is_known, peaks.likelihood[number], 0.0)
             stddev = np.where(is_known, peaks.stddev[number] / scale, np.inf)
             pixels = np.where(is_known[:, None], pixels, np.nan)
@@ -130,7 +131,9 @@ class WholeImageDetector:
             return [_CropView(sides=tuple(boxes), canvas=canvas, window=canvas)]
         rest = {side: whole if len(self._points) == 1 else _half(whole, side) for side in boxes}
         windows = [boxes[side] or rest[side] for side in boxes]
-        canvases = [whole] * len(windows) if self._is_frozen else _equalize(windows, whole)
+        largest = np.max([(window.width, window.height) for window in windows], axis=0)
+        equal = [_place((window.x, window.y), largest, whole) for window in windows]
+        canvases = [whole] * len(windows) if self._is_frozen else equal
         return [
             _CropView(
                 sides=(side,), canvas=canvas, window=window if self._is_frozen else canvas, is_mirrored=side == "right"
@@ -195,12 +198,6 @@ def _map_back(pixels: NDArray, view: _CropView, scale: float) -> NDArray:
     return pixels + (view.canvas.x, view.canvas.y)
 
 
-def _contains(box: Crop, pixels: NDArray) -> NDArray:
-    """Tell (n,) which pixels (n, 2) lie in a box; NaN does not."""
-    places = pixels - (box.x, box.y)
-    return ((places >= -0.5) & (places <= (box.width - 0.5, box.height - 0.5))).all(axis=1)
-
-
 def _half(whole: Crop, side: str) -> Crop:
     """Return the half of an image on the side of a jaw; the rows of the image run from the left to the right jaw."""
     width = whole.width // 2
@@ -212,12 +209,6 @@ def _join(boxes: Sequence[Crop], whole: Crop) -> Crop:
     low = np.min([(box.x, box.y) for box in boxes], axis=0)
     high = np.max([(box.x + box.width, box.y + box.height) for box in boxes], axis=0)
     return _fit_box(low, high, whole)
-
-
-def _equalize(boxes: Sequence[Crop], whole: Crop) -> list[Crop]:
-    """Return boxes of the same size around the given ones."""
-    size = np.max([(box.width, box.height) for box in boxes], axis=0)
-    return [_place((box.x, box.y), size, whole) for box in boxes]
 
 
 def _fit_box(low: NDArray, high: NDArray, whole: Crop) -> Crop:

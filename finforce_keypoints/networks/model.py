@@ -311,7 +311,11 @@ class KeypointModel:
         self.metadata: ModelMetadata = read_metadata(self.path.parent / METADATA_FILE)
         self._network = Network(self.path, threads)
         self._input = find_input(self._network.inputs)
-        self._scale, self._shift = self._build_normalization()
+        axes = (COLOURS, 1, 1) if self._input.channel_axis == 1 else (COLOURS,)
+        scale, shift = np.full(COLOURS, 1.0 / 255.0, np.float32), np.zeros(COLOURS, np.float32)
+        if self.metadata.normalize_images:
+            scale, shift = scale / _STD, -_MEAN / _STD
+        self._scale, self._shift = scale.reshape(axes), shift.reshape(axes)
         self._check_sizes()
         try:
             self._outputs = self._probe()
@@ -477,14 +481,6 @@ class KeypointModel:
         if padded == tuple(size):
             return batch
         return np.pad(batch, ((0, 0), (0, padded[0] - size[0]), (0, padded[1] - size[1]), (0, 0)), mode="reflect")
-
-    def _build_normalization(self) -> tuple[NDArray, NDArray]:
-        """Return factor and shift per colour, in the axes of the network's input."""
-        axes = (COLOURS, 1, 1) if self._input.channel_axis == 1 else (COLOURS,)
-        scale, shift = np.full(COLOURS, 1.0 / 255.0, np.float32), np.zeros(COLOURS, np.float32)
-        if self.metadata.normalize_images:
-            scale, shift = scale / _STD, -_MEAN / _STD
-        return scale.reshape(axes), shift.reshape(axes)
 
 
 def find_network(path: str | Path) -> Path:

@@ -101,19 +101,15 @@ class SideNetwork:
         self._coarse, self._fine = (open_session(self.path / name, 1) for name in (COARSE, FINE))
         self._helpers = Helpers(threads)
         for session, layout, name in ((self._coarse, COARSE_LAYOUT, COARSE), (self._fine, FINE_LAYOUT, FINE)):
-            self._check_layout(session, layout, name)
+            found = tuple(tuple(item.name for item in items) for items in (session.get_inputs(), session.get_outputs()))
+            if found != layout:
+                raise ModelError(
+                    f"{self.path / name}: a network of {', '.join(found[0])} to {', '.join(found[1])}; expected "
+                    f"{', '.join(layout[0])} to {', '.join(layout[1])}"
+                )
         self.height, self.width = self._read_size(self._coarse, COARSE)
         self._piece, _ = self._read_size(self._fine, FINE)
         self._factor = self._read_factor()
-
-    def _check_layout(self, session, layout: tuple[tuple[str, ...], ...], name: str) -> None:
-        """Refuse a file with other inputs or outputs."""
-        found = tuple(tuple(item.name for item in items) for items in (session.get_inputs(), session.get_outputs()))
-        if found != layout:
-            raise ModelError(
-                f"{self.path / name}: a network of {', '.join(found[0])} to {', '.join(found[1])}; expected "
-                f"{', '.join(layout[0])} to {', '.join(layout[1])}"
-            )
 
     def _read_size(self, session, name: str) -> tuple[int, int]:
         """Return height and width of a part's pictures (batch, height, width, 3)."""

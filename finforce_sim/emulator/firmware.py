@@ -192,17 +192,14 @@ class EmulatedGripper:
         if self.mode is Mode.GRIPPER:
             self._control.step(self.jaws, self.endpoints, self._position, self.calibrated and self.configured)
         elif self.mode is Mode.CALIBRATE:
-            self._calibrate()
+            self._calibrating += 1
+            finished = next(self._stops, True)
+            if finished or self._calibrating >= self._firmware.calibration_timeout:
+                self.calibrated = bool(finished)
+                self.mode = Mode.IDLE
+                self._restart_calibration()
         else:
             self.jaws.rest()
-
-    def _calibrate(self) -> None:
-        self._calibrating += 1
-        finished = next(self._stops, True)
-        if finished or self._calibrating >= self._firmware.calibration_timeout:
-            self.calibrated = bool(finished)
-            self.mode = Mode.IDLE
-            self._restart_calibration()
 
     def _restart_calibration(self) -> None:
         self._stops = find_stops(self._firmware, self.jaws, self.endpoints)

@@ -69,7 +69,11 @@ class PtyPort:
         self._stop.set()
         self._thread.join()
         self._thread = None
-        self._drop_port()
+        if self._link is not None and self._link.is_symlink() and os.readlink(self._link) == self._name:
+            self._link.unlink()
+        os.close(self._master)
+        os.close(self._slave)
+        self._name = ""
 
     def __enter__(self) -> PtyPort:
         self.open()
@@ -91,13 +95,6 @@ class PtyPort:
             temporary.unlink(missing_ok=True)
             temporary.symlink_to(self._name)
             temporary.replace(self._link)
-
-    def _drop_port(self) -> None:
-        if self._link is not None and self._link.is_symlink() and os.readlink(self._link) == self._name:
-            self._link.unlink()
-        os.close(self._master)
-        os.close(self._slave)
-        self._name = ""
 
     def _serve(self) -> None:
         last = monotonic()

@@ -118,14 +118,7 @@ def run(options: argparse.Namespace) -> CommandResult:
     broken = {summary["name"]: list_broken(summary, trials[summary["name"]]) for summary in summaries}
     print("\n".join(line for lines in broken.values() for line in lines))
     content = {"plan": asdict(plan), "tables": {"families": format_summaries(summaries)}}
-    content["families"] = collect_figures(summaries, trials)
-    status = int(any(broken[family.name] for family in families if family.ruled))
-    return CommandResult(content, status=status)
-
-
-def collect_figures(summaries: Sequence[Mapping[str, Any]], trials: Mapping[str, Sequence[Trial]]) -> dict[str, Any]:
-    """Return families, their levels and worst trials as JSON has them."""
-    return {
+    content["families"] = {
         summary["name"]: {
             **summary,
             "levels": summarise_levels(trials[summary["name"]]),
@@ -133,3 +126,5 @@ def collect_figures(summaries: Sequence[Mapping[str, Any]], trials: Mapping[str,
         }
         for summary in summaries
     }
+    status = int(any(broken[family.name] for family in families if family.ruled))
+    return CommandResult(content, status=status)

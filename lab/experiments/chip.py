@@ -98,15 +98,12 @@ def find(options: RunOptions, figures: Mapping[str, Mapping[str, Any]], folder: 
         row["images without force"] = int(grasps.untold.map(len).sum())
         rows.append(row | {"violations": int(grasps.violations.sum())})
     notes = [f"Broken: a true force of {BREAKS:g} N was reached; wanted: {BEARS:g} N."]
-    notes += [_tell_end(name, row) for name, row in figures.items() if row["error"]]
+    for name, row in figures.items():
+        if row["error"]:
+            last = f" ({row['untold'][-1][1]})" if row["untold"] else ""
+            notes.append(f"{name} ended early: {row['error']}{last}.")
     drawn = {"True force over time; the line is where it breaks": "chips.png"}
     return Figures(tables={"Grasps": pd.DataFrame(rows)}, notes=notes, drawn=drawn)
-
-
-def _tell_end(name: str, row: Mapping[str, Any]) -> str:
-    """Return why a grasp ended early, and what the jaws said of the last image that had no force."""
-    last = f" ({row['untold'][-1][1]})" if row["untold"] else ""
-    return f"{name} ended early: {row['error']}{last}."
 
 
 def _lay(seed: int | None) -> PressedGrasp:

@@ -123,16 +123,12 @@ class RunOptions:
         if is_own:
             bag = Path(settings["bag"])
         else:
-            bag, source = find_scene(build_scene(settings), folder / RECORDINGS), source or "images"
+            about = {name: settings[name] for name in ("changes", "seed", "size")}
+            scene = TwinScene(scenario=settings["scene"], **about)
+            bag, source = find_scene(scene, folder / RECORDINGS), source or "images"
         yield KeypointSource(source=source, jaw_file=settings["jaw"]).apply(read_recording(bag))
         if not is_own:
             rmtree(bag, ignore_errors=True)
-
-
-def build_scene(settings: Mapping[str, Any]) -> TwinScene:
-    """Return the scene of the twin that a case's settings name."""
-    about = {name: settings[name] for name in ("changes", "seed", "size")}
-    return TwinScene(scenario=settings["scene"], **about)
 
 
 def list_missing(recording: Recording, needed: Sequence[str]) -> list[str]:

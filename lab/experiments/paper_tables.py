@@ -13,7 +13,7 @@ import pandas as pd
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluate import evaluate_all
 from finforce_eval.evaluation.contact_source import ContactChoice
-from finforce_eval.evaluation.scoring import ONSET_FORCE, Evaluation
+from finforce_eval.evaluation.scoring import ONSET_FORCE
 from finforce_eval.evaluation.setup import EvaluationSetup
 from finforce_eval.recordings.tracks import Recording
 from finforce_eval.table import AXES
@@ -90,23 +90,19 @@ def score_contact(recording: Recording, setup: EvaluationSetup) -> dict[str, Any
     except RecordingError as error:
         return {"rmse_N": float("nan"), "solved_pct": 0.0, "reason": str(error)}
     score = evaluation.total
+    # of the scored images with a true force
+    loaded = [
+        (result.scored & (result.true_magnitude > ONSET_FORCE), result.solved) for result in evaluation.results.values()
+    ]
+    answered = sum(int((rows & solved).sum()) for rows, solved in loaded)
     return {
         "rmse_N": score.all.rmse_N,
         "nrmsd_pct": score.cycles["all"]["nrmsd_pct"]["mean"],
         "bias_N": score.all.bias_N,
         "within_3_sigma_pct": score.all.within_3_sigma_pct,
         "sharpness": axis_sharpness(evaluation),
-        "solved_pct": _share_solved(evaluation),
+        "solved_pct": 100.0 * answered / max(sum(int(rows.sum()) for rows, _ in loaded), 1),
     }
-
-
-def _share_solved(evaluation: Evaluation) -> float:
-    """Return the share of the scored images with a true force that was answered [%]."""
-    loaded = [
-        (result.scored & (result.true_magnitude > ONSET_FORCE), result.solved) for result in evaluation.results.values()
-    ]
-    answered = sum(int((rows & solved).sum()) for rows, solved in loaded)
-    return 100.0 * answered / max(sum(int(rows.sum()) for rows, _ in loaded), 1)
 
 
 def find_places(options: RunOptions, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Figures:

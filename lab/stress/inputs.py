@@ -322,7 +322,9 @@ def _contact_of(kind: str, session: Session) -> Contact | None:
         case "wrong fixed":
             return replace(Contact.fixed(session.bench.jaw, away), free=False)
         case "regions":
-            return _region(session, 3e-3)
+            points = np.repeat(session.contact.points, 3, axis=0)
+            points[:, 2] += 3e-3 * np.array([-1.0, 0.0, 1.0])
+            return Contact(points=points, weights=np.array([0.25, 0.5, 0.25]))
         case "outline":
             error = OUTLINE_STDDEV * random.normal(size=3)
             return _round(session, height + error[1], radius, error[2])
@@ -330,13 +332,6 @@ def _contact_of(kind: str, session: Session) -> Contact | None:
             return _round(session, height, radius * random.uniform(1.5, 3.0), 0.0)
         case _:
             return _round(session, away, radius, 0.0)
-
-
-def _region(session: Session, half: float) -> Contact:
-    """Return a contact of three heights about the right one, `half` [m] apart, with weights."""
-    points = np.repeat(session.contact.points, 3, axis=0)
-    points[:, 2] += half * np.array([-1.0, 0.0, 1.0])
-    return Contact(points=points, weights=np.array([0.25, 0.5, 0.25]))
 
 
 def _round(session: Session, height: float, radius: float, tilt: float) -> Contact:

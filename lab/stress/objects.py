@@ -49,7 +49,8 @@ def press_scene(bench: Bench, scene: HardScene) -> list[PressedImage]:
     Raises:
         ContactError: The jaw has no equilibrium with the object.
     """
-    R, jaw, surface = rotation_of(scene.tilt), bench.jaw, bench.mechanics.contact.surface
+    c, s = np.cos(scene.tilt), np.sin(scene.tilt)
+    R, jaw, surface = np.array([[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]]), bench.jaw, bench.mechanics.contact.surface
     height = bench.find_height(scene.height)
     polygons = cut_outline(scene.mesh, R, float(surface.high[0]), scene.across)
     try:
@@ -80,12 +81,6 @@ def _frame_of(bench: Bench, T: NDArray, press: PressState | None) -> PressedImag
     model = bench.mechanics.model
     points = model.positions(model.attach(bench.jaw.keypoints, 1.0), press.q)
     return PressedImage(T=T, points=points, force=press.force, torque=press.torque)
-
-
-def rotation_of(tilt: float) -> NDArray:
-    """Return the turn (3, 3) by a tilt [rad] from x to z."""
-    c, s = np.cos(tilt), np.sin(tilt)
-    return np.array([[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]])
 
 
 class _Chain:
@@ -205,17 +200,12 @@ def leave_open(mesh: ObjectMesh) -> ObjectMesh:
     return ObjectMesh(vertices=mesh.vertices, triangles=kept, watertight=False, name="open prism")
 
 
-def in_single_precision(mesh: ObjectMesh) -> ObjectMesh:
-    """Return a mesh with vertices in single precision."""
-    return replace(mesh, vertices=mesh.vertices.astype(np.float32))
-
-
 def build_scenes() -> tuple[HardScene, ...]:
     """Return the scenes."""
     rod, bar = build_prism(circle(0.0125)), build_prism(rectangle(0.03, 0.03))
     return (
         HardScene(name="rod", mesh=rod),
-        HardScene(name="rod, single precision", mesh=in_single_precision(rod)),
+        HardScene(name="rod, single precision", mesh=replace(rod, vertices=rod.vertices.astype(np.float32))),
         HardScene(name="rod near the base", mesh=rod, height=0.018),
         HardScene(name="rod near the tip", mesh=rod, height=0.066),
         HardScene(name="rod grazing by 0.05 mm", mesh=rod, depth=5e-5),

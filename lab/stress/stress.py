@@ -305,10 +305,10 @@ def _find_broken(figures: Mapping[str, Any], least_sure: float, timed: bool) -> 
             yield f"{figures[name]} {words}"
 
 
-def format_summaries(summaries: Sequence[Mapping[str, Any]], first: str = "family") -> str:
+def format_summaries(summaries: Sequence[Mapping[str, Any]]) -> str:
     """Return a row for each summary, in Markdown."""
     rows = [
-        {first: summary["name"], **{title: factor * summary[key] for key, (title, factor) in PRINTED.items()}}
+        {"family": summary["name"], **{title: factor * summary[key] for key, (title, factor) in PRINTED.items()}}
         for summary in summaries
     ]
     return format_table(pd.DataFrame(rows))

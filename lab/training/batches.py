@@ -223,7 +223,7 @@ def _change_light(picture: NDArray, settings: AugmentSettings, rng: np.random.Ge
     if is_dim or rng.random() < settings.noise:
         light = _add_noise(light, rng)
     if rng.random() < settings.sharpen:
-        light = _sharpen(light, rng)
+        light = light + np.float32(rng.uniform(0.2, 0.8)) * (light - import_cv2().GaussianBlur(light, (0, 0), 1.5))
     image = np.clip(light + 0.5, 0.0, 255.0).astype(np.uint8)
     return _compress(image, rng) if rng.random() < settings.jpeg else image
 
@@ -324,11 +324,6 @@ def _blur(light: NDArray, rng: np.random.Generator) -> NDArray:
     rows, columns = (np.round(size // 2 + steps * part).astype(int) for part in (np.sin(angle), np.cos(angle)))
     np.add.at(kernel, (rows, columns), 1.0)
     return cv2.filter2D(light, -1, kernel / kernel.sum())
-
-
-def _sharpen(light: NDArray, rng: np.random.Generator) -> NDArray:
-    """Return the picture with a camera's unsharp mask."""
-    return light + np.float32(rng.uniform(0.2, 0.8)) * (light - import_cv2().GaussianBlur(light, (0, 0), 1.5))
 
 
 def _add_noise(light: NDArray, rng: np.random.Generator) -> NDArray:

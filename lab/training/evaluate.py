@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +34,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     with one_line_errors():
         pictures = load_pictures(options.dataset, VALIDATION)
         detections = detect(SideNetwork(options.network, threads=1), pictures)
-    scores = score_groups(detections, pictures)
+    level = pictures.middle.mean(axis=(1, 2, 3))
+    groups = {"all": np.ones(len(pictures), dtype=bool)}
+    groups |= {name: (level >= low) & (level < high) for name, (low, high) in LIGHT_LEVELS.items()}
+    scores = {name: score_detections(detections.take(mask)) for name, mask in groups.items() if mask.any()}
     scores |= {f"likelihood from {limit:g}": score_detections(detections, limit) for limit in THRESHOLDS}
     print(format_scores(scores))
 
@@ -52,14 +55,6 @@ def detect(network: SideNetwork, pictures: FingerPictures) -> Detections:
         np.concatenate([getattr(places, name) for places in found]) for name in ("pixels", "likelihood", "stddev")
     )
     return gather_detections(pictures, *columns)
-
-
-def score_groups(detections: Detections, pictures: FingerPictures) -> dict[str, Score]:
-    """Return the scores of all pictures and of each level of light."""
-    level = pictures.middle.mean(axis=(1, 2, 3))
-    groups = {"all": np.ones(len(pictures), dtype=bool)}
-    groups |= {name: (level >= low) & (level < high) for name, (low, high) in LIGHT_LEVELS.items()}
-    return {name: score_detections(detections.take(mask)) for name, mask in groups.items() if mask.any()}
 
 
 def format_scores(scores: Mapping[str, Score]) -> str:
@@ -135,10 +130,6 @@ class Score:
     worst: float
     hidden_accepted: float
     visible_lost: float
-
-    def as_row(self) -> dict[str, float]:
-        """Return the numbers, rounded for a log."""
-        return {name: round(float(value), 5) for name, value in asdict(self).items()}
 
 
 def score_detections(detections: Detections, threshold: float = THRESHOLD) -> Score:

@@ -228,16 +228,11 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--sides", nargs="+", choices=SIDES, default=SIDES, help="labelled jaws (both)")
     parser.add_argument("--map", nargs="*", default=[], help="BODYPART=NAME for body parts with names of their own")
     parser.add_argument("--dataset", type=Path, help="shards of training.scenes, mixed in against forgetting")
-    add_refinement(parser)
-    return parser
-
-
-def add_refinement(parser: argparse.ArgumentParser) -> None:
-    """Add how long and how fast the network learns."""
     parser.add_argument("--minutes", type=float, default=MINUTES, help=f"time for training ({MINUTES:g})")
     parser.add_argument("--rate", type=float, default=RATE, help=f"largest learning rate ({RATE:g})")
     parser.add_argument("--threads", type=int, default=1, help="threads of the network's arithmetic (1)")
     parser.add_argument("--seed", type=int, default=0, help="of order and augmentation (0)")
+    return parser
 
 
 def run(options: argparse.Namespace) -> None:

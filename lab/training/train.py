@@ -84,9 +84,10 @@ def compute_losses(network: FingerNetwork, batch: Batch, *, low: bool) -> Losses
         coarse = (weight * away).sum() / weight.sum().clamp(min=1.0)
         chosen = choose_points(batch)
         rest, places, visible = (_take(part, chosen) for part in (batch.rest, places, batch.visible))
-        found, judged = network.compare(
-            pictures, templates, rest, places + _draw_miss(rest), network.read(features, rest)
-        )
+        far = torch.rand(rest.shape[:2], device=rest.device) < FAR_SHARE
+        anywhere = FAR * (2.0 * torch.rand(rest.shape, device=rest.device) - 1.0)
+        missed = torch.where(far[..., None], anywhere, NEAR * torch.randn(rest.shape, device=rest.device))
+        found, judged = network.compare(pictures, templates, rest, places + missed, network.read(features, rest))
     shown = visible.float()
     count = shown.sum().clamp(min=1.0)
     logit, spread = judged[..., 0].float(), judged[..., 1].float().clamp(-LARGEST_SPREAD, LARGEST_SPREAD)
@@ -122,13 +123,6 @@ def choose_points(batch: Batch) -> torch.Tensor:
 def _take(values: torch.Tensor, chosen: torch.Tensor) -> torch.Tensor:
     """Return values (B, P, ...) of chosen points (B, k, ...)."""
     return values[torch.arange(len(values), device=values.device)[:, None], chosen]
-
-
-def _draw_miss(rest: torch.Tensor) -> torch.Tensor:
-    """Return by how much guesses (B, k, 2) are off [px]."""
-    far = torch.rand(rest.shape[:2], device=rest.device) < FAR_SHARE
-    anywhere = FAR * (2.0 * torch.rand(rest.shape, device=rest.device) - 1.0)
-    return torch.where(far[..., None], anywhere, NEAR * torch.randn(rest.shape, device=rest.device))
 
 
 CHECKPOINT, LOG = "checkpoint.pt", "log.jsonl"
@@ -271,7 +265,7 @@ class FingerTraining:
     def _report(self, shown: Mapping[str, float], score: Score, folder: Path) -> None:
         """Add a line to the log, write the checkpoint."""
         line: dict[str, float] = {"step": self.step, "minutes": round(self.elapsed / 60.0, 2)}
-        line |= {name: round(value, 5) for name, value in shown.items()} | score.as_row()
+        line |= {name: round(float(value), 5) for name, value in {**shown, **asdict(score)}.items()}
         with (folder / LOG).open("a", encoding="utf-8") as log:
             log.write(json.dumps(line) + "\n")
         tqdm.write(json.dumps(line))
