@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from functools import partial
 from time import perf_counter
 from typing import Any
@@ -276,12 +275,3 @@ def describe_slip(slip: Slip | None) -> str:
         return "unknown"
     speed = 1e3 * float(np.linalg.norm(slip.velocity))
     return f"{speed:.1f} ± {1e3 * slip.stddev:.1f} mm/s{', slides' if slip.sliding else ''}"
-
-
-def main(args: Sequence[str] | None = None) -> int:
-    """Run the node until Ctrl-C."""
-    return ros.run_node("contact_estimator", ContactEstimatorNode, args)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

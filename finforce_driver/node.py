@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-import sys
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from typing import Any
@@ -367,12 +366,3 @@ class GripperDriverNode(Node):
         while self.actions:
             self.actions.pop().destroy()
         super().destroy_node()
-
-
-def main(args: Sequence[str] | None = None) -> int:
-    """Run the node until Ctrl-C."""
-    return ros.run_node("gripper_driver", GripperDriverNode, args)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

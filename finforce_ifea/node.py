@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from threading import Timer
@@ -357,12 +356,3 @@ class IfeaSolverNode(ros.ImageNode):
         tared = {"tared": str(self.estimator.tared), "friction": friction}
         health = self.health[self.parameters.jaw_name]
         return health.report(alarms, describe_solution(self.last) | tared | self.skips.describe())
-
-
-def main(args: Sequence[str] | None = None) -> int:
-    """Run the node until Ctrl-C."""
-    return ros.run_node("ifea_solver", IfeaSolverNode, args)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

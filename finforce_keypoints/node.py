@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -19,7 +18,6 @@ from finforce.camera_topics import COMPRESSED_DEPTH
 from finforce.errors import FinforceError, ObservationError
 from finforce.health import IDLE, STILL, UNHEARD, Health, Idling, Outcome, Report, Skips, StampGate
 from finforce.messages import CameraStream, Stamped
-from finforce.processors import bind_caller
 from finforce.ros import node as ros
 from finforce.transforms import pose_numbers
 from finforce_keypoints.build import build_detector
@@ -296,18 +294,3 @@ class KeypointDetectorNode(ros.ImageNode):
         if monotonic() - self.rested > self.parameters.max_age:
             return report
         return report_of_rest(alarms, report.values)
-
-
-def main(args: Sequence[str] | None = None) -> int:
-    """Run the node until Ctrl-C."""
-
-    def build() -> KeypointDetectorNode:
-        node = KeypointDetectorNode()
-        bind_caller(node.parameters.threads)
-        return node
-
-    return ros.run_node("keypoint_detector", build, args)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from time import monotonic
 from typing import Any
@@ -202,13 +201,9 @@ def play_scene(node: TwinCameraNode, executor: Executor) -> None:
         executor.spin_once()
 
 
-def main(args: Sequence[str] | None = None) -> int:
+def main() -> int:
     """Run the node until the scene is over, or Ctrl-C."""
-    return ros.run_node("twin_camera", TwinCameraNode, args, play_scene)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    return ros.run_node("twin_camera", TwinCameraNode, play_scene)
 
 
 @dataclass(frozen=True, kw_only=True)

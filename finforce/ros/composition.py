@@ -15,14 +15,8 @@ from rclpy.node import Node
 
 from finforce.processors import bind_caller
 from finforce.ros import node as ros
-from finforce.ros.start import NODES
+from finforce.ros.start import CLASSES, NODES
 
-CLASSES = {
-    "keypoint_detector": "KeypointDetectorNode",
-    "contact_estimator": "ContactEstimatorNode",
-    "ifea_solver": "IfeaSolverNode",
-    "gripper_driver": "GripperDriverNode",
-}
 APART = ("gripper_driver",)  # in a thread of its own: it waits for no image, and its topics are those between processes
 
 
@@ -97,7 +91,3 @@ def main(args: Sequence[str] | None = None) -> int:
         return build_nodes(parts)
 
     return ros.run_nodes("pipeline", build, args, lambda nodes, executor: spin(parts, nodes, executor))
-
-
-if __name__ == "__main__":
-    sys.exit(main())

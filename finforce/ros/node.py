@@ -302,11 +302,9 @@ class TolerantExecutor(SingleThreadedExecutor):
             return None
 
 
-def run_node(
-    name: str, build: Callable[[], Node], args: Sequence[str] | None = None, work: Callable[..., None] = rclpy.spin
-) -> int:
+def run_node(name: str, build: Callable[[], Node], work: Callable[..., None] = rclpy.spin) -> int:
     """Build a node and let it work until it is done, Ctrl-C or SIGTERM; return 0, or 2 on our errors."""
-    return run_nodes(name, lambda: [build()], args, lambda nodes, executor: work(*nodes, executor))
+    return run_nodes(name, lambda: [build()], None, lambda nodes, executor: work(*nodes, executor))
 
 
 def spin(nodes: Sequence[Node], executor: Executor) -> None:

@@ -7,6 +7,9 @@ import signal
 import sys
 from importlib import import_module
 from pathlib import Path
+from typing import Any
+
+from finforce.processors import bind_caller
 
 NODES = {
     "ifea_solver": "finforce_ifea.node",
@@ -17,6 +20,12 @@ NODES = {
     "emulated_gripper": "finforce_sim.emulator.__main__",
     "recording_player": "finforce_eval.replay.node",
     "twin_camera": "finforce_sim.node",
+}
+CLASSES = {  # of the nodes that may share a process
+    "keypoint_detector": "KeypointDetectorNode",
+    "contact_estimator": "ContactEstimatorNode",
+    "ifea_solver": "IfeaSolverNode",
+    "gripper_driver": "GripperDriverNode",
 }
 STOPS = (signal.SIGINT, signal.SIGTERM)
 
@@ -36,7 +45,16 @@ def start(name: str) -> int:
         return 2
     for number, handler in zip(STOPS, before, strict=True):
         signal.signal(number, handler)
-    return module.main()
+    if name not in CLASSES:
+        return module.main()
+    from finforce.ros.node import run_node
+
+    def build() -> Any:
+        node = getattr(module, CLASSES[name])()
+        bind_caller(getattr(node.parameters, "threads", 1))
+        return node
+
+    return run_node(name, build)
 
 
 def main() -> int:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
@@ -195,13 +194,9 @@ def play_recording(node: PlayerNode, _: Executor) -> None:
     node.spin_until(monotonic() + 0.5)
 
 
-def main(args: Sequence[str] | None = None) -> int:
+def main() -> int:
     """Play a recording with its own stamps and /clock."""
-    return ros.run_node("recording_player", PlayerNode, args, play_recording)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    return ros.run_node("recording_player", PlayerNode, play_recording)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,8 +6,8 @@ import sys
 import threading
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib import import_module
 from time import monotonic, time_ns
+from unittest import mock
 
 import numpy as np
 import rclpy
@@ -22,7 +22,7 @@ from std_msgs.msg import Header
 from finforce.errors import ObservationError
 from finforce.ros import node as ros
 from finforce.ros.node import TolerantExecutor
-from finforce.ros.start import NODES
+from finforce.ros.start import start
 from finforce.ros.transport import free_domain
 from finforce_ifea.errors import UnderLoadError
 from finforce_ifea.jaw.jaw import load_jaw
@@ -200,8 +200,8 @@ def run_node(command):
 
 def run_here(name, *parameters):
     """The exit status of a node of this very process that ends by itself."""
-    module = import_module(NODES[name])
-    return module.main(command_of(name, *parameters)[4:])
+    with mock.patch.object(sys, "argv", command_of(name, *parameters)[3:]):
+        return start(name)
 
 
 def stop_when_ready(command, number):
