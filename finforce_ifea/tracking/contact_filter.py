@@ -350,7 +350,7 @@ def update_state(points, average, extended, forecast, expectation, state):
         state.moved[i] = state.x_asked[i] - forecast.x[i]
     state.residual = _move_residuals(points, extended, state.moved, state.x_asked[0] - depth)
     covariance[2, 2] += height_doubt
-    state.misfit = _measure_misfit(points, extended)
+    state.misfit, state.scatter = _measure_misfit(points, extended)
     state.speed = forecast.speed + gain_speed * innovation
     # what chance leaves of the innovation may be a motion that was not expected; the gain has followed a part of it
     beyond = max(0.0, innovation**2 - 1.0 / information - max(forecast.spread[0, 0], 0.0))
@@ -438,7 +438,7 @@ def _extend_average(average, points, deeper, memory, extended):
         for a in range(2):
             left = point.r[a] - point.modes[a, 0] * deeper
             new.residual[a] = old.residual[a] + share * (left - old.residual[a])
-            for i in range(3):
+            for i in range(4):
                 new.modes[a, i] = old.modes[a, i] + share * (point.modes[a, i] - old.modes[a, i])
 
 
@@ -448,12 +448,79 @@ _PRIOR_REACH = 4.0
 _DEPTH_SHARE = 1e-3
 
 
+# Of what a detector states, as shares: what points of one sight err by together, and each for itself.
+_ALIKE, _ALONE = 0.125, 0.05
+# Distance along a side of the finger over which such errors stay alike [m]: a network sees its points in patches of
+# such a size, which overlap.
+_PATCH = 15e-3
+
+
+def link_neighbours(points, rest):
+    """Say which key points err alike in one sight: each and the nearest below it that is no other's next.
+
+    Args:
+        points: (K,), see `KEYPOINT`.
+        rest: of the undeformed jaw (K, 3) [m].
+    """
+    points["likeness"], points["above"] = 0.0, 0
+    for k in np.argsort(rest[:, 2]):
+        free = (points["above"] == 0) & (rest[:, 2] < rest[k, 2])
+        distances = np.where(free, np.linalg.norm(rest - rest[k], axis=1), np.inf)
+        below = int(np.argmin(distances))
+        if distances[below] < _PATCH:
+            points["likeness"][k], points["above"][below] = np.exp(-distances[below] / _PATCH), k + 1
+
+
 @njit(**_OPTIONS)
-def _find_averaged_spread(point, count):
-    """Return the entries 00, 11 and 01 of the covariance of a key point's averaged residual [m^2]."""
-    share = 1.0 / max(count, 1.0)
-    noise = point.noise
-    return noise[0, 0] * share + point.bias, noise[1, 1] * share + point.bias, noise[0, 1] * share
+def _whiten_averages(points, average):
+    """Return averaged residuals and their derivatives (K, 2, 5) as if all erred independently, by one; zero where none.
+
+    What a point errs by in one sight, s u with s^2 its variance, is like that of the point below,
+
+        u_k = c u_(k-1) + sqrt(1 - c^2) v,    v ~ N(0, 1) along x and z,
+
+    so that a Kalman filter from the base to the tip tells what the points below leave to be expected, and the
+    innovations are independent.
+
+    Args:
+        points: (K,), see `KEYPOINT`.
+        average: of their residuals (K,), see `AVERAGE`.
+    """
+    white = np.zeros((len(points), 2, 5))
+    row, known = np.empty((2, 5)), np.empty((2, 5))
+    for first in range(len(points)):
+        k = first if points[first].likeness == 0.0 else -1
+        known[:] = 0.0
+        p00, p11, p01 = 1.0, 1.0, 0.0
+        while k >= 0:
+            point, mean, out = points[k], average[k], white[k]
+            square = point.likeness**2
+            known *= point.likeness
+            p00, p11, p01 = square * p00 + 1.0 - square, square * p11 + 1.0 - square, square * p01
+            k = point.above - 1
+            if mean.count <= 0.5:
+                continue
+            noise, share, s = point.noise, 1.0 / max(mean.count, 1.0), np.sqrt(_ALIKE * point.sight)
+            own = point.bias - (1.0 - _ALONE) * point.sight
+            s00, s11 = noise[0, 0] * share + own + s * s * p00, noise[1, 1] * share + own + s * s * p11
+            s01 = noise[0, 1] * share + s * s * p01
+            for axis in range(2):
+                row[axis, 0], row[axis, 1:] = mean.residual[axis], mean.modes[axis]
+            row -= s * known
+            scale, mixed = np.sqrt(s00), s01 / np.sqrt(s00)
+            out[0] = row[0] / scale
+            out[1] = (row[1] - mixed * out[0]) / np.sqrt(s11 - mixed * mixed)
+            gain = s / (s00 * s11 - s01 * s01)
+            g00, g01 = gain * (p00 * s11 - p01 * s01), gain * (p01 * s00 - p00 * s01)
+            g10, g11 = gain * (p01 * s11 - p11 * s01), gain * (p11 * s00 - p01 * s01)
+            known[0] += g00 * row[0] + g01 * row[1]
+            known[1] += g10 * row[0] + g11 * row[1]
+            p00, p11, p01 = (
+                p00 - s * (g00 * p00 + g01 * p01),
+                p11 - s * (g10 * p01 + g11 * p11),
+                p01 - s * (g00 * p01 + g01 * p11),
+            )
+    return white
 
 
 @njit(**_OPTIONS)
@@ -464,22 +531,13 @@ def sum_averages(points, average):
         points: (K,), see `KEYPOINT`.
         average: of their residuals (K,), see `AVERAGE`.
     """
-    normal, right, row = np.zeros((4, 4)), np.zeros(4), np.empty((2, 4))
-    for k in range(len(points)):
-        mean = average[k]
-        if mean.count <= 0.5:
-            continue
-        s00, s11, s01 = _find_averaged_spread(points[k], mean.count)
-        det = s00 * s11 - s01 * s01
-        for axis in range(2):
-            row[axis, :3] = mean.modes[axis]
-            row[axis, 3] = points[k].modes[axis, 3]
-        for i in range(4):
-            a = (s11 * row[0, i] - s01 * row[1, i]) / det
-            b = (s00 * row[1, i] - s01 * row[0, i]) / det
-            right[i] += a * mean.residual[0] + b * mean.residual[1]
-            for j in range(4):
-                normal[i, j] += a * row[0, j] + b * row[1, j]
+    normal, right = np.zeros((4, 4)), np.zeros(4)
+    for rows in _whiten_averages(points, average):
+        for row in rows:
+            for i in range(4):
+                right[i] += row[i + 1] * row[0]
+                for j in range(4):
+                    normal[i, j] += row[i + 1] * row[j + 1]
     return normal, right
 
 
@@ -609,16 +667,19 @@ def _move_residuals(points, average, moved, deeper):
 
 @njit(**_OPTIONS)
 def _measure_misfit(points, average):
-    """Return the root mean square of averaged residuals over their standard deviations."""
-    total, freedom = 0.0, -3.0
+    """Return the root mean square of averaged residuals over their standard deviations: as stated, and as whitened."""
+    total, freedom, white = 0.0, -3.0, 0.0
     for k in range(len(points)):
         if average[k].count <= 0.5:
             continue
-        s00, s11, s01 = _find_averaged_spread(points[k], average[k].count)
+        noise, bias, share = points[k].noise, points[k].bias, 1.0 / max(average[k].count, 1.0)
+        s00, s11, s01 = noise[0, 0] * share + bias, noise[1, 1] * share + bias, noise[0, 1] * share
         m0, m1 = average[k].residual[0], average[k].residual[1]
         total += (s11 * m0 * m0 - 2.0 * s01 * m0 * m1 + s00 * m1 * m1) / (s00 * s11 - s01 * s01)
         freedom += 2.0
-    return np.sqrt(total / max(freedom, 1.0))
+    for row in _whiten_averages(points, average)[:, :, 0].ravel():
+        white += row * row
+    return np.sqrt(total / max(freedom, 1.0)), np.sqrt(white / max(freedom, 1.0))
 
 
 @njit(**_OPTIONS)

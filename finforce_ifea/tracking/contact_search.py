@@ -93,7 +93,7 @@ class ContactSearch:
 
     def explain(self, change: float) -> None:
         """Take what a traction ratio [-] that was learnt from the averaged residuals explains of them out of them."""
-        self.average["residual"] -= change * self.points["modes"][:, :, 3]
+        self.average["residual"] -= change * self.average["modes"][:, :, 3]
 
     def find(
         self, contact: RigidContact, traction: Traction, probe: Any, dt: float, *, iterations: int, is_sudden: bool
@@ -217,7 +217,7 @@ def _is_settled(state, correction, x, moved, share, expectation):
 def _complete_state(state, moved, q, expectation):
     """Fill in the force after the last step, its uncertainty, and whether all numbers are finite."""
     state, expectation = state[()], expectation[()]
-    misfit, depth = max(1.0, state.misfit**2), state.depth
+    scale, depth = max(1.0, state.scatter**2), state.depth
     continued = max(0.0, depth / _LEAST_DEPTH) if depth < _LEAST_DEPTH else 1.0
     changed, total = 0.0, q.sum()
     for a in range(3):
@@ -230,8 +230,8 @@ def _complete_state(state, moved, q, expectation):
     state.height_stddev = np.sqrt(max(state.covariance[HEIGHT, HEIGHT], 0.0))
     for a in range(3):
         for i in range(3):
-            state.covariance[a, i] *= misfit
-    state.covariance[DEPTH, DEPTH] += state.depth_variance * misfit
+            state.covariance[a, i] *= scale
+    state.covariance[DEPTH, DEPTH] += state.depth_variance * scale
     state.magnitude = np.sqrt((state.force * state.force).sum())
     state.stddev = measure_along(state.force, state.force_modes, state.covariance)
     state.stiffening = 1.0

@@ -44,6 +44,7 @@ CONTACT_STATE = np.dtype(
         ("jumped", bool),  # whether the depth changed beyond what was expected
         ("residual", float),  # weighted root mean square [m]
         ("misfit", float),  # averaged residuals over their standard deviations, about 1 where the model fits
+        ("scatter", float),  # the same, by errors that neighbours share
         ("kkt", float),  # what is left of the objective's gradient, relative to its parts
         ("offset", float),  # contact location that the key points alone ask for, from the stated one [m]
         ("mistaken", float),  # probability that the stated location is wrong
@@ -81,6 +82,9 @@ KEYPOINT = np.dtype(
         ("width_variance", float),  # along y in such an image [m^2]
         ("trust", float),  # variance in the tare over that in this image
         ("offset_variance", float),  # of what is constant [m^2]
+        ("sight", float),  # part of it that the detector errs by in the sight of this shape [m^2]
+        ("likeness", float),  # correlation of that with the next point below; 0 where there is none
+        ("above", int),  # 1 + index of the point whose next one below this is; 0 where there is none
         ("r", float, 2),  # residual in the plane about the forecast, zero where unused [m]
         ("modes", float, (2, 4)),  # its derivatives by x and by the traction ratio
         ("weight", float),  # agreement times trust, 0 to 1
@@ -92,8 +96,8 @@ KEYPOINT = np.dtype(
 )
 
 # Residuals of a key point averaged over the last images. An image in which the finger was hardly pressed tells hardly
-# anything of shape and height: the derivatives are averaged alike.
-AVERAGE = np.dtype([("residual", float, 2), ("modes", float, (2, 3)), ("count", float)])
+# anything of shape, height and traction: the derivatives are averaged alike.
+AVERAGE = np.dtype([("residual", float, 2), ("modes", float, (2, 4)), ("count", float)])
 
 # Half of the friction cone is one standard deviation of an unseen traction ratio.
 UNSEEN_TRACTION = 0.5

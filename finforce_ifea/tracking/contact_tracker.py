@@ -19,6 +19,7 @@ from finforce_ifea.observation import Contact, Observation
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tare import PointNoise, Tare
 from finforce_ifea.tracking.common_motion import CommonMotion
+from finforce_ifea.tracking.contact_filter import link_neighbours
 from finforce_ifea.tracking.contact_search import LOADED_DEPTH, TOUCH_DEPTH, ContactSearch, find_x_model
 from finforce_ifea.tracking.contact_state import (
     MIDDLE_STDDEV,
@@ -107,6 +108,7 @@ class ContactTracker:
         self._fidelity = 0
         self._use(0)
         self._search = ContactSearch(len(keypoints), settings)
+        link_neighbours(self._search.points, keypoints)
         self._search.expectation["farthest"] = _FARTHEST_HEIGHT * settings.height_stddev
         self.response = measure_influence(self._contact, self._probe, len(keypoints))
         self._outline: OutlineIndenter | None = None
@@ -272,7 +274,7 @@ class ContactTracker:
         points["measured"], points["rest"] = measured, self._rest
         points["tare_noise"], points["gain"] = noise.plane, noise.gain
         points["width_variance"], points["trust"] = noise.width_variance, noise.trust
-        points["offset_variance"] = tare.offset_variance() + noise.bias
+        points["offset_variance"], points["sight"] = tare.offset_variance() + noise.bias, noise.bias
 
     def significance(self, tare: Tare, stddev: float) -> float:
         """Return by how many standard deviations a force explains the offsets of a tare; see `explain_offsets`."""

@@ -69,7 +69,7 @@ class HoldHypotheses:
             dt: time since the last image [s].
         """
         asked, spread = evidence
-        spread = spread * max(1.0, float(state["misfit"]) ** 2) + _RATIO_ERROR**2
+        spread = spread * max(1.0, float(state["scatter"]) ** 2) + _RATIO_ERROR**2
         seen = float(state["traction_ratio"]) + asked
         odds, fitted = 0.0, []
         for sign, each in zip((1.0, -1.0), expected, strict=True):
