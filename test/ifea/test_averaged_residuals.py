@@ -40,7 +40,7 @@ def solve(points, average):
             for b, j in enumerate(side):
                 path = REST[side[min(a, b) : max(a, b) + 1]]
                 way = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
-                alike = 0.125 * np.sqrt(points["sight"][i] * points["sight"][j]) * np.exp(-way / PATCH)
+                alike = 0.2 * np.sqrt(points["sight"][i] * points["sight"][j]) * np.exp(-way / PATCH)
                 covariance[i, :, j] += alike * np.eye(2)
     seen = average["count"] > 0.5
     C = covariance[seen][:, :, seen].reshape(2 * seen.sum(), -1)

@@ -15,12 +15,15 @@ MODES = np.random.default_rng(7).normal(0.0, [[[0.5, 5e-5, 0.3, 3e-3]]], (POINTS
 HELD, FIXED = Coefficient(0.4, 0.1), Coefficient(0.0, 0.08)
 
 
-def image(ratio, counted=0.0, noise=0.05e-3, deeper=0.0, count=30.0):
-    """Averaged key points of a true traction ratio, of which so much is counted already; the noise [m] of an image."""
+def image(ratio, counted=0.0, noise=0.05e-3, deeper=0.0, count=30.0, pressed=1.0):
+    """Averaged key points of a true traction ratio, of which so much is counted already; the noise [m] of an image.
+
+    On average over the images, the finger was pressed by a share of what it is now.
+    """
     points, average, state = np.zeros(POINTS, KEYPOINT), np.zeros(POINTS, AVERAGE), blank_contact_state()
     points["modes"], points["noise"], points["bias"] = MODES, noise**2 * np.eye(2), 0.02e-3**2
-    average["modes"], average["count"] = MODES[:, :, :3], count
-    average["residual"] = MODES[:, :, 3] * (ratio - counted) + MODES[:, :, 0] * deeper
+    average["modes"], average["count"] = pressed * MODES, count
+    average["residual"] = pressed * (MODES[:, :, 3] * (ratio - counted) + MODES[:, :, 0] * deeper)
     state["traction_ratio"] = counted
     return points, average, state
 
@@ -35,8 +38,9 @@ def weigh(images, hold=None):
 
 @pytest.mark.parametrize("counted", [0.0, 0.2, 0.4])
 @pytest.mark.parametrize("deeper", [0.0, 0.3e-3])
-def test_the_ratio_is_seen_whatever_is_counted_already_and_however_deep_the_object_is(counted, deeper):
-    points, average, _ = image(0.3, counted, deeper=deeper)
+@pytest.mark.parametrize("pressed", [1.0, 0.5])
+def test_the_ratio_is_seen_whatever_is_counted_already_and_however_deep_the_object_is(counted, deeper, pressed):
+    points, average, _ = image(0.3, counted, deeper=deeper, pressed=pressed)
     asked, variance, _ = measure_traction(points, average, PRIOR)
     assert counted + asked == pytest.approx(0.3, abs=0.01)
     assert 0.0 < variance < 0.1**2
