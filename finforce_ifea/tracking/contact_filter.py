@@ -448,9 +448,9 @@ _PRIOR_REACH = 4.0
 _DEPTH_SHARE = 1e-3
 
 
-# What errs anew in each shape, as shares of the variance that a detector states beyond the scatter of the tare: alike for
-# neighbours, and each point for itself. Measured on rendered images of four bent fingers, where the shipped networks err
-# by less than they state.
+# Errors that are others in each shape, as shares of the variance that a detector states beyond the scatter of the tare:
+# alike for neighbours, and each point for itself. Measured on rendered images of four bent fingers; the shipped networks
+# err by less than they state.
 _ALIKE, _ALONE = 0.2, 0.05
 # Distance along a side of the finger over which such errors stay alike [m]: a network sees its points in patches of
 # such a size, which overlap.

@@ -7,7 +7,8 @@ from finforce_ifea.tracking.contact_filter import link_neighbours, sum_averages
 from finforce_ifea.tracking.contact_state import AVERAGE, KEYPOINT
 
 # two sides of a finger that meet at the tip, out of order [m]
-REST = 1e-3 * np.array([[10, 0, 20], [10, 0, 12], [-9, 0, 13], [10, 0, 30], [-6, 0, 24], [-2, 0, 35], [8, 0, 44], [10, 0, 38.0]])
+HEIGHTS, WAYS = [20, 12, 13, 30, 24, 35, 44, 38], [10, 10, -9, 10, -6, -2, 8, 10]
+REST = 1e-3 * np.column_stack((WAYS, np.zeros(8), HEIGHTS))
 SIDES = [[1, 0, 3, 7, 6], [2, 4, 5]]  # from the base to the tip
 PATCH = 15e-3
 
