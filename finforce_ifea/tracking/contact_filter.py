@@ -449,8 +449,8 @@ _DEPTH_SHARE = 1e-3
 
 
 # Errors that are others in each shape, as shares of the variance that a detector states beyond the scatter of the tare:
-# alike for neighbours, and each point for itself. Measured on rendered images of four bent fingers; the shipped networks
-# err by less than they state.
+# alike for neighbours, and each point for itself. Measured on rendered images of four bent fingers: the shipped
+# networks err by less than they state.
 _ALIKE, _ALONE = 0.2, 0.05
 # Distance along a side of the finger over which such errors stay alike [m]: a network sees its points in patches of
 # such a size, which overlap.
