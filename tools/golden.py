@@ -3,7 +3,8 @@
     python -m tools.golden freeze FOLDER --recordings BAG... [--images BAG...] [--parts forces,stress,driver,interface]
     python -m tools.golden compare BEFORE AFTER
 
-Forces are kept image by image; stress, driver faults and the interface as figures and lists, without times.
+Forces are kept image by image; stress, driver faults and the interface as figures and lists. Times are left out, but
+for the latency of the chain, which `compare` shows and does not judge.
 """
 
 from __future__ import annotations
@@ -77,6 +78,12 @@ def freeze_driver(folder: Path) -> None:
         write_figures(folder / f"{name}.json", {"seed": 1, **tally.plain()})
 
 
+def freeze_chain(folder: Path, bags: list[str]) -> None:
+    """Keep the latency of every stage on the first recording with images."""
+    words = ("--from", "images", "--calibration", "twin", "--json", str(folder / "chain.json"))
+    run_tool("-m", "finforce_eval.cli.main", "trace", bags[0], *words)
+
+
 def freeze_interface(folder: Path) -> None:
     """Keep the commands with their options, and the topics, services and parameters of every node."""
     from finforce_eval.cli.main import COMMANDS
@@ -130,7 +137,7 @@ def compare(before: Path, after: Path) -> int:
             print(f"{path.name}: not made again")
             continue
         lines = compare_series(path, other) if path.suffix == ".npz" else compare_figures(path, other)
-        different += bool(lines)
+        different += bool(lines) and path.name != "chain.json"
         print(f"{path.name}: {'equal' if not lines else ''}", *lines, sep="\n    " if lines else "")
     return different
 
@@ -154,10 +161,11 @@ def compare_series(before: Path, after: Path) -> list[str]:
 
 
 def compare_figures(before: Path, after: Path) -> list[str]:
-    """Return a line for each figure of two JSON files that differs; times are left out."""
+    """Return a line for each figure of two JSON files that differs; times are left out, but for the chain's."""
+    keep: Callable[[str], bool] = lambda key: before.name == "chain.json" or not any(word in key for word in TIMES)  # noqa: E731
     old, new = (dict(_flat(json.loads(path.read_text()))) for path in (before, after))
     lines = []
-    for key in sorted(key for key in old.keys() | new.keys() if not any(word in key for word in TIMES)):
+    for key in sorted(filter(keep, old.keys() | new.keys())):
         one, two = old.get(key, "nothing"), new.get(key, "nothing")
         numbers = isinstance(one, int | float) and isinstance(two, int | float)
         if one != two and not (numbers and np.isclose(one, two, rtol=1e-6, equal_nan=True)):
@@ -187,7 +195,7 @@ def main() -> int:
     freeze.add_argument("folder", type=Path)
     freeze.add_argument("--recordings", nargs="*", default=[], help="with key points")
     freeze.add_argument("--images", nargs="*", default=[], help="with images, of the twin")
-    freeze.add_argument("--parts", default="forces,stress,driver,interface")
+    freeze.add_argument("--parts", default="forces,stress,driver,interface,chain")
     other = actions.add_parser("compare")
     other.add_argument("before", type=Path)
     other.add_argument("after", type=Path)
@@ -203,6 +211,7 @@ def main() -> int:
         "stress": lambda: freeze_stress(options.folder),
         "driver": lambda: freeze_driver(options.folder),
         "interface": lambda: freeze_interface(options.folder),
+        "chain": lambda: freeze_chain(options.folder, options.images),
     }
     for part in options.parts.split(","):
         parts[part]()
