@@ -933,6 +933,20 @@ def test_a_curved_inner_face_is_taken(tmp_path, capsys):
     assert np.ptp(faces[1].x[free]) > 1e-3
 
 
+def test_candidates_end_where_a_flat_inner_face_does(tmp_path):
+    """Above a notch in the inner face there is a nose, which is off the plane of the face."""
+    outline = shapely.Polygon([(0.0, 0.0), (16.0, 0.0), (16.0, 44.0), (11.0, 45.0), (12.0, 54.0), (0.0, 36.0)])
+    room = outline.buffer(-1.2, join_style="mitre").intersection(shapely.box(-50.0, 10.0, 50.0, 90.0))
+    for z in (18.0, 26.0, 34.0):
+        room = room.difference(shapely.box(-50.0, z, 50.0, z + 1.0))
+    loops = [ring.tolist() for ring in order_rings(outline.difference(room))]
+    (tmp_path / "notch.json").write_text(json.dumps({"unit": "mm", "width": 12, "loops": loops}))
+    make_jaw(tmp_path / "notch.json", tmp_path / "jaw.yaml", name="notch", overrides=Overrides())
+    jaw = load_jaw(tmp_path / "jaw.yaml")
+    assert shapely.distance(jaw.section.polygon.exterior, shapely.points(jaw.candidates[:, [0, 2]])).max() < 1e-4
+    assert 38e-3 < jaw.candidates[:, 2].max() < 44e-3
+
+
 def test_another_origin_is_another_number_alone(tmp_path, surface):
     """Key points keep their places on the finger wherever x = 0 is."""
     surface.export(tmp_path / "finger.stl")

@@ -18,7 +18,7 @@ from finforce_ifea.jaw.cad.picture import draw_finger, draw_refused
 from finforce_ifea.jaw.cad.recognition import Overrides, RecognizedFinger, count_cells, recognize
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_ifea.jaw.jaw_file import MATERIALS
-from finforce_ifea.jaw.section import cut_below, find_reach, order_rings
+from finforce_ifea.jaw.section import cut_below, find_face, find_reach, order_rings
 
 # Key points [m] above the clamp at least; candidates so far from either end of the inner face, and from each other.
 _ABOVE, _AWAY, _STEP = 1e-3, 4e-3, 4e-3
@@ -264,9 +264,10 @@ def _put_on_side(finger: RecognizedFinger, x: float, z: float) -> NDArray:
 
 
 def _find_face_end(finger: RecognizedFinger) -> float:
-    """Return the highest z [m] at which the outline is on the plane of the inner face."""
+    """Return the highest z [m] at which the outline is on the plane of the inner face, or near that of a curved one."""
     ring = np.array(finger.polygon.exterior.coords)
-    return float(ring[np.abs(ring[:, 0] - finger.face_x) < max(1e-4, 1.1 * finger.face_deviation), 1].max())
+    bent = 0.0 if find_face(finger, finger.face_x).is_flat else 1.1 * finger.face_deviation
+    return float(ring[np.abs(ring[:, 0] - finger.face_x) < max(1e-4, bent), 1].max())
 
 
 def _choose_reference(finger: RecognizedFinger) -> tuple[NDArray, str]:
