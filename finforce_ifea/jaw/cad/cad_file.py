@@ -18,7 +18,6 @@ from finforce_ifea.errors import JawFileError
 from finforce_ifea.jaw.cad.curves import read_dxf, read_svg
 from finforce_ifea.jaw.cad.layers import find_layers
 from finforce_ifea.jaw.cad.photo import PHOTOS, SCALE, Photo, read_photo
-from finforce_ifea.jaw.cad.recognition import count_cells
 from finforce_ifea.jaw.section import UNITS, Layer, SectionFile, check_loops, join_loops, read_section_file
 
 SURFACES = (".stl", ".obj", ".ply", ".off", ".3mf", ".glb")
@@ -137,7 +136,7 @@ def _take_section(content: SectionFile) -> RawSection:
 
 
 def _find_usual(layers: Sequence[Layer]) -> shapely.Polygon:
-    """Return the area of the layer in one piece with most cells, of several that of which most is solid.
+    """Return the area of the layer in one piece of which most is holes, as cells are; without holes, most solid.
 
     Raises:
         JawFileError: none is, or all together are not.
@@ -146,7 +145,11 @@ def _find_usual(layers: Sequence[Layer]) -> shapely.Polygon:
     if not whole:
         raise JawFileError("none of its layers is in one piece, expected one finger")
     _one_piece(shapely.union_all([layer.area for layer in layers]))
-    return max(whole, key=lambda layer: (count_cells(layer.area), (layer.high - layer.low) * layer.area.area)).area
+    holes = [
+        (layer.high - layer.low) * (shapely.Polygon(layer.area.exterior).area - layer.area.area) for layer in whole
+    ]
+    solid = [(layer.high - layer.low) * layer.area.area for layer in whole]
+    return whole[max(range(len(whole)), key=lambda number: (holes[number], solid[number]))].area
 
 
 def _choose_unit(extent: float, unit: str | None) -> tuple[float, str]:

@@ -20,8 +20,8 @@ _SAME = 2e-3
 _LOST = 0.02
 # Of the edge of what an outline leaves as it moves half is along the rest, of a wall the ends are, within so much [m].
 _ALONG, _AT = 0.4, 1e-6
-# Areas are compared on a grid of this size [m], which keeps them valid.
-_GRID = 1e-8
+# Areas are compared on a grid of this size [m], which keeps them valid; parts of less area [m^2] are left by that.
+_GRID, _SPECK = 1e-8, 1e-10
 # Steps closer to each other than this [m] are one.
 _STEP = 2e-5
 
@@ -131,7 +131,8 @@ def _share_lines(cut: shapely.Geometry, others: list[shapely.Geometry], apart: f
     if added.is_empty and gone.is_empty:
         return like
     more = shapely.union(like, added, grid_size=_GRID).buffer(0.0)  # without what has no area
-    return shapely.difference(more, gone, grid_size=_GRID).buffer(0.0)
+    parts = shapely.get_parts(shapely.difference(more, gone, grid_size=_GRID).buffer(0.0))
+    return shapely.union_all(parts[shapely.area(parts) > _SPECK])
 
 
 def _compare(one: shapely.Geometry, two: shapely.Geometry) -> shapely.Geometry:
