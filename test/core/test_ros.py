@@ -184,7 +184,7 @@ def test_what_a_node_was_built_of_is_not_looked_through_for_garbage_again():
     kept = [[] for _ in range(1000)]
     node = Quiet()
     node.known = kept
-    assert ros.run_node("some_node", lambda: node, [], lambda *_: frozen.append(gc.get_freeze_count())) == 0
+    assert ros.run_node("some_node", lambda: node, lambda *_: frozen.append(gc.get_freeze_count())) == 0
     assert frozen[0] >= before + len(kept)
 
 
@@ -193,7 +193,7 @@ def test_a_defect_is_not_swallowed():
         raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
-        ros.run_node("some_node", build, [])
+        ros.run_node("some_node", build)
     assert not rclpy.ok()
 
 
