@@ -13,6 +13,7 @@ import shapely.affinity
 import trimesh
 from mechanics_fakes import compute_volume
 from PIL import Image
+from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 from section_fakes import BASE, LENGTH, MILLIMETRE, TPU, WIDTH, draw_polygon, make_section
 
@@ -490,6 +491,8 @@ def test_slanted_ribs_that_end_on_base_and_notch_are_ribs(slope, step):
     heights = [rib.wall.line[:, 1].mean() for rib in finger.ribs]
     assert min(heights[:3]) == min(heights) and 40e-3 < max(heights[-5:]) == max(heights)
     assert all(rib.wall.usual == pytest.approx(0.4e-3, abs=2e-5) for rib in finger.ribs)
+    points = np.array(list(choose_keypoints(finger).values()))
+    assert pdist(points).min() > 0.6e-3 and len(points) > 1.5 * len(finger.ribs)
 
 
 def test_sides_that_are_alike_are_told_and_a_step_of_the_base_bends_no_face():
@@ -914,7 +917,8 @@ def test_of_few_key_points_those_between_are_taken_too(tmp_path, surface):
         ends = [points[end if end == "tip" else f"{band}_{end}"][2] for end in (below, above) if end != "clamp"]
         assert z == pytest.approx(np.mean([*ends, finger.clamped_z][:2]))
         assert finger.polygon.contains(shapely.Point(x, z))
-    many = replace(finger, ribs=finger.ribs * 2)
+    others = [replace(rib, inner=rib.inner + [0.0, 2.5e-3], outer=rib.outer + [0.0, 2.5e-3]) for rib in finger.ribs]
+    many = replace(finger, ribs=[*finger.ribs, *others])
     assert len(choose_keypoints(many)) == 17
 
 

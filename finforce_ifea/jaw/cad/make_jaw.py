@@ -221,20 +221,24 @@ def choose_keypoints(finger: RecognizedFinger) -> dict[str, NDArray]:
     """Return what a camera can see by name: (3,) [m], jaw frame.
 
     Key points are where the ribs meet the bands, on the side face towards the camera, inner band first, base to tip,
-    and the tip; what the clamp holds is left out, since it does not move, and ends of ribs on no band. Where these are
-    few, points of the bands half way between them come behind.
+    and the tip; what the clamp holds is left out, since it does not move, ends of ribs on no band, and all but one of
+    those that meet a band within its thickness, as the walls of a corner. Where these are few, points of the bands half
+    way between them come behind.
     """
-    places = {}
+    places: dict[str, tuple[float, float]] = {}
+    tips = shapely.get_parts(finger.polygon.intersection(shapely.box(-1.0, finger.length - _TIP, 1.0, 1.0)))
+    top = max(tips, key=lambda part: part.area).centroid
     for band in BANDS:
         wall = getattr(finger, band)
         line = shapely.LineString(wall.line)
         for number, rib in enumerate(finger.ribs, start=1):
             x, z = getattr(rib, band)
             is_there = line.distance(shapely.Point(x, z)) < wall.usual  # else it ends elsewhere, as on the base
-            if is_there and z > finger.clamp_height(x) + _ABOVE and not finger.find_clamped(np.array([[x, z]])).any():
+            others = [(top.x, top.y), *places.values()]
+            is_new = all(np.hypot(x - other, z - height) > wall.usual for other, height in others)
+            is_free = z > finger.clamp_height(x) + _ABOVE and not finger.find_clamped(np.array([[x, z]])).any()
+            if is_there and is_new and is_free:
                 places[f"{band}_{number}"] = (x, z)
-    tips = shapely.get_parts(finger.polygon.intersection(shapely.box(-1.0, finger.length - _TIP, 1.0, 1.0)))
-    top = max(tips, key=lambda part: part.area).centroid
     places["tip"] = (top.x, top.y)
     if len(places) < FEW:
         places |= _find_middles(finger, places)
