@@ -333,7 +333,8 @@ def update_state(points, average, extended, forecast, expectation, state):
     deeper = depth - forecast.x[0]
     _extend_average(average, points, deeper, LONGEST_AVERAGE, extended)
     offset = (forecast.x[1] - expectation.mean[0], forecast.x[2] - expectation.mean[1])
-    hessian, gradient = _compute_posterior(points, extended, offset, expectation.variance, information)
+    white = _whiten_averages(points, extended)
+    hessian, gradient = _compute_posterior(white, offset, expectation.variance, information)
     covariance = invert_symmetric(hessian)
     height_doubt = _question_height(hessian, gradient, offset[1], expectation.variance[1], state)
     shift = _find_shift(hessian, covariance, gradient, state)
@@ -350,7 +351,8 @@ def update_state(points, average, extended, forecast, expectation, state):
         state.moved[i] = state.x_asked[i] - forecast.x[i]
     state.residual = _move_residuals(points, extended, state.moved, state.x_asked[0] - depth)
     covariance[2, 2] += height_doubt
-    state.misfit, state.scatter = _measure_misfit(points, extended)
+    moved = np.array([state.x_asked[0] - depth, state.moved[1], state.moved[2]])
+    state.misfit, state.scatter = _measure_misfit(points, extended, white, moved)
     state.speed = forecast.speed + gain_speed * innovation
     # what chance leaves of the innovation may be a motion that was not expected; the gain has followed a part of it
     beyond = max(0.0, innovation**2 - 1.0 / information - max(forecast.spread[0, 0], 0.0))
@@ -533,8 +535,14 @@ def sum_averages(points, average):
         points: (K,), see `KEYPOINT`.
         average: of their residuals (K,), see `AVERAGE`.
     """
+    return _sum_whitened(_whiten_averages(points, average))
+
+
+@njit(**_OPTIONS)
+def _sum_whitened(white):
+    """Return the normal equations (4, 4), (4,) of whitened residuals and their derivatives (K, 2, 5)."""
     normal, right = np.zeros((4, 4)), np.zeros(4)
-    for rows in _whiten_averages(points, average):
+    for rows in white:
         for row in rows:
             for i in range(4):
                 right[i] += row[i + 1] * row[0]
@@ -544,9 +552,9 @@ def sum_averages(points, average):
 
 
 @njit(**_OPTIONS)
-def _compute_posterior(points, average, offset, prior_variance, information):
-    """Return Hessian and gradient of the log posterior of the state for averaged residuals."""
-    normal, right = sum_averages(points, average)
+def _compute_posterior(white, offset, prior_variance, information):
+    """Return Hessian and gradient of the log posterior of the state for whitened residuals (K, 2, 5)."""
+    normal, right = _sum_whitened(white)
     hessian, gradient = normal[:3, :3].copy(), right[:3].copy()
     for i in range(2):
         # far from its mean the prior lets go (Cauchy), for an object may touch first elsewhere than was stated
@@ -668,9 +676,16 @@ def _move_residuals(points, average, moved, deeper):
 
 
 @njit(**_OPTIONS)
-def _measure_misfit(points, average):
-    """Return the root mean square of averaged residuals over their standard deviations: as stated, and as whitened."""
-    total, freedom, white = 0.0, -3.0, 0.0
+def _measure_misfit(points, average, white, moved):
+    """Return the root mean square of averaged residuals over their standard deviations: as stated, and as whitened.
+
+    Args:
+        points: (K,), see `KEYPOINT`.
+        average: of their residuals (K,), see `AVERAGE`, at the new state.
+        white: the same before, whitened, with their derivatives (K, 2, 5).
+        moved: change of the state since (3,).
+    """
+    total, freedom, square = 0.0, -3.0, 0.0
     for k in range(len(points)):
         if average[k].count <= 0.5:
             continue
@@ -679,9 +694,11 @@ def _measure_misfit(points, average):
         m0, m1 = average[k].residual[0], average[k].residual[1]
         total += (s11 * m0 * m0 - 2.0 * s01 * m0 * m1 + s00 * m1 * m1) / (s00 * s11 - s01 * s01)
         freedom += 2.0
-    for row in _whiten_averages(points, average)[:, :, 0].ravel():
-        white += row * row
-    return np.sqrt(total / max(freedom, 1.0)), np.sqrt(white / max(freedom, 1.0))
+    for rows in white:
+        for row in rows:
+            left = row[0] - row[1] * moved[0] - row[2] * moved[1] - row[3] * moved[2]
+            square += left * left
+    return np.sqrt(total / max(freedom, 1.0)), np.sqrt(square / max(freedom, 1.0))
 
 
 @njit(**_OPTIONS)
