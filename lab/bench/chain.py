@@ -29,7 +29,6 @@ from finforce.gripper_frames import SIDES
 from finforce.health import IDLE
 from finforce.messages import NANOSECONDS
 from finforce.systems.processes import Process, ReplayOptions, compose, replay_processes
-from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.keypoint_source import TRUTH, KeypointSource
 from finforce_eval.evaluation.scoring import delay_stats, force_delays, match_truth, rms
 from finforce_eval.recordings.objects import require_mesh
@@ -40,7 +39,7 @@ from finforce_eval.replay.live import ReplayLog
 from finforce_eval.replay.node_run import OBJECT_TOPIC, NodeRun, describe_load, run_nodes
 from finforce_eval.replay.playback import Playback, RawMessage
 from lab.harness import Figures, percentiles
-from lab.scenes import GRASP, GRASP_FAST, find_scene
+from lab.scenes import GRASP, find_scene
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -70,60 +69,23 @@ class SyntheticStream:
         yield from self.messages
 
 
-def stream_images(source: Path, rate: int) -> SyntheticStream:
-    """Return what a camera sees at a rate [Hz], with the object's poses at 10 Hz.
-
-    Args:
-        source: the scene.
-        rate: of the images [Hz].
-
-    Raises:
-        RecordingError: the scene has no images at this rate.
-    """
-    topics = {COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC, OBJECT_TOPIC}
-    return thin_messages(Playback(source), topics, rate)
+def stream_images(source: Path) -> SyntheticStream:
+    """Return what the camera of a scene sees, with the object's poses."""
+    return choose_messages(Playback(source), {COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC, OBJECT_TOPIC})
 
 
-def stream_keypoints(source: Path, rate: int) -> SyntheticStream:
-    """Return the true key points and jaw poses of a scene at a rate [Hz], with the object's poses at 10 Hz.
-
-    Raises:
-        RecordingError: the scene has no images at this rate.
-    """
+def stream_keypoints(source: Path) -> SyntheticStream:
+    """Return the true key points and jaw poses of a scene, with the object's poses."""
     recording = KeypointSource(source=TRUTH).apply(read_recording(source))
     with TemporaryDirectory() as folder:
         plain = write_recording(replace(recording, images=None), Path(folder) / "truth")
         topics = {f"/{side}/{name}" for side in recording.jaws for name in ("keypoints", "jaw_pose")}
-        return thin_messages(Playback(plain), topics | {OBJECT_TOPIC}, rate)
+        return choose_messages(Playback(plain), topics | {OBJECT_TOPIC})
 
 
-def thin_messages(messages: Playback, topics: set[str], rate: int) -> SyntheticStream:
-    """Return the messages of some topics at a rate [Hz]."""
-    if FINE_RATE % rate:
-        raise RecordingError(f"rate {rate} Hz: expected a divisor of {FINE_RATE} Hz")
-    step = FINE_RATE // rate
-    kept = [
-        message
-        for message in messages
-        if message.topic in topics
-        and slot_of(message.stamp) % (POSE_SLOTS if message.topic == OBJECT_TOPIC else step) == 0
-    ]
-    images = {slot_of(message.stamp) // step for message in kept if message.topic != OBJECT_TOPIC}
-    if not images or len(images) <= max(images):
-        raise RecordingError(
-            f"the scene has {len(images)} images at {rate} Hz, some are missing; expected one for {rate} Hz"
-        )
-    return SyntheticStream(messages=kept)
-
-
-FINE_RATE = 180  # [Hz] of the slots in which images can lie; 30, 60 and 90 divide it
-POSE_SLOTS = 18  # the object is tracked at 10 Hz
-START = 1_000_000_000_000  # [ns] stamp of slot 0, as the twin has it
-
-
-def slot_of(stamp: int) -> int:
-    """Return in which slot of 1/180 s a stamp [ns] of a scene lies."""
-    return round((stamp - START) * FINE_RATE / 1_000_000_000)
+def choose_messages(messages: Playback, topics: set[str]) -> SyntheticStream:
+    """Return the messages of some topics."""
+    return SyntheticStream(messages=[message for message in messages if message.topic in topics])
 
 
 RATES = (30, 60, 90)  # [Hz]
@@ -156,11 +118,12 @@ def measure(quick: bool) -> Figures:
         MissingDependencyError: ROS 2 is not installed.
         FinforceError: the scene cannot be rendered, or a node ended early.
     """
-    scene = find_scene(GRASP if quick else GRASP_FAST)
-    recording = read_recording(scene)
-    truth, rows = true_grasp(recording), []
+    rows = []
     for rate in RATES[:1] if quick else RATES:
-        for source, stream in ((IMAGES, stream_images(scene, rate)), (KEYPOINTS, stream_keypoints(scene, rate))):
+        scene = find_scene(replace(GRASP, changes={**GRASP.changes, "rate": rate}))
+        recording = read_recording(scene)
+        truth = true_grasp(recording)
+        for source, stream in ((IMAGES, stream_images(scene)), (KEYPOINTS, stream_keypoints(scene))):
             more = (BUSY, SKIPPING) if source == IMAGES and rate == RATES[0] else ()
             for setup in (TOGETHER, APART, *more):
                 rows.append(describe_run(source, setup, rate, _run(source, setup, stream, recording), truth))

@@ -6,9 +6,9 @@ import pytest
 from finforce.messages import NANOSECONDS
 from finforce_eval.replay.live import ReplayLog
 from finforce_eval.replay.node_run import NodeRun
+from finforce_sim.footage import START
 from lab.bench.chain import (
     IMAGES,
-    START,
     TOGETHER,
     TrueGrasp,
     describe_run,

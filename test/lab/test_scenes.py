@@ -1,4 +1,4 @@
-"""Rendered scenes: states between those of a script, made once, and another one for another scene."""
+"""Rendered scenes: states between others, made once, and another one for another scene."""
 
 from dataclasses import replace
 
@@ -7,11 +7,10 @@ import pytest
 from rgbd_fakes import FakeGripper
 from scipy.spatial.transform import Rotation
 
-from finforce_sim.footage import START
+from finforce_sim.scenarios import write_script
 from lab import scenes
 from lab.bench import chain
-from lab.bench.chain import FINE_RATE, slot_of
-from lab.scenes import EVERY_RATE, GRASP, SmoothGripper, find_scene
+from lab.scenes import GRASP, find_scene
 
 
 def turned(state, angle):
@@ -37,27 +36,6 @@ def test_scene_without_an_object_has_none_in_between():
     assert before.blend(after, 0.5).T_gripper_object is None
 
 
-@pytest.mark.parametrize("rate", [30, 60, 90])
-def test_a_camera_of_every_rate_finds_all_of_its_images(rate):
-    gripper = SmoothGripper(FakeGripper(), EVERY_RATE)
-    course = [round(state.stamp * FINE_RATE) for state in gripper.states()]
-    slots = set(course)
-    assert course == sorted(slots) and len(course) == len(gripper)
-    assert set(range(0, max(slots) + 1, FINE_RATE // rate)) <= slots
-    assert 1 not in slots  # no camera of these rates sees it
-
-
-def test_states_of_the_script_are_not_changed():
-    plain, smooth = list(FakeGripper().states()), list(SmoothGripper(FakeGripper(), EVERY_RATE).states())
-    assert [state.stamp for state in smooth[::4]] == [state.stamp for state in plain]
-    np.testing.assert_array_equal(smooth[32].jaws["left"].force, plain[8].jaws["left"].force)
-
-
-def test_slots_are_those_of_the_stamps_that_a_scene_is_recorded_with():
-    assert chain.START == START
-    assert slot_of(START + round(1e9 * 7 / FINE_RATE)) == 7
-
-
 def test_a_scene_is_rendered_once(tmp_path, monkeypatch):
     made = []
     monkeypatch.setattr(scenes, "_render", lambda scene, path: (made.append(path), path.mkdir()))
@@ -79,11 +57,12 @@ def test_a_scene_that_cannot_be_finished_leaves_nothing(tmp_path, monkeypatch):
 
 
 def test_another_scene_or_rate_has_another_name():
-    others = [replace(GRASP, seed=3), replace(GRASP, slots=(0, 3)), replace(GRASP, changes={"settle": 0.1})]
+    others = [replace(GRASP, seed=3), replace(GRASP, changes={"rate": 60}), replace(GRASP, changes={"settle": 0.1})]
     assert len({scenes.fingerprint(scene) for scene in [GRASP, *others]}) == 4
     assert scenes.fingerprint(GRASP) == scenes.fingerprint(replace(GRASP))
 
 
-def test_every_scene_of_the_benchmarks_can_be_built():
-    for scene in (scenes.GRASP, scenes.GRASP_FAST):
-        assert scene.build().name == scene.scenario
+@pytest.mark.parametrize("rate", chain.RATES)
+def test_the_scene_of_the_chain_has_an_image_every_period_of_its_camera(rate):
+    scenario = replace(GRASP, changes={**GRASP.changes, "rate": rate}).build()
+    np.testing.assert_allclose(np.diff(write_script(scenario).stamps), 1.0 / rate, atol=1e-9)
