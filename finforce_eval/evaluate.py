@@ -16,7 +16,7 @@ from finforce_eval.evaluation.scoring import Evaluation, score_results, score_se
 from finforce_eval.evaluation.setup import EvaluationSetup, describe_options, print_notes, share_setup
 from finforce_eval.recordings.bags import list_files, name_recordings
 from finforce_eval.recordings.tracks import Recording
-from finforce_eval.table import read_table, write_table
+from finforce_eval.table import ForceSeries, read_table, write_table
 from finforce_eval.tasks import OK, EngineOptions, Manifest, Task, choose_shard, hash_settings, run_tasks
 
 
@@ -103,4 +103,12 @@ def evaluate_task(name: str, path: str, target: str, options: argparse.Namespace
     cases = {case: asdict(score) for case, score in score_results(results, [recording]).scores.items()}
     about = {"about": dict(setup.about), "path": path, "true_range_N": true_range(recording), "keypoint_names": names}
     write_table(Path(target), results, about | {"cases": cases})
-    return {"cases": cases, "notes": list(recording.notes), "version": setup.about["version"]}
+    notes = [*recording.notes, *(note_left_out(recording, result) for result in results if setup.as_live)]
+    return {"cases": cases, "notes": notes, "version": setup.about["version"]}
+
+
+def note_left_out(recording: Recording, result: ForceSeries) -> str:
+    """Return how many images of a jaw the live chain would have left out."""
+    track = recording.jaw(result.side)
+    images = len(track.keypoints.stamps if track.detection is None else recording.images)
+    return f"{result.side} jaw: {images - len(result)} of {images} images left out, as the live chain leaves them out"

@@ -25,6 +25,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("bags", nargs="+", metavar="BAG", help=BAG_HELP)
     add_run_options(parser)
     results = parser.add_argument_group("results")
+    text = "skip the images that the nodes skip: nothing moved, or the object is out of reach"
+    results.add_argument("--as-live", action="store_true", help=text)
     results.add_argument("--report", metavar="DIR", help="write a page with figures to this folder")
     text = "write a Parquet table of every recording (one row per image and jaw) and manifest.jsonl, with which "
     text += "a killed run resumes; finforce report shows the tables, finforce compare compares two folders"

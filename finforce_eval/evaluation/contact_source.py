@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from finforce.errors import PoseError
+from finforce.health import Idling
 from finforce.messages import SECOND
 from finforce_contact.loop import ContactLoop, ContactSource, GivenContact
 from finforce_eval.errors import OptionError, RecordingError
@@ -32,10 +33,14 @@ class RecordedContact(ContactLoop):
         estimator: a fresh ContactEstimator.
         track: the object's poses in the jaw frame.
         name: for reports.
+        idling: passes images over as the contact estimator's node does; None for none.
     """
 
-    def __init__(self, estimator: Any, track: ObjectTrack, name: str = "estimate") -> None:
+    def __init__(
+        self, estimator: Any, track: ObjectTrack, name: str = "estimate", idling: Idling | None = None
+    ) -> None:
         super().__init__(estimator)
+        self._idling = idling
         self.name, self._track, self._next = name, track, 0
 
     def contact_at(self, stamp: int) -> Contact | None:
@@ -47,7 +52,13 @@ class RecordedContact(ContactLoop):
         while self._next < len(self._track.stamps) and self._track.stamps[self._next] <= stamp + ROUNDING:
             self._take_recorded(self._next)
             self._next += 1
-        return super().contact_at(stamp)
+        if self._idling is None:
+            return super().contact_at(stamp)
+        if self._idling.passes(stamp):
+            return self.last.estimate.contact
+        contact = super().contact_at(stamp)
+        self._idling.note(stamp, self.is_idle)
+        return contact
 
     def _take_recorded(self, index: int) -> None:
         """Give one pose to the estimator."""
@@ -63,7 +74,9 @@ class RecordedContact(ContactLoop):
 LEAST_POSES = 3
 
 
-def build_source(choice: ContactChoice, recording: Recording, jaw: Jaw, mesh: str = "default") -> ContactSource:
+def build_source(
+    choice: ContactChoice, recording: Recording, jaw: Jaw, mesh: str = "default", *, as_live: bool = False
+) -> ContactSource:
     """Return a fresh contact source for one jaw of a recording.
 
     Args:
@@ -71,6 +84,7 @@ def build_source(choice: ContactChoice, recording: Recording, jaw: Jaw, mesh: st
         recording: it tells height, or mesh and poses.
         jaw: the jaw of that side, as calibrated.
         mesh: mesh density of the solver, whose surface the contact estimator gets.
+        as_live: whether images are passed over as by the contact estimator's node.
 
     Raises:
         FinforceError: height, mesh or poses are missing or cannot be used.
@@ -80,7 +94,8 @@ def build_source(choice: ContactChoice, recording: Recording, jaw: Jaw, mesh: st
         height = choice.height(recording)
         return GivenContact(Contact.fixed(jaw, height), f"fixed:{1e3 * height:g}")
     estimator = build_estimator(choice, mode, recording, jaw, mesh)
-    return RecordedContact(estimator, track_object(recording, jaw.side), mode)
+    track, idling = track_object(recording, jaw.side), Idling() if as_live else None
+    return RecordedContact(estimator, track, mode, idling)
 
 
 def build_estimator(choice: ContactChoice, mode: str, recording: Recording, jaw: Jaw, mesh: str = "default") -> Any:

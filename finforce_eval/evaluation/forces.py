@@ -11,6 +11,7 @@ import numpy as np
 
 from finforce.errors import ObservationError
 from finforce.gripper_frames import SIDES
+from finforce.health import Idling
 from finforce_contact.loop import ContactSource, ForceLoop, GivenContact
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.gripper import with_distances
@@ -90,7 +91,7 @@ def estimate_forces(
     for side in sides:
         check_keypoint_count(recording, side, setup.jaw)
     both, found = len(sides) == len(SIDES), {}
-    how = {"strict": strict, "stills": setup.stills, "progress": progress, "watch": watch}
+    how = {"strict": strict, "as_live": setup.as_live, "stills": setup.stills, "progress": progress, "watch": watch}
     for side in sides:
         own = setup.side(side)
         source = GivenContact(None) if _is_unseen(recording, side) else own.source(recording)
@@ -161,6 +162,7 @@ def find_forces(
     side: str = "left",
     *,
     strict: bool = True,
+    as_live: bool = False,
     stills: bool = False,
     progress: Callable[[int], Any] = lambda steps: None,
     watch: Callable[[str, int, ForceEstimator], Any] | None = None,
@@ -176,6 +178,7 @@ def find_forces(
         estimator: one that knows of no recording.
         side: "left" or "right".
         strict: an image that is refused ends the run, else it has no force and says why.
+        as_live: whether the images that the solver's node passes over are left out.
         stills: whether nothing of one image is known in the next.
         progress: called with the number of images done since its last call.
         watch: called with side, stamp [ns] and estimator after every image.
@@ -186,20 +189,28 @@ def find_forces(
     """
     stamps = recording.jaw(side).keypoints.stamps
     run, rows = _JawRun(recording, side, jaw, ForceLoop(source, estimator), stills), []
+    idling, passed = Idling(), np.zeros(len(stamps), dtype=bool)
     unseen = _is_unseen(recording, side)
     for index, stamp in enumerate(stamps.tolist()):
         progress(1)
         if unseen:
             rows.append(run.row(NOT_FOUND, f"the {side} jaw is in none of the images"))
             continue
+        passed[index] = idling.passes(stamp)
+        if passed[index]:
+            source.contact_at(stamp)  # its node has rules of its own
+            rows.append(run.row("", ""))
+            continue
         rows.append(run.answer(index, strict))
+        idling.note(stamp, as_live and rows[-1]["status"] != REFUSED and estimator.is_idle)
         if watch is not None:
             watch(side, stamp, estimator)
     columns = _stack_rows(rows, source)
     columns |= recording.phases_at(stamps) | truth_columns(recording, side) | sight_columns(recording, side)
     if "detector_ms" in columns:
         columns["latency_ms"] = columns["step_ms"] + columns["detector_ms"]
-    return ForceSeries.build(recording.name, side, stamps, **columns)
+    series = ForceSeries.build(recording.name, side, stamps, **columns)
+    return series.at(~passed) if as_live else series
 
 
 def _stack_rows(rows: Sequence[Mapping[str, Any]], source: ContactSource) -> dict[str, Any]:

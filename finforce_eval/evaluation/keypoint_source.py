@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from time import perf_counter
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from finforce.camera import ImageError
 from finforce.errors import FinforceError, PoseError, suggest
 from finforce.gripper_frames import SIDES, read_extrinsics
+from finforce.health import Idling
 from finforce.messages import NANOSECONDS
 from finforce.transforms import pose_from_quaternion, pose_numbers, quaternion_from_pose
 from finforce_eval.errors import OptionError, RecordingError
@@ -66,6 +67,7 @@ class KeypointSource:
         jaw_file: of the jaws.
         parameters: parameters of the detector node that differ from its defaults, by their ROS names.
         strict: refuse recordings that are damaged.
+        as_live: leave out the images that the detector's node leaves out.
         stills: whether nothing of one image is known in the next.
         choice: which images are read.
         sides: jaws that are in the images, whether or not a topic tells of them.
@@ -75,6 +77,7 @@ class KeypointSource:
     jaw_file: str = "bench"
     parameters: Mapping[str, Any] = field(default_factory=dict)
     strict: bool = False
+    as_live: bool = False
     stills: bool = False
     choice: ImageChoice = field(default_factory=ImageChoice)
     sides: tuple[str, ...] = ()
@@ -145,14 +148,14 @@ class KeypointSource:
             raise OptionError(f"--detector {live}: means nothing offline; leave it out, or use finforce replay")
         parameters, settings, dots = build_records(self.node_parameters(recording))
         watched = not recording.images.is_video
-        return build_detector(load_jaws(parameters), parameters, settings, dots, watched=watched)
+        return build_detector(load_jaws(parameters), parameters, settings, dots, self.as_live, watched)
 
     def _detect(self, recording: Recording) -> Recording:
         detector, parameters = self.build(recording), build_records(self.node_parameters(recording)).parameters
         images = choose_images(recording, parameters.depth)
         recording = replace(recording, images=replace(images, depth_scale=parameters.depth_scale))
         with progress_bar(len(recording.images), "image", recording.name) as bar:
-            return detect_keypoints(recording, detector, stills=self.stills, progress=bar.update)
+            return detect_keypoints(recording, detector, as_live=self.as_live, stills=self.stills, progress=bar.update)
 
 
 def choose_images(recording: Recording, depth: str) -> ImageTrack:
@@ -234,7 +237,7 @@ def parse_source(options: argparse.Namespace) -> KeypointSource:
         parameters |= _parse_parameters(changes)
     if extrinsics:
         parameters["T_gripper_camera"] = _parse_extrinsics(extrinsics)
-    switches = {name: bool(getattr(options, name, False)) for name in ("strict", "stills")}
+    switches = {name: bool(getattr(options, name, False)) for name in ("strict", "as_live", "stills")}
     seconds, pose = parameters.get("sync_tolerance"), parameters.get("T_gripper_camera")
     given = {name: getattr(options, option, None) for name, option in _CHOICES.items()}
     choice = ImageChoice(
@@ -312,6 +315,7 @@ def detect_keypoints(
     recording: Recording,
     detector: KeypointDetector,
     *,
+    as_live: bool = False,
     stills: bool = False,
     progress: Callable[[int], Any] = lambda images: None,
 ) -> Recording:
@@ -322,6 +326,7 @@ def detect_keypoints(
     Args:
         recording: with images.
         detector: a fresh one, of the recording's jaws.
+        as_live: whether the images that the detector's node leaves out have no row.
         stills: whether nothing of one image is known in the next.
         progress: called with the number of images done since its last call.
 
@@ -331,6 +336,7 @@ def detect_keypoints(
     images, refused = recording.images, []
     found: dict[str, dict[int, JawKeypoints]] = {side: {} for side in recording.jaws}
     step_ms: dict[int, float] = {}
+    idling, passed = Idling(), set()
     for stamp, image in images:
         begin = perf_counter()
         if stills:
@@ -340,6 +346,12 @@ def detect_keypoints(
         except (KeypointError, ImageError) as error:
             seen = {}
             refused.append(str(error))
+        else:
+            is_still = as_live and detector.was_still
+            if is_still and idling.passes(stamp):
+                passed.add(stamp)
+            else:
+                idling.note(stamp, is_still)
         step_ms[stamp] = 1e3 * (perf_counter() - begin)
         for side in found.keys() & seen.keys():
             found[side][stamp] = seen[side]
@@ -353,7 +365,7 @@ def detect_keypoints(
     notes = [f"{count} images rejected: {text}" for text, count in reasons.items()] + warnings
     notes += [f"the {side} jaw is in none of the images" for side, seen in found.items() if not seen]
     recording = replace(recording, notes=(*recording.notes, *notes))
-    return with_detections(recording, found, dict.fromkeys(found, step_ms))
+    return with_detections(recording, found, dict.fromkeys(found, step_ms), passed)
 
 
 def count_reasons(texts: Iterable[str]) -> dict[str, int]:
@@ -376,6 +388,7 @@ def with_detections(
     recording: Recording,
     found: Mapping[str, Mapping[int, JawKeypoints]],
     step_ms: Mapping[str, Mapping[int, float]],
+    passed: Collection[int] = (),
 ) -> Recording:
     """Return a recording whose key points and jaw poses are those that a detector found.
 
@@ -383,13 +396,15 @@ def with_detections(
         recording: with images.
         found: by side and stamp [ns]; a jaw that was never found has no key points in any image.
         step_ms: wall time [ms] of every image, likewise.
+        passed: stamps [ns] of images that are left out.
     """
-    stamps, frame = recording.images.stamps, recording.images.frame_id
+    images = recording.images
+    stamps = images.stamps[~np.isin(images.stamps, list(passed))]
     # a jaw that was never found has as many key points as the other
     counts = [len(jaw.points) for jaws in found.values() for jaw in jaws.values()]
     counts += [track.sight.points.shape[1] for track in recording.jaws.values() if track.sight]
     jaws = {
-        side: _with_detection(recording.jaw(side), found[side], step_ms[side], stamps, frame, counts[0])
+        side: _with_detection(recording.jaw(side), found[side], step_ms[side], stamps, images.frame_id, counts[0])
         for side in found
     }
     return replace(recording, jaws=jaws)

@@ -31,7 +31,8 @@ _OUTSIDE = ("bags", "out", "workers", "memory", "shard", "run", "prefix", "json"
 class EvaluationSetup:
     """The set-up of an offline run; its estimators are built and compiled once for all recordings.
 
-    With `stills` every image is one by itself.
+    With `as_live` the images are left out that the nodes of contact and force leave out; with `stills` every image is
+    one by itself.
     """
 
     jaw: Jaw
@@ -39,6 +40,7 @@ class EvaluationSetup:
     calibration: Calibration | None
     contacts: ContactChoice
     about: Mapping[str, str]
+    as_live: bool = False
     stills: bool = False
     _sides: dict[str, EvaluationSetup] = field(default_factory=dict, init=False, repr=False, compare=False)
     _estimators: dict[bool, ForceEstimator] = field(default_factory=dict, init=False, repr=False, compare=False)
@@ -70,7 +72,7 @@ class EvaluationSetup:
     def source(self, recording: Recording) -> ContactSource:
         """Return a fresh contact source for this jaw of a recording."""
         jaw = self.calibration.apply(self.jaw) if self.calibration else self.jaw
-        return build_source(self.contacts, recording, jaw, self.density)
+        return build_source(self.contacts, recording, jaw, self.density, as_live=self.as_live)
 
 
 def make_setup(options: argparse.Namespace) -> EvaluationSetup:
@@ -87,6 +89,7 @@ def make_setup(options: argparse.Namespace) -> EvaluationSetup:
     if stills:  # no picture tells the offsets of another
         settings = replace(settings, automatic_tare=False)
     calibration = load_calibration(options.calibration) if options.calibration else None
+    as_live = getattr(options, "as_live", False)
     about = {
         "jaw": jaw.name,
         "solver": options.solver,
@@ -95,7 +98,7 @@ def make_setup(options: argparse.Namespace) -> EvaluationSetup:
         "contact": ", ".join(options.contact) or "estimate where mesh and poses are known, else fixed:case",
         "settings": ", ".join(changes) or "as they come",
         "calibration": options.calibration or "none",
-        "images": "each by itself" if stills else "all",
+        "images": "each by itself" if stills else "those that the live chain answers" if as_live else "all",
         "version": version(),
     }
     return EvaluationSetup(
@@ -104,6 +107,7 @@ def make_setup(options: argparse.Namespace) -> EvaluationSetup:
         calibration=calibration,
         contacts=contacts,
         about=about,
+        as_live=as_live,
         stills=stills,
     )
 
