@@ -199,9 +199,7 @@ class ContactEstimator:
             T = self._symmetry.choose(T, self._poses.at(stamp).T)
         outcome = self._poses.update(stamp, T, covariance)
         if outcome in ("used", "rejected") and self._face is not None:
-            slip = self._slips.update(stamp, T, self._face, odd=outcome == "rejected")
-            if slip is not None and slip.stamp == stamp:
-                self._poses.slide(T, slip.velocity[1:] * slip.sliding)
+            self._slips.update(stamp, T, self._face, odd=outcome == "rejected")
         self.counts["late pose"] += outcome == "late"
         self.counts["odd pose"] += outcome == "rejected"
 

@@ -2,7 +2,8 @@
 
 from collections import deque
 from dataclasses import dataclass
-from math import isfinite
+from math import exp, isfinite
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,22 +12,20 @@ from finforce.errors import PoseError
 from finforce.transforms import check_pose, move_pose, step_between
 from finforce_contact.parameters import ContactSettings
 
-_X = 0
-# Random walks of the object along the jaw [m/s^0.5], of its rotation [rad/s^0.5] and of its closing speed [m/s^1.5];
-# what moves more is noticed and followed.
-_DRIFT, _ROTATION_DRIFT, _ACCELERATION = 0.1e-3, 2e-3, 2e-3
+# An object rests in the jaw's frame but for random walks [m/s^0.5, rad/s^0.5], or moves at a speed that does the same
+# [m/s^1.5, rad/s^1.5] and starts within such speeds [m/s, rad/s]: each for translation and rotation.
+_DRIFT = np.repeat([0.1e-3, 2e-3], 3) ** 2
+_ACCELERATION = np.repeat([2e-3, 0.04], 3) ** 2
+_START = np.repeat([8e-3, 0.15], 3) ** 2
+# Mean times of rest and motion [s].
+_RESTS, _MOVES = 20.0, 5.0
 _GATE = 5.0  # [sigma]; a pose farther off is not believed at once
 _JUMP_POSES = 3  # in a row off the trajectory that agree with each other are believed
 # Samples over which noise is learnt, and how many the assumed noise counts for.
 _NOISE_MEMORY, _NOISE_PRIOR = 60.0, 6.0
 _NOISE_RANGE = (1e-2, 1e2)
-# An average of innovations, one share of each new, that is so many of its standard deviations off calls for a turn.
-_TREND_SHARE, _TREND_SIGMA = 0.35, 3.5
-_TREND_STDDEV = float(np.sqrt(_TREND_SHARE / (2.0 - _TREND_SHARE)))
-_SPEED_SURPRISE = 5e-3
 _LONGEST_FORECAST = 0.2
-# Noise of poses by which a trajectory is widened while an object slides: it follows them by four fifths.
-_SLIDING = 4.0
+_REST, _MOTION = 0, 1
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -44,12 +43,89 @@ class FilteredPose:
     speed: float
 
 
-class PoseFilter:
-    """Kalman filter of a pose: x moves at constant speed, all else hardly moves in the frame of a closing jaw.
+class _Tracks(NamedTuple):
+    """One object as one that rests and as one that moves, in each of six numbers.
 
-    Each of the six numbers has a variance of its own. How noisy they are is learnt from the innovations: r = v^2 - p. A
-    pose far off the trajectory is rejected until some in a row agree with each other; a trend in the innovations
-    widens the search at once.
+    Attributes:
+        odds: (2, 6) of rest and motion, of sum one.
+        step: (2, 6) from the trajectory.
+        spread: (2, 6), variances of the steps.
+        speed: (6,) of the one that moves.
+        cross: (6,), covariances of its step and speed.
+        speed_spread: (6,), variances of its speed.
+    """
+
+    odds: NDArray
+    step: NDArray
+    spread: NDArray
+    speed: NDArray
+    cross: NDArray
+    speed_spread: NDArray
+
+    @property
+    def mean(self) -> NDArray:
+        """Expected step (6,)."""
+        return (self.odds * self.step).sum(axis=0)
+
+    @property
+    def variance(self) -> NDArray:
+        """Variance of the step (6,), that between the two included."""
+        return (self.odds * (self.spread + (self.step - self.mean) ** 2)).sum(axis=0)
+
+    def mix(self, dt: float) -> "_Tracks":
+        """Let rest become motion, and motion rest, within a time [s]."""
+        starts, stops = 1.0 - exp(-dt / _RESTS), 1.0 - exp(-dt / _MOVES)
+        to_rest = self.odds * np.array([[1.0 - starts], [stops]])
+        to_motion = self.odds * np.array([[starts], [1.0 - stops]])
+        rests, moves = to_rest.sum(axis=0), to_motion.sum(axis=0)
+        to_rest, to_motion = to_rest / rests, to_motion / moves
+        step = np.array([(to_rest * self.step).sum(axis=0), (to_motion * self.step).sum(axis=0)])
+        spread = [
+            (share * (self.spread + (self.step - middle) ** 2)).sum(axis=0)
+            for share, middle in zip((to_rest, to_motion), step, strict=True)
+        ]
+        begun, goes_on = to_motion
+        return _Tracks(
+            odds=np.array([rests, moves]),
+            step=step,
+            spread=np.array(spread),
+            speed=goes_on * self.speed,
+            cross=goes_on * (self.cross + begun * (self.step[_MOTION] - self.step[_REST]) * self.speed),
+            speed_spread=goes_on * (self.speed_spread + begun * self.speed**2) + begun * _START,
+        )
+
+    def advance(self, dt: float) -> "_Tracks":
+        """Move on by a time [s]."""
+        spread = self.spread + _DRIFT * dt
+        spread[_MOTION] += 2.0 * dt * self.cross + dt**2 * self.speed_spread + _ACCELERATION * dt**3 / 3.0
+        return self._replace(
+            step=self.step + np.array([np.zeros(6), dt * self.speed]),
+            spread=spread,
+            cross=self.cross + dt * self.speed_spread + _ACCELERATION * dt**2 / 2.0,
+            speed_spread=self.speed_spread + _ACCELERATION * dt,
+        )
+
+    def correct(self, innovation: NDArray, noise: NDArray) -> "_Tracks":
+        """Take a measured step (6,) of some variances (6,)."""
+        left, total = innovation - self.step, self.spread + noise
+        odds = self.odds * np.exp(-0.5 * (left**2 / total - (left**2 / total).min(axis=0))) / np.sqrt(total)
+        gain, speed_gain = self.spread / total, self.cross / total[_MOTION]
+        return _Tracks(
+            odds=odds / odds.sum(axis=0),
+            step=self.step + gain * left,
+            spread=self.spread * (1.0 - gain),
+            speed=self.speed + speed_gain * left[_MOTION],
+            cross=self.cross * (1.0 - gain[_MOTION]),
+            speed_spread=self.speed_spread - speed_gain * self.cross,
+        )
+
+
+class PoseFilter:
+    """Two Kalman filters of each of the six numbers of a pose, of one that rests and of one that moves, by their odds.
+
+    The filter of interacting multiple models (Blom and Bar-Shalom, 1988): objects start and stop at random times. How
+    noisy the poses are is learnt from the innovations: r = v^2 - p. A pose far off the trajectory is rejected until
+    some in a row agree with each other.
     """
 
     def __init__(self, settings: ContactSettings) -> None:
@@ -57,8 +133,6 @@ class PoseFilter:
         self._timeout = settings.pose_timeout
         noise = np.repeat([settings.pose_noise, settings.rotation_noise], 3)
         self._assumed = noise**2
-        self._drift = np.repeat([_DRIFT, _ROTATION_DRIFT], 3) ** 2
-        self._drift[_X] = 0.0
         self.reset()
 
     def reset(self) -> None:
@@ -67,7 +141,7 @@ class PoseFilter:
         self.believed = 0.0
         self.latest: NDArray | None = None
         self._scale = np.ones(6)
-        self._learnt, self._slide = _NOISE_PRIOR, np.zeros(2)
+        self._learnt = _NOISE_PRIOR
         self._rejected: deque[tuple[float, NDArray]] = deque(maxlen=_JUMP_POSES)
 
     def update(self, stamp: float, T: NDArray, covariance: NDArray | None = None) -> str:
@@ -91,15 +165,16 @@ class PoseFilter:
         if self.stamp is None or stamp - self.stamp > self._timeout:
             self._begin(stamp, T, noise)
             return "used"
-        self._predict(stamp)
-        innovation = step_between(self._T, T)
-        spread = self._P + noise
-        if (innovation**2 > _GATE**2 * spread).any():
+        self._tracks = self._tracks.mix(stamp - self.stamp).advance(stamp - self.stamp)
+        self.stamp = stamp
+        self._centre()
+        innovation, spread = step_between(self._T, T), self._tracks.variance
+        if (innovation**2 > _GATE**2 * (spread + noise)).any():
             return self._reject(stamp, T, noise)
         self._rejected.clear()
-        self._learn(innovation, None if covariance is None else noise)
-        self._follow_trend(innovation / np.sqrt(spread), noise)
-        self._correct(innovation, noise)
+        self._learn(innovation**2 - spread, None if covariance is None else noise)
+        self._tracks = self._tracks.correct(innovation, noise)
+        self._centre()
         self.believed = stamp
         return "used"
 
@@ -108,21 +183,6 @@ class PoseFilter:
         if self.stamp is not None:
             self._T = T @ self._T
             self._rejected = deque(((stamp, T @ pose) for stamp, pose in self._rejected), maxlen=self._rejected.maxlen)
-
-    def slide(self, T: NDArray, velocity: NDArray) -> None:
-        """Take an object for one that slides: this pose, the last that came, is near it, and it goes on so.
-
-        Args:
-            T: T_jaw_object (4, 4).
-            velocity: in the jaw's y and z (2,) [m/s], zero once it rests.
-        """
-        self._slide = velocity
-        if velocity.any():
-            noise = self._noise(None)
-            self._P[1:] += _SLIDING * noise[1:]
-            self._correct(step_between(self._T, T), noise)
-            self.believed = self.stamp
-            self._rejected.clear()
 
     def at(self, stamp: float) -> FilteredPose:
         """Return the pose at a time [s], continued at its speed for a fifth of a second at most.
@@ -133,12 +193,10 @@ class PoseFilter:
         if self.stamp is None:
             raise PoseError("no pose of the object has come yet")
         ahead = max(stamp - self.stamp, 0.0)
-        dt = min(ahead, _LONGEST_FORECAST)
-        T = self._T.copy()
-        T[:3, 3] += dt * np.array([self._speed, *self._slide])
-        variance = self._P + self._drift * ahead
-        variance[_X] += 2.0 * dt * self._cross + dt**2 * self._speed_variance
-        return FilteredPose(T=T, stddev=np.sqrt(np.maximum(variance, 0.0)), speed=self._speed)
+        tracks = self._tracks.advance(min(ahead, _LONGEST_FORECAST))
+        stddev = np.sqrt(tracks.variance + _DRIFT * max(ahead - _LONGEST_FORECAST, 0.0))
+        speed = float(tracks.odds[_MOTION, 0] * tracks.speed[0])
+        return FilteredPose(T=move_pose(self._T, tracks.mean), stddev=stddev, speed=speed)
 
     def _noise(self, covariance: NDArray | None) -> NDArray:
         """Return the variances (6,) of a pose; stated ones are raised when the poses scatter more."""
@@ -152,50 +210,31 @@ class PoseFilter:
             )
         return np.diag(stated) * np.maximum(self._scale, 1.0)
 
-    def _begin(self, stamp: float, T: NDArray, noise: NDArray, speed: float = 0.0) -> None:
-        """Start the trajectory at a pose."""
-        self.stamp, self.believed, self._T, self._speed = stamp, stamp, T.copy(), speed
-        self._P, self._cross, self._speed_variance = noise.copy(), 0.0, _SPEED_SURPRISE**2
-        self._trend = np.zeros(6)
+    def _centre(self) -> None:
+        """Count the steps of the tracks from their mean."""
+        mean = self._tracks.mean
+        self._T = move_pose(self._T, mean)
+        self._tracks = self._tracks._replace(step=self._tracks.step - mean)
+
+    def _begin(self, stamp: float, T: NDArray, noise: NDArray, speed: NDArray | None = None) -> None:
+        """Start the trajectory at a pose, with a speed (6,) where it is known to move."""
+        self.stamp, self.believed, self._T = stamp, stamp, T.copy()
+        moves = _MOVES / (_MOVES + _RESTS) if speed is None else 0.5
+        self._tracks = _Tracks(
+            odds=np.repeat([[1.0 - moves], [moves]], 6, axis=1),
+            step=np.zeros((2, 6)),
+            spread=np.array([noise, noise]),
+            speed=np.zeros(6) if speed is None else speed,
+            cross=np.zeros(6),
+            speed_spread=_START.copy(),
+        )
         self._rejected.clear()
 
-    def _predict(self, stamp: float) -> None:
-        """Move the trajectory on to a time [s]: constant speed under white acceleration in x, a random walk else."""
-        dt, power = stamp - self.stamp, _ACCELERATION**2
-        self._T[:3, 3] += dt * np.array([self._speed, *self._slide])
-        self._P = self._P + self._drift * dt
-        self._P[_X] += 2.0 * dt * self._cross + dt**2 * self._speed_variance + power * dt**3 / 3.0
-        self._cross += dt * self._speed_variance + power * dt**2 / 2.0
-        self._speed_variance += power * dt
-        self.stamp = stamp
-
-    def _correct(self, innovation: NDArray, noise: NDArray) -> None:
-        """Move the trajectory towards a pose by the Kalman gain p / (p + r)."""
-        gain = self._P / (self._P + noise)
-        speed_gain = self._cross / (self._P[_X] + noise[_X])
-        self._T = move_pose(self._T, gain * innovation)
-        self._speed += speed_gain * innovation[_X]
-        self._speed_variance -= speed_gain * self._cross
-        self._cross *= 1.0 - gain[_X]
-        self._P = self._P * (1.0 - gain)
-
-    def _learn(self, innovation: NDArray, stated: NDArray | None) -> None:
-        """Average how much larger the noise is than assumed, or than stated."""
+    def _learn(self, seen: NDArray, stated: NDArray | None) -> None:
+        """Average how much larger the noise (6,) that is seen is than assumed, or than stated."""
         base = self._assumed if stated is None else stated / np.maximum(self._scale, 1.0)
-        seen = (innovation**2 - self._P) / base
         self._learnt = min(self._learnt + 1.0, _NOISE_MEMORY)
-        self._scale = np.clip(self._scale + (seen - self._scale) / self._learnt, *_NOISE_RANGE)
-
-    def _follow_trend(self, standard: NDArray, noise: NDArray) -> None:
-        """Widen what the innovations, in standard deviations (6,), have been off for some while."""
-        self._trend += _TREND_SHARE * (standard - self._trend)
-        turning = np.abs(self._trend) > _TREND_SIGMA * _TREND_STDDEV
-        if not turning.any():
-            return
-        self._P = np.where(turning, self._P + noise, self._P)
-        self._trend[turning] = 0.0
-        if turning[_X]:
-            self._speed_variance += _SPEED_SURPRISE**2
+        self._scale = np.clip(self._scale + (seen / base - self._scale) / self._learnt, *_NOISE_RANGE)
 
     def _reject(self, stamp: float, T: NDArray, noise: NDArray) -> str:
         """Keep a pose off the trajectory; once enough in a row agree, the trajectory starts anew from them."""
@@ -203,7 +242,7 @@ class PoseFilter:
         if len(self._rejected) < _JUMP_POSES or not self._agree(noise):
             return "rejected"
         (first, T_first), (last, T_last) = self._rejected[0], self._rejected[-1]
-        self._begin(stamp, T_last, noise, speed=float((T_last - T_first)[_X, 3] / (last - first)))
+        self._begin(stamp, T_last, noise, step_between(T_first, T_last) / (last - first))
         return "jump"
 
     def _agree(self, noise: NDArray) -> bool:
