@@ -53,6 +53,8 @@ _UNCALIBRATED = 0.1
 _EXTRAPOLATED = 0.015
 # Relative error of a jaw that is taken to be linear, 10 mm deep.
 _LINEAR = 0.05
+# Share of a force that was found but not told by which it may be off.
+_UNTOLD = 0.5
 # Fingers and settings for which this process has compiled everything.
 _WARM: set[tuple[str, EstimatorSettings]] = set()
 
@@ -102,7 +104,8 @@ class ForceEstimator:
         self._given = GivenContactTracker(self.jaw, self.mechanics, self.settings, self._tracked.response)
         self._tracker: ContactTracker | GivenContactTracker = self._tracked
         self._gate = KeypointGate(self.jaw, self.settings)
-        self._relaxation = Relaxation(calibration.relaxation if calibration else ())
+        terms = calibration.relaxation if calibration else ()
+        self._relaxation, self._untold = Relaxation(terms), Relaxation(terms)
         solver = self.settings.solver
         known = calibration.expect_error(self.jaw, solver) if calibration else _UNCALIBRATED
         self._modulus_error = 0.0 if calibration else self.jaw.material.spread
@@ -125,6 +128,7 @@ class ForceEstimator:
         self._gate.reset()
         self._reach.reset()
         self._relaxation.reset()
+        self._untold.reset()
         self._tracked.reset()
         self._given.reset()
 
@@ -253,7 +257,7 @@ class ForceEstimator:
         if self._taring.tared:
             return ""
         if self._taring.missing:
-            self._relax()
+            self._relax(np.zeros(3))
             return f"{self._taring.missing} more unloaded frames for the tare"
         try:
             self._taring.begin()
@@ -289,7 +293,7 @@ class ForceEstimator:
     def _rest(self, message: str, points: NDArray) -> Solution:
         """Tell that nothing presses, as far as the key points (K, 3) [m] tell it."""
         self._taring.note(quiet=True, loaded=False)
-        self._relax()
+        self._relax(np.zeros(3))
         if not self._at_rest:  # the shape of a load that has gone
             self._tracker.reset()
             self._contact, self._at_rest = None, True
@@ -321,13 +325,17 @@ class ForceEstimator:
         if reason:
             if state["bumped"] > BUMPED and self._contact.touching is False:
                 self._taring.note(quiet=True, loaded=False)
+            if state["bumped"] <= BUMPED and state["magnitude"] <= state["bearable"]:
+                self._relax(state["force"])
             return self._fail("unobservable", reason, used, iterations)
         self._taring.note(quiet=bool(state["quiet"]), loaded=bool(state["loaded"]))
         return self._solution(state, used)
 
-    def _relax(self) -> None:
-        """Let the material relax without a load."""
-        self._relaxation.update(np.zeros(3), self._pass_time())
+    def _relax(self, force: NDArray) -> None:
+        """Let the material relax under a force (3,) [N] that is not told."""
+        dt = self._pass_time()
+        self._relaxation.update(force, dt)
+        self._untold.update(_UNTOLD * force, dt)
 
     def _pass_time(self) -> float:
         """Return the time since the material's last force [s]."""
@@ -341,6 +349,10 @@ class ForceEstimator:
         vectors, dt = np.empty((7, 3)), self._pass_time()
         magnitude, stddev = compute_force(state, self._relaxation.packed, dt, error, self._modulus_error, vectors)
         force, torque, force_stddev, torque_stddev, point, location, normal = vectors
+        self._untold.update(np.zeros(3), dt)
+        memory = self._untold.overstress
+        if memory.any():
+            force_stddev, stddev = np.hypot(force_stddev, memory), hypot(stddev, *memory)
         return Solution(
             stamp=self._stamp,
             status="ok" if magnitude > 0.0 else "unloaded",

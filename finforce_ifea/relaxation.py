@@ -42,6 +42,11 @@ class Relaxation:
         return out
 
     @property
+    def overstress(self) -> NDArray:
+        """What the past adds to the elastic force (3,) [N]."""
+        return self._over.sum(axis=0)
+
+    @property
     def packed(self) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """The last elastic force (3,) and overstresses (n, 3) [N], shares and time constants (n,) of `relax_force`."""
         return self._elastic, self._over, self._share, self._tau

@@ -27,6 +27,7 @@ from estimator_fakes import (
 )
 from mechanics_fakes import BENCH, bench_press
 
+from finforce_ifea import estimator as estimator_module
 from finforce_ifea.estimator import ForceEstimator, warm_up
 from finforce_ifea.jaw.attachment import attach_points
 from finforce_ifea.observation import Contact
@@ -260,3 +261,19 @@ def test_relaxation_of_the_material_is_added():
     # the force's direction turns a little while its overstress decays
     np.testing.assert_allclose(found[45:], expected[45:], atol=0.005)
     assert np.nanmax(found - elastic) > 0.1
+
+
+def test_relaxation_under_a_force_that_is_not_told_is_remembered(monkeypatch):
+    """As of a deep press that the key points cannot tell: what it leaves in the material is half known."""
+    relaxing = CALIBRATION.changed(relaxation=(RelaxationTerm(share=0.3, time_constant=2.0),))
+    told = run(pressed(), make_estimator(solver="frame", calibration=relaxing))
+    judge, largest = estimator_module.find_rejection_reason, 0.8 * np.nanmax(magnitudes(told))
+
+    def reject(state, **kind):
+        return "too much" if state["magnitude"] > largest else judge(state, **kind)
+
+    monkeypatch.setattr(estimator_module, "find_rejection_reason", reject)
+    untold = run(pressed(), make_estimator(solver="frame", calibration=relaxing))
+    assert untold[HELD_5].status == "unobservable"
+    np.testing.assert_allclose(untold[230].force, told[230].force, atol=0.01)
+    assert untold[230].force_stddev[0] > 1.2 * told[230].force_stddev[0]
