@@ -192,7 +192,7 @@ class PoseFilter:
         """
         if self.stamp is None:
             raise PoseError("no pose of the object has come yet")
-        ahead = max(stamp - self.stamp, 0.0)
+        ahead = stamp - self.stamp if stamp > self.stamp else 0.0
         tracks = self._tracks.advance(min(ahead, _LONGEST_FORECAST))
         stddev = np.sqrt(tracks.variance + _DRIFT * max(ahead - _LONGEST_FORECAST, 0.0))
         speed = float(tracks.odds[_MOTION, 0] * tracks.speed[0])
