@@ -81,7 +81,7 @@ setup(
             "ros-jazzy-common-interfaces",
             "ros-jazzy-ament-index-python",
         ],
-        "cad": ["cascadio"],  # fingers from STEP files
+        "cad": ["cascadio", "ezdxf", "svgelements"],  # fingers from STEP, DXF and SVG files
         "can": ["python-can>=4.3"],  # other CAN adapters than SLCAN ones: SocketCAN and more
         "lerobot": ["av"],  # videos of LeRobot datasets, by the library that they are made with
         "zarr": ["numcodecs"],  # UMI's chunks; the library zarr itself takes a missing chunk for zeros, a force of none
@@ -90,7 +90,7 @@ setup(
         # training of key point networks; without a GPU, torch's own index has a build of a tenth of the size
         "train": ["torch", "onnx"],
         "test": ["pytest", "pytest-xdist", "pytest-timeout", "hypothesis", "onnx", "python-can>=4.3,!=4.6.0", "xacro"]
-        + ["cascadio", "av", "rerun-sdk", "playwright", "argcomplete", "numcodecs"],
+        + ["cascadio", "ezdxf", "svgelements", "av", "rerun-sdk", "playwright", "argcomplete", "numcodecs"],
         "lint": ["ruff", "import-linter"],
     },
     entry_points={

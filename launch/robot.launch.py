@@ -1,4 +1,4 @@
-"""Two jaws on a robot's wrist: `ros2 launch finforce robot.launch.py object_mesh:=FILE`.
+"""Two jaws on a robot's wrist: `ros2 launch finforce robot.launch.py object_mesh:=FILE arm:=true robot_ip:=ADDRESS`.
 
 `sim:=true` needs no hardware: `ros2 launch finforce robot.launch.py sim:=true`.
 """
@@ -13,5 +13,5 @@ SHARE = Path(__file__).resolve().parents[1]
 
 
 def generate_launch_description():
-    """Return camera, detector, contacts, solvers, gripper; with `config/robot.yaml` or `robot_sim.yaml`."""
+    """Return camera, detector, contacts, solvers, gripper, arm; with `config/robot.yaml` or `robot_sim.yaml`."""
     return describe_system(RobotOptions, robot_processes, SHARE)

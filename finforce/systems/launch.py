@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import Field, fields
 from pathlib import Path
@@ -174,10 +175,17 @@ def _node_action(process: Process) -> Any:
 
 
 def _include_action(part: Include, folder: Path) -> Any:
-    """Return the action that includes a launch file, with its own arguments and none of ours."""
+    """Return the action that includes a launch file, with its own arguments and none of ours.
+
+    Raises:
+        MissingDependencyError: a program that it calls is not on the path.
+    """
     from launch.actions import GroupAction, IncludeLaunchDescription, SetEnvironmentVariable
     from launch.launch_description_sources import PythonLaunchDescriptionSource
 
+    for program in part.programs:
+        if shutil.which(program) is None:
+            raise MissingDependencyError(missing(program, part.advice))
     source = PythonLaunchDescriptionSource(str(folder / "launch" / part.file))
     environment = [SetEnvironmentVariable(name, value) for name, value in part.environment.items()]
     included = IncludeLaunchDescription(source, launch_arguments=list(part.arguments.items()))

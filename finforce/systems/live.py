@@ -63,7 +63,7 @@ def bench_processes(options: BenchOptions, share: Path) -> list[Process | Includ
 
 
 def robot_processes(options: RobotOptions, share: Path) -> list[Process | Include]:
-    """Return the processes of two jaws on a robot: camera, detector, contacts, solvers, gripper, frames.
+    """Return the processes of two jaws on a robot: camera, detector, contacts, solvers, gripper, frames, arm.
 
     Raises:
         ValueError: the simulated robot is asked for what it has not got, or a camera that is to be started has no name.
@@ -72,6 +72,7 @@ def robot_processes(options: RobotOptions, share: Path) -> list[Process | Includ
     parts = [
         *[see_camera(process, options) for process in twin_processes("grasp_cylinder", options)],
         *camera_includes(options, share),
+        *arm_includes(options, share),
         solver_process("left", options, peer="right"),
         solver_process("right", options, paired=True),
         *[see_camera(process, options) for process in contact_processes("both", options, waits=True)],
@@ -186,10 +187,38 @@ def camera_includes(options: RobotOptions, share: Path) -> list[Include]:
     ]
 
 
+def arm_includes(options: RobotOptions, share: Path) -> list[Include]:
+    """Return the launch file of the arm, if it is to be started, with our description of arm and gripper.
+
+    The controllers stay those of kortex_description: an absolute path of the description is taken as it is.
+    """
+    if not options.arm:
+        return []
+    description = options.arm_description or str(share / "urdf" / "gen3_finray.urdf.xacro")
+    arguments = {
+        "robot_type": "gen3",
+        "robot_ip": options.robot_ip,
+        "dof": str(options.dof),
+        "description_file": str(Path(description).resolve()),
+        "gripper": "",
+        "use_fake_hardware": str(options.sim).lower(),
+        "launch_rviz": "false",
+    }
+    return [
+        Include(
+            package="kortex_bringup",
+            file="kortex_control.launch.py",
+            arguments=arguments,
+            programs=("xacro",),
+            advice="or leave arm:=true out",
+        )
+    ]
+
+
 def frame_processes(options: RobotOptions, share: Path) -> list[Process]:
     """Return what publishes the frames of gripper and camera on /tf, as far as nobody else does."""
     publishers = []
-    if options.frames:
+    if not options.arm:  # whose description holds the gripper, too
         model = (share / "urdf" / "finray_gripper.urdf").read_text(encoding="utf-8")
         told = {"robot_description": model, **given({"frame_prefix": options.frame_prefix})}
         publishers.append(_frames("robot_state_publisher", "robot_state_publisher", told))

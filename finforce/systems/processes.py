@@ -90,6 +90,7 @@ class Include:
         file: in the package's folder `launch`.
         arguments: of that file.
         environment: variables for its processes only.
+        programs: that it calls, each named as the package it comes with.
         advice: what else would do, for who has not got the package.
     """
 
@@ -97,6 +98,7 @@ class Include:
     file: str
     arguments: Mapping[str, str] = field(default_factory=dict)
     environment: Mapping[str, str] = field(default_factory=dict)
+    programs: tuple[str, ...] = ()
     advice: str = ""
 
 
@@ -337,7 +339,10 @@ class RobotOptions(GripperOptions):
         "wrist_camera", "Topics /camera/NAME/..., frames NAME_...; none: topics and frame of the parameter file"
     )
     camera_config: str = setting("", "YAML file with parameters of realsense2_camera; none: the included d405.yaml")
-    frames: bool = setting(True, "Frames of the gripper on /tf; false: the description of the arm holds the gripper")
+    arm: bool = setting(False, "Start of the arm, a Kinova Gen3, by kortex_bringup; with sim one that is not there")
+    arm_description: str = setting("", "xacro file of arm and gripper; none: the gripper on the flange of a Gen3")
+    robot_ip: str = setting("192.168.1.10", "Address of the arm")
+    dof: int = setting(7, "Joints of the arm", choices=(6, 7))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,14 +14,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     from finforce_ifea.jaw.jaw_file import MATERIALS
     from finforce_ifea.jaw.section import UNITS
 
-    parser.add_argument("file", type=Path, help="finger: .stl or another surface, .step, .json, or a photo")
+    parser.add_argument("file", type=Path, help="finger: .stl or another surface, .step, .dxf, .svg, .json, or a photo")
     parser.add_argument("-o", "--output", type=Path, help="jaw file to write (FILE.yaml)")
     parser.add_argument("--name", help="name of the finger (that of the file)")
     parser.add_argument("--unit", choices=tuple(UNITS), help="unit of the file (from the size of the finger)")
     text = "scale of a photo: two marks of the ruler [px] and the millimetres between them, or millimetres per pixel"
     parser.add_argument("--scale", dest="unit", metavar="X1,Y1,X2,Y2=MM", help=text)
     parser.add_argument("--body", type=int, metavar="N", help="number of the body, from 1")
-    parser.add_argument("--width", type=length_mm, metavar="MM", help="width along y [mm], for photos")
+    parser.add_argument("--width", type=length_mm, metavar="MM", help="width along y [mm], for drawings, photos")
     parser.add_argument("--material", default="tpu95a", choices=tuple(MATERIALS), help="material (tpu95a)")
     parser.add_argument(
         "--clamp",

@@ -152,8 +152,8 @@ def test_none_is_an_empty_value(recorded_launch):
     assert not {"camera_frame", "detection_method"} & set(detector["parameters"][1])
     with pytest.raises(ValueError, match="camera_name:=none: camera:=true needs a name"):
         act(ROBOT, camera_name="none")
-    with pytest.raises(ValueError, match="gripper:=none: expected true or false"):
-        act(ROBOT, gripper="none")
+    with pytest.raises(ValueError, match="dof:=none: expected a int"):
+        act(ROBOT, dof="none")
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
@@ -193,6 +193,7 @@ def lack(monkeypatch, *packages):
     ("texts", "package", "advice"),
     [
         ({}, "realsense2_camera", "ros-jazzy-realsense2-camera; or say camera:=false"),
+        ({"camera": "false", "arm": "true"}, "kortex_bringup", "ros-jazzy-kortex-bringup; or leave arm:=true out"),
         ({"camera": "false", "rviz": "true"}, "rviz2", "ros-jazzy-rviz2; or leave rviz:=true out"),
     ],
 )
@@ -205,6 +206,12 @@ def test_a_package_that_is_asked_for_and_missing_is_one_line_with_advice(
         act(ROBOT, **texts)
     assert str(caught.value).startswith(f"{package} is not installed: sudo apt install {advice}")
     assert "\n" not in str(caught.value)
+
+
+def test_without_xacro_the_arm_is_refused_before_it_starts(recorded_launch, monkeypatch):
+    monkeypatch.setattr("shutil.which", lambda program: None)
+    with pytest.raises(MissingDependencyError, match="^xacro is not installed: sudo apt install ros-.*-xacro;"):
+        act(ROBOT, camera="false", arm="true")
 
 
 def test_without_publishers_of_frames_the_rest_starts(recorded_launch, monkeypatch):

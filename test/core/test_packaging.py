@@ -32,7 +32,7 @@ KEYS = {
     "psutil": "python3-psutil",
 }
 # packages of ROS that launch files start, and that a user asks for by an argument
-OPTIONAL = {"controller_manager", "moveit_ros_move_group", "realsense2_camera", "rviz2"}
+OPTIONAL = {"controller_manager", "kortex_bringup", "moveit_ros_move_group", "realsense2_camera", "rviz2"}
 
 
 def setup_arguments():

@@ -170,12 +170,20 @@ def test_the_camera_of_somebody_else_publishes_its_own_frames():
     assert "static_transform_publisher" not in robot(camera=False)
 
 
-def test_the_gripper_has_no_frames_of_its_own_where_the_arm_has_them():
-    assert "robot_state_publisher" in robot() and "robot_state_publisher" not in robot(frames=False)
+def test_the_arm_comes_with_our_description_and_its_own_frames():
+    parts = robot(arm=True, robot_ip="10.0.0.2", dof=6)
+    told = parts["kortex_bringup"].arguments
+    assert (told["robot_ip"], told["dof"], told["gripper"], told["use_fake_hardware"]) == ("10.0.0.2", "6", "", "false")
+    assert Path(told["description_file"]).is_absolute() and Path(told["description_file"]).is_file()
+    # kortex_description stays the package, since controllers are looked for there, too
+    assert "description_package" not in told
+    assert "robot_state_publisher" not in parts
 
 
-def test_without_hardware_no_camera_is_touched():
-    assert "realsense2_camera" in robot() and "realsense2_camera" not in robot(sim=True)
+def test_without_hardware_no_camera_and_no_arm_are_touched():
+    parts = robot(sim=True, arm=True)
+    assert "realsense2_camera" not in parts
+    assert parts["kortex_bringup"].arguments["use_fake_hardware"] == "true"
 
 
 @pytest.mark.parametrize(
@@ -243,7 +251,7 @@ def test_the_simulated_bench_has_the_left_jaw_only():
 
 
 def test_only_the_frames_can_be_done_without():
-    parts = robot(rviz=True) | robot(sim=True)
+    parts = robot(arm=True, rviz=True) | robot(sim=True)
     assert {name for name, part in parts.items() if getattr(part, "optional", False)} == {
         "robot_state_publisher",
         "static_transform_publisher",

@@ -46,7 +46,7 @@ def test_with_ros_from_apt_nodes_of_other_packages_are_started_too(monkeypatch):
         ("simm:=true", "'simm' is not an option: did you mean sim?"),
         ("sim", "'sim': expected sim:=VALUE"),
         ("contact_height:=40", "contact_height: got 40.0, expected 0 to 0.5 m; 40 mm are 0.04 m"),
-        ("depth:=near", "expected one of "),
+        ("dof:=5", "expected one of 6, 7"),
     ],
 )
 def test_a_word_that_cannot_be_used_is_one_line(word, reason, capsys):

@@ -776,6 +776,34 @@ def test_a_slot_in_a_band_is_no_cell_and_no_bolt(half):
     assert any("1 slot in its bands: no cell" in note for note in finger.notes)
 
 
+def write_dxf(path, loops):
+    ezdxf = pytest.importorskip("ezdxf")
+    document = ezdxf.new(units=4)
+    for loop in loops:
+        document.modelspace().add_lwpolyline(loop, close=True)
+    document.saveas(path)
+
+
+def write_svg(path, loops):
+    pytest.importorskip("svgelements")
+    data = " ".join("M " + " L ".join(f"{x},{-y}" for x, y in loop) + " Z" for loop in loops)
+    path.write_text(
+        '<svg xmlns="http://www.w3.org/2000/svg" width="60mm" height="100mm" viewBox="0 0 60 100">'
+        f'<path d="{data}"/></svg>'
+    )
+
+
+@pytest.mark.parametrize(("suffix", "write"), [(".dxf", write_dxf), (".svg", write_svg)])
+def test_a_drawing_is_read_and_needs_a_width(tmp_path, capsys, suffix, write):
+    path = tmp_path / f"finger{suffix}"
+    write(path, [ring.tolist() for ring in order_rings(draw_polygon())])
+    raw = read_section(path)
+    assert raw.width is None
+    check_found(recognize(raw.polygon, WIDTH * MILLIMETRE, Overrides()))
+    assert main(["jaw", str(path), "-o", str(tmp_path / "out.yaml")]) == 2
+    assert "a flat file has no width; give it in millimetres: --width" in capsys.readouterr().err
+
+
 PER_MM, TWO_MARKS = 8, "360,60,360,620=70"
 
 
@@ -978,6 +1006,8 @@ def test_bad_files_are_refused_in_one_line(tmp_path, capsys, surface):
     (tmp_path / "huge.stl").write_bytes(b"\0" * 80 + (10_000_000).to_bytes(4, "little") + b"\0" * 200)
     (tmp_path / "noise.stl").write_bytes(np.random.default_rng(0).bytes(5000))
     (tmp_path / "noise.obj").write_bytes(np.random.default_rng(0).bytes(5000))
+    (tmp_path / "noise.dxf").write_bytes(np.random.default_rng(0).bytes(5000))
+    (tmp_path / "noise.svg").write_bytes(np.random.default_rng(0).bytes(5000))
     (tmp_path / "loop.step").write_text(LOOP)
     (tmp_path / "cross.json").write_text(crossing_loops())
     (tmp_path / "text.txt").write_text("a finger")
@@ -988,6 +1018,8 @@ def test_bad_files_are_refused_in_one_line(tmp_path, capsys, surface):
         "noise.stl": "expected 1 to 2000000 of a whole .stl file|cannot be read",
         "noise.obj": "expected 1 to 2000000 of a whole .obj file|cannot be read",
         "loop.step": "loop.step: .* expected a whole .step file",
+        "noise.dxf": "noise.dxf: made its reader fail",
+        "noise.svg": "noise.svg: made its reader fail",
         "cross.json": "touches or crosses itself",
         "text.txt": "files of this kind are not read; expected one of .stl",
         "none.stl": "there is no file",

@@ -1,4 +1,4 @@
-"""The section of a prismatic finger out of the files that people print: surfaces, STEP, JSON, photographs."""
+"""The section of a prismatic finger out of the files that people print: surfaces, STEP, DXF, SVG, JSON."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -15,12 +15,13 @@ from finforce.sandbox import SandboxError, run_limited
 from finforce.surfaces import read_surface
 from finforce.triangle_surface import Surface, join_surfaces, unite
 from finforce_ifea.errors import JawFileError
+from finforce_ifea.jaw.cad.curves import read_dxf, read_svg
 from finforce_ifea.jaw.cad.layers import find_layers
 from finforce_ifea.jaw.cad.photo import PHOTOS, SCALE, Photo, read_photo
-from finforce_ifea.jaw.section import UNITS, Layer, SectionFile, join_loops, read_section_file
+from finforce_ifea.jaw.section import UNITS, Layer, SectionFile, check_loops, join_loops, read_section_file
 
 SURFACES = (".stl", ".obj", ".ply", ".off", ".3mf", ".glb")
-SUFFIXES = (*SURFACES, ".step", ".stp", ".json", *PHOTOS)
+SUFFIXES = (*SURFACES, ".step", ".stp", ".dxf", ".svg", ".json", *PHOTOS)
 # Largest size of a finger [m]; the second pair is for a unit that was stated.
 _PLAUSIBLE, _POSSIBLE = (0.015, 0.25), (0.005, 1.0)
 # What encloses less than this share of the largest body is no part of a finger.
@@ -83,7 +84,7 @@ def read_section(path: Path, *, unit: str | None = None, body: int | None = None
     """Read the section of a finger.
 
     Args:
-        path: a surface (.stl and others), a solid (.step), a section (.json), or a photograph.
+        path: a surface (.stl and others), a solid (.step), a drawing (.dxf, .svg), a section (.json), or a photograph.
         unit: one of `UNITS`; None for the only one in which it has a finger's size; of a photograph see `SCALE`.
         body: which one of several bodies, from 1.
         layered: take a solid as layers along its width, whatever its shape.
@@ -111,6 +112,13 @@ def read_section(path: Path, *, unit: str | None = None, body: int | None = None
             photo = run_limited(read_photo, path, unit, memory=2 << 30, seconds=60)
             notes = [f"traced at {1e-3 / photo.pixel:.3g} pixels a millimetre"]
             return RawSection(polygon=join_loops(photo.loops), width=None, notes=notes, photo=photo)
+        if suffix in (".dxf", ".svg"):
+            loops, named = run_limited(read_dxf if suffix == ".dxf" else read_svg, path)
+            check_loops(loops, path.name)
+            extent = np.ptp(np.concatenate(loops), axis=0).max()
+            scale, note = _choose_unit(float(extent), unit or named)
+            polygon = _one_piece(_fill_lines([scale * loop for loop in loops]))
+            return RawSection(polygon=polygon, width=None, notes=[note])
         notes = []
         return _cut_surface(_load_surface(path, unit, notes), body, layered, notes)
     except (JawFileError, FileError, ImageError, SandboxError) as error:
@@ -531,13 +539,14 @@ def _one_piece(area: shapely.Geometry) -> shapely.Polygon:
     return area
 
 
-def _fill_lines(lines: NDArray) -> shapely.Geometry:
-    """Return what straight lines (k, 2, 2) [m] bound together: a polygon or several.
+def _fill_lines(lines: list[NDArray] | NDArray) -> shapely.Geometry:
+    """Return what lines (n, 2) [m], open or closed, bound together: a polygon or several; many at once as one array.
 
     Raises:
         JawFileError: They bound nothing.
     """
-    strings = shapely.linestrings(np.round(lines / _GRID) * _GRID)
+    number = np.repeat(np.arange(len(lines)), list(map(len, lines)))
+    strings = shapely.linestrings(np.round(np.concatenate(lines) / _GRID) * _GRID, indices=number)
     strings = strings[shapely.length(strings) > 0.0]
     found = shapely.polygonize(shapely.get_parts(shapely.union_all(strings)))
     areas = sorted(found.geoms, key=lambda area: -area.area)

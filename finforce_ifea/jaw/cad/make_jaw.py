@@ -63,7 +63,7 @@ def make_jaw(
         material: a name in `MATERIALS`.
         unit: of the file; None to guess it; of a photograph its scale.
         body: which one of several bodies, from 1.
-        width: along y [m]; needed for photographs.
+        width: along y [m]; needed for drawings and photographs.
         overrides: what is stated in place of the guesses.
         picture: the PNG file; None for one next to the jaw file.
         solid: take a closed solid as it is, as layers along its width, whatever its shape.
