@@ -38,8 +38,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     text = "intrinsics of the camera, as --intrinsics; of larger images the middle, scaled, is taken"
     parser.add_argument("--calibration", dest="intrinsics", nargs="+", metavar="FILE", help=text)
     parser.add_argument("-o", "--output", default="rig.yaml", metavar="FILE", help="rig file (rig.yaml)")
-    text = "picture with the jaws drawn as found (the rig file's name with .png)"
-    parser.add_argument("--overlay", metavar="PNG", help=text)
     text = "numbers of the tags on the holders, which then tell where the jaws are under load"
     parser.add_argument("--tags", nargs="+", type=int, default=[], metavar="ID", help=text)
     text = "length of an edge of these tags' black square [mm] (16)"
@@ -68,7 +66,7 @@ def run(options: argparse.Namespace) -> CommandResult:
     output = Path(options.output)
     rig = build_rig(found, recording, options.jaw, options.tag_family)
     write_rig(rig, output)
-    picture = Path(options.overlay or output.with_suffix(".png"))
+    picture = output.with_suffix(".png")
     import_cv2().imwrite(str(picture), draw_placement(found, colors[0], recording, jaws)[..., ::-1])
     print(describe_placement(found, jaws))
     print(f"Rig: {output}; {picture}: jaws as found in orange, key points seen in green")

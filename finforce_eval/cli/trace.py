@@ -23,7 +23,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add what names the recording, and how the stages run."""
     parser.add_argument("bag", metavar="BAG", help=BAG_HELP)
     add_run_options(parser, settings=False)
-    parser.add_argument("--apart", action="store_true", help="run every stage in its own process")
 
 
 def run(options: argparse.Namespace) -> CommandResult:
@@ -35,7 +34,7 @@ def run(options: argparse.Namespace) -> CommandResult:
     keypoints = parse_source(options)
     recording = keypoints.read(options.bag)
     with TemporaryDirectory() as folder:
-        playing = Playing(composed=not options.apart, trace=folder)
+        playing = Playing(trace=folder)
         log = play_to_nodes(
             recording,
             make_setup(options),

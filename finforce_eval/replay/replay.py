@@ -39,14 +39,12 @@ class Playing:
     Attributes:
         rate: speed; at 1 the stamps are shifted to now, else they stay and the nodes take their time from /clock.
         domain: ROS_DOMAIN_ID; None takes one by chance.
-        composed: detector, contact estimator and solvers in one process.
         trace: folder in which the nodes note when they were at work; empty for none. Then only the grasp
             force is received: more would add work.
     """
 
     rate: float = 1.0
     domain: int | None = None
-    composed: bool = True
     trace: str = ""
 
     @property
@@ -147,7 +145,7 @@ def play_to_nodes(
         processes = _for_scores(processes, recording, setup, keypoints)
         environment = {} if playing.domain is None else {"ROS_DOMAIN_ID": str(playing.domain)}
         run = run_nodes(
-            compose(processes) if playing.composed else processes,
+            compose(processes),
             messages,
             sides,
             heard=() if playing.trace else sides,
