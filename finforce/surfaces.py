@@ -100,7 +100,7 @@ def _refuse_other_kinds(content: bytes) -> None:
     if content[:3] == b"ply" and end and b"element vertex 0" not in header:
         if b"f_dc_0" in header:
             raise FileError(
-                "holds Gaussian splats, expected triangles: take the GLB that the generator writes beside it"
+                "holds Gaussian splats, no triangles: `finforce reconstruct --mesh` takes those of a binary PLY"
             )
         if b"element face" not in header and b"element tristrips" not in header:
             raise FileError("is a point cloud, expected triangles: reconstruct its surface, as MeshLab does")

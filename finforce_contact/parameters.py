@@ -145,12 +145,12 @@ def load_generated(parameters: ContactParameters) -> GeneratedMesh | None:
         PoseError: the pose is not seven finite numbers with a unit quaternion.
     """
     from finforce.transforms import pose_from_quaternion
-    from finforce_contact.mesh.object_mesh import read_triangles
     from finforce_contact.reconstruction.evidence import GeneratedMesh
+    from finforce_contact.reconstruction.generated import read_generated
 
     if not parameters.generated_mesh:
         return None
-    vertices, triangles = read_triangles(parameters.generated_mesh)
+    vertices, triangles = read_generated(parameters.generated_mesh)
     affine = pose_from_quaternion(parameters.generated_pose[:3], parameters.generated_pose[3:])
     affine[:3, :3] *= parameters.generated_scale
     name = Path(parameters.generated_mesh).name

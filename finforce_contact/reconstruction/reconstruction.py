@@ -230,7 +230,7 @@ def prepare_generated(generated: GeneratedMesh, evidence: ImageEvidence) -> tupl
     """
     vertices = np.asarray(generated.vertices, dtype=float)
     if vertices.ndim != 2 or vertices.shape[-1] != 3 or len(vertices) < 4 or not np.isfinite(vertices).all():
-        raise ReconstructionError(f"{generated.name}: vertices {vertices.shape}; expected finite ones, (n, 3), n > 3")
+        raise ReconstructionError(f"generated mesh: vertices {vertices.shape}; expected finite ones, (n, 3), n > 3")
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     size = max(float(np.linalg.norm(high - low)), 1e-12)
     factor = float(np.linalg.norm(np.ptp(evidence.points, axis=0))) / size

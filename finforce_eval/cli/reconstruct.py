@@ -17,10 +17,10 @@ from finforce.camera import MILLIMETRE
 from finforce.errors import PoseError
 from finforce.files import read_json
 from finforce.optional import import_trimesh
-from finforce_contact.mesh.object_mesh import read_triangles
 from finforce_contact.mesh.views import MeshView
 from finforce_contact.reconstruction.evidence import GeneratedMesh, ImageEvidence, Reconstruction, collect_evidence
 from finforce_contact.reconstruction.generated import affine_from_generator
+from finforce_contact.reconstruction.generated import read_generated as read_mesh
 from finforce_contact.reconstruction.reconstruction import FROM_GENERATED, reconstruct
 from finforce_eval.cli.parser import CommandResult, picture_file
 from finforce_eval.errors import OptionError
@@ -43,7 +43,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     intrinsics = "fx fy cx cy [k1 k2 p1 p2 k3] in pixels, or a file of ROS, OpenCV, kalibr, BOP or OpenICC"
     parser.add_argument("--intrinsics", required=True, nargs="+", metavar="NUMBER", help=intrinsics)
     parser.add_argument("--color", metavar="FILE", help="colour image, shown in --picture")
-    parser.add_argument("--mesh", metavar="FILE", help="generated mesh (STL, OBJ, PLY, GLB), in any unit")
+    parser.add_argument(
+        "--mesh", metavar="FILE", help="generated mesh (STL, OBJ, PLY, GLB) or splats (PLY), in any unit"
+    )
     pose = "JSON with its pose: rotation (w x y z), translation and scale as from SAM-3D, or a 4x4 matrix"
     parser.add_argument("--pose", metavar="FILE", help=pose)
     method = "method (robust with a generated mesh; otherwise primitive if one fits, else completion)"
@@ -118,7 +120,7 @@ def read_generated(options: argparse.Namespace) -> GeneratedMesh:
     Raises:
         FinforceError: mesh or pose cannot be used.
     """
-    vertices, triangles = read_triangles(options.mesh)
+    vertices, triangles = read_mesh(options.mesh)
     affine = read_generated_pose(options.pose)
     return GeneratedMesh(vertices=vertices, triangles=triangles, affine=affine, name=Path(options.mesh).stem)
 

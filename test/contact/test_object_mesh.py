@@ -343,7 +343,7 @@ PLY = f"ply\nformat ascii 1.0\nelement vertex 1\n{AXES}{{}}end_header\n0 0 0\n"
 OTHERS = {
     "old.glb": (b"glTF\1\0\0\0" + bytes(12), "glTF 1.0, expected 2.0"),
     "cloud.ply": (PLY.format("").encode(), "is a point cloud"),
-    "splats.ply": (PLY.format("property float f_dc_0\n").encode(), "Gaussian splats, expected triangles.*GLB"),
+    "splats.ply": (PLY.format("property float f_dc_0\n").encode(), "Gaussian splats, no triangles.*reconstruct --mesh"),
     "cup.dae": (b"<COLLADA/>", "got ending '.dae'"),
 }
 
