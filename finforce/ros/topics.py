@@ -428,14 +428,14 @@ class Listening(NamedTuple):
 
 
 def listen(
-    types: Mapping[str, str], enough: Callable[[Heard], bool], patience: float, domain: int | None = None
+    types: Mapping[str, str], enough: Callable[[Heard], bool], timeout: float, domain: int | None = None
 ) -> Listening:
     """Listen to topics until enough has come, or for some time.
 
     Args:
         types: of the topics, as `sensor_msgs/msg/Image`.
         enough: says whether what came is enough.
-        patience: the longest time [s].
+        timeout: the longest time [s].
         domain: ROS_DOMAIN_ID; None for that of the environment.
     """
     heard: dict[str, list[bytes]] = {topic: [] for topic in types}
@@ -449,7 +449,7 @@ def listen(
             node.create_subscription(
                 getattr(import_module(f"{package}.msg"), kind), topic, heard[topic].append, SENSOR, raw=True
             )
-        deadline = monotonic() + patience
+        deadline = monotonic() + timeout
         while not enough(heard) and monotonic() < deadline:
             executor.spin_once(timeout_sec=0.1)
         there = {name: tuple(kinds) for name, kinds in node.get_topic_names_and_types() if node.count_publishers(name)}

@@ -94,12 +94,12 @@ def build_splat_surface(places: NDArray, name: str) -> tuple[NDArray, NDArray]:
     outer = int(np.argmax(np.linalg.norm(points - points.mean(axis=0), axis=1)))
     if normals[outer] @ (points[outer] - points.mean(axis=0)) < 0.0:
         normals = -normals
-    return solve_poisson(points, normals, POISSON_ROOMS[0])
+    return solve_poisson(points, normals, POISSON_SCALES[0])
 
 
 POISSON_POINTS = 60000
 POISSON_DEPTH = 7  # 128 cells along the largest extent: 0.9 mm for an object of 100 mm
-POISSON_ROOMS = (1.1, 1.3, 1.6)  # where a hole is large, its cover swells and needs room to close
+POISSON_SCALES = (1.1, 1.3, 1.6)  # where a hole is large, its cover swells and needs room to close
 
 
 def close_mesh(mesh: ObjectMesh) -> ObjectMesh:
@@ -120,8 +120,8 @@ def build_poisson_mesh(mesh: ObjectMesh) -> ObjectMesh:
     """
     points = sample_surface(mesh, POISSON_POINTS, np.random.default_rng(0)).points
     normals = MeshView(mesh).closest(points, np.eye(4)).normals
-    for room in POISSON_ROOMS:
-        vertices, triangles = solve_poisson(points, normals, room)
+    for scale in POISSON_SCALES:
+        vertices, triangles = solve_poisson(points, normals, scale)
         closed = prepare_object_mesh(vertices, triangles, name=mesh.name)
         if closed.watertight:
             return replace(closed, notes=(*mesh.notes, "Closed by a Poisson surface.", *closed.notes))
@@ -130,7 +130,7 @@ def build_poisson_mesh(mesh: ObjectMesh) -> ObjectMesh:
     )
 
 
-def solve_poisson(points: NDArray, normals: NDArray, room: float) -> tuple[NDArray, NDArray]:
+def solve_poisson(points: NDArray, normals: NDArray, scale: float) -> tuple[NDArray, NDArray]:
     """Return vertices (n, 3) and triangles (m, 3) of the Poisson surface of points (k, 3) with outward normals.
 
     Of several pieces the largest is kept: the others are specks between walls that are nearly touching.
@@ -138,13 +138,13 @@ def solve_poisson(points: NDArray, normals: NDArray, room: float) -> tuple[NDArr
     Args:
         points: of the surface.
         normals: there.
-        room: side of the cube that is solved in, over the largest extent of the points.
+        scale: side of the cube that is solved in, over the largest extent of the points.
     """
     open3d = import_open3d()
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
     cloud.normals = open3d.utility.Vector3dVector(normals)
     solve = open3d.geometry.TriangleMesh.create_from_point_cloud_poisson
-    surface, _ = solve(cloud, depth=POISSON_DEPTH, scale=room, n_threads=1)
+    surface, _ = solve(cloud, depth=POISSON_DEPTH, scale=scale, n_threads=1)
     pieces, sizes, _ = surface.cluster_connected_triangles()
     return np.asarray(surface.vertices), np.asarray(surface.triangles)[np.asarray(pieces) == np.argmax(sizes)]
 

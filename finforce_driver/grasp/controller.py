@@ -50,7 +50,7 @@ class ForceGrasp:
         ratios: list[float] | None = None,
     ) -> None:
         jaws, self._ratios = jaws or GripperSettings(), [] if ratios is None else ratios
-        self._below, self._doubts = False, 0
+        self._below, self._low_images = False, 0
         self.goal, self.settings = goal, settings or GraspSettings()
         self.set_force = self.settings.check_force(goal.force)
         self._feed = ForceFeed(self.settings.stale_after)
@@ -290,8 +290,8 @@ class ForceGrasp:
             return
         known = state.force * (median(self._ratios) if len(self._ratios) >= _SETTLED else 1.0)
         low = known > _FACTOR * load.pressing + _REST_FRICTION
-        self._doubts = self._doubts + 1 if low else 0
-        if self._doubts >= _SETTLED:
+        self._low_images = self._low_images + 1 if low else 0
+        if self._low_images >= _SETTLED:
             raise UnseenForceError(
                 f"the motor holds {known:.1f} N by its current, the camera says {load.pressing:.2f} N: is the "
                 "camera's calibration off by a factor? The jaws back off"

@@ -100,7 +100,7 @@ class Knowledge:
 
     Attributes:
         reply: the last believed one; None before the first.
-        doubt: why the gripper's own flag of a calibration is not trusted, in a sentence; empty: it is.
+        distrust: why the gripper's own flag of a calibration is not trusted, in a sentence; empty: it is.
         asleep: the power stage sleeps since a fault, a calibration or a stop, whatever the reply echoes of orders.
         telemetry: temperature, supply, errors.
         filter: decides which replies are believed.
@@ -111,7 +111,7 @@ class Knowledge:
     """
 
     def __init__(self, settings: GripperSettings) -> None:
-        self.doubt = ""
+        self.distrust = ""
         self.asleep = False
         self.telemetry = Telemetry(settings.telemetry_period)
         self.filter = ReplyFilter(settings.reply_timeout)
@@ -120,7 +120,7 @@ class Knowledge:
         self._contact_since = math.inf
 
     def forget(self) -> None:
-        """Know nothing any more; only a doubt and a sleeping power stage do not heal by themselves."""
+        """Know nothing any more; only such distrust and a sleeping power stage do not heal by themselves."""
         self.reply, self._contact_since = None, math.inf
         self.telemetry.forget()
         self.filter.forget()
@@ -140,7 +140,7 @@ class Knowledge:
     @property
     def calibrated(self) -> bool:
         """Whether the position means something."""
-        return self.reply is not None and self.reply.calibrated and not self.doubt
+        return self.reply is not None and self.reply.calibrated and not self.distrust
 
     @property
     def error(self) -> bool:

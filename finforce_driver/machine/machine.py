@@ -158,7 +158,9 @@ class GripperMachine(Drive):
         self.orders.drop()
         self._watch.forget()
         self.note, self._enabled = "", True
-        self.calibration = CalibrationRun(self.settings, calibrated=self.known.calibrated, reset=bool(self.known.doubt))
+        self.calibration = CalibrationRun(
+            self.settings, calibrated=self.known.calibrated, reset=bool(self.known.distrust)
+        )
 
     @_command
     def clear_errors(self) -> None:
@@ -254,7 +256,7 @@ class GripperMachine(Drive):
         """Forget what can have changed by the time the link is back, and want nothing."""
         if self.calibration is not None:
             # without an earlier calibration the gripper's flag will say whether it was completed
-            self.known.doubt = self.known.doubt or (HALF_CALIBRATED if self.known.calibrated else "")
+            self.known.distrust = self.known.distrust or (HALF_CALIBRATED if self.known.calibrated else "")
             self.calibration = None
         self.recovery = None
         self._abort(reason)
@@ -381,7 +383,7 @@ class GripperMachine(Drive):
     def _break_calibration(self) -> None:
         """Note that a calibration under way is cut short."""
         if self.calibration is not None:
-            self.calibration, self.known.doubt = None, HALF_CALIBRATED
+            self.calibration, self.known.distrust = None, HALF_CALIBRATED
             self.known.asleep = True
 
     def _postpone_hold(self) -> None:
@@ -431,8 +433,8 @@ class GripperMachine(Drive):
             self._follow_calibration(reply)
         elif before is not None and before.calibrated and not reply.calibrated:
             self._abort(REBOOTED)
-            self.known.doubt = ""
-        elif before is not None and reply.calibrated and not before.calibrated and not self.known.doubt:
+            self.known.distrust = ""
+        elif before is not None and reply.calibrated and not before.calibrated and not self.known.distrust:
             self._lose_place("the gripper was calibrated, but not by this driver", False)
         elif not reply.error:
             self._follow_orders(reply)
@@ -485,7 +487,7 @@ class GripperMachine(Drive):
         run.take(reply)
         if run.step.over:
             self.calibration = None
-            self.known.doubt = HALF_CALIBRATED if run.step is Step.FAILED else ""
+            self.known.distrust = HALF_CALIBRATED if run.step is Step.FAILED else ""
             self.known.asleep = True
             self.known.restart_history()
             self._abort(run.reason)
@@ -553,6 +555,6 @@ class GripperMachine(Drive):
         stop = self.order(position=position, flags=flags)
         self._break_calibration()
         self._abort()
-        self.known.doubt = LOST.format(what=what)
+        self.known.distrust = LOST.format(what=what)
         self.orders.want(stop, urgent=True)
         self.refresh()

@@ -45,7 +45,7 @@ def run(options: argparse.Namespace) -> CommandResult:
         print(f"{name}: {old} -> {new}")
     print(format_changes(changes))
     found = {"changes": [asdict(change) for change in changes], "mean": asdict(total_change(changes))}
-    worse = options.strict and any(change.verdict in (WORSE, LOST) for change in changes)
+    worse = options.strict and any(change.outcome in (WORSE, LOST) for change in changes)
     return CommandResult(found, status=WORSE_FOUND if worse else 0)
 
 
@@ -72,12 +72,12 @@ def format_changes(changes: Sequence[Change]) -> str:
             "difference/N": row.difference,
             "chance/N": row.stddev if np.isfinite(row.stddev) else np.nan,
             "answered/%": "{:.1f} {:.1f}".format(*row.answered),
-            "verdict": row.verdict,
+            "outcome": row.outcome,
         }
         for row in (*changes, total_change(changes))
     ]
     lines = [pd.DataFrame(rows).set_index("").to_string(float_format="{:.4f}".format, na_rep="-")]
-    counts = {verdict: sum(change.verdict == verdict for change in changes) for verdict in (BETTER, WORSE, SAME)}
+    counts = {outcome: sum(change.outcome == outcome for change in changes) for outcome in (BETTER, WORSE, SAME)}
     rest = len(changes) - sum(counts.values())
     lines.append(
         f"{counts[BETTER]} better, {counts[WORSE]} worse, {counts[SAME]} the same, {rest} unsure or in one file only. "

@@ -39,7 +39,7 @@ class Change:
         after: in the second [N], NaN without.
         stddev: of the difference [N]; infinite where nobody can tell.
         answered: share of the frames to be answered that were, before and after [%].
-        verdict: "better", "worse", "same", "unsure", "new" or "gone".
+        outcome: "better", "worse", "same", "unsure", "new" or "gone".
     """
 
     name: str
@@ -47,7 +47,7 @@ class Change:
     after: float
     stddev: float
     answered: tuple[float, float]
-    verdict: str
+    outcome: str
 
     @property
     def difference(self) -> float:
@@ -89,7 +89,7 @@ def total_change(changes: Sequence[Change]) -> Change:
     """Return the change of the mean error of the recordings that both evaluations have."""
     both = [change for change in changes if np.isfinite(change.difference)]
     if not both:
-        return Change(name="mean", before=nan, after=nan, stddev=inf, answered=(nan, nan), verdict=UNSURE)
+        return Change(name="mean", before=nan, after=nan, stddev=inf, answered=(nan, nan), outcome=UNSURE)
     before, after = (float(np.mean([getattr(change, side) for change in both])) for side in ("before", "after"))
     stddev = sqrt(sum(change.stddev**2 for change in both)) / len(both)
     answered = tuple(float(np.mean([change.answered[side] for change in both])) for side in (0, 1))
@@ -99,7 +99,7 @@ def total_change(changes: Sequence[Change]) -> Change:
         after=after,
         stddev=stddev,
         answered=answered,
-        verdict=_judge(after - before, stddev),
+        outcome=_judge(after - before, stddev),
     )
 
 
@@ -115,11 +115,11 @@ def _compare(name: str, before: Mapping[str, Any] | None, after: Mapping[str, An
     errors = [_error(case) for case in (before, after)]
     answered = (_answered(before), _answered(after))
     if before is None or after is None:
-        verdict = GAINED if before is None else LOST
-        return Change(name=name, before=errors[0], after=errors[1], stddev=inf, answered=answered, verdict=verdict)
+        outcome = GAINED if before is None else LOST
+        return Change(name=name, before=errors[0], after=errors[1], stddev=inf, answered=answered, outcome=outcome)
     stddev = _find_stddev(before, after, *errors)
-    verdict = WORSE if answered[1] < answered[0] - LEAST_ANSWERS else _judge(errors[1] - errors[0], stddev)
-    return Change(name=name, before=errors[0], after=errors[1], stddev=stddev, answered=answered, verdict=verdict)
+    outcome = WORSE if answered[1] < answered[0] - LEAST_ANSWERS else _judge(errors[1] - errors[0], stddev)
+    return Change(name=name, before=errors[0], after=errors[1], stddev=stddev, answered=answered, outcome=outcome)
 
 
 def _error(case: Mapping[str, Any] | None) -> float:

@@ -336,7 +336,7 @@ def update_state(points, average, extended, forecast, expectation, state):
     white = _whiten_averages(points, extended)
     hessian, gradient = _compute_posterior(white, offset, expectation.variance, information)
     covariance = invert_symmetric(hessian)
-    height_doubt = _question_height(hessian, gradient, offset[1], expectation.variance[1], state)
+    height_variance = _question_height(hessian, gradient, offset[1], expectation.variance[1], state)
     shift = _find_shift(hessian, covariance, gradient, state)
     largest = (expectation.largest_change, LARGEST_SHIFT)
     for i in range(3):
@@ -350,7 +350,7 @@ def update_state(points, average, extended, forecast, expectation, state):
     for i in range(3):
         state.moved[i] = state.x_asked[i] - forecast.x[i]
     state.residual = _move_residuals(points, extended, state.moved, state.x_asked[0] - depth)
-    covariance[2, 2] += height_doubt
+    covariance[2, 2] += height_variance
     moved = np.array([state.x_asked[0] - depth, state.moved[1], state.moved[2]])
     state.misfit, state.scatter = _measure_misfit(points, extended, white, moved)
     state.speed = forecast.speed + gain_speed * innovation

@@ -155,10 +155,10 @@ def find_rejection_reason(state: ContactState, *, settles: bool) -> str:
     if magnitude > state["bearable"]:
         most = f"expected {state['bearable']:.0f} N at most"
         return f"the shape would take {magnitude:.0f} N, {most}; is the contact elsewhere?"
-    return _find_doubt(state, float(magnitude))
+    return _find_ambiguity(state, float(magnitude))
 
 
-def _find_doubt(state: ContactState, magnitude: float) -> str:
+def _find_ambiguity(state: ContactState, magnitude: float) -> str:
     """Return why the force of a contact that fits the key points may still be another one."""
     if state["bumped"] > BUMPED:
         motion = f"all key points have moved together by {1e3 * state['motion']:.1f} mm since the tare"

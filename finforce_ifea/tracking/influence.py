@@ -180,15 +180,15 @@ class ReachWatch:
     def reset(self) -> None:
         """Forget what was seen."""
         self._contact: Contact | None = None
-        self._is_away = False
+        self._is_out_of_reach = False
         self._modes: NDArray | None = None
         self._mean, self._count = 0.0, 0
 
     def is_idle(self, contact: Contact, points: NDArray, tare: Tare) -> bool:
         """Whether the contact's object is away and the key points (K, 3) [m] show the unloaded jaw."""
         if contact is not self._contact:
-            self._contact, self._is_away = contact, is_out_of_reach(contact, self._face_x)
-        if not self._is_away:
+            self._contact, self._is_out_of_reach = contact, is_out_of_reach(contact, self._face_x)
+        if not self._is_out_of_reach:
             self._modes, self._count = None, 0
             return False
         if self._modes is None:

@@ -25,7 +25,7 @@ from finforce_keypoints.parameters import DetectorSettings, JawMount
 _BENT_AT = 0.010  # height for which the bending is given [m]
 _HIGHEST_RIGID = 3.5e-3  # key points that bend more than this say nothing about the jaw's place [m]
 _LEAST_AGREEMENT = 0.6  # share of the points near the base that stand where the jaw is said to be: of a jaw, all do
-_SET_ASIDE = 3  # consecutive places off the course that are believed when they agree
+_SET_ASIDE = 3  # consecutive places off the trajectory that are believed when they agree
 _RIGID_STDDEV = 0.3e-3  # [m] bending of the jaw at that height; more with the square of the height
 _ORIGIN_STDDEV = 0.6e-3  # [m] a jaw whose place is less well known is not found
 COVERED_STDDEV = 3e-3  # [m] the same of a jaw whose rigid part is covered: how sure its place is goes into the force
@@ -35,7 +35,7 @@ _LEAST_NOISE = 0.05e-3  # [m] of a place by points near the base, from image to 
 _LEAST_BENT = 5  # points that tell the place of a jaw that may be bent
 _ORIGIN_GATE = 3.0  # standard deviations of an origin off the forecast, which mean that the speed has changed
 _ACCELERATION = 2e-3  # [m/s^1.5] random walk of the closing speed; what is more is noticed and followed
-_LONGEST_STEP = 0.5  # [s] without an image, after which the course starts anew
+_LONGEST_STEP = 0.5  # [s] without an image, after which the trajectory starts anew
 SCALE = 0.25e-3  # [m] of a pixel of the patch
 HALF = 20  # [px] of the patch's width and height
 BLUR = 1.5  # [px] standard deviation; wide enough that a slide by a pixel is still linear
@@ -175,14 +175,14 @@ class OriginEstimator:
         along = np.broadcast_to(self._axis, (1, *points.shape))
         columns = np.einsum("kab,ikb->kai", slopes, np.concatenate((along, self._motions[:, seen])))
         away = rays[seen, :2] - points[:, :2] / points[:, 2:]
-        prior, variance, doubt = np.diag([0.0, *np.ones(1 + BENDS)]), stddev[seen] ** 2, np.ones(len(points))
+        prior, variance, weights = np.diag([0.0, *np.ones(1 + BENDS)]), stddev[seen] ** 2, np.ones(len(points))
         for _ in range(_ROUNDS):
-            weighted = columns * (doubt / variance)[:, None, None]
+            weighted = columns * (weights / variance)[:, None, None]
             covariance = np.linalg.inv(np.einsum("kai,kaj->ij", weighted, columns) + prior)
             found = covariance @ np.einsum("kai,ka->i", weighted, away)
             # what moves far differs from its shapes more
             variance = stddev[seen] ** 2 + (SHARE**2) * ((columns[:, :, 2:] @ found[2:]) ** 2).sum(axis=1)
-            doubt = 1.0 / (1.0 + 0.5 * ((away - columns @ found) ** 2).sum(axis=1) / variance)
+            weights = 1.0 / (1.0 + 0.5 * ((away - columns @ found) ** 2).sum(axis=1) / variance)
         place, spread = middle + float(found[0]), float(np.sqrt(covariance[0, 0]))
         # what a finger differs from its shapes by is the same from image to image
         origin = Origin(x=place, stddev=spread, shared=spread, slip=SLIP * float(found[1]))
@@ -405,7 +405,7 @@ class OriginTrack:
             self._stamp, self._state[1] = stamp, 0.0
 
     def _begin(self, stamp: float, origin: Origin, speed: float = 0.0) -> Origin:
-        """Start the course at an origin."""
+        """Start the trajectory at an origin."""
         self._stamp, self._state = stamp, np.array([origin.x, speed])
         self._P = np.diag([(origin.noise or origin.stddev) ** 2, 0.01**2])
         self._aside, self._missed, self._last = [], 0, origin

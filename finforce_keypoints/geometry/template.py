@@ -286,12 +286,12 @@ def fit_motion(shapes: NDArray, moves: NDArray, stddev: NDArray, weight: NDArray
 def _fit_motion(shapes, moves, stddev, weight):
     """Return the motion (K, 2) [px] within a finger's shapes that is nearest to another; see `fit_motion`."""
     sizes, believed = np.zeros(shapes.shape[1] - len(_PAIRS)), np.zeros(len(moves))
-    found, doubt = np.zeros(moves.shape), np.ones(len(moves))
+    found, robust = np.zeros(moves.shape), np.ones(len(moves))
     for k in range(len(moves)):
         if np.isfinite(moves[k, 0]) and np.isfinite(moves[k, 1]) and np.isfinite(stddev[k]):
             believed[k] = weight[k] / stddev[k] ** 2
     for _ in range(ROUNDS):
-        sizes = _improve_sizes(shapes, sizes, moves - found, believed * doubt)
+        sizes = _improve_sizes(shapes, sizes, moves - found, believed * robust)
         sizes = np.minimum(np.maximum(sizes, -LARGEST_SIZE), LARGEST_SIZE)
         before, found = found, _move_by(shapes, sizes)
         if np.abs(found - before).max() < SETTLED:
@@ -299,7 +299,7 @@ def _fit_motion(shapes, moves, stddev, weight):
         for k in range(len(moves)):
             if believed[k] > 0.0:
                 apart = (moves[k, 0] - found[k, 0]) ** 2 + (moves[k, 1] - found[k, 1]) ** 2
-                doubt[k] = 1.0 / (1.0 + 0.5 * apart / stddev[k] ** 2)
+                robust[k] = 1.0 / (1.0 + 0.5 * apart / stddev[k] ** 2)
     return found
 
 

@@ -60,23 +60,23 @@ def run(options: RunOptions, case: Case, folder: Path) -> dict[str, Any]:
         make = ImageSensor if case.settings["source"] == "images" else EstimatorSensor
         more = {"size": case.settings["size"]} if make is ImageSensor else {}
         sensor = make(pressed, seed, **more)
-        course, untold = World(grasp, sensor, holding=HOLDING).run(), sensor.untold
+        trace, untold = World(grasp, sensor, holding=HOLDING).run(), sensor.untold
         told = sensor.told
     else:
         opening = find_taught_opening() if way == "position" else 0.0
-        course = World(grasp, NoisySensor(0.0, seed)).run_blind(opening, STRONG if way == "position" else CURRENT)
+        trace = World(grasp, NoisySensor(0.0, seed)).run_blind(opening, STRONG if way == "position" else CURRENT)
     stated, off = np.reshape(told, (-1, 2)).T
-    times, forces = np.array(course.times), np.array(course.forces)
-    start = course.touched_at if np.isfinite(course.touched_at) else 0.0
+    times, forces = np.array(trace.times), np.array(trace.forces)
+    start = trace.touched_at if np.isfinite(trace.touched_at) else 0.0
     return {
         "way": way,
         "peak_N": float(forces.max(initial=0.0)),
         "end_N": float(forces[times > times[-1] - 1.0].mean()),
         "is_broken": bool(forces.max(initial=0.0) >= BREAKS),
-        "error": course.error,
+        "error": trace.error,
         "within_3_sigma_pct": 100.0 * float((np.abs(off) <= 3.0 * stated).mean()) if told else float("nan"),
         "untold": [[round(stamp - start, 3), words] for stamp, words in untold],
-        "violations": sum(course.violations.values()),
+        "violations": sum(trace.violations.values()),
         "drawn": {
             "seconds": np.round(times[::DRAWN_EVERY] - start, 3).tolist(),
             "force": np.round(forces[::DRAWN_EVERY], 3).tolist(),

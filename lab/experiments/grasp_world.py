@@ -142,7 +142,7 @@ class World:
         self._order = count()
         self._next_image = 0.0
         self.force = 0.0
-        self.course = GraspTrace()
+        self.trace = GraspTrace()
 
     def _connect(self) -> VirtualBus:
         """Return the bus to the gripper."""
@@ -153,10 +153,10 @@ class World:
         now, opening = self.clock.now(), self.emulated.jaws.opening
         elastic = np.array([self._case.plant.force_at(opening), 0.0, 0.0])
         self.force = float(self._relaxation.update(elastic, dt)[0])
-        self.course.times.append(now)
-        self.course.forces.append(self.force)
-        if math.isnan(self.course.touched_at) and self.force > 0.02:
-            self.course.touched_at = now
+        self.trace.times.append(now)
+        self.trace.forces.append(self.force)
+        if math.isnan(self.trace.touched_at) and self.force > 0.02:
+            self.trace.touched_at = now
         if now >= self._next_image:
             self._next_image = now + 1.0 / IMAGES
             self._photograph(now, opening)
@@ -177,9 +177,9 @@ class World:
         try:
             hold_force(self.gripper, self.take, goal, self._settings, until=self._is_over)
         except Exception as error:  # whatever ends a grasp is a result of the benchmark
-            self.course.error = str(error)
-        self.course.violations = dict(self.emulated.violations)
-        return self.course
+            self.trace.error = str(error)
+        self.trace.violations = dict(self.emulated.violations)
+        return self.trace
 
     def run_blind(self, opening: float, current: float) -> GraspTrace:
         """Calibrate, open, and go to an opening [m] with a limit of the motor's current [A], whatever is there."""
@@ -189,9 +189,9 @@ class World:
             end = self.clock.now() + BLIND
             self.gripper.wait(lambda state: self.clock.now() > end, BLIND + 1.0)
         except Exception as error:  # whatever ends a grasp is a result of the benchmark
-            self.course.error = str(error)
-        self.course.violations = dict(self.emulated.violations)
-        return self.course
+            self.trace.error = str(error)
+        self.trace.violations = dict(self.emulated.violations)
+        return self.trace
 
     def _prepare(self) -> None:
         """Make the gripper ready and leave it open before the object, with the camera on."""
@@ -232,10 +232,10 @@ class World:
     def _is_over(self, status: GraspStatus) -> bool:
         """Keep the status, and say whether the force was held for long enough."""
         now = self.clock.now()
-        self.course.statuses.append((now, status))
-        if math.isnan(self.course.held_at) and status.phase is GraspPhase.HOLDING:
-            self.course.held_at = now
-        return now > self.course.held_at + self._holding
+        self.trace.statuses.append((now, status))
+        if math.isnan(self.trace.held_at) and status.phase is GraspPhase.HOLDING:
+            self.trace.held_at = now
+        return now > self.trace.held_at + self._holding
 
 
 def build_plant(pressed: PressedGrasp) -> Plant:

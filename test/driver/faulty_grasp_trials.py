@@ -176,7 +176,7 @@ class FaultyGrasp(World):
         tally.faults.update(fault.kind.value for fault in self.adapter.injected)
         tally.cameras[self._camera.kind] += 1
         tally.ends[" ".join(end.split()[:3])] += 1
-        tally.excess.append(max(self.course.forces) - self._case.force)
+        tally.excess.append(max(self.trace.forces) - self._case.force)
         if tally.complaints:
             tally.wrong.append(self._seed)
         return tally
@@ -211,10 +211,10 @@ class FaultyGrasp(World):
     def _is_over(self, status: GraspStatus) -> bool:
         """Do what the user does, and check what the grasp reports."""
         now = self.clock.now()
-        if math.isnan(self.course.held_at) and status.phase is GraspPhase.HOLDING:
-            self.course.held_at = now
+        if math.isnan(self.trace.held_at) and status.phase is GraspPhase.HOLDING:
+            self.trace.held_at = now
         sound = self._camera.is_sound(now) and now - self._unlinked > SOUND
-        settled = now - self.course.held_at > SOUND and self.emulated.mode is Mode.GRIPPER
+        settled = now - self.trace.held_at > SOUND and self.emulated.mode is Mode.GRIPPER
         if status.phase is GraspPhase.HOLDING and sound and settled and abs(self.force - status.goal) > 1.0:
             self._complain("holds something else")
         if now - self._began > self._act_at and self._act != "none":
@@ -222,7 +222,7 @@ class FaultyGrasp(World):
             if act == "estop":
                 self.gripper.estop()
             return act == "stop"
-        return now - self.course.held_at > HELD
+        return now - self.trace.held_at > HELD
 
     def _check_state(self, state: GripperState) -> None:
         """Check what the gripper reports: it is not ready while it closes."""

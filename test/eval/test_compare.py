@@ -38,13 +38,13 @@ ERRORS = RANDOM.uniform(0.002, 0.006, 100)
 
 def test_what_is_the_same_is_called_so():
     change = only(evaluation(ERRORS), evaluation(ERRORS))
-    assert (change.verdict, change.difference) == ("same", 0.0)
+    assert (change.outcome, change.difference) == ("same", 0.0)
 
 
-@pytest.mark.parametrize(("factor", "verdict"), [(0.7, "better"), (1.4, "worse")])
-def test_a_change_in_every_second_is_one(factor, verdict):
+@pytest.mark.parametrize(("factor", "outcome"), [(0.7, "better"), (1.4, "worse")])
+def test_a_change_in_every_second_is_one(factor, outcome):
     change = only(evaluation(ERRORS), evaluation(factor * ERRORS))
-    assert change.verdict == verdict
+    assert change.outcome == outcome
     assert change.difference == pytest.approx((np.sqrt(factor) - 1.0) * np.sqrt(ERRORS.mean()))
 
 
@@ -53,17 +53,17 @@ def test_one_bad_second_is_no_change_for_the_worse():
     after[50] += 0.5
     change = only(evaluation(ERRORS), evaluation(after))
     assert change.difference > 0.01
-    assert change.verdict == "unsure"
+    assert change.outcome == "unsure"
 
 
 @pytest.mark.parametrize("block", [1, 4])
 def test_chance_alone_is_rarely_called_a_change(block):
-    verdicts = []
+    outcomes = []
     for seed in range(400):
         random = np.random.default_rng(seed)
         first, second = np.repeat(random.chisquare(2, (2, 100 // block)) * 0.002, block, axis=1)
-        verdicts.append(only(evaluation(first), evaluation(second)).verdict)
-    assert sum(verdict in ("better", "worse") for verdict in verdicts) < 0.03 * len(verdicts)
+        outcomes.append(only(evaluation(first), evaluation(second)).outcome)
+    assert sum(outcome in ("better", "worse") for outcome in outcomes) < 0.03 * len(outcomes)
 
 
 def test_the_stated_chance_is_that_of_other_recordings():
@@ -80,13 +80,13 @@ def test_the_stated_chance_is_that_of_other_recordings():
 def test_without_seconds_or_with_few_nothing_is_sure():
     before, after = evaluation(ERRORS), evaluation(2 * ERRORS)
     del after["cases"]["a"]["seconds"]
-    assert only(before, after).verdict == "unsure"
-    assert only(evaluation(ERRORS[:8]), evaluation(2 * ERRORS[:8])).verdict == "unsure"
+    assert only(before, after).outcome == "unsure"
+    assert only(evaluation(ERRORS[:8]), evaluation(2 * ERRORS[:8])).outcome == "unsure"
 
 
 def test_recordings_of_one_evaluation_are_named_and_in_no_mean():
     changes = compare_evaluations(evaluation(ERRORS), evaluation(ERRORS, name="b"))
-    assert {change.name: change.verdict for change in changes} == {"a": "gone", "b": "new"}
+    assert {change.name: change.outcome for change in changes} == {"a": "gone", "b": "new"}
     assert np.isnan(total_change(changes).difference)
 
 
@@ -104,7 +104,7 @@ def test_table_and_json_tell_the_same(files, tmp_path, capsys):
     said = capsys.readouterr().out
     assert "solver: reduced -> solid" in said
     assert "1 worse" in said and "100.0 90.0" in said
-    assert json.loads(out.read_text())["changes"][0]["verdict"] == "worse"
+    assert json.loads(out.read_text())["changes"][0]["outcome"] == "worse"
     assert main(["compare", *files, "--strict"]) == 1
     assert main(["compare", files[0], files[0], "--strict"]) == 0
 

@@ -196,8 +196,8 @@ def test_bag_files_without_their_metadata_are_to_be_indexed(tmp_path):
 def test_fewer_answers_are_worse_whatever_the_error():
     case = {"all": {"rmse_N": 0.1}, "record_frames": 100, "record_skipped": 14}
     before, after = {"cases": {"a": case}}, {"cases": {"a": case | {"record_skipped": 50}}}
-    assert [change.verdict for change in compare_evaluations(before, after)] == ["worse"]
-    assert [change.verdict for change in compare_evaluations(before, before)] == ["same"]
+    assert [change.outcome for change in compare_evaluations(before, after)] == ["worse"]
+    assert [change.outcome for change in compare_evaluations(before, before)] == ["same"]
 
 
 av = pytest.importorskip("av")

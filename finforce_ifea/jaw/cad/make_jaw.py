@@ -77,12 +77,12 @@ def make_jaw(
     picture = picture or output.with_suffix(".png")
     output.parent.mkdir(parents=True, exist_ok=True)
     raw = _read_section(file, unit, body, picture, solid)
-    finger, doubt = _find_finger(file, raw, width, overrides, picture)
+    finger, stiffness_error = _find_finger(file, raw, width, overrides, picture)
     reference, place = _choose_reference(finger)
     section = output.with_suffix(".section.json")
     section.write_text(_describe_section(finger, file.name), encoding="utf-8")
     heading = f"# {name}, from {file.name}. Lengths in metres, jaw frame (x closing, y width, z base to tip)."
-    lines = [heading, f"name: {name}", *_describe_finger(finger, section.name, material, doubt)]
+    lines = [heading, f"name: {name}", *_describe_finger(finger, section.name, material, stiffness_error)]
     lines.append(f"reference_point: {_list(_put_on_side(finger, *reference))}  # {place}")
     jaw = _write_jaw(output, lines)
     if len(finger.layers) > 1 and measure_warping and (warping := measure_warping(jaw)) > _WARPING:
@@ -131,22 +131,22 @@ def _find_finger(
         raise JawFileError(f"{file.name}: a flat file has no width; give it in millimetres: --width 25")
     try:
         finger = _recognize(raw, width, overrides)
-        return finger, 0.0 if raw.photo is None else _doubt_walls(finger, raw.photo)
+        return finger, 0.0 if raw.photo is None else _find_wall_error(finger, raw.photo)
     except JawFileError as error:
         draw_refused(raw.polygon, str(error), picture)
         raise JawFileError(f"{file.name}: {error} (its section is drawn in {picture})") from error
 
 
-def _doubt_walls(finger: RecognizedFinger, photo: Photo) -> float:
+def _find_wall_error(finger: RecognizedFinger, photo: Photo) -> float:
     """Return, and note, the relative deviation of a photographed stiffness; raises JawFileError for too few pixels."""
     thinnest = min(finger.inner.usual, finger.outer.usual, float(np.median([rib.wall.usual for rib in finger.ribs])))
     across = thinnest / photo.pixel
     if across < _ACROSS:
         raise JawFileError(f"its thinnest walls are {across:.1f} pixels across, expected at least {_ACROSS}: zoom in")
-    doubt = 3.0 * float(np.hypot(_BLURRED * photo.edge, _SIDES * finger.width * photo.is_dark)) / thinnest
+    stiffness_error = 3.0 * float(np.hypot(_BLURRED * photo.edge, _SIDES * finger.width * photo.is_dark)) / thinnest
     advice = "; the sides of its walls, as dark, look like walls: chalk it and lay it on black" * photo.is_dark
-    finger.notes.append(f"thinnest walls {across:.1f} pixels across: a stiffness +- {doubt:.0%}{advice}")
-    return doubt
+    finger.notes.append(f"thinnest walls {across:.1f} pixels across: a stiffness +- {stiffness_error:.0%}{advice}")
+    return stiffness_error
 
 
 def _recognize(raw: RawSection, width: float, overrides: Overrides) -> RecognizedFinger:
@@ -178,27 +178,27 @@ def _open_cells(polygon: shapely.Polygon) -> shapely.Polygon:
     corners = np.array(polygon.minimum_rotated_rectangle.exterior.coords)[:4]
     across, along = sorted((corners[1] - corners[0], corners[2] - corners[1]), key=lambda way: np.hypot(*way))
     start, size = corners.mean(axis=0) - 0.5 * along, np.hypot(*along)
-    room = polygon.buffer(-_SKIN * np.hypot(*across))
+    interior = polygon.buffer(-_SKIN * np.hypot(*across))
     cells = []
-    for low, high in pairwise(np.linspace(*_find_whole(room, start, along, across), _CELLS + 1)):
+    for low, high in pairwise(np.linspace(*_find_whole(interior, start, along, across), _CELLS + 1)):
         middle = shapely.LineString([start + (low + _GAP) * along, start + (high - _GAP) * along])
-        parts = shapely.get_parts(room.intersection(middle.buffer(size, cap_style="flat")))
+        parts = shapely.get_parts(interior.intersection(middle.buffer(size, cap_style="flat")))
         cells.append(max(parts, key=lambda part: part.area, default=shapely.Polygon()))
     return polygon.difference(shapely.union_all(cells))
 
 
-def _find_whole(room: shapely.Geometry, start: NDArray, along: NDArray, across: NDArray) -> tuple[float, float]:
+def _find_whole(interior: shapely.Geometry, start: NDArray, along: NDArray, across: NDArray) -> tuple[float, float]:
     """Return between which shares of an outline's length cells lie: not beside a slot in either end, as of a base.
 
     Args:
-        room: what is left for cells [m].
+        interior: what is left for cells [m].
         start: the middle of one end of the box around the outline (2,) [m].
         along: from there to the other end (2,) [m].
         across: from side to side (2,) [m].
     """
     shares = np.linspace(0.0, 1.0, _LEVELS)
     ends = start + shares[:, None, None] * along + np.array([[-1.0], [1.0]]) * across
-    is_apart = shapely.get_num_geometries(shapely.intersection(room, shapely.linestrings(ends))) > 1
+    is_apart = shapely.get_num_geometries(shapely.intersection(interior, shapely.linestrings(ends))) > 1
     lower, upper = (shares[is_apart & side].tolist() for side in (shares < _SLOT, shares > 1.0 - _SLOT))
     return max([_CELLS_FROM[0], *lower]), min([_CELLS_FROM[1], *upper])
 
@@ -303,18 +303,18 @@ def _list_rings(rings: Sequence[NDArray]) -> list:
     return [np.round(1e3 * ring, 4).tolist() for ring in rings]
 
 
-def _describe_finger(finger: RecognizedFinger, section: str, name: str, doubt: float) -> list[str]:
+def _describe_finger(finger: RecognizedFinger, section: str, name: str, stiffness_error: float) -> list[str]:
     """Return the lines of a jaw file on section, material, key points and candidates.
 
     Args:
         finger: what was recognized.
         section: name of its file.
         name: of its material.
-        doubt: relative standard deviation of the stiffness for another reason.
+        stiffness_error: relative standard deviation of the stiffness for another reason.
     """
     material, tapers = MATERIALS[name], bool(finger.taper.any())
-    if doubt:
-        spread = round(min(float(np.hypot(material.spread, doubt)), 1.0), 2)
+    if stiffness_error:
+        spread = round(min(float(np.hypot(material.spread, stiffness_error)), 1.0), 2)
         material = material.model_copy(update={"name": name, "spread": spread})
         name = json.dumps(material.model_dump())
     low, high = float(finger.clamp_height(finger.face_x)) + _AWAY, _find_face_end(finger) - _AWAY
