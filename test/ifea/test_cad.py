@@ -22,7 +22,7 @@ from finforce_eval.cli.main import main
 from finforce_ifea.errors import JawFileError
 from finforce_ifea.fem.plane import PlaneModel
 from finforce_ifea.jaw.cad.cad_file import _GRID, _cut, read_section
-from finforce_ifea.jaw.cad.make_jaw import _doubt_walls, choose_keypoints, make_jaw
+from finforce_ifea.jaw.cad.make_jaw import _find_wall_error, choose_keypoints, make_jaw
 from finforce_ifea.jaw.cad.photo import Photo, read_photo
 from finforce_ifea.jaw.cad.recognition import Overrides, recognize
 from finforce_ifea.jaw.jaw import load_jaw
@@ -883,9 +883,9 @@ def test_a_photographed_finger_states_how_sure_its_stiffness_is(tmp_path, capsys
     assert load_jaw(output).material.spread == pytest.approx(np.hypot(0.3, doubt), abs=0.01)
     polygon = shapely.affinity.scale(draw_polygon(), MILLIMETRE, MILLIMETRE, origin=(0, 0))
     finger = recognize(polygon, WIDTH * MILLIMETRE, Overrides())
-    assert _doubt_walls(finger, Photo([], 1e-4, 2e-4, True)) > 1.0  # a camera sees the sides of dark walls, too
+    assert _find_wall_error(finger, Photo([], 1e-4, 2e-4, True)) > 1.0  # a camera sees the sides of dark walls, too
     with pytest.raises(JawFileError, match="walls are 4.0 pixels across, expected at least 5"):
-        _doubt_walls(finger, Photo([], 3e-4, 6e-4, False))
+        _find_wall_error(finger, Photo([], 3e-4, 6e-4, False))
 
 
 def test_the_command_writes_a_jaw_that_loads(tmp_path, capsys, surface):
