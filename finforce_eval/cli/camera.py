@@ -24,7 +24,16 @@ from finforce_keypoints.build import ANY_FINGER
 from finforce_keypoints.detectors.side_plane import AnyFinger
 from finforce_keypoints.networks.side_network import SideNetwork
 from finforce_keypoints.parameters import NO_DEPTH
-from finforce_keypoints.placement import KEPT, POLISHED, ROUNDS, STARTS, STEPS, CameraPlacement, find_placement
+from finforce_keypoints.placement import (
+    KEPT,
+    POLISHED,
+    ROUNDS,
+    STARTS,
+    STEPS,
+    TURN_STDDEV,
+    CameraPlacement,
+    find_placement,
+)
 from finforce_keypoints.rig import Rig, RigCamera, describe_mount, write_rig
 from finforce_keypoints.tags import FAMILIES, TagFinder, find_tag
 
@@ -166,6 +175,12 @@ def describe_placement(found: CameraPlacement, jaws) -> str:
         lines.append(
             "WARNING: one picture hardly tells the camera's distance and where along the jaws it looks: give images "
             "at several openings"
+        )
+    askew = [side for side, mount in found.mounts.items() if np.abs(mount.turn).max() > 2.0 * TURN_STDDEV]
+    if askew:
+        lines.append(
+            f"WARNING: {' and '.join(askew)} jaw turned by more than {np.degrees(2.0 * TURN_STDDEV):.1f} degrees, "
+            "which few mounts are: check the picture, and give images at several openings or in other light"
         )
     if found.rival > RIVAL:
         lines.append(

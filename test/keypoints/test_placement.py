@@ -441,3 +441,17 @@ def test_another_place_that_explains_the_pictures_as_well_is_named(contrast, tol
     assert ("WARNING" in describe_placement(replace(best, rival=rival), jaws)) == told
     alone = replace(best, origins={"left": np.array([-0.04])})
     assert "one picture hardly tells" in describe_placement(alone, jaws)
+
+
+@pytest.mark.parametrize(("degrees", "told"), [(6.7, True), (-6.7, True), (3.2, False)])
+def test_a_jaw_that_is_mounted_far_askew_is_named(degrees, told):
+    found = CameraPlacement(
+        T_gripper_camera=ROBOT_CAMERA,
+        mounts={"left": JawMount(turn=np.radians([0.0, 1.0, degrees]))},
+        origins={"left": np.array([-0.04, -0.03])},
+        contrast=0.9,
+        residual=0.5,
+        seen={},
+    )
+    text = describe_placement(found, {"left": load_jaw("bench")})
+    assert ("WARNING: left jaw turned by more than 5.7 degrees" in text) == told
