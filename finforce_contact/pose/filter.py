@@ -12,8 +12,8 @@ from finforce.errors import PoseError
 from finforce.transforms import check_pose, move_pose, step_between
 from finforce_contact.parameters import ContactSettings
 
-# An object rests in the jaw's frame but for random walks [m/s^0.5, rad/s^0.5], or moves at a speed that does the same
-# [m/s^1.5, rad/s^1.5] and starts within such speeds [m/s, rad/s]: each for translation and rotation.
+# For translation and rotation: random walk of an object [m/s^0.5, rad/s^0.5], of its speed while it moves [m/s^1.5,
+# rad/s^1.5], and standard deviation of the speed at which it starts [m/s, rad/s].
 _DRIFT = np.repeat([0.1e-3, 2e-3], 3) ** 2
 _ACCELERATION = np.repeat([2e-3, 0.04], 3) ** 2
 _START = np.repeat([8e-3, 0.15], 3) ** 2
@@ -44,18 +44,18 @@ class FilteredPose:
 
 
 class _Tracks(NamedTuple):
-    """One object as one that rests and as one that moves, in each of six numbers.
+    """The two states of each coordinate of a pose, at rest and in motion; x, y, z [m] and rotations [rad].
 
     Attributes:
-        odds: (2, 6) of rest and motion, of sum one.
+        probability: (2, 6) of rest and motion.
         step: (2, 6) from the trajectory.
         spread: (2, 6), variances of the steps.
-        speed: (6,) of the one that moves.
-        cross: (6,), covariances of its step and speed.
-        speed_spread: (6,), variances of its speed.
+        speed: (6,) in motion [1/s].
+        cross: (6,), covariances of step and speed in motion.
+        speed_spread: (6,), variances of the speed.
     """
 
-    odds: NDArray
+    probability: NDArray
     step: NDArray
     spread: NDArray
     speed: NDArray
@@ -65,18 +65,18 @@ class _Tracks(NamedTuple):
     @property
     def mean(self) -> NDArray:
         """Expected step (6,)."""
-        return (self.odds * self.step).sum(axis=0)
+        return (self.probability * self.step).sum(axis=0)
 
     @property
     def variance(self) -> NDArray:
         """Variance of the step (6,), that between the two included."""
-        return (self.odds * (self.spread + (self.step - self.mean) ** 2)).sum(axis=0)
+        return (self.probability * (self.spread + (self.step - self.mean) ** 2)).sum(axis=0)
 
     def mix(self, dt: float) -> "_Tracks":
-        """Let rest become motion, and motion rest, within a time [s]."""
+        """Let objects start and stop within a time [s]."""
         starts, stops = 1.0 - exp(-dt / _RESTS), 1.0 - exp(-dt / _MOVES)
-        to_rest = self.odds * np.array([[1.0 - starts], [stops]])
-        to_motion = self.odds * np.array([[starts], [1.0 - stops]])
+        to_rest = self.probability * np.array([[1.0 - starts], [stops]])
+        to_motion = self.probability * np.array([[starts], [1.0 - stops]])
         rests, moves = to_rest.sum(axis=0), to_motion.sum(axis=0)
         to_rest, to_motion = to_rest / rests, to_motion / moves
         step = np.array([(to_rest * self.step).sum(axis=0), (to_motion * self.step).sum(axis=0)])
@@ -86,7 +86,7 @@ class _Tracks(NamedTuple):
         ]
         begun, goes_on = to_motion
         return _Tracks(
-            odds=np.array([rests, moves]),
+            probability=np.array([rests, moves]),
             step=step,
             spread=np.array(spread),
             speed=goes_on * self.speed,
@@ -108,10 +108,11 @@ class _Tracks(NamedTuple):
     def correct(self, innovation: NDArray, noise: NDArray) -> "_Tracks":
         """Take a measured step (6,) of some variances (6,)."""
         left, total = innovation - self.step, self.spread + noise
-        odds = self.odds * np.exp(-0.5 * (left**2 / total - (left**2 / total).min(axis=0))) / np.sqrt(total)
+        square = left**2 / total
+        likelihood = self.probability * np.exp(-0.5 * (square - square.min(axis=0))) / np.sqrt(total)
         gain, speed_gain = self.spread / total, self.cross / total[_MOTION]
         return _Tracks(
-            odds=odds / odds.sum(axis=0),
+            probability=likelihood / likelihood.sum(axis=0),
             step=self.step + gain * left,
             spread=self.spread * (1.0 - gain),
             speed=self.speed + speed_gain * left[_MOTION],
@@ -121,11 +122,11 @@ class _Tracks(NamedTuple):
 
 
 class PoseFilter:
-    """Two Kalman filters of each of the six numbers of a pose, of one that rests and of one that moves, by their odds.
+    """Two Kalman filters for each coordinate of a pose, at rest and in motion, weighted by their probabilities.
 
-    The filter of interacting multiple models (Blom and Bar-Shalom, 1988): objects start and stop at random times. How
-    noisy the poses are is learnt from the innovations: r = v^2 - p. A pose far off the trajectory is rejected until
-    some in a row agree with each other.
+    Interacting multiple models (Blom and Bar-Shalom, 1988): objects start and stop at random times. The noise of the
+    poses is learnt from the innovations: r = v^2 - p. A pose far off the trajectory is rejected until some in a row
+    agree with each other.
     """
 
     def __init__(self, settings: ContactSettings) -> None:
@@ -195,7 +196,7 @@ class PoseFilter:
         ahead = stamp - self.stamp if stamp > self.stamp else 0.0
         tracks = self._tracks.advance(min(ahead, _LONGEST_FORECAST))
         stddev = np.sqrt(tracks.variance + _DRIFT * max(ahead - _LONGEST_FORECAST, 0.0))
-        speed = float(tracks.odds[_MOTION, 0] * tracks.speed[0])
+        speed = float(tracks.probability[_MOTION, 0] * tracks.speed[0])
         return FilteredPose(T=move_pose(self._T, tracks.mean), stddev=stddev, speed=speed)
 
     def _noise(self, covariance: NDArray | None) -> NDArray:
@@ -221,7 +222,7 @@ class PoseFilter:
         self.stamp, self.believed, self._T = stamp, stamp, T.copy()
         moves = _MOVES / (_MOVES + _RESTS) if speed is None else 0.5
         self._tracks = _Tracks(
-            odds=np.repeat([[1.0 - moves], [moves]], 6, axis=1),
+            probability=np.repeat([[1.0 - moves], [moves]], 6, axis=1),
             step=np.zeros((2, 6)),
             spread=np.array([noise, noise]),
             speed=np.zeros(6) if speed is None else speed,
