@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
+from math import ceil
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -325,13 +326,15 @@ def why_unanswered(jaws: Collection[ForceSeries]) -> str:
     """
     found = [each for each in jaws if not (each.column("status") == NOT_FOUND).all()]
     images, answered = max(map(len, jaws)), int(np.all([each.solved for each in found], axis=0).sum()) if found else 0
-    if answered >= max(1, LEAST_ANSWERED * images):
+    least = max(1, ceil(LEAST_ANSWERED * images))
+    if answered >= least:
         return ""
     counts = Counter(reason for each in jaws for reason in no_force_reasons(each) if reason)
     reasons = "; ".join(reason for reason, _ in counts.most_common(2))
     is_taring = all(np.isin(each.column("status"), ("waiting", NOT_FOUND)).all() for each in jaws)
     hint = " (separate photographs? give --stills)" if is_taring and found else ""
-    return f"a force in {answered} of {images} images, on all jaws that were found: {reasons}{hint}"
+    told = f"a force in {answered} of {images} images, on all jaws that were found, expected {least} at least"
+    return f"{told}: {reasons}{hint}"
 
 
 def no_force_reasons(forces: ForceSeries) -> list[str]:
