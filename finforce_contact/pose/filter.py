@@ -75,20 +75,16 @@ class _Tracks(NamedTuple):
     def mix(self, dt: float) -> "_Tracks":
         """Let objects start and stop within a time [s]."""
         starts, stops = 1.0 - exp(-dt / _RESTS), 1.0 - exp(-dt / _MOVES)
-        to_rest = self.probability * np.array([[1.0 - starts], [stops]])
-        to_motion = self.probability * np.array([[starts], [1.0 - stops]])
-        rests, moves = to_rest.sum(axis=0), to_motion.sum(axis=0)
-        to_rest, to_motion = to_rest / rests, to_motion / moves
-        step = np.array([(to_rest * self.step).sum(axis=0), (to_motion * self.step).sum(axis=0)])
-        spread = [
-            (share * (self.spread + (self.step - middle) ** 2)).sum(axis=0)
-            for share, middle in zip((to_rest, to_motion), step, strict=True)
-        ]
-        begun, goes_on = to_motion
+        transition = np.array([[1.0 - starts, stops], [starts, 1.0 - stops]])
+        shares = transition[:, :, None] * self.probability  # to, from, coordinate
+        probability = shares.sum(axis=1)
+        shares /= probability[:, None]
+        step = (shares * self.step).sum(axis=1)
+        begun, goes_on = shares[_MOTION]
         return _Tracks(
-            probability=np.array([rests, moves]),
+            probability=probability,
             step=step,
-            spread=np.array(spread),
+            spread=(shares * (self.spread + (self.step - step[:, None]) ** 2)).sum(axis=1),
             speed=goes_on * self.speed,
             cross=goes_on * (self.cross + begun * (self.step[_MOTION] - self.step[_REST]) * self.speed),
             speed_spread=goes_on * (self.speed_spread + begun * self.speed**2) + begun * _START,
