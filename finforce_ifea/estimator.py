@@ -347,12 +347,10 @@ class ForceEstimator:
         """Return the force that belongs to a contact, and how good it is."""
         error = hypot(self._force_error, state["location_error"], _EXTRAPOLATED * state["extrapolation"])
         vectors, dt = np.empty((7, 3)), self._pass_time()
-        magnitude, stddev = compute_force(state, self._relaxation.packed, dt, error, self._modulus_error, vectors)
-        force, torque, force_stddev, torque_stddev, point, location, normal = vectors
         self._untold.update(np.zeros(3), dt)
-        memory = self._untold.overstress
-        if memory.any():
-            force_stddev, stddev = np.hypot(force_stddev, memory), hypot(stddev, *memory)
+        relaxation, untold = self._relaxation.packed, self._untold.overstress
+        magnitude, stddev = compute_force(state, relaxation, untold, dt, error, self._modulus_error, vectors)
+        force, torque, force_stddev, torque_stddev, point, location, normal = vectors
         return Solution(
             stamp=self._stamp,
             status="ok" if magnitude > 0.0 else "unloaded",

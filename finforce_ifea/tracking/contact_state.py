@@ -198,7 +198,7 @@ UNSEEN_ALONG = 0.3
 
 
 @njit(**_OPTIONS)
-def compute_force(state, relaxation, dt, error, stiffness_error, out):
+def compute_force(state, relaxation, untold, dt, error, stiffness_error, out):
     """Write the force that the material gives now, and what belongs to it, to out (7, 3).
 
     The rows are force [N], torque about the jaw frame's origin [N m], their standard deviations, contact point [m],
@@ -207,6 +207,7 @@ def compute_force(state, relaxation, dt, error, stiffness_error, out):
     Args:
         state: see `CONTACT_STATE`.
         relaxation: the finger's, see `Relaxation.packed`, which is advanced by dt.
+        untold: standard deviation of what forces that were not told have left in it (3,) [N].
         dt: time since the last force [s].
         error: relative standard deviation of the mechanics, in magnitude and direction alike.
         stiffness_error: relative standard deviation of the material's modulus, which leaves the direction as it is.
@@ -231,7 +232,7 @@ def compute_force(state, relaxation, dt, error, stiffness_error, out):
     more = (wrong + leaked[0] ** 2 + state.hidden**2, lateral, wrong + inclination + leaked[2] ** 2)
     along = (leaked * force).sum() / max(magnitude, 1e-300)
     for a in range(3):
-        variance = more[a] + (stiffness_error * force[a]) ** 2
+        variance = more[a] + (stiffness_error * force[a]) ** 2 + untold[a] ** 2
         for i in range(3):
             for j in range(3):
                 variance += modes[a, i] * covariance[i, j] * modes[a, j]
@@ -250,8 +251,8 @@ def compute_force(state, relaxation, dt, error, stiffness_error, out):
             normal[a] = force[a] / magnitude
         else:
             arm[a] = undeformed[a] = normal[a] = np.nan
-    scaled = (stiffness_error * magnitude) ** 2
-    return magnitude, np.sqrt(fit**2 + wrong + scaled + along**2 + state.hidden**2)
+    scaled, left = (stiffness_error * magnitude) ** 2, _measure_length(untold) ** 2
+    return magnitude, np.sqrt(fit**2 + wrong + scaled + along**2 + state.hidden**2 + left)
 
 
 @njit(**_OPTIONS)

@@ -277,3 +277,4 @@ def test_relaxation_under_a_force_that_is_not_told_is_remembered(monkeypatch):
     assert untold[HELD_5].status == "unobservable"
     np.testing.assert_allclose(untold[230].force, told[230].force, atol=0.01)
     assert untold[230].force_stddev[0] > 1.2 * told[230].force_stddev[0]
+    assert untold[230].torque_stddev[1] > 1.2 * told[230].torque_stddev[1]
