@@ -99,9 +99,15 @@ class Section:
         """The section as one polygon with holes."""
         return shapely.Polygon(self.rings[0], self.rings[1:])
 
-    @property
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Section) and (self.content, self.size) == (other.content, other.size)
+
+    def __hash__(self) -> int:
+        return hash((self.content, self.size))
+
+    @cached_property
     def content(self) -> bytes:
-        """All that makes the finger's shape and clamp, to a micrometre."""
+        """All that makes the finger's shape and clamp, to a micrometre; sections with the same are equal."""
         numbers = [self.width, np.nan if self.clamped_z is None else self.clamped_z, *self.clamped_circles.ravel()]
         numbers += self.taper.tolist() if self.taper.any() else []
         numbers += [self.clamp_slope] if self.clamp_slope else []

@@ -1,6 +1,7 @@
 """Quadratic triangles in a finger's section, and quadratic tetrahedra in what it becomes when it is extruded."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import shapely
@@ -41,6 +42,7 @@ class PlaneMesh:
     corners: int
 
 
+@lru_cache(maxsize=4)  # of one finger at two densities, and of another
 def mesh_section(section: Section, share: float = 1.0) -> PlaneMesh:
     """Divide a section into quadratic triangles.
 
@@ -223,6 +225,7 @@ def _add_middles(points: NDArray, triangles: NDArray) -> PlaneMesh:
     )
 
 
+@lru_cache(maxsize=4)
 def extrude_section(section: Section, share: float = 1.0) -> VolumeMesh:
     """Return the finger as 10-node tetrahedra, three to a prism.
 

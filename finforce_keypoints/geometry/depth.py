@@ -118,11 +118,12 @@ def _thin_out(raster: NDArray, chosen: NDArray) -> NDArray:
 
 def _cover(triangles: NDArray, raster: NDArray) -> NDArray[np.bool_]:
     """Return which points (a, a) of a raster (a, a, 2) triangles (n, 3, 2) cover."""
-    inside, slack = np.zeros(raster.shape[:2], dtype=bool), 1e-9
+    inside, steps, slack = np.zeros(raster.shape[:2], dtype=bool), raster[:, 0, 0], 1e-9
     for corners in triangles:
-        along, away = np.roll(corners, -1, axis=0) - corners, raster[..., None, :] - corners
+        box = tuple(map(slice, *np.searchsorted(steps, (corners.min(axis=0) - slack, corners.max(axis=0) + slack))))
+        along, away = np.roll(corners, -1, axis=0) - corners, raster[box][..., None, :] - corners
         turn = along[:, 0] * away[..., 1] - along[:, 1] * away[..., 0]
-        inside |= (turn >= -slack).all(axis=2) | (turn <= slack).all(axis=2)
+        inside[box] |= (turn >= -slack).all(axis=2) | (turn <= slack).all(axis=2)
     return inside
 
 
