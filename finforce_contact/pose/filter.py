@@ -24,6 +24,7 @@ _JUMP_POSES = 3  # in a row off the trajectory that agree with each other are be
 # Samples over which noise is learnt, and how many the assumed noise counts for.
 _NOISE_MEMORY, _NOISE_PRIOR = 60.0, 6.0
 _NOISE_RANGE = (1e-2, 1e2)
+_MOST_ALIKE = 0.9  # correlation of errors from one pose to the next
 _LONGEST_FORECAST = 0.2
 _REST, _MOTION = 0, 1
 
@@ -121,8 +122,9 @@ class PoseFilter:
     """Two Kalman filters for each coordinate of a pose, at rest and in motion, weighted by their probabilities.
 
     Interacting multiple models (Blom and Bar-Shalom, 1988): objects start and stop at random times. The noise of the
-    poses is learnt from the innovations: r = v^2 - p. A pose far off the trajectory is rejected until some in a row
-    agree with each other.
+    poses is learnt from the innovations: r = v^2 - p. Poses whose errors are alike from one to the next, by a
+    correlation c, tell less: they count as if of the variance r (1 + c) / (1 - c). A pose far off the trajectory is
+    rejected until some in a row agree with each other.
     """
 
     def __init__(self, settings: ContactSettings) -> None:
@@ -137,7 +139,7 @@ class PoseFilter:
         self.stamp: float | None = None
         self.believed = 0.0
         self.latest: NDArray | None = None
-        self._scale = np.ones(6)
+        self._scale, self._alike = np.ones(6), np.zeros(6)
         self._learnt = _NOISE_PRIOR
         self._rejected: deque[tuple[float, NDArray]] = deque(maxlen=_JUMP_POSES)
 
@@ -169,8 +171,9 @@ class PoseFilter:
         if (innovation**2 > _GATE**2 * (spread + noise)).any():
             return self._reject(stamp, T, noise)
         self._rejected.clear()
-        self._learn(innovation**2 - spread, None if covariance is None else noise)
-        self._tracks = self._tracks.correct(innovation, noise)
+        self._learn(innovation, spread, None if covariance is None else noise)
+        alike = np.clip(self._alike / self._scale, 0.0, _MOST_ALIKE)
+        self._tracks = self._tracks.correct(innovation, noise * (1.0 + alike) / (1.0 - alike))
         self._centre()
         self.believed = stamp
         return "used"
@@ -215,7 +218,7 @@ class PoseFilter:
 
     def _begin(self, stamp: float, T: NDArray, noise: NDArray, speed: NDArray | None = None) -> None:
         """Start the trajectory at a pose, with a speed (6,) where it is known to move."""
-        self.stamp, self.believed, self._T = stamp, stamp, T.copy()
+        self.stamp, self.believed, self._T, self._innovation = stamp, stamp, T.copy(), np.zeros(6)
         moves = _MOVES / (_MOVES + _RESTS) if speed is None else 0.5
         self._tracks = _Tracks(
             probability=np.repeat([[1.0 - moves], [moves]], 6, axis=1),
@@ -227,11 +230,16 @@ class PoseFilter:
         )
         self._rejected.clear()
 
-    def _learn(self, seen: NDArray, stated: NDArray | None) -> None:
-        """Average how much larger the noise (6,) that is seen is than assumed, or than stated."""
+    def _learn(self, innovation: NDArray, spread: NDArray, stated: NDArray | None) -> None:
+        """Average how much larger the noise (6,) that is seen is than assumed or stated, and how alike at rest."""
         base = self._assumed if stated is None else stated / np.maximum(self._scale, 1.0)
         self._learnt = min(self._learnt + 1.0, _NOISE_MEMORY)
-        self._scale = np.clip(self._scale + (seen / base - self._scale) / self._learnt, *_NOISE_RANGE)
+        self._scale = np.clip(
+            self._scale + ((innovation**2 - spread) / base - self._scale) / self._learnt, *_NOISE_RANGE
+        )
+        alike = innovation * self._innovation / base
+        self._alike += self._tracks.probability[_REST] ** 2 * (alike - self._alike) / self._learnt
+        self._innovation = innovation
 
     def _reject(self, stamp: float, T: NDArray, noise: NDArray) -> str:
         """Keep a pose off the trajectory; once enough in a row agree, the trajectory starts anew from them."""

@@ -372,6 +372,20 @@ class TestPoseFilter:
             filtered.update(0.1 * sample, noisy(pose(0.03, 0.02 + 0.7 * MM * max(0, sample - 40)), random))
         assert np.sqrt(filtered._scale[2]) < 1.6
 
+    @pytest.mark.parametrize("seed", range(3))
+    def test_errors_that_are_alike_from_pose_to_pose_are_averaged_less_and_stated(self, seed):
+        filtered, random = PoseFilter(SETTINGS), np.random.default_rng(seed)
+        error, off, stated = np.zeros(6), [], []
+        for sample in range(600):
+            error = 0.7 * error + np.sqrt(1.0 - 0.7**2) * random.normal(0.0, 1.0, 6)
+            filtered.update(0.1 * sample, pose(*(np.array([0.03, 0.04]) + 0.5 * MM * error[:2])))
+            found = filtered.at(0.1 * sample)
+            if sample >= 120:
+                off.append(found.T[[0, 2], 3] - (0.03, 0.04))
+                stated.append(found.stddev[[0, 2]])
+        assert (np.abs(off) < 3.0 * np.array(stated)).mean() > 0.93
+        assert np.sqrt(np.mean(np.square(off))) < 0.7 * 0.5 * MM
+
     def test_single_wild_pose_is_set_aside_and_three_that_agree_are_believed(self):
         filtered = PoseFilter(SETTINGS)
         for sample in range(20):
