@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from finforce.errors import FinforceError, one_line
 from finforce.files import FileError, check_inside
 from finforce.messages import read_stamp
+from finforce_eval.annotation.video import write_video
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.forces import estimate_forces, no_force_reasons, why_unanswered
 from finforce_eval.evaluation.gripper import combine_jaws
@@ -39,7 +40,7 @@ from finforce_eval.table import AXES, ForceSeries, write_table
 from finforce_eval.tasks import Task, hash_settings
 
 GRIPPER_FRAME = "gripper_base"
-NOTE, TABLE = "annotation.json", "forces.parquet"
+NOTE, TABLE, VIDEO = "annotation.json", "forces.parquet", "forces.mp4"
 _OK, _WARN = 0, 1
 
 
@@ -88,6 +89,8 @@ def annotate_bag(source: Path, target: Path, options: argparse.Namespace, settin
         else:
             messages = ForceMessages(jaws, combine_jaws(jaws))
             write_annotated(recording, bag_source(recording.source), messages, folder, side_file=options.side_file)
+        if options.video:
+            write_video(folder / VIDEO, recording, jaws)
         (folder / NOTE).write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
     return figures
 

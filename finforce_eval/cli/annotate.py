@@ -30,6 +30,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", default="annotated", metavar="DIR", help=text)
     text = "bags only: write the new messages without a copy of the recording"
     parser.add_argument("--side-file", action="store_true", help=text)
+    text = "draw key points and forces into the images, too: forces.mp4; not for LeRobot datasets"
+    parser.add_argument("--video", action="store_true", help=text)
     parser.add_argument("--images", dest="color", help=argparse.SUPPRESS)
     text = "datasets only: prefix of the new features (observation)"
     parser.add_argument("--prefix", default="observation", metavar="NAME", help=text)
@@ -45,6 +47,8 @@ def run(options: argparse.Namespace) -> CommandResult:
         _set_unless_given(options, "threads=1")  # a core for each recording, whatever the engine
     datasets = {name: path for name, path in named if is_dataset(path)}
     if datasets:
+        if options.video:
+            raise OptionError("--video: not for LeRobot datasets; expected recordings, videos or folders of pictures")
         if options.shard:
             raise OptionError(f"--shard {options.shard}: a dataset is written as one; give its folder to one job")
         options.jaws = options.jaws or "both"

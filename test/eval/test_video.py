@@ -1,5 +1,7 @@
 """Claims about pictures without messages: a video and a folder of them are recordings like others."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from eval_fakes import FakeEstimator, FakeJaw, make_recording
@@ -8,12 +10,15 @@ from PIL import Image
 from finforce.gripper_frames import ROBOT_CAMERA
 from finforce.transforms import pose_numbers
 from finforce_contact.loop import GivenContact
+from finforce_eval.annotation import video
 from finforce_eval.cli.main import main
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.forces import STILL_UPDATES, find_forces
 from finforce_eval.evaluation.keypoint_source import detect_keypoints
 from finforce_eval.recordings.images import ImageChoice
 from finforce_eval.recordings.recording import read_recording
+from finforce_eval.recordings.tracks import PoseTrack
+from finforce_eval.table import ForceSeries
 from finforce_keypoints.rig import Rig, RigCamera, write_rig
 
 CAMERA = RigCamera(width=64, height=48, fx=50.0, fy=50.0, cx=32.0, cy=24.0, model="plumb_bob")
@@ -54,6 +59,36 @@ def test_frames_of_a_video_have_its_times(tmp_path):
     np.testing.assert_array_equal(images.stamps, [50_000_000, 100_000_000])
     np.testing.assert_allclose([image.color.mean() for _, image in images], LEVELS[1:3], atol=6)
     assert set(recording.jaws) == {"left"} and len(recording.images) == 5
+
+
+def test_forces_are_drawn_where_they_act_at_the_times_of_the_images(tmp_path):
+    av = pytest.importorskip("av")
+    recording = read_recording(write_pictures(tmp_path / "stills"), CHOICE, ("left",))
+    stamps, ahead = recording.images.stamps, np.tile([0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0], (3, 1))
+    pose = PoseTrack(stamps=stamps, position=ahead[:, :3], quaternion=ahead[:, 3:], frame_id="camera")
+    recording.jaws["left"] = replace(recording.jaws["left"], pose=pose)
+    # 5 N, 25 mm: from (459, 244) to (374, 244) px, ten times those of the image
+    force, point = np.full((3, 3), np.nan), np.full((3, 3), np.nan)
+    force[1], point[1] = (-5.0, 0.0, 0.0), (0.014, 0.0, 0.04)
+    columns = {"force": force, "force_stddev": 0.1 * np.abs(force), "contact_point": point, "message": ["", "", "late"]}
+    forces = ForceSeries.build("stills", "left", stamps, status=["waiting", "ok", "late"], **columns)
+    video.write_video(tmp_path / "forces.mp4", recording, {"left": forces})
+    with av.open(str(tmp_path / "forces.mp4")) as file:
+        frames = list(file.decode(video=0))
+    np.testing.assert_allclose([frame.time for frame in frames], 1e-9 * (stamps - stamps[0]), atol=1e-3)
+    shown = [frame.to_ndarray(format="rgb24").astype(int) for frame in frames]
+    assert [picture.shape for picture in shown] == [(480, 640, 3)] * 3
+    purple = [int((picture[..., 0] - picture[..., 1] > 60)[240:249, 390:450].sum()) for picture in shown]
+    assert purple[0] == purple[2] == 0 < purple[1]
+    words = [int((picture[:20] > 180).all(axis=2).sum()) for picture in shown]
+    assert min(words) > 100
+
+
+def test_without_images_there_is_nothing_to_draw_into(tmp_path):
+    pytest.importorskip("av")
+    recording = replace(read_recording(write_pictures(tmp_path / "stills"), CHOICE), images=None)
+    with pytest.raises(RecordingError, match="no images to draw forces into; expected color images"):
+        video.write_video(tmp_path / "forces.mp4", recording, {})
 
 
 def test_pictures_of_another_size_than_the_rigs_are_refused(tmp_path):

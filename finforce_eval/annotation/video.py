@@ -1,0 +1,112 @@
+"""Forces drawn into the images of a recording, as a video."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce.camera import CameraIntrinsics, project
+from finforce.messages import NANOSECONDS
+from finforce.optional import import_cv2, import_library
+from finforce.transforms import pose_from_quaternion
+from finforce_eval.errors import RecordingError
+from finforce_eval.evaluation.forces import no_force_reasons
+from finforce_eval.recordings.tracks import JawTrack, Recording
+from finforce_eval.table import ForceSeries
+from finforce_eval.tasks import progress_bar
+from finforce_ifea.messages import CONTACT, FORCE, NEWTONS_PER_METRE
+
+USED, REFUSED, INK = (25, 204, 51), (230, 51, 25), (255, 255, 255)
+LEAST_HEIGHT = 480  # [px] of the video; smaller images are enlarged, so that words can be read
+LINE = 0.045  # of the height, for each jaw's words
+_QUALITY = "20"  # of H.264, constant rate factor
+
+
+def write_video(path: Path, recording: Recording, jaws: Mapping[str, ForceSeries]) -> None:
+    """Write the images of a recording with key points, force arrows and forces, at their own times.
+
+    Args:
+        path: of the new file, MP4 with H.264.
+        recording: with images.
+        jaws: the forces, by side.
+
+    Raises:
+        RecordingError: the recording has no images, or they cannot be read.
+        MissingDependencyError: PyAV is not installed.
+    """
+    av = import_library("av", "writing videos", "'finforce[lerobot]'")
+    if recording.images is None or not len(recording.images):
+        raise RecordingError(f"{recording.name}: no images to draw forces into; expected color images")
+    images, camera = recording.images.all_colors(), recording.images.camera
+    scale = -(-LEAST_HEIGHT // camera.height)
+    overlays = [_Overlay(recording.jaw(side), forces, camera, scale) for side, forces in jaws.items()]
+    first = int(images.stamps[0])
+    with av.open(str(path), "w") as file, progress_bar(len(images), "image", path.name) as bar:
+        stream = file.add_stream("libx264", rate=30, options={"crf": _QUALITY})
+        # the format has two pixels by two for each colour
+        stream.width, stream.height = 2 * (scale * camera.width // 2), 2 * (scale * camera.height // 2)
+        stream.pix_fmt, stream.codec_context.time_base = "yuv420p", Fraction(1, 1000)
+        for stamp, image in images:
+            picture = np.ascontiguousarray(image.color.repeat(scale, axis=0).repeat(scale, axis=1))
+            picture[: round(LINE * len(overlays) * stream.height)] //= 3  # words are white
+            for line, overlay in enumerate(overlays, start=1):
+                overlay.draw(picture, stamp, line)
+            frame = av.VideoFrame.from_ndarray(picture[: stream.height, : stream.width], format="rgb24")
+            frame.pts, frame.time_base = round((stamp - first) / NANOSECONDS * 1000), Fraction(1, 1000)
+            file.mux(stream.encode(frame))
+            bar.update()
+        file.mux(stream.encode())
+
+
+class _Overlay:
+    """What is drawn of one jaw."""
+
+    def __init__(self, track: JawTrack, forces: ForceSeries, camera: CameraIntrinsics, scale: int) -> None:
+        self._track, self._forces, self._camera, self._scale = track, forces, camera, scale
+        self._reasons = no_force_reasons(forces)
+        self._stated = np.linalg.norm(forces.column("force_stddev"), axis=1)
+        self._points = forces.column("contact_point")
+        self._rows = {stamp: row for row, stamp in enumerate(forces.stamps.tolist())}
+        tracks = {"found": track.detection, "pose": track.pose}
+        self._at = {
+            name: {stamp: row for row, stamp in enumerate(each.stamps.tolist())} if each is not None else {}
+            for name, each in tracks.items()
+        }
+
+    def draw(self, picture: NDArray, stamp: int, line: int) -> None:
+        """Draw what was found in an image [ns] into its picture (h, w, 3), with words in a line, the first is 1."""
+        cv2, row, found = import_cv2(), self._rows.get(stamp), self._at["found"].get(stamp)
+        if found is not None:
+            detection = self._track.detection
+            for pixel, used in zip(detection.pixels[found], detection.accepted[found], strict=True):
+                if np.isfinite(pixel).all():
+                    cv2.circle(picture, self._place(pixel), 3 * 8, USED if used else REFUSED, 1, cv2.LINE_AA, 3)
+        words = "no key points" if row is None else self._reasons[row]
+        if row is not None and not words:
+            words = f"{self._forces.magnitude[row]:.2f} N +- {self._stated[row]:.2f}"
+            self._draw_arrow(picture, row, self._at["pose"].get(stamp))
+        height, text = picture.shape[0], f"{self._forces.side}: {words}"
+        place = 8, round(LINE * height * (line - 0.3))
+        cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, height / 1000.0, INK, 1, cv2.LINE_AA)
+
+    def _draw_arrow(self, picture: NDArray, row: int, at: int | None) -> None:
+        """Draw the force where it acts, on a jaw whose pose is known."""
+        cv2, force, point = import_cv2(), self._forces.force[row], self._points[row]
+        known = at is not None and force.any() and np.isfinite([*point, *self._track.pose.position[at]]).all()
+        if not known:
+            return
+        T = pose_from_quaternion(self._track.pose.position[at], self._track.pose.quaternion[at])
+        ends = np.array([point - force / NEWTONS_PER_METRE, point]) @ T[:3, :3].T + T[:3, 3]
+        start, end = map(self._place, project(ends, self._camera))
+        colour, contact = ([round(255 * part) for part in each[:3]] for each in (FORCE, CONTACT))
+        cv2.arrowedLine(picture, start, end, colour, 2, cv2.LINE_AA, 3)
+        cv2.circle(picture, end, 4 * 8, contact, -1, cv2.LINE_AA, 3)
+
+    def _place(self, pixel: NDArray) -> tuple[int, int]:
+        """Return where a pixel of the image is in its picture, in eighths."""
+        x, y = np.clip(8.0 * (self._scale * (np.asarray(pixel) + 0.5) - 0.5), -1e5, 1e5)
+        return round(float(x)), round(float(y))
