@@ -21,7 +21,7 @@ from finforce.files import FileError, check_inside
 from finforce.messages import read_stamp
 from finforce_eval.annotation.video import write_video
 from finforce_eval.errors import RecordingError
-from finforce_eval.evaluation.forces import estimate_forces, no_force_reasons, why_unanswered
+from finforce_eval.evaluation.forces import estimate_forces, no_force_reasons, share_reached, why_unanswered
 from finforce_eval.evaluation.gripper import combine_jaws
 from finforce_eval.evaluation.keypoint_source import parse_source
 from finforce_eval.evaluation.setup import share_setup
@@ -80,7 +80,7 @@ def annotate_bag(source: Path, target: Path, options: argparse.Namespace, settin
     why = why_unanswered(jaws.values())
     if why:
         raise RecordingError(f"{target.name}: {why}")
-    figures = without_nan(_describe(jaws) | {"notes": list(recording.notes)})
+    figures = without_nan(_describe(jaws, recording) | {"notes": list(recording.notes)})
     about = {"key": key, "figures": figures, "settings": dict(setup.about), "version": version()}
     with new_folder(target) as folder:
         if is_frames(source):
@@ -95,16 +95,19 @@ def annotate_bag(source: Path, target: Path, options: argparse.Namespace, settin
     return figures
 
 
-def _describe(jaws: Mapping[str, ForceSeries]) -> dict[str, Any]:
-    """Return what the manifest tells of the forces."""
+def _describe(jaws: Mapping[str, ForceSeries], recording: Recording) -> dict[str, Any]:
+    """Return what the manifest tells of the forces, and of the key points' quality, for which no labels are needed."""
     sides = {}
     for side, forces in jaws.items():
         words, counts = np.unique(forces.column("status")[~forces.solved], return_counts=True)
+        known = bool(forces.solved.any())
         sides[side] = {
             "images": len(forces),
             "answered": int(forces.solved.sum()),
             "unanswered": dict(zip(words.tolist(), counts.tolist(), strict=True)),
-            "largest_N": float(np.nanmax(forces.magnitude)) if forces.solved.any() else float("nan"),
+            "largest_N": float(np.nanmax(forces.magnitude)) if known else None,
+            "residual_mm": 1e3 * float(np.median(forces.column("residual")[forces.solved])) if known else None,
+            "within_reach": share_reached(forces, recording.jaw(side).detection),
         }
     stamps = np.concatenate([forces.stamps for forces in jaws.values()])
     return {"jaws": sides, "span_s": round(1e-9 * float(np.ptp(stamps)), 3) if len(stamps) else 0.0}

@@ -125,8 +125,10 @@ def _print_outcome(line: dict[str, Any]) -> None:
         print(error if error.startswith(f"{name}: ") else f"{name}: {error}", file=sys.stderr)
         return
     print_notes(name, line["figures"].get("notes", ()))
-    words = [
-        f"{side} {jaw['answered']} of {jaw['images']} images, {jaw['largest_N'] or 0.0:.2f} N at most"
-        for side, jaw in line["figures"].get("jaws", {}).items()
-    ]
-    print(f"{name}: {'; '.join(words)}")
+    for side, jaw in line["figures"].get("jaws", {}).items():
+        words = [f"{name}: {side} {jaw['answered']} of {jaw['images']} images, {jaw['largest_N'] or 0.0:.2f} N at most"]
+        if jaw.get("within_reach") is not None:
+            words.append(
+                f"key points {jaw['residual_mm']:.2f} mm off, {100 * jaw['within_reach']:.0f} % within the jaw's reach"
+            )
+        print("; ".join(words))

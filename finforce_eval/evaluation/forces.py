@@ -18,7 +18,7 @@ from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.gripper import with_distances
 from finforce_eval.evaluation.pressure_centre import InnerSurface, true_lines
 from finforce_eval.evaluation.scoring import ONSET_FORCE, compare_detection, match_samples, match_truth
-from finforce_eval.recordings.tracks import Recording
+from finforce_eval.recordings.tracks import DetectionTrack, Recording
 from finforce_eval.table import AXES, ForceSeries
 from finforce_eval.tasks import progress_bar
 
@@ -341,3 +341,11 @@ def no_force_reasons(forces: ForceSeries) -> list[str]:
     """Return for each image why it has no force, "" where it has one."""
     columns = zip(forces.solved, forces.column("message"), forces.column("status"), strict=True)
     return ["" if solved else str(message or status) for solved, message, status in columns]
+
+
+def share_reached(forces: ForceSeries, detection: DetectionTrack | None) -> float | None:
+    """Return which share of the key points accepted in answered images the mechanics can reach; None if unknown."""
+    if detection is None or not forces.solved.any():
+        return None
+    accepted = detection.accepted[np.searchsorted(detection.stamps, forces.stamps[forces.solved])]
+    return float((forces.column("used")[forces.solved] & accepted).sum() / accepted.sum())

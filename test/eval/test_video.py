@@ -13,11 +13,11 @@ from finforce_contact.loop import GivenContact
 from finforce_eval.annotation import video
 from finforce_eval.cli.main import main
 from finforce_eval.errors import OptionError, RecordingError
-from finforce_eval.evaluation.forces import STILL_UPDATES, find_forces
+from finforce_eval.evaluation.forces import STILL_UPDATES, find_forces, share_reached
 from finforce_eval.evaluation.keypoint_source import detect_keypoints
 from finforce_eval.recordings.images import ImageChoice
 from finforce_eval.recordings.recording import read_recording
-from finforce_eval.recordings.tracks import PoseTrack
+from finforce_eval.recordings.tracks import DetectionTrack, PoseTrack
 from finforce_eval.table import ForceSeries
 from finforce_keypoints.rig import Rig, RigCamera, write_rig
 
@@ -82,6 +82,26 @@ def test_forces_are_drawn_where_they_act_at_the_times_of_the_images(tmp_path):
     assert purple[0] == purple[2] == 0 < purple[1]
     words = [int((picture[:20] > 180).all(axis=2).sum()) for picture in shown]
     assert min(words) > 100
+
+
+def test_of_accepted_points_those_in_answered_images_count_as_within_reach_or_not():
+    stamps, accepted = np.array([0, 10, 20, 30]), np.array([[1, 1, 1], [1, 1, 1], [1, 0, 1], [1, 1, 1]], bool)
+    nothing = np.full((4, 3, 3), np.nan)
+    found = {
+        "pixels": nothing[..., :2],
+        "points": nothing,
+        "reasons": accepted.astype(str),
+        "step_ms": nothing[:, 0, 0],
+    }
+    detection = DetectionTrack(stamps=stamps, accepted=accepted, **found)
+    force, used = (
+        np.array([[np.nan] * 3, [1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]),
+        [[False] * 3, [True] * 3, [True, True, False]],
+    )
+    series = ForceSeries.build("a", "left", stamps[:3], force=force, used=used, status=["waiting", "ok", "ok"])
+    assert share_reached(series, detection) == pytest.approx(4 / 5)
+    assert share_reached(series, None) is None
+    assert share_reached(series.at(np.array([0])), detection) is None
 
 
 def test_without_images_there_is_nothing_to_draw_into(tmp_path):
