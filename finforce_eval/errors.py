@@ -14,6 +14,10 @@ class DamagedError(RecordingError):
     """A recording breaks off, or part of it is no longer what was written."""
 
 
+class UnseenError(RecordingError):
+    """A detector found no jaw in any image."""
+
+
 class SilentReplayError(RecordingError):
     """The nodes gave no force for a recording that was played to them."""
 

@@ -33,6 +33,7 @@ from finforce_ifea.tracking.contact_state import (
     BUMPED,
     UNSEEN_ALONG,
     ContactState,
+    bound_residual,
     compute_force,
     find_rejection_reason,
 )
@@ -321,7 +322,8 @@ class ForceEstimator:
             self._tracker.reset()
             self._contact = None
             return self._fail("diverged", "the shape cannot be reached by the jaw", used, iterations)
-        reason = find_rejection_reason(state, settles=self.settings.solver != "paper")
+        most = bound_residual(self.jaw.keypoints, self._taring.tare.noise)
+        reason = find_rejection_reason(state, largest_residual=most, settles=self.settings.solver != "paper")
         if reason:
             if state["bumped"] > BUMPED and self._contact.touching is False:
                 self._taring.note(quiet=True, loaded=False)

@@ -20,11 +20,12 @@ from finforce.errors import FinforceError, one_line
 from finforce.files import FileError, check_inside
 from finforce.messages import read_stamp
 from finforce_eval.annotation.video import write_video
-from finforce_eval.errors import RecordingError
+from finforce_eval.errors import RecordingError, UnseenError
 from finforce_eval.evaluation.forces import estimate_forces, no_force_reasons, share_reached, why_unanswered
 from finforce_eval.evaluation.gripper import combine_jaws
 from finforce_eval.evaluation.keypoint_source import parse_source
 from finforce_eval.evaluation.setup import share_setup
+from finforce_eval.evaluation.unseen import describe_unseen, explain_unseen
 from finforce_eval.machine import version, without_nan
 from finforce_eval.recordings.bags import NO_DIGEST, BagReader, bag_source, is_frames, list_files, open_bag
 from finforce_eval.recordings.tracks import Recording
@@ -75,12 +76,17 @@ def annotate_bag(source: Path, target: Path, options: argparse.Namespace, settin
     setup, keypoints = share_setup(settings, options), parse_source(options)
     recording = keypoints.read(source)
     setup.contacts.check(recording)
-    recording = keypoints.apply(replace(recording, name=target.name))
+    recording = replace(recording, name=target.name)
+    try:
+        recording = keypoints.apply(recording)
+    except UnseenError as error:
+        raise RecordingError("; ".join((str(error), *explain_unseen(recording, keypoints)))) from error
     jaws = estimate_forces(recording, setup)
     why = why_unanswered(jaws.values())
+    notes = [*describe_unseen(recording, keypoints, jaws), *recording.notes]
     if why:
-        raise RecordingError(f"{target.name}: {why}")
-    figures = without_nan(_describe(jaws, recording) | {"notes": list(recording.notes)})
+        raise RecordingError(f"{target.name}: {'; '.join((*notes, why))}")
+    figures = without_nan(_describe(jaws, recording) | {"notes": notes})
     about = {"key": key, "figures": figures, "settings": dict(setup.about), "version": version()}
     with new_folder(target) as folder:
         if is_frames(source):

@@ -20,7 +20,7 @@ from finforce.gripper_frames import SIDES, read_extrinsics
 from finforce.health import Idling
 from finforce.messages import NANOSECONDS
 from finforce.transforms import pose_from_quaternion, pose_numbers, quaternion_from_pose
-from finforce_eval.errors import OptionError, RecordingError
+from finforce_eval.errors import OptionError, RecordingError, UnseenError
 from finforce_eval.recordings.images import DEPTH_ENDS, ImageChoice, ImageTrack
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.tracks import DetectionTrack, JawTrack, KeypointTrack, PoseTrack, Recording
@@ -331,7 +331,8 @@ def detect_keypoints(
         progress: called with the number of images done since its last call.
 
     Raises:
-        RecordingError: an image is damaged, or not one jaw was found in any.
+        RecordingError: an image is damaged.
+        UnseenError: not one jaw was found in any.
     """
     images, refused = recording.images, []
     found: dict[str, dict[int, JawKeypoints]] = {side: {} for side in recording.jaws}
@@ -361,7 +362,7 @@ def detect_keypoints(
     if not any(found.values()):
         commonest = max(reasons, key=reasons.get, default="")
         why = commonest or "; ".join(warnings) or "no jaw stands where it could be; another camera pose or rig?"
-        raise RecordingError(f"{recording.name}: no key points in {len(images)} images: {why}")
+        raise UnseenError(f"{recording.name}: no key points in {len(images)} images: {why}")
     notes = [f"{count} images rejected: {text}" for text, count in reasons.items()] + warnings
     notes += [f"the {side} jaw is in none of the images" for side, seen in found.items() if not seen]
     recording = replace(recording, notes=(*recording.notes, *notes))

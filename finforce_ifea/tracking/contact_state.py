@@ -126,15 +126,31 @@ _FARTHEST_SHAPE = 2.0
 _MAJORITY = 0.5
 # A location that is so surely wrong, and by at least so much [m].
 _MISTAKEN, _LEAST_OFFSET = 0.99, 4e-3
+# What is left over of the key points' places [m], and its share of the finger's length: the mechanics explain a finger
+# within 0.6 mm or 1 %, even at a height that is not quite right; in a zoomed or empty picture 1.2 mm and more remain.
+# Key points that were noisy when the jaw was tared leave more, by so many standard deviations.
+_LARGEST_RESIDUAL, _RESIDUAL_SHARE, _NOISY = 1e-3, 0.015, 3.0
 # A camera that has more probably moved than not.
 BUMPED = 0.5
 
 
-def find_rejection_reason(state: ContactState, *, settles: bool) -> str:
+def bound_residual(rest: NDArray, noise: NDArray) -> float:
+    """Return the largest residual [m] that key points of a jaw leave.
+
+    Args:
+        rest: key points of the jaw file (K, 3) [m].
+        noise: covariance (3, 3) of key points in the tare [m^2].
+    """
+    chance = _NOISY * np.sqrt(noise[0, 0] + noise[2, 2])
+    return float(max(_LARGEST_RESIDUAL, _RESIDUAL_SHARE * np.ptp(rest[:, 2]), chance))
+
+
+def find_rejection_reason(state: ContactState, *, largest_residual: float, settles: bool) -> str:
     """Return why the force of a contact state must be rejected, empty where it can be trusted.
 
     Args:
         state: of one image.
+        largest_residual: of key points of the jaw, see `bound_residual` [m].
         settles: whether the solver iterates until nothing changes, so that one that has not is rejected.
     """
     magnitude, agreement = state["magnitude"], state["agreed"] / state["known"]
@@ -155,7 +171,12 @@ def find_rejection_reason(state: ContactState, *, settles: bool) -> str:
     if magnitude > state["bearable"]:
         most = f"expected {state['bearable']:.0f} N at most"
         return f"the shape would take {magnitude:.0f} N, {most}; is the contact elsewhere?"
-    return _find_ambiguity(state, float(magnitude))
+    ambiguity = _find_ambiguity(state, float(magnitude))
+    if ambiguity or state["residual"] <= largest_residual:
+        return ambiguity
+    off = f"the key points lie {1e3 * state['residual']:.1f} mm off any shape of the jaw"
+    expected = f"expected {1e3 * largest_residual:.1f} mm at most"
+    return f"{off}, {expected}; another finger or camera, a zoomed picture, or nothing of the jaw in view?"
 
 
 def _find_ambiguity(state: ContactState, magnitude: float) -> str:

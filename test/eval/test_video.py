@@ -1,6 +1,7 @@
 """Claims about pictures without messages: a video and a folder of them are recordings like others."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from finforce_contact.loop import GivenContact
 from finforce_eval.annotation import video
 from finforce_eval.cli.main import main
 from finforce_eval.errors import OptionError, RecordingError
+from finforce_eval.evaluation import unseen
 from finforce_eval.evaluation.forces import STILL_UPDATES, find_forces, share_reached
 from finforce_eval.evaluation.keypoint_source import detect_keypoints
 from finforce_eval.recordings.images import ImageChoice
@@ -134,7 +136,8 @@ def test_pictures_without_a_jaw_have_no_force(tmp_path, capsys):
     write_rig(RIG, tmp_path / "rig.yaml")
     words = ["annotate", str(folder), "--rig", str(tmp_path / "rig.yaml"), "--contact", "fixed:40"]
     assert main([*words, "--out", str(tmp_path / "out")]) == 2
-    assert "no key points in 3 images" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "no key points in 3 images" in said and "hidden, out of the picture, or another rig?" in said
     assert not (tmp_path / "out" / "stills").exists()
 
 
@@ -174,3 +177,20 @@ def test_nothing_of_one_still_is_known_in_the_next():
     np.testing.assert_allclose(found.magnitude, STILL_UPDATES - 1)  # and settles
     times = np.array([stamp for _, stamp in seen]).reshape(4, -1)
     assert (np.diff(times, axis=1) > 0.0).all()
+
+
+def test_why_key_points_were_of_no_use_for_long_is_said_with_the_time(monkeypatch):
+    stamps, asked = 100_000_000 * np.arange(40), []
+    monkeypatch.setattr(unseen, "explain_unseen", lambda recording, source, chosen: asked.append(chosen) or ["zoomed"])
+
+    def describe(bad, status, detection="found"):
+        forces = SimpleNamespace(stamps=stamps, column=lambda name: np.where(bad, status, "ok"))
+        jaws = {"right": SimpleNamespace(detection=detection)}
+        recording = SimpleNamespace(jaws=jaws, images=SimpleNamespace(stamps=stamps))
+        return unseen.describe_unseen(recording, None, {"right": forces})
+
+    long = (stamps >= 5e8) & (stamps <= 2e9) | (stamps == 3e9)
+    assert describe(long, "unobservable") == ["right jaw, 0.5 to 2.0 s: zoomed"]
+    np.testing.assert_array_equal(asked[0], stamps[5:21])
+    for fine in ((long, "unloaded"), (long, "waiting"), (stamps < 9e8, "unobservable"), (long, "unobservable", None)):
+        assert describe(*fine) == []

@@ -33,6 +33,7 @@ from finforce_ifea.jaw.attachment import attach_points
 from finforce_ifea.observation import Contact
 from finforce_ifea.relaxation import RelaxationTerm, apply_relaxation
 from finforce_ifea.settings import EstimatorSettings
+from finforce_ifea.tracking.contact_state import bound_residual
 
 # --- accuracy
 
@@ -278,3 +279,17 @@ def test_relaxation_under_a_force_that_is_not_told_is_remembered(monkeypatch):
     np.testing.assert_allclose(untold[230].force, told[230].force, atol=0.01)
     assert untold[230].force_stddev[0] > 1.2 * told[230].force_stddev[0]
     assert untold[230].torque_stddev[1] > 1.2 * told[230].torque_stddev[1]
+
+
+def test_key_points_that_no_shape_of_the_jaw_explains_give_no_force():
+    """As a network finds them in a picture of something else, some of them near a shape by chance."""
+    recording, random = pressed(), np.random.default_rng(0)
+    wild = [
+        each.points + random.normal(0.0, 2e-3, each.points.shape) * (1, 0, 1) for each in recording.observations[60:]
+    ]
+    wild = [replace(each, points=points) for each, points in zip(recording.observations[60:], wild, strict=True)]
+    found = run(replace(recording, observations=[*recording.observations[:60], *wild]), solver="frame")[60:]
+    most = bound_residual(BENCH.keypoints, np.zeros((3, 3)))
+    assert 1e-3 < most < 1.1e-3 and all(each.residual <= most for each in found if each.trusted)
+    assert any("off any shape of the jaw" in each.message for each in found)
+    assert bound_residual(BENCH.keypoints, np.diag([1e-6, 0.0, 1e-6])) > 4e-3  # of a camera that is far away
