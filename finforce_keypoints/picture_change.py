@@ -18,7 +18,6 @@ from scipy.spatial.transform import Rotation
 
 from finforce.camera import CameraIntrinsics, project
 from finforce.gripper_frames import OpeningRange, jaw_in_camera
-from finforce_keypoints.detectors.side_plane import LIKELY_SCORE
 from finforce_keypoints.geometry.side_picture import find_side, map_picture, project_plane, take_picture
 from finforce_keypoints.placement import LEAST_GUESSED, OutlineContrast
 
@@ -34,7 +33,8 @@ FLIPS = {
     (-1, 1): "the pictures are mirrored from left to right: give them as the camera of the rig took its own",
     (1, -1): "the pictures are mirrored from top to bottom: give them as the camera of the rig took its own",
 }
-FLIPPED = 0.1  # of contrast that turning over wins: 0.4 and more, or hardly any where a gripper mirrors itself
+SURE = 0.7  # likelihood of points in pictures that show the jaws
+FLIPPED = 0.2  # of likelihood and contrast that turning over wins: networks dream, outlines look like something else
 ZOOMS = 1.1 ** np.arange(-6.0, 7.0)  # tried; outlines are found from half as far away
 STEP, SEARCH = 4e-3, 8e-3  # [m] between the openings tried, likewise, by outlines and by key points
 ROUNDS = 4  # of finding key points with the change found before
@@ -56,12 +56,14 @@ class PictureChange:
         shift: across the closing axis [px].
         turn: about the camera's axis [rad].
         likelihood: mean likelihood of the points that a holder does not cover.
+        contrast: of the outlines, in the mean.
     """
 
     zoom: float
     shift: float
     turn: float
     likelihood: float
+    contrast: float = 0.0
 
 
 class PictureChanges:
@@ -147,17 +149,20 @@ class PictureChanges:
             x = least_squares(self._misses, x, x_scale=scale, loss="soft_l1", args=(seen, weights)).x
         wanted = np.concatenate([self._mounts[side].seen_points(jaw) for side, jaw in self._jaws.items()])
         likelihood = float((weights[wanted] ** 2).mean())
-        return PictureChange(zoom=float(np.exp(x[0])), shift=float(x[1]), turn=float(x[2]), likelihood=likelihood)
+        zoom, shift, turn = float(np.exp(x[0])), float(x[1]), float(x[2])
+        contrast = float(self.contrasts(color, x).mean())
+        return PictureChange(zoom=zoom, shift=shift, turn=turn, likelihood=likelihood, contrast=contrast)
 
     def explain(self, colors: Sequence[NDArray]) -> str:
         """Return what was done to pictures (h, w, 3) of one video, and what to do; "" where it is nothing known."""
-        ends, flip, best = [*colors[:1], *colors[1:][-1:]], (1, 1), -np.inf
+        flip, best = (1, 1), -np.inf
         for other in FLIPS:
-            shown = float(np.mean([self._scan(_turn_over(color, other))[0] for color in ends]))
+            ends = [self.find(_turn_over(color, other)) for color in (*colors[:1], *colors[1:][-1:])]
+            shown = float(np.mean([each.likelihood + each.contrast for each in ends]))
             if shown > best + FLIPPED:
                 flip, best = other, shown
         colors = [_turn_over(color, flip) for color in colors]
-        changes = [change for color in colors if (change := self.find(color)).likelihood >= LIKELY_SCORE]
+        changes = [change for color in colors if (change := self.find(color)).likelihood >= SURE]
         if len(changes) < max(min(FEWEST, len(colors)), FEWEST_SHARE * len(colors)):
             shown = np.median([self._scan(color, (1.0,))[0] for color in colors])
             hidden = "nothing of such jaws shows where the rig has them: hidden, out of the picture, or another rig?"

@@ -8,22 +8,22 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from finforce.camera import EQUIDISTANT, CameraIntrinsics, ImageError
 from finforce.errors import FinforceError, one_line
 from finforce.gripper_frames import HALF_TURN, OpeningRange, jaw_in_camera
 from finforce.optional import import_cv2
-from finforce.transforms import invert_pose, move_pose, pose_numbers, rotation_between
+from finforce.transforms import invert_pose, pose_numbers, rotation_between
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.at_rest import JawsAtRest, approach
 from finforce_eval.evaluation.keypoint_source import KeypointSource, build_records, choose_images
+from finforce_eval.evaluation.unseen import explain_unseen
 from finforce_eval.recordings.frames import STILL_RATE, FrameImages
 from finforce_eval.recordings.tracks import Recording
 from finforce_ifea.jaw.jaw import Jaw, list_shipped_jaws, load_jaw
 from finforce_keypoints.errors import KeypointError
-from finforce_keypoints.geometry.extrinsics import Extrinsics, SeenJaw, measure_misses
+from finforce_keypoints.geometry.extrinsics import Extrinsics
 from finforce_keypoints.geometry.side_picture import find_side, project_plane
 from finforce_keypoints.geometry.template import find_shape
 from finforce_keypoints.images import RgbdImage
@@ -36,7 +36,6 @@ COVERED = 0.30  # share of the picture's parts without any detail, from which on
 FLAT, TILES = 1.5, 12  # of 255: contrast of such a part; parts each way
 GOOD_RESIDUAL = 1.0  # [px] left over when jaws at rest are laid on what is seen
 FAR, TURNED = 3e-3, np.radians(1.5)  # [m], [rad] by which the camera may be elsewhere than it is stated to be
-FOCAL_ERROR = 0.03  # of the focal length, from which on it is named
 # Share of a jaw's key points that have to be seen for another reading to be named: pictures of fingers that are none of
 # the known ones show at most 0.75 of a wrong one's.
 ENOUGH = 0.8
@@ -163,30 +162,7 @@ def _judge_pose(found: Extrinsics, look: JawsAtRest, recording: Recording, guess
         )
     else:
         findings.append(Finding(OK, f"extrinsics within {shown}, {found.residual:.2f} px left over"))
-    focal = fit_focal(look.jaws, recording.images.camera, found)
-    if found.residual > 0.5 * GOOD_RESIDUAL and abs(focal) > FOCAL_ERROR:
-        findings.append(
-            Finding(
-                FAULT, f"a focal length {100 * focal:+.0f} % from that of camera_info fits better: wrong intrinsics?"
-            )
-        )
     return findings
-
-
-def fit_focal(jaws: Mapping[str, SeenJaw], camera: CameraIntrinsics, found: Extrinsics) -> float:
-    """Return by which share another focal length would explain what is seen better; 0 where it hardly does."""
-    half = float(np.mean([abs(x) for x in found.origins.values()]))
-
-    def misses(x: NDArray) -> NDArray:
-        lens = replace(camera, fx=camera.fx * np.exp(x[6]), fy=camera.fy * np.exp(x[6]))
-        T = move_pose(found.T_gripper_camera, x[:6])
-        pixels = [measure_misses(side, jaw, lens, T, half + x[7]) for side, jaw in jaws.items()]
-        return np.nan_to_num(np.concatenate(pixels), nan=1e3)
-
-    scale = np.r_[np.full(3, 5e-3), np.full(3, 0.05), 0.1, 5e-3]
-    fit = least_squares(misses, np.zeros(8), x_scale=scale, loss="soft_l1", f_scale=2.0)
-    before, after = (float(np.sqrt((misses(x) ** 2).mean())) for x in (np.zeros(8), fit.x))
-    return float(np.expm1(fit.x[6])) if after < 0.6 * before else 0.0
 
 
 def _find_reasons(mean: RgbdImage, source: KeypointSource, recording: Recording, guess: NDArray) -> list[Finding]:
@@ -194,16 +170,17 @@ def _find_reasons(mean: RgbdImage, source: KeypointSource, recording: Recording,
 
     That a network likes a picture, as it does some that show no finger, is no reason.
     """
-    readings = _readings(mean, source, guess)
-    residual, words = min((_misfit(recording, source, *reading), text) for text, *reading in readings)
+    readings = _readings(source, guess)
+    residual, words = min((_misfit(recording, source, mean, *reading), text) for text, *reading in readings)
     if residual <= GOOD_RESIDUAL:
         return [Finding(FAULT, f"the jaws show, {residual:.2f} px left over, if {words}")]
     return [
+        *(Finding(FAULT, text) for text in explain_unseen(recording, source)),
         Finding(
             WARNING,
-            "none of the known fingers; no better upside down, mirrored, or with other conventions of the extrinsics: "
-            "are the jaws in view, lit, and within some 15 mm of where the extrinsics say?",
-        )
+            "none of the known fingers; no better with other conventions of the extrinsics: are the jaws in view, lit, "
+            "and within some 15 mm of where the extrinsics say?",
+        ),
     ]
 
 
@@ -220,12 +197,9 @@ def _misfit(recording: Recording, source: KeypointSource, image: RgbdImage, pose
     return found.residual if seen >= ENOUGH else np.inf
 
 
-def _readings(image: RgbdImage, source: KeypointSource, T: NDArray) -> Iterator[tuple[str, RgbdImage, NDArray, str]]:
-    """Yield other readings: in words, and the image, the extrinsics and the jaw file by them."""
+def _readings(source: KeypointSource, T: NDArray) -> Iterator[tuple[str, NDArray, str]]:
+    """Yield other readings: in words, and the extrinsics and the jaw file by them."""
     own = source.jaw_file
-    turned, mirrored = _flip(image, rows=True, columns=True), _flip(image, rows=False, columns=True)
-    yield "the image is upside down: rotate it, or turn T_gripper_camera by 180 degrees", turned, T, own
-    yield "the image is mirrored: disable that in the camera's driver", mirrored, T, own
     body = _pose_of(Rotation.from_matrix([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]))
     poses = {
         "T_gripper_camera is inverted, the gripper in the camera's frame: give its inverse": invert_pose(T),
@@ -235,10 +209,10 @@ def _readings(image: RgbdImage, source: KeypointSource, T: NDArray) -> Iterator[
         "the quaternion of T_gripper_camera begins with w: give x y z w": _reorder(T),
     }
     for words, pose in poses.items():
-        yield words, image, pose, own
+        yield words, pose, own
     for name in list_shipped_jaws():
         if name != own and load_jaw(name).model != "frame":
-            yield f"the finger is {name}: give its jaw file", image, T, name
+            yield f"the finger is {name}: give its jaw file", T, name
 
 
 def _pose_of(rotation: Rotation) -> NDArray:
@@ -253,15 +227,6 @@ def _reorder(T: NDArray) -> NDArray:
     turned = _pose_of(Rotation.from_quat([y, z, w, x]))
     turned[:3, 3] = T[:3, 3]
     return turned
-
-
-def _flip(image: RgbdImage, *, rows: bool, columns: bool) -> RgbdImage:
-    """Return an image turned over, with the intrinsics that belong to it."""
-    camera = image.camera
-    color = image.color[:: -1 if rows else 1, :: -1 if columns else 1]
-    cx = camera.width - 1 - camera.cx if columns else camera.cx
-    cy = camera.height - 1 - camera.cy if rows else camera.cy
-    return replace(image, color=np.ascontiguousarray(color), camera=replace(camera, cx=cx, cy=cy))
 
 
 GIVEN, SEEN, FITTED = (150, 150, 150), (60, 230, 90), (255, 170, 40)

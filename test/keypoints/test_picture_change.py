@@ -9,10 +9,10 @@ import pytest
 from finforce.gripper_frames import ROBOT_CAMERA, OpeningRange
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints.build import ANY_FINGER
-from finforce_keypoints.detectors.side_plane import LIKELY_SCORE, AnyFinger
+from finforce_keypoints.detectors.side_plane import AnyFinger
 from finforce_keypoints.networks.side_network import SideNetwork
 from finforce_keypoints.parameters import JawMount
-from finforce_keypoints.picture_change import PictureChange, PictureChanges, describe_changes
+from finforce_keypoints.picture_change import SURE, PictureChange, PictureChanges, describe_changes
 from finforce_sim.footage import build_footage
 from finforce_sim.scenarios import build_scenario
 from finforce_sim.sensor import build_d405_vga
@@ -47,7 +47,7 @@ def changed(picture, zoom=1.0, shift=0.0, degrees=0.0):
 @pytest.mark.parametrize(("zoom", "shift", "degrees"), [(1.0, 0.0, 0.0), (1.3, 0.0, 0.0), (0.9, 8.0, 3.0)])
 def test_how_a_picture_was_changed_is_found(changes, picture, zoom, shift, degrees):
     found = changes.find(changed(picture, zoom, shift, degrees))
-    assert found.likelihood > LIKELY_SCORE
+    assert found.likelihood > SURE
     assert found.zoom == pytest.approx(zoom, abs=0.02) and found.shift == pytest.approx(shift, abs=2.0)
     assert np.degrees(found.turn) == pytest.approx(degrees, abs=0.5)
 
