@@ -132,6 +132,8 @@ _MISTAKEN, _LEAST_OFFSET = 0.99, 4e-3
 _LARGEST_RESIDUAL, _RESIDUAL_SHARE, _NOISY = 1e-3, 0.015, 3.0
 # A camera that has more probably moved than not.
 BUMPED = 0.5
+# An object would have to pull by so many standard deviations of the depth, from the least to the most [m].
+_PULLING, _LEAST_PULL, _MOST_PULL = 3.0, 0.5e-3, 0.9e-3
 
 
 def bound_residual(rest: NDArray, noise: NDArray) -> float:
@@ -184,6 +186,10 @@ def _find_ambiguity(state: ContactState, magnitude: float) -> str:
     if state["bumped"] > BUMPED:
         motion = f"all key points have moved together by {1e3 * state['motion']:.1f} mm since the tare"
         return f"{motion}: the camera was bumped (open the jaw and tare), or the contact is elsewhere"
+    pulled = -float(state["depth"])
+    if pulled > np.clip(_PULLING * np.sqrt(state["depth_variance"]), _LEAST_PULL, _MOST_PULL):
+        bent = f"the jaw is bent towards the object, as if that pulled by {1e3 * pulled:.1f} mm"
+        return f"{bent}: open the jaw and tare, or the contact is elsewhere"
     vague = max(_VAGUE_FORCE, _VAGUE_SHARE * magnitude)
     if state["hidden"] > vague:
         return "the object may press next to the clamp, where no key point shows a force"

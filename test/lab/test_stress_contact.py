@@ -46,6 +46,14 @@ def test_hard_objects_are_pressed_with_the_right_force(name):
     assert not any(summary[key] for key in ("crashed", "hung", "nans", "refused"))
 
 
+def test_a_flat_object_that_presses_is_not_told_as_away():
+    # where the face tilts by a few mrad, the key points would agree with an object that pulls at its other end
+    pressed = Bench(Plan(seed=889972, jaw="xlerobot"))
+    frames = press_scene(pressed, SCENES["coplanar face, deeper"])
+    trials = [trial for trial in play_scene(pressed, SCENES["coplanar face, deeper"], frames, 1) if trial.sure]
+    assert len(trials) > 20 and max(trial.sigmas for trial in trials) < 5.0
+
+
 @pytest.mark.parametrize("name", ["rod 0.3 mm away", "rod far away", "beyond the tip", "engulfing"])
 def test_nothing_presses_without_a_press(name):
     assert all(trial.sigmas <= 3.5 for trial in played(name) if trial.sure)
