@@ -33,7 +33,7 @@ CONTACT_STATE = np.dtype(
         ("traction_ratio", float),  # of tangential to normal force, with which the state was found
         ("magnitude", float),  # of the force [N]
         ("stddev", float),  # of the force along itself [N]
-        ("hidden", float),  # standard deviation of a force next to the clamp, which moves no key point [N]
+        ("hidden", float),  # standard deviation of a force elsewhere, which key points hardly show [N]
         ("depth", float),  # below first touch [m]
         ("depth_variance", float),  # [m^2]
         ("height_stddev", float),  # of the pressure centre [m]
@@ -192,7 +192,7 @@ def _find_ambiguity(state: ContactState, magnitude: float) -> str:
         return f"{bent}: open the jaw and tare, or the contact is elsewhere"
     vague = max(_VAGUE_FORCE, _VAGUE_SHARE * magnitude)
     if state["hidden"] > vague:
-        return "the object may press next to the clamp, where no key point shows a force"
+        return "the object may press where key points hardly show a force: next to the clamp, or along its face"
     if not state["stddev"] <= vague:
         return f"the visible key points tell the force only within {state['stddev']:.2g} N"
     return ""

@@ -5,7 +5,7 @@ The shape of an unknown object is its radius, that of a known outline its tilt.
 
 from __future__ import annotations
 
-from math import hypot, log, nan, sqrt
+from math import hypot, inf, log, nan, sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -46,6 +46,8 @@ _FULL_ITERATIONS = 3
 _SETTLING, _SETTLED = 8, 2e-3
 # An object is apart from the jaw where its pose says so by this many standard deviations.
 _APART_SIGMAS = 3.0
+# So far from the pressure centre is elsewhere along the finger [m], of whose heights every third is asked.
+_ELSEWHERE, _EVERY = 5e-3, 3
 # Heights next to the clamp, as shares of the lowest at which key points show a force; objects farther off than this,
 # or deeper in, are surely so [m].
 _NEXT_TO_CLAMP, _WELL_CLEAR = np.array([0.2, 0.4, 0.6, 0.8, 1.0]), 3e-3
@@ -116,6 +118,8 @@ class ContactTracker:
         self.slips = SlipHistory(self._contact)
         self.roughness = FrictionEstimate(settings, smooth)
         self._base = [(height, self._measure_stiffness(height)) for height in contact_range[0] * _NEXT_TO_CLAMP]
+        _, vague = self.response.fit_forces(np.ones(len(keypoints), bool))
+        self._along = list(zip(self.response.heights, self.response.stiffness, vague, strict=True))[::_EVERY]
         self._lateral = LateralLoad(torsion, len(keypoints), UNSEEN_TRACTION * settings.friction)
         self._held = HeldWeight(self._lateral.half_width)
         self._hold = HoldHypotheses()
@@ -397,27 +401,29 @@ class ContactTracker:
         state["bearable"] = self._fidelities[0].contact.bearable
 
     def _find_hidden(self, state: ContactState, normal: float) -> float:
-        """Return the standard deviation of a force [N] where the jaw is clamped, by an object that may reach there.
+        """Return the standard deviation of a force [N] elsewhere than the key points have it, which they hardly show.
 
         Within the uncertainty of its state, as by rocking, an object that is clear of the base may press there, and one
-        that seems to press there may be clear of it. A force whose centre is there is not known at all.
+        that seems to press there may be clear of it; so may a flat one anywhere along a stiff finger. A force whose
+        centre is next to the clamp is not known at all.
         """
         if self._is_apart:
             return 0.0
         lowest, _ = self._base[-1]
-        if state["pressure_location"][2] < lowest:
+        centre = state["pressure_location"][2]
+        if centre < lowest:
             return normal
+        places = [(height, stiffness, inf) for height, stiffness in self._base]
+        places += [place for place in self._along if abs(place[0] - centre) > _ELSEWHERE]
         x, indenter, surface = state["x"], self._contact.indenter, self._contact.surface
-        clearances = [indenter.find_clearance(x, 0.0, height) for height, _ in self._base]
-        if not any(abs(clearance) < _WELL_CLEAR for clearance in clearances):
+        near = [(place, c) for place in places if abs(c := indenter.find_clearance(x, 0.0, place[0])) < _WELL_CLEAR]
+        if not near:
             return 0.0
-        moved = self._contact.place_points(self.q)[:, 0] - surface.points[:, 0]
-        hidden = 0.0
-        for clearance, (height, stiffness) in zip(clearances, self._base, strict=True):
-            if abs(clearance) < _WELL_CLEAR:
-                row = max(0, int(np.searchsorted(surface.heights, height)) - 1) * surface.across
-                beyond = self._find_clearance_stddev(state, height) - abs(clearance - moved[row]) / _APART_SIGMAS
-                hidden = max(hidden, stiffness * beyond)
+        moved, hidden = self._contact.place_points(self.q)[:, 0] - surface.points[:, 0], 0.0
+        for (height, stiffness, vague), clearance in near:
+            row = max(0, int(np.searchsorted(surface.heights, height)) - 1) * surface.across
+            beyond = self._find_clearance_stddev(state, height) - abs(clearance - moved[row]) / _APART_SIGMAS
+            hidden = max(hidden, min(stiffness * beyond, vague))
         return hidden
 
     def _find_clearance_stddev(self, state: ContactState, height: float) -> float:

@@ -75,22 +75,22 @@ class InfluenceCoefficients:
             deviations: of the key points from their places at rest (K, 3) [m], NaN where unseen.
         """
         seen = np.isfinite(deviations[:, 0])
-        gains, stddevs = self._fit(seen.tobytes())
+        gains, stddevs = self.fit_forces(seen)
         loads = gains @ deviations[seen][:, ::2].ravel()
         return float(np.sqrt((np.maximum(loads, 0.0) ** 2 + stddevs**2).mean()))
 
-    def _fit(self, seen: bytes) -> tuple[NDArray, NDArray]:
-        """Return gains (m, 2 n) [N/m] of the key points that are seen, (K,) bool as bytes, and standard deviations [N].
+    def fit_forces(self, seen: NDArray[np.bool_]) -> tuple[NDArray, NDArray]:
+        """Return gains (m, 2 n) [N/m] of the key points (K,) that are seen, and standard deviations (m,) [N].
 
         They are kept, for the same points are seen most of the time.
         """
-        if seen not in self.fits:
-            rows = np.frombuffer(seen, bool)
-            fits = [_fit_load(motions[rows], np.full(int(rows.sum()), OFFSET_STDDEV)) for motions in self.motions]
+        key = seen.tobytes()
+        if key not in self.fits:
+            fits = [_fit_load(motions[seen], np.full(int(seen.sum()), OFFSET_STDDEV)) for motions in self.motions]
             gains, stddevs = zip(*fits, strict=True)
             self.fits.clear()
-            self.fits[seen] = np.stack(gains), np.array(stddevs)
-        return self.fits[seen]
+            self.fits[key] = np.stack(gains), np.array(stddevs)
+        return self.fits[key]
 
 
 def measure_influence(contact: RigidContact, probe: Any, keypoints: int) -> InfluenceCoefficients:
