@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from finforce.camera import CameraIntrinsics, project
 from finforce.gripper_frames import OpeningRange, jaw_in_camera
 from finforce_keypoints.geometry.side_picture import find_side, map_picture, project_plane, take_picture
-from finforce_keypoints.placement import LEAST_GUESSED, OutlineContrast
+from finforce_keypoints.placement import LEAST_FOUND, LEAST_GUESSED, OutlineContrast
 
 if TYPE_CHECKING:
     from finforce_ifea.jaw.jaw import Jaw
@@ -135,11 +135,14 @@ class PictureChanges:
 
     def find(self, color: NDArray) -> PictureChange:
         """Return how an image (h, w, 3) was changed, begun with the outlines or with no change, what is likelier."""
+        starts = self._improve(color, self._scan(color)[1]), self.find_near(color)
+        return max(starts, key=lambda change: change.likelihood)
+
+    def find_near(self, color: NDArray) -> PictureChange:
+        """Return how an image (h, w, 3) was changed, begun with no change."""
         signs = np.array([-1.0 if side == "left" else 1.0 for side in self._jaws])
         straight = [np.r_[0.0, 0.0, 0.0, signs * half] for half in self._origins[:: round(SEARCH / STEP)]]
-        likeliest = max(straight, key=lambda x: self._find_points(color, x)[1].sum())
-        starts = (self._scan(color)[1], likeliest)
-        return max((self._improve(color, x) for x in starts), key=lambda change: change.likelihood)
+        return self._improve(color, max(straight, key=lambda x: self._find_points(color, x)[1].sum()))
 
     def _improve(self, color: NDArray, x: NDArray) -> PictureChange:
         """Return how an image (h, w, 3) was changed, from a change nearby on."""
@@ -155,6 +158,10 @@ class PictureChanges:
 
     def explain(self, colors: Sequence[NDArray]) -> str:
         """Return what was done to pictures (h, w, 3) of one video, and what to do; "" where it is nothing known."""
+        near = [self.find_near(color) for color in colors]
+        is_plain = all(each.likelihood >= SURE and each.contrast >= LEAST_FOUND for each in near)
+        if is_plain and not describe_changes(near, self._camera.width):
+            return ""
         flip, best = (1, 1), -np.inf
         for other in FLIPS:
             ends = [self.find(_turn_over(color, other)) for color in (*colors[:1], *colors[1:][-1:])]
