@@ -214,7 +214,8 @@ def describe_changes(changes: Sequence[PictureChange], width: int) -> str:
     if steps[0] > UNSTEADY[0] * width or steps[1] > UNSTEADY[1]:
         said.append(
             f"the picture moves against the jaws from image to image, by {steps[0]:.1f} px and "
-            f"{np.degrees(steps[1]):.1f} degrees in the median: turn off image stabilisation (EIS, HyperSmooth)"
+            f"{np.degrees(steps[1]):.1f} degrees in the median: turn off image stabilisation (EIS, HyperSmooth), or "
+            "fix the camera"
         )
     elif abs(shift) > SHIFTED * width or abs(turn) > TURNED:
         said.append(
