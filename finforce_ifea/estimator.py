@@ -31,6 +31,7 @@ from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tare import TareKeeper
 from finforce_ifea.tracking.contact_state import (
     BUMPED,
+    LARGEST_RESIDUAL,
     UNSEEN_ALONG,
     ContactState,
     bound_residual,
@@ -322,7 +323,8 @@ class ForceEstimator:
             self._tracker.reset()
             self._contact = None
             return self._fail("diverged", "the shape cannot be reached by the jaw", used, iterations)
-        most = bound_residual(self.jaw.keypoints, self._taring.tare.noise)
+        is_far = state["residual"] > LARGEST_RESIDUAL  # the bound is no less
+        most = bound_residual(self.jaw.keypoints, self._taring.tare.noise) if is_far else np.inf
         reason = find_rejection_reason(state, largest_residual=most, settles=self.settings.solver != "paper")
         if reason:
             if state["bumped"] > BUMPED and self._contact.touching is False:

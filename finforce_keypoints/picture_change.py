@@ -18,8 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from finforce.camera import CameraIntrinsics, project
 from finforce.gripper_frames import OpeningRange, jaw_in_camera
-from finforce_keypoints.geometry.side_picture import find_side, map_picture, project_plane, take_picture
-from finforce_keypoints.placement import LEAST_FOUND, LEAST_GUESSED, OutlineContrast
+from finforce_keypoints.geometry.side_picture import find_side
+from finforce_keypoints.placement import LEAST_FOUND, LEAST_GUESSED, OutlineContrast, find_points
 
 if TYPE_CHECKING:
     from finforce_ifea.jaw.jaw import Jaw
@@ -91,6 +91,7 @@ class PictureChanges:
         self._outlines = {side: OutlineContrast(jaw) for side, jaw in jaws.items()}
         self._edges = {side: self._find_edge(side) for side in jaws}
         self._planes = {side: find_side(jaw) for side, jaw in jaws.items()}
+        self._signs = np.array([-1.0 if side == "left" else 1.0 for side in jaws])
         self._origins = np.arange(opening.nearest, opening.farthest + STEP, STEP)
         self._points = {side: np.vstack((jaw.keypoints, jaw.reference_point)) for side, jaw in jaws.items()}
         along = project(
@@ -125,11 +126,11 @@ class PictureChanges:
 
     def _scan(self, color: NDArray, zooms: Sequence[float] = ZOOMS) -> tuple[float, NDArray]:
         """Return contrast and change where outlines in an image show best, with one of the zooms and any opening."""
-        signs, found = np.array([-1.0 if side == "left" else 1.0 for side in self._jaws]), []
+        found = []
         for zoom in zooms:
-            tried = [np.r_[np.log(zoom), 0.0, 0.0, signs * half] for half in self._origins]
+            tried = [np.r_[np.log(zoom), 0.0, 0.0, self._signs * half] for half in self._origins]
             shown = np.array([self.contrasts(color, x) for x in tried])
-            best = signs * self._origins[shown.argmax(axis=0)]
+            best = self._signs * self._origins[shown.argmax(axis=0)]
             found.append((float(shown.max(axis=0).mean()), np.r_[tried[0][:3], best]))
         return max(found, key=lambda each: each[0])
 
@@ -140,8 +141,7 @@ class PictureChanges:
 
     def find_near(self, color: NDArray) -> PictureChange:
         """Return how an image (h, w, 3) was changed, begun with no change."""
-        signs = np.array([-1.0 if side == "left" else 1.0 for side in self._jaws])
-        straight = [np.r_[0.0, 0.0, 0.0, signs * half] for half in self._origins[:: round(SEARCH / STEP)]]
+        straight = [np.r_[0.0, 0.0, 0.0, self._signs * half] for half in self._origins[:: round(SEARCH / STEP)]]
         return self._improve(color, max(straight, key=lambda x: self._find_points(color, x)[1].sum()))
 
     def _improve(self, color: NDArray, x: NDArray) -> PictureChange:
@@ -180,12 +180,11 @@ class PictureChanges:
         """Return the pixels (n, 2) of all jaws' points in an image, and the roots (n,) of their likelihoods."""
         (camera, poses), pixels, weights = self._look_from(x), [], []
         for side, T in poses.items():
-            grid, plane, mount = self._locator.grids[side], self._planes[side], self._mounts[side]
-            picture = take_picture(color, map_picture(grid, plane, T, camera))
-            found = self._locator.locate(picture[None], [side])
-            pixels.append(project_plane(grid.places(found.pixels[0]), plane, T, camera))
-            inside = np.isfinite(pixels[-1]).all(axis=1) & mount.seen_points(self._jaws[side])
-            weights.append(np.where(inside, np.sqrt(mount.believe(found.likelihood[0])), 0.0))
+            mount, plane = self._mounts[side], self._planes[side]
+            (seen,), (likelihood,) = find_points([color], camera, self._locator, side, plane, [T])
+            inside = np.isfinite(seen).all(axis=1) & mount.seen_points(self._jaws[side])
+            pixels.append(seen)
+            weights.append(np.where(inside, np.sqrt(mount.believe(likelihood)), 0.0))
         return np.nan_to_num(np.concatenate(pixels)), np.concatenate(weights)
 
     def _misses(self, x: NDArray, seen: NDArray, weights: NDArray) -> NDArray:

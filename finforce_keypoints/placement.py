@@ -23,7 +23,14 @@ from finforce.optional import import_cv2
 from finforce.transforms import move_pose
 from finforce_keypoints.detectors.side_plane import AnyFinger
 from finforce_keypoints.errors import GeometryError
-from finforce_keypoints.geometry.side_picture import PlaneGrid, find_side, map_picture, project_plane, take_picture
+from finforce_keypoints.geometry.side_picture import (
+    PlaneGrid,
+    SidePlane,
+    find_side,
+    map_picture,
+    project_plane,
+    take_picture,
+)
 from finforce_keypoints.geometry.template import find_shape, fit_grid
 from finforce_keypoints.parameters import REFERENCE, JawMount
 
@@ -272,6 +279,33 @@ def measure_rival(best: CameraPlacement, other: CameraPlacement, jaws: Mapping[s
     return float(np.mean(np.concatenate(away)))
 
 
+def find_points(
+    images: Sequence[NDArray],
+    camera: CameraIntrinsics,
+    locator: AnyFinger,
+    side: str,
+    plane: SidePlane,
+    poses: Sequence[NDArray],
+) -> tuple[NDArray, NDArray]:
+    """Return pixels (n, K + 1, 2) and likelihoods (n, K + 1) of a jaw's points in images (h, w, 3), one pose each.
+
+    Args:
+        images: RGB.
+        camera: intrinsics.
+        locator: finds the points in pictures of the side.
+        side: of the jaw.
+        plane: of its side.
+        poses: T_camera_jaw (4, 4).
+    """
+    grid = locator.grids[side]
+    pictures = [
+        take_picture(color, map_picture(grid, plane, T, camera)) for color, T in zip(images, poses, strict=True)
+    ]
+    found = locator.locate(np.stack(pictures), [side] * len(pictures))
+    pixels = [project_plane(grid.places(each), plane, T, camera) for each, T in zip(found.pixels, poses, strict=True)]
+    return np.array(pixels), found.likelihood
+
+
 def find_covered(likelihood: NDArray, places: NDArray) -> NDArray[np.bool_]:
     """Return which points (n,) are covered: those beyond the straight edge that parts likely and unlikely ones best.
 
@@ -359,22 +393,13 @@ class _Refinement:
         T, turns, origins = self._split(self._x)
         self._seen, self._likelihood = {}, {}
         for side in self._jaws:
-            grid, plane = self._locator.grids[side], self._planes[side]
             poses = [jaw_in_camera(T, side, x, turns[side]) for x in origins[side]]
-            pictures = [
-                take_picture(color, map_picture(grid, plane, pose, self._camera))
-                for color, pose in zip(self._images, poses, strict=True)
-            ]
-            found = self._locator.locate(np.stack(pictures), [side] * len(pictures))
-            pixels = [
-                project_plane(grid.places(each), plane, pose, self._camera)
-                for each, pose in zip(found.pixels, poses, strict=True)
-            ]
-            self._seen[side] = np.array(pixels)
+            found = find_points(self._images, self._camera, self._locator, side, self._planes[side], poses)
+            self._seen[side], likelihood = found
             inside = np.isfinite(self._seen[side]).all(axis=2)
             inside &= (self._seen[side] >= 0.0).all(axis=2)
             inside &= (self._seen[side] < (self._camera.width, self._camera.height)).all(axis=2)
-            self._likelihood[side] = np.where(inside, found.likelihood, 0.0)
+            self._likelihood[side] = np.where(inside, likelihood, 0.0)
 
     def _misses(self, x: NDArray) -> NDArray:
         """Return what is off, in standard deviations."""

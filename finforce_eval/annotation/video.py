@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from finforce.messages import NANOSECONDS
 from finforce.optional import import_cv2, import_library
 from finforce.transforms import pose_from_quaternion
 from finforce_eval.errors import RecordingError
+from finforce_eval.evaluation.check import draw_points
 from finforce_eval.evaluation.forces import no_force_reasons
 from finforce_eval.recordings.tracks import JawTrack, Recording
 from finforce_eval.table import ForceSeries
@@ -70,26 +71,23 @@ class _Overlay:
         self._reasons = no_force_reasons(forces)
         self._stated = np.linalg.norm(forces.column("force_stddev"), axis=1)
         self._points = forces.column("contact_point")
-        self._rows = {stamp: row for row, stamp in enumerate(forces.stamps.tolist())}
-        tracks = {"found": track.detection, "pose": track.pose}
-        self._at = {
-            name: {stamp: row for row, stamp in enumerate(each.stamps.tolist())} if each is not None else {}
-            for name, each in tracks.items()
-        }
+        self._rows = [
+            {stamp: row for row, stamp in enumerate(each.stamps.tolist())} if each is not None else {}
+            for each in (forces, track.detection, track.pose)
+        ]
 
     def draw(self, picture: NDArray, stamp: int, line: int) -> None:
         """Draw what was found in an image [ns] into its picture (h, w, 3), with words in a line, the first is 1."""
-        cv2, row, found = import_cv2(), self._rows.get(stamp), self._at["found"].get(stamp)
+        row, found, at = (rows.get(stamp) for rows in self._rows)
         if found is not None:
-            detection = self._track.detection
-            for pixel, used in zip(detection.pixels[found], detection.accepted[found], strict=True):
-                if np.isfinite(pixel).all():
-                    cv2.circle(picture, self._place(pixel), 3 * 8, USED if used else REFUSED, 1, cv2.LINE_AA, 3)
+            pixels, used = self._place(self._track.detection.pixels[found]), self._track.detection.accepted[found]
+            draw_points(picture, pixels[used], USED)
+            draw_points(picture, pixels[~used], REFUSED)
         words = "no key points" if row is None else self._reasons[row]
         if row is not None and not words:
             words = f"{self._forces.magnitude[row]:.2f} N +- {self._stated[row]:.2f}"
-            self._draw_arrow(picture, row, self._at["pose"].get(stamp))
-        height, text = picture.shape[0], f"{self._forces.side}: {words}"
+            self._draw_arrow(picture, row, at)
+        cv2, height, text = import_cv2(), picture.shape[0], f"{self._forces.side}: {words}"
         place = 8, round(LINE * height * (line - 0.3))
         cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, height / 1000.0, INK, 1, cv2.LINE_AA)
 
@@ -101,12 +99,15 @@ class _Overlay:
             return
         T = pose_from_quaternion(self._track.pose.position[at], self._track.pose.quaternion[at])
         ends = np.array([point - force / NEWTONS_PER_METRE, point]) @ T[:3, :3].T + T[:3, 3]
-        start, end = map(self._place, project(ends, self._camera))
-        colour, contact = ([round(255 * part) for part in each[:3]] for each in (FORCE, CONTACT))
-        cv2.arrowedLine(picture, start, end, colour, 2, cv2.LINE_AA, 3)
-        cv2.circle(picture, end, 4 * 8, contact, -1, cv2.LINE_AA, 3)
+        start, end = np.round(8.0 * self._place(project(ends, self._camera))).astype(int).tolist()
+        cv2.arrowedLine(picture, start, end, to_bytes(FORCE), 2, cv2.LINE_AA, 3)
+        cv2.circle(picture, end, 4 * 8, to_bytes(CONTACT), -1, cv2.LINE_AA, 3)
 
-    def _place(self, pixel: NDArray) -> tuple[int, int]:
-        """Return where a pixel of the image is in its picture, in eighths."""
-        x, y = np.clip(8.0 * (self._scale * (np.asarray(pixel) + 0.5) - 0.5), -1e5, 1e5)
-        return round(float(x)), round(float(y))
+    def _place(self, pixels: NDArray) -> NDArray:
+        """Return where pixels (n, 2) of the image are in its picture."""
+        return np.clip(self._scale * (pixels + 0.5) - 0.5, -1e4, 1e4)
+
+
+def to_bytes(colour: Sequence[float]) -> list[int]:
+    """Return red, green and blue of a colour, and its opacity if given, as 0 to 255."""
+    return [round(255 * part) for part in colour]

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from finforce.messages import NANOSECONDS
 from finforce.optional import import_cv2, import_library, import_trimesh
+from finforce_eval.annotation.video import REFUSED, USED, to_bytes
 from finforce_eval.cli.parser import BAG_HELP, CommandResult, add_run_options
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.forces import estimate_forces
@@ -53,7 +54,6 @@ def run(options: argparse.Namespace) -> CommandResult:
 
 TIMELINE = "recording"
 _QUALITY = 80  # of the pictures, JPEG
-_USED, _REFUSED = (25, 204, 51), (230, 51, 25)
 _COLOURS = {"left": (0, 114, 178), "right": (213, 94, 0), "grasp": (0, 158, 115), "truth": (204, 204, 204)}
 
 
@@ -108,7 +108,7 @@ class _RerunView:
         found = track.detection
         for row, stamp in enumerate(found.stamps.tolist() if found is not None else ()):
             seen = np.isfinite(found.pixels[row]).all(axis=1)
-            colours = [_USED if accepted else _REFUSED for accepted in found.accepted[row][seen]]
+            colours = [USED if accepted else REFUSED for accepted in found.accepted[row][seen]]
             self._at(stamp)
             points = self._rr.Points2D(found.pixels[row][seen], colors=colours, radii=2.5)
             self._stream.log(f"camera/{side}", points)
@@ -164,9 +164,9 @@ class _RerunView:
                 self._stream.log(f"jaws/{side}/force", rr.Clear(recursive=True))
                 continue
             vector = force / NEWTONS_PER_METRE
-            arrow = rr.Arrows3D(vectors=[vector], origins=[point - vector], colors=_to_bytes(FORCE), radii=ARROW[0] / 2)
+            arrow = rr.Arrows3D(vectors=[vector], origins=[point - vector], colors=to_bytes(FORCE), radii=ARROW[0] / 2)
             self._stream.log(f"jaws/{side}/force/arrow", arrow)
-            contact = rr.Points3D([point], colors=_to_bytes(CONTACT), radii=CONTACT_DIAMETER / 2)
+            contact = rr.Points3D([point], colors=to_bytes(CONTACT), radii=CONTACT_DIAMETER / 2)
             self._stream.log(f"jaws/{side}/force/contact", contact)
 
     def _plot(self, path: str, stamps: NDArray[np.int64], values: NDArray, colour: tuple, name: str) -> None:
@@ -175,10 +175,6 @@ class _RerunView:
         self._stream.log(path, rr.SeriesLines(colors=[colour], names=[name]), static=True)
         times = rr.TimeColumn(TIMELINE, timestamp=stamps / NANOSECONDS)
         self._stream.send_columns(path, indexes=[times], columns=rr.Scalars.columns(scalars=values))
-
-
-def _to_bytes(colour: tuple[float, ...]) -> list[int]:
-    return [round(255 * part) for part in colour]
 
 
 def _lay_out(rrb: Any) -> Any:

@@ -129,7 +129,7 @@ _MISTAKEN, _LEAST_OFFSET = 0.99, 4e-3
 # What is left over of the key points' places [m], and its share of the finger's length: the mechanics explain a finger
 # within 0.6 mm or 1 %, even at a height that is not quite right; in a zoomed or empty picture 1.2 mm and more remain.
 # Key points that were noisy when the jaw was tared leave more, by so many standard deviations.
-_LARGEST_RESIDUAL, _RESIDUAL_SHARE, _NOISY = 1e-3, 0.015, 3.0
+LARGEST_RESIDUAL, _RESIDUAL_SHARE, _NOISY = 1e-3, 0.015, 3.0
 # A camera that has more probably moved than not.
 BUMPED = 0.5
 # An object would have to pull by so many standard deviations of the depth, from the least to the most [m].
@@ -144,7 +144,7 @@ def bound_residual(rest: NDArray, noise: NDArray) -> float:
         noise: covariance (3, 3) of key points in the tare [m^2].
     """
     chance = _NOISY * np.sqrt(noise[0, 0] + noise[2, 2])
-    return float(max(_LARGEST_RESIDUAL, _RESIDUAL_SHARE * np.ptp(rest[:, 2]), chance))
+    return float(max(LARGEST_RESIDUAL, _RESIDUAL_SHARE * np.ptp(rest[:, 2]), chance))
 
 
 def find_rejection_reason(state: ContactState, *, largest_residual: float, settles: bool) -> str:

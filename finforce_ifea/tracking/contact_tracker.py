@@ -117,7 +117,8 @@ class ContactTracker:
         self._is_apart = False
         self.slips = SlipHistory(self._contact)
         self.roughness = FrictionEstimate(settings, smooth)
-        self._base = [(height, self._measure_stiffness(height)) for height in contact_range[0] * _NEXT_TO_CLAMP]
+        # height [m], stiffness [N/m], and standard deviation of what key points tell of a force there [N]
+        self._base = [(height, self._measure_stiffness(height), inf) for height in contact_range[0] * _NEXT_TO_CLAMP]
         _, vague = self.response.fit_forces(np.ones(len(keypoints), bool))
         self._along = list(zip(self.response.heights, self.response.stiffness, vague, strict=True))[::_EVERY]
         self._lateral = LateralLoad(torsion, len(keypoints), UNSEEN_TRACTION * settings.friction)
@@ -409,12 +410,10 @@ class ContactTracker:
         """
         if self._is_apart:
             return 0.0
-        lowest, _ = self._base[-1]
         centre = state["pressure_location"][2]
-        if centre < lowest:
+        if centre < self._base[-1][0]:
             return normal
-        places = [(height, stiffness, inf) for height, stiffness in self._base]
-        places += [place for place in self._along if abs(place[0] - centre) > _ELSEWHERE]
+        places = self._base + [place for place in self._along if abs(place[0] - centre) > _ELSEWHERE]
         x, indenter, surface = state["x"], self._contact.indenter, self._contact.surface
         near = [(place, c) for place in places if abs(c := indenter.find_clearance(x, 0.0, place[0])) < _WELL_CLEAR]
         if not near:
