@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from finforce.errors import ObservationError
 from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics
 from finforce_ifea.errors import ContactError, NotEnoughDataError, UnobservableError
+from finforce_ifea.filter.tracker import FilterTracker
 from finforce_ifea.jaw.calibration import Calibration, load_calibration
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_ifea.mechanics import build_chosen
@@ -95,7 +96,8 @@ class ForceEstimator:
         # the least and the greatest y and z of contacts on the inner surface [m]
         self._surface_range = np.stack([surface.low - _TOLERANCE, surface.high + _TOLERANCE])
         smooth = Coefficient(calibration.friction, calibration.friction_stddev) if calibration else SMOOTH
-        self._tracked = ContactTracker(
+        tracker = FilterTracker if self.settings.tracker == "filter" else ContactTracker
+        self._tracked = tracker(
             self.mechanics,
             self.jaw.keypoints,
             self.settings,
@@ -139,6 +141,10 @@ class ForceEstimator:
         self.reset()
         self._tracked.forget()
 
+    def expect_friction(self, friction: Coefficient | None) -> None:
+        """Expect an object of a stated coefficient of friction; None for one of which the settings say all."""
+        self._tracked.expect_friction(friction)
+
     @property
     def seen_friction(self) -> Coefficient:
         """What the key points alone say of the object's coefficient of friction; infinite deviation: nothing."""
@@ -147,7 +153,7 @@ class ForceEstimator:
     @property
     def friction(self) -> Coefficient:
         """The object's coefficient of friction as far as it is known."""
-        return self._tracked.roughness.coefficient
+        return self._tracked.friction
 
     @property
     def mobilised(self) -> float:

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from finforce.errors import ObservationError
 from finforce.settings import check_bounds, setting
 
+TRACKERS = ("contact", "filter")
 SOLVERS = ("default", "reduced", "solid", "frame", "plane", "linear", "paper")
 _SOLVER_MEANING = (
     "mechanics: reduced (default), stored equilibria of the model that the jaw file recommends; solid, plane or frame, "
@@ -20,6 +21,11 @@ class EstimatorSettings:
     """
 
     solver: str = setting("default", _SOLVER_MEANING, choices=SOLVERS)
+    tracker: str = setting(
+        "contact",
+        "tracking of the contact: contact, or filter, one Kalman filter whose state includes friction (experimental)",
+        choices=TRACKERS,
+    )
     mesh: str = setting("default", "mesh density of a drawing", choices=("coarse", "default", "fine"))
     likelihood_threshold: float = setting(0.6, "minimum likelihood of a used key point", "1", 0.0, 1.0)
     ignored_keypoints: str = setting("", "names of unused key points, comma-separated")

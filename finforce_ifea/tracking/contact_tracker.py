@@ -32,8 +32,8 @@ from finforce_ifea.tracking.hold import HoldHypotheses, measure_traction
 from finforce_ifea.tracking.influence import explain_offsets, measure_influence, press_lightly
 from finforce_ifea.tracking.lateral_load import LateralLoad, Torsion
 
-_IMAGES_RELEASED = 15
-_LOST_STDDEV = 1e-3
+IMAGES_RELEASED = 15
+LOST_STDDEV = 1e-3
 # The height may leave what was given by this many of its standard deviations; beyond, the contact is another one.
 _FARTHEST_HEIGHT = 8.0
 # Shapes so many times as far from the stored ones as these are good for are left to the full mechanics, until the
@@ -41,7 +41,7 @@ _FARTHEST_HEIGHT = 8.0
 _BEYOND_STORED, _BACK = 1.0, 0.8
 # Iterations of the full mechanics in one image, each as long as a hundred others: a shape that asks for more is wrong,
 # or settles over the next images.
-_FULL_ITERATIONS = 3
+FULL_ITERATIONS = 3
 # Those that find the equilibrium of the full mechanics in the state at which they take over, and their last correction.
 _SETTLING, _SETTLED = 8, 2e-3
 # An object is apart from the jaw where its pose says so by this many standard deviations.
@@ -80,6 +80,8 @@ class ContactTracker:
         response: of the unloaded jaw, see `InfluenceCoefficients`.
     """
 
+    search_type = ContactSearch
+
     def __init__(
         self,
         mechanics: Mechanics,
@@ -109,7 +111,7 @@ class ContactTracker:
         ]
         self._fidelity = 0
         self._use(0)
-        self._search = ContactSearch(len(keypoints), settings)
+        self._search = self.search_type(len(keypoints), settings)
         link_neighbours(self._search.points, keypoints)
         self._search.expectation["farthest"] = _FARTHEST_HEIGHT * settings.height_stddev
         self.response = measure_influence(self._contact, self._probe, len(keypoints))
@@ -241,15 +243,15 @@ class ContactTracker:
             measured -= self._lateral.motions + held
         self._fill(measured, tare, noise)
         is_sudden = bool(self._released or self._jumped)
-        most = _FULL_ITERATIONS if self._fidelity else self.settings.iterations
+        most = FULL_ITERATIONS if self._fidelity else self.settings.iterations
         if not self._search.find(self._contact, self._traction, self._probe, dt, iterations=most, is_sudden=is_sudden):
-            self._search.lose(_LOST_STDDEV)
+            self._search.lose(LOST_STDDEV)
             return None
         state = self._search.state
         state["traction_ratio"] = self._traction.ratio
         self._jumped = bool(state["jumped"])
         self._released = self._released + 1 if state["depth"] < TOUCH_DEPTH else 0
-        if self._released >= _IMAGES_RELEASED:  # the next object may be any again, and nothing hangs on the jaw yet
+        if self._released >= IMAGES_RELEASED:  # the next object may be any again, and nothing hangs on the jaw yet
             self._forget_contact()
             if self.settings.may_be_held:
                 self._held.reset()
@@ -295,6 +297,15 @@ class ContactTracker:
         """Forget what was learnt of the object."""
         self.roughness.reset()
         self.reset()
+
+    def expect_friction(self, friction: Coefficient | None) -> None:
+        """Expect an object of a stated coefficient of friction; None for one of which the settings say all."""
+        self.roughness.expect(friction)
+
+    @property
+    def friction(self) -> Coefficient:
+        """What is known of the object's coefficient of friction."""
+        return self.roughness.coefficient
 
     @property
     def _is_known(self) -> bool:

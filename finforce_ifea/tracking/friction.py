@@ -65,8 +65,13 @@ class FrictionEstimate:
 
     def __init__(self, settings: EstimatorSettings, smooth: Coefficient = SMOOTH) -> None:
         """Keep what is expected of objects, that of those of the calibration included."""
-        self._rough = Coefficient(settings.friction, settings.friction_stddev)
-        self._smooth, self._share = smooth, settings.smooth_share
+        self._unknown = Coefficient(settings.friction, settings.friction_stddev), settings.smooth_share
+        self._smooth = smooth
+        self.expect(None)
+
+    def expect(self, friction: Coefficient | None) -> None:
+        """Expect an object of a stated coefficient, or one of which nothing is known."""
+        self._rough, self._share = self._unknown if friction is None else (friction, 0.0)
         self.reset()
 
     def reset(self) -> None:

@@ -1,0 +1,149 @@
+"""Kalman filter of one coordinate that is at rest or in motion: interacting multiple models.
+
+At rest x drifts as a random walk; in motion it has a speed v whose changes are white. The object starts and stops at
+random times. Means and covariances of both models are mixed before each step by the transition matrix, and each model
+is weighted by the likelihood of its innovation (Blom and Bar-Shalom, 1988).
+"""
+
+from __future__ import annotations
+
+from math import exp
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+_OPTIONS = {"cache": True, "error_model": "numpy"}
+REST, MOTION = 0, 1
+
+
+class MotionNoise(NamedTuple):
+    """Process noise of a coordinate.
+
+    Attributes:
+        drift: variance per time at rest and in motion [1/s].
+        acceleration: variance of the speed per time in motion [1/s^3].
+        start: variance of the speed at which motion begins [1/s^2].
+        rest_time: mean time of rest [s].
+        motion_time: mean time of motion [s].
+    """
+
+    drift: float
+    acceleration: float
+    start: float
+    rest_time: float
+    motion_time: float
+
+
+class Track:
+    """State of one coordinate.
+
+    Attributes:
+        mu: probabilities of rest and motion (2,).
+        x: position at rest and in motion (2,).
+        v: speed in motion.
+        P: variances of the positions (2,).
+        cross: covariance of position and speed in motion.
+        speed_variance: of the speed in motion.
+    """
+
+    def __init__(self, noise: MotionNoise, x: float, variance: float) -> None:
+        """Start at rest at x with a variance."""
+        self.noise = noise
+        self._state = np.array([0.5, x, x, 0.0, variance, variance, 0.0, noise.start])
+
+    @property
+    def x(self) -> float:
+        """Expected position."""
+        mu, a, b = self._state[:3]
+        return float(mu * a + (1.0 - mu) * b)
+
+    @property
+    def variance(self) -> float:
+        """Variance of the position, that between the models included."""
+        return float(_variance(self._state))
+
+    @property
+    def speed(self) -> float:
+        """Expected speed."""
+        return float((1.0 - self._state[0]) * self._state[3])
+
+    @property
+    def rests(self) -> float:
+        """Probability of rest."""
+        return float(self._state[0])
+
+    def shift(self, change: float) -> None:
+        """Count the position from another origin."""
+        self._state[1:3] += change
+
+    def widen(self, variance: float) -> None:
+        """Add a variance to the position."""
+        self._state[4:6] += variance
+
+    def predict(self, dt: float) -> None:
+        """Advance by a time [s]."""
+        starts, stops = 1.0 - exp(-dt / self.noise.rest_time), 1.0 - exp(-dt / self.noise.motion_time)
+        _mix(self._state, starts, stops, self.noise.start)
+        _advance(self._state, dt, self.noise.drift, self.noise.acceleration)
+
+    def expect(self, z: float, R: float) -> float:
+        """Return the position that a measured one z of a variance R would leave."""
+        state = self._state.copy()
+        _correct(state, z, R)
+        return float(state[0] * state[1] + (1.0 - state[0]) * state[2])
+
+    def update(self, z: float, R: float) -> None:
+        """Take a measured position z of a variance R."""
+        _correct(self._state, z, R)
+
+
+@njit(**_OPTIONS)
+def _variance(s):
+    """Return the variance of the position of a state (8,)."""
+    mean = s[0] * s[1] + (1.0 - s[0]) * s[2]
+    return s[0] * (s[4] + (s[1] - mean) ** 2) + (1.0 - s[0]) * (s[5] + (s[2] - mean) ** 2)
+
+
+@njit(**_OPTIONS)
+def _mix(s, starts, stops, start_variance):
+    """Mix both models of a state (8,) by the probabilities that motion starts and stops."""
+    rest, a, b, v, pa, pb, cross, pv = s
+    stays, ends = (1.0 - starts) * rest, stops * (1.0 - rest)
+    begins, goes_on = starts * rest, (1.0 - stops) * (1.0 - rest)
+    to_rest, to_motion = stays + ends, begins + goes_on
+    x0 = (stays * a + ends * b) / to_rest
+    x1 = (begins * a + goes_on * b) / to_motion
+    w = goes_on / to_motion
+    s[0], s[1], s[2], s[3] = to_rest, x0, x1, w * v
+    s[4] = (stays * (pa + (a - x0) ** 2) + ends * (pb + (b - x0) ** 2)) / to_rest
+    s[5] = (begins * (pa + (a - x1) ** 2) + goes_on * (pb + (b - x1) ** 2)) / to_motion
+    s[6] = w * (cross + (1.0 - w) * (b - a) * v)
+    s[7] = w * (pv + (1.0 - w) * v * v) + (1.0 - w) * start_variance
+
+
+@njit(**_OPTIONS)
+def _advance(s, dt, drift, acceleration):
+    """Advance a state (8,) by a time [s]."""
+    s[2] += dt * s[3]
+    s[4] += drift * dt
+    s[5] += drift * dt + 2.0 * dt * s[6] + dt * dt * s[7] + acceleration * dt**3 / 3.0
+    s[6] += dt * s[7] + acceleration * dt**2 / 2.0
+    s[7] += acceleration * dt
+
+
+@njit(**_OPTIONS)
+def _correct(s, z, R):
+    """Take a measured position z of a variance R into a state (8,)."""
+    nu0, nu1, S0, S1 = z - s[1], z - s[2], s[4] + R, s[5] + R
+    odds = 0.5 * (nu0 * nu0 / S0 - nu1 * nu1 / S1) + 0.5 * np.log(S0 / S1)
+    motion = (1.0 - s[0]) * np.exp(min(max(odds, -50.0), 50.0))
+    s[0] = s[0] / (s[0] + motion)
+    gain, speed_gain, cross = s[5] / S1, s[6] / S1, s[6]
+    s[1] += s[4] / S0 * nu0
+    s[2] += gain * nu1
+    s[3] += speed_gain * nu1
+    s[4] *= R / S0
+    s[5] *= R / S1
+    s[6] -= gain * cross
+    s[7] -= speed_gain * cross

@@ -1,0 +1,171 @@
+"""Hypotheses of the traction of one object, and the path that tells how much of its friction each one uses."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce.kalman import Track
+from finforce_ifea.contact_mechanics.pressed_jaw import RigidContact
+from finforce_ifea.filter.slip_path import SlipPath
+from finforce_ifea.tracking.friction import Coefficient
+
+# Coefficients of friction that are weighed against each other.
+NODES = 9
+# They cover the expected coefficient by so many standard deviations, up to the largest [-].
+_SPAN = 2.5
+_LARGEST = 1.2
+# The largest traction ratio that the mechanics is asked for [-].
+LARGEST_RATIO = 0.9
+# Prior probability that only the jaws hold an object between two of them [-].
+_HELD = 0.5
+# A motion back by less than this is noise [sigma], and so is one along the finger [m].
+_REVERSAL = 2.5
+_HEIGHT_PLAY = 1e-3
+# Motion that is not worth a step [m].
+_SHORTEST = 0.01e-3
+# A stop is known better than the motion before it once its deviation is less by this factor.
+_STOPPED = 0.7
+# 1 sigma of the depth of first touch [m].
+_TOUCH_STDDEV = 0.1e-3
+# Part of the path's deviation that is left while all of the contact slides.
+_SLIDING = 0.3
+_LEAST_PROBABILITY = 1e-6
+
+
+class TractionHypotheses:
+    """Coefficients of friction on a grid, and that only the jaws hold the object.
+
+    What the jaws alone hold does not move along the finger: friction balances the inclination of their faces.
+
+    Attributes:
+        mu: coefficients of friction (NODES,) [-].
+        upright: traction ratio of an object that only the jaws hold [-].
+        motion: of the object along the path since it was last asked for [m].
+        stddev: of the traction ratio by errors of the path [-].
+    """
+
+    def __init__(self, friction: Coefficient, held: str) -> None:
+        """Expect an object of a coefficient of friction; `held` is "no", "yes" or "either"."""
+        self._held = {"yes": 1.0, "no": 0.0}.get(held, _HELD)
+        self.expect(friction)
+
+    def expect(self, friction: Coefficient) -> None:
+        """Expect another coefficient of friction."""
+        mean, stddev = friction
+        low = max(mean - _SPAN * stddev, 0.0)
+        high = max(min(mean + _SPAN * stddev, _LARGEST), low + 1e-3)
+        self.mu = np.linspace(low, high, NODES)
+        prior = np.exp(-0.5 * ((self.mu - mean) / max(stddev, 1e-6)) ** 2) + 1e-300
+        self._prior = prior / prior.sum()
+        self._path = SlipPath(self.mu)
+        self.reset()
+
+    def reset(self) -> None:
+        """Expect an object that does not touch yet."""
+        self.upright, self._bears, self.motion = 0.0, 0.0, 0.0
+        self.leave()
+
+    def leave(self) -> None:
+        """Forget the path, as once nothing touches."""
+        self._path.reset()
+        self._anchor: NDArray | None = None
+        self._anchor_stddev, self._direction, self.stddev = _TOUCH_STDDEV, 1.0, 0.0
+
+    @property
+    def prior(self) -> NDArray:
+        """Log prior probabilities (N,), those of the grid first."""
+        parts = [np.log(self._prior * (1.0 - self._held))] if self._held < 1.0 else []
+        return np.concatenate([*parts, [np.log(self._held)]]) if self._held > 0.0 else parts[0]
+
+    @property
+    def ratios(self) -> NDArray:
+        """Traction ratio kappa of each hypothesis (N,) [-]."""
+        parts = [self._path.ratios] if self._held < 1.0 else []
+        if self._held > 0.0:
+            parts.append(np.array([self.upright]))
+        return np.clip(np.concatenate(parts), -LARGEST_RATIO, LARGEST_RATIO)
+
+    @property
+    def follows_path(self) -> bool:
+        """Whether any hypothesis depends on the path."""
+        return self._held < 1.0
+
+    def estimate(self, weights: NDArray) -> Coefficient:
+        """Return the coefficient of friction for the weights of the hypotheses (N,)."""
+        if not self.follows_path:
+            return Coefficient(0.0, np.inf)
+        own = weights[:NODES] / max(weights[:NODES].sum(), 1e-300)
+        mean = float(own @ self.mu)
+        return Coefficient(mean, float(np.sqrt(max(own @ self.mu**2 - mean**2, 0.0) + self._cell_variance)))
+
+    @property
+    def _cell_variance(self) -> float:
+        return float(self.mu[1] - self.mu[0]) ** 2 / 12.0
+
+    def spread_cells(self, weights: NDArray) -> float:
+        """Return the variance of kappa within the cells of the grid, for the weights of the hypotheses (N,)."""
+        if not self.follows_path:
+            return 0.0
+        slopes = np.gradient(np.clip(self._path.ratios, -LARGEST_RATIO, LARGEST_RATIO), self.mu)
+        return float(weights[:NODES] @ slopes**2) * self._cell_variance
+
+    def bound_held(self, log_weights: NDArray) -> NDArray:
+        """Return the weights (N,), that of "held" less what friction does not bear: P(mu > |kappa|)."""
+        if not 0.0 < self._held < 1.0:
+            return log_weights
+        step = self.mu[1] - self.mu[0]
+        bears = self._prior @ np.clip((self.mu + 0.5 * step - abs(self.upright)) / step, 0.0, 1.0)
+        bears = float(np.log(max(bears, _LEAST_PROBABILITY)))
+        weighed = log_weights.copy()
+        weighed[-1] += bears - self._bears
+        self._bears = bears
+        return weighed - np.log(np.exp(weighed).sum())
+
+    def take_motion(self) -> float:
+        """Return the motion [m] since the last call."""
+        motion, self.motion = self.motion, 0.0
+        return motion
+
+    def shift(self, change: float) -> None:
+        """Count the depth `change` [m] more."""
+        if self._anchor is not None:
+            self._anchor[:, 0] += change
+
+    def follow(
+        self, contact: RigidContact, q: NDArray, x: NDArray, places: NDArray, track: Track, weights: NDArray
+    ) -> None:
+        """Follow the object to where it is now.
+
+        A motion back counts once it is no chance; what stopped short of it stopped where it is known best.
+
+        Args:
+            contact: of the jaw.
+            q: its unknowns (size,).
+            x: state of the contact (3,).
+            places: depth and height of each hypothesis (N, 2) [m].
+            track: of the depth.
+            weights: of the hypotheses (N,).
+        """
+        places, own = places[:NODES], weights[:NODES] / max(weights[:NODES].sum(), 1e-300)
+        if self._anchor is None:
+            self._anchor = places.copy()
+        motion = places - self._anchor
+        motion[:, 1] -= np.clip(motion[:, 1], -_HEIGHT_PLAY, _HEIGHT_PLAY)
+        deeper, stddev = float(own @ motion[:, 0]), float(np.sqrt(max(track.variance, 0.0)))
+        if not motion[:, 1].any():
+            is_back = deeper * self._direction < 0.0
+            if is_back and abs(deeper) < _REVERSAL * np.hypot(stddev, self._anchor_stddev):
+                if stddev < _STOPPED * self._anchor_stddev:
+                    self._anchor, self._anchor_stddev = places.copy(), stddev
+                return
+            if abs(deeper) < _SHORTEST:
+                return
+        self._anchor_stddev, self._direction = stddev, float(np.sign(deeper))
+        self._anchor = self._anchor + motion
+        self.motion += abs(deeper)
+        self._path.move(contact, q, x, motion)
+        slides = np.abs(np.abs(self._path.ratios) - self.mu) < 1e-6
+        self.stddev = self._path.turn_at(float(own @ self._path.ratios)) * stddev
+        if own @ slides > 0.5:
+            self.stddev *= _SLIDING

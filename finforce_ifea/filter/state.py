@@ -1,0 +1,34 @@
+"""Layout of the filter's state vector x (n,) and of its covariance P (n, n).
+
+    x = (d, s, h, dk, c_x, c_z, c_phi, e, o_1 ... o_K, r_1 ... r_K)
+
+d is the depth of the object [m], s its shape (logarithm of the radius, or tilt [rad]) and h its height [m]; dk is the
+traction ratio beyond what friction explains [-]; (c_x, c_z) [m] and c_phi [rad] are the shift and turn of the camera
+since the tare; e is the traction ratio that errors of the mechanics look like [-]. Each key point has, along x and z,
+an offset o [m] and an error r of the mechanics relative to the point's displacement [-].
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+DEPTH, SHAPE, HEIGHT, TRACTION, CAMERA_X, CAMERA_Z, CAMERA_TURN, APPARENT = range(8)
+# Entries that no single key point owns.
+SHARED = 8
+CONTACT = np.array([DEPTH, SHAPE, HEIGHT])
+CAMERA = np.array([CAMERA_X, CAMERA_Z, CAMERA_TURN])
+
+
+def state_size(keypoints: int) -> int:
+    """Return n for a number of key points."""
+    return SHARED + 4 * keypoints
+
+
+def offset_entries(keypoints: int) -> slice:
+    """Return the entries of the offsets o, x and z of each key point in turn."""
+    return slice(SHARED, SHARED + 2 * keypoints)
+
+
+def relative_entries(keypoints: int) -> slice:
+    """Return the entries of the relative errors r, x and z of each key point in turn."""
+    return slice(SHARED + 2 * keypoints, SHARED + 4 * keypoints)
