@@ -101,7 +101,7 @@ def solve_lower(L, B):
 
 @njit(**_OPTIONS)
 def update(x, log_weights, H, rows, u, P, R, nu):
-    """Return the updated means (N, n), log weights (N,), A (m, n) with P <- P - A^T A, and the noise of the first four (4, 4).
+    """Return updated means (N, n) and log weights (N,), A (m, n) with P <- P - A^T A, and K R K^T of four entries.
 
     Args:
         x: predicted means (N, n).

@@ -19,11 +19,15 @@ _LARGEST = 1.2
 LARGEST_RATIO = 0.9
 # Prior probability that only the jaws hold an object between two of them [-].
 _HELD = 0.5
-# A motion back by less than this is noise [sigma], and so is one along the finger [m].
+# A motion back by less than this is noise [sigma] while the object moves, and where it has stopped; and one along the
+# finger by less than this [m].
 _REVERSAL = 2.5
+_REVERSAL_AT_REST = 4.0
 _HEIGHT_PLAY = 1e-3
 # Motion that is not worth a step [m].
 _SHORTEST = 0.01e-3
+# Probability of rest below which the object moves [-].
+_MOVES = 0.2
 # A stop is known better than the motion before it once its deviation is less by this factor.
 _STOPPED = 0.7
 # 1 sigma of the depth of first touch [m].
@@ -155,7 +159,8 @@ class TractionHypotheses:
         deeper, stddev = float(own @ motion[:, 0]), float(np.sqrt(max(track.variance, 0.0)))
         if not motion[:, 1].any():
             is_back = deeper * self._direction < 0.0
-            if is_back and abs(deeper) < _REVERSAL * np.hypot(stddev, self._anchor_stddev):
+            sigmas = _REVERSAL if track.rests < _MOVES else _REVERSAL_AT_REST
+            if is_back and abs(deeper) < sigmas * np.hypot(stddev, self._anchor_stddev):
                 if stddev < _STOPPED * self._anchor_stddev:
                     self._anchor, self._anchor_stddev = places.copy(), stddev
                 return

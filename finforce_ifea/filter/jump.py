@@ -35,16 +35,13 @@ class Jump:
 
     def log_odds(self, information: NDArray, score: NDArray) -> float:
         """Return the log odds of the jump for H^T S^-1 H (8, 8) and H^T S^-1 nu (8,)."""
-        I, y = information[self.columns[:, None], self.columns], score[self.columns]
-        Q = self.stddev**2
-        gain = 0.5 * float(y @ np.linalg.solve(np.diag(1.0 / Q) + I, y))
-        cost = 0.5 * float(np.linalg.slogdet(np.eye(len(Q)) + Q[:, None] * I)[1])
+        known, y, Q = information[self.columns[:, None], self.columns], score[self.columns], self.stddev**2
+        gain = 0.5 * float(y @ np.linalg.solve(np.diag(1.0 / Q) + known, y))
+        cost = 0.5 * float(np.linalg.slogdet(np.eye(len(Q)) + Q[:, None] * known)[1])
         return float(np.log(self.probability / (1.0 - self.probability))) + gain - cost
 
 
 # The camera was bumped, by a millimetre and half a degree.
-BUMPED = Jump(
-    entries=CAMERA, columns=np.array([4, 5, 6]), stddev=np.array([1e-3, 1e-3, 10e-3]), probability=1e-5
-)
+BUMPED = Jump(entries=CAMERA, columns=np.array([4, 5, 6]), stddev=np.array([1e-3, 1e-3, 10e-3]), probability=1e-5)
 # The object touches elsewhere than stated, anywhere within 30 mm.
 MISPLACED = Jump(entries=np.array([HEIGHT]), columns=np.array([2]), stddev=np.array([30e-3]), probability=1e-4)

@@ -28,7 +28,7 @@ LATERAL_ERROR = 0.1e-3
 
 @njit(**_OPTIONS)
 def linearize(points, seen, positions, motions):
-    """Return H (2 m, 8), |u| (2 m,) [m], residual (m, 2) [m] and squared normalised residual along y (m,) of key points.
+    """Return H (2 m, 8), |u| (2 m,) [m], residuals (m, 2) [m], and squared normalised ones along y (m,).
 
     Args:
         points: all key points of the image (K,), see `KEYPOINT`.
@@ -42,9 +42,7 @@ def linearize(points, seen, positions, motions):
         k = seen[i]
         point, p = points[k], positions[k]
         lateral = point.measured[1] - p[1]
-        square[i] = lateral * lateral / (
-            point.width_variance / point.trust + point.offset_variance + LATERAL_ERROR**2
-        )
+        square[i] = lateral * lateral / (point.width_variance / point.trust + point.offset_variance + LATERAL_ERROR**2)
         size = np.hypot(p[0] - point.rest[0], p[2] - point.rest[2])
         for a in range(2):
             row = 2 * i + a

@@ -349,13 +349,14 @@ class FilterSearch(ContactSearch):
             traction: ratio of each hypothesis (N,), and that of the linearisation.
             smoothing: see `_smooth_depth` (4, 4).
         """
-        s, J, w, mean, (ratios, ratio) = blank_contact_state(), at.pressed.force_modes, self.weights, self.mean, traction
+        s, (ratios, ratio) = blank_contact_state(), traction
+        J, w, mean = at.pressed.force_modes, self.weights, self.mean
         x_model, depth = find_x_model(contact, x)
         offsets = self.x[:, CONTACT] - at.x
         offsets[:, 0] += self._smooth + x_model[0] - x[0]
         forces = at.pressed.force + offsets @ J[:, :3].T + np.outer(ratios + self.x[:, TRACTION] - ratio, J[:, 3])
         force = w @ forces
-        covariance = J @ (self.P[:4, :4] + smoothing) @ J.T + np.einsum("i,ia,ib->ab", w, forces - force, forces - force)
+        covariance = J @ (self.P[:4, :4] + smoothing) @ J.T + (forces - force).T @ (w[:, None] * (forces - force))
         covariance += (self.hypotheses.spread_cells(w) + _MISDIRECTED**2) * np.outer(J[:, 3], J[:, 3])
         s["x"], s["x_model"], s["x_asked"], s["depth"] = x, x_model, x, depth
         s["force"] = force * min(1.0, max(0.0, depth / _LEAST_DEPTH))
@@ -393,5 +394,3 @@ class FilterSearch(ContactSearch):
     def contact_covariance(self) -> NDArray:
         """Return the covariance of depth, shape and height (3, 3)."""
         return self.P[np.ix_(CONTACT, CONTACT)]
-
-

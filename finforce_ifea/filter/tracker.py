@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 from numpy.typing import NDArray
 
 from finforce_ifea.filter.search import FilterSearch
@@ -27,7 +26,8 @@ class FilterTracker(ContactTracker):
     def update(self, points: NDArray, tare: Tare, dt: float, observation: Observation) -> ContactState | None:
         """See `ContactTracker.update`."""
         search, measured = self._search, points - tare.offsets
-        self._fill(measured - self._lateral.motions if self._is_known else measured, tare, tare.point_noise(observation.stddev))
+        planar = measured - self._lateral.motions if self._is_known else measured
+        self._fill(planar, tare, tare.point_noise(observation.stddev))
         most = FULL_ITERATIONS if self._fidelity else self.settings.iterations
         if not search.find(self._contact, self._traction, self._probe, dt, iterations=most, is_sudden=False):
             search.lose(LOST_STDDEV)
