@@ -15,7 +15,8 @@ from finforce.messages import check_stddev
 from finforce_ifea.errors import ContactError
 from finforce_ifea.jaw.jaw import Jaw
 
-TRUSTED = ("ok", "unloaded")
+TOUCHING = "ok"
+TRUSTED = (TOUCHING, "unloaded")
 _UNIT = 1e-3  # by which the length of a unit vector may be off
 # Images are at least so long apart [s]; what comes sooner is the same one, stamped again.
 _SHORTEST_PERIOD = 0.5e-3
@@ -136,6 +137,11 @@ class Solution(NamedTuple):
     def trusted(self) -> bool:
         """Whether a wrench may be published."""
         return self.status in TRUSTED
+
+    @property
+    def touching(self) -> bool:
+        """Whether the object touches, as far as that can be trusted."""
+        return self.status == TOUCHING
 
 
 def blank_solution(stamp: float, status: str, message: str, used: NDArray, iterations: int = 0) -> Solution:

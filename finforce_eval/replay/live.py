@@ -82,7 +82,7 @@ class ReplayLog:
         contact, row = contact_from_cloud(message, f"{side}_jaw", free=False), self.rows[side][self._stamp(message)]
         if len(contact.points):
             row["contact_height"] = float(np.average(contact.points[:, 2], weights=contact.weights))
-        row |= {"touching": bool(contact.touching), "contact_status": "live"}
+        row["contact_status"] = "live"
 
     def take_pose(self, side: str, message: Any) -> None:
         """Keep the pose of a jaw that the detector found."""
@@ -167,7 +167,7 @@ def live_result(
         message="",
         step_ms=np.array([row.get("step_ms", np.nan) for row in rows]),
         **recording.phases_at(track.stamps),
-        **(_contact_columns(recording, side, rows, estimator) if any("touching" in row for row in rows) else {}),
+        **(_contact_columns(recording, side, rows, estimator) if any("contact_status" in row for row in rows) else {}),
         true_force=truth_columns(recording, side)["true_force"],
         **sight_columns(recording, side),
     )
@@ -185,7 +185,7 @@ def _contact_columns(recording: Recording, side: str, rows: list[dict[str, Any]]
         "contact_source": "live",
         "contact_height": np.array([row.get("contact_height", np.nan) for row in rows]),
         "true_height": np.array(truth),
-        "touching": np.array([row.get("touching", False) for row in rows]),
+        "touching": np.array([bool(np.any(row.get("force", 0.0))) for row in rows]),
         "contact_status": np.array([row.get("contact_status", "") for row in rows]),
     }
 

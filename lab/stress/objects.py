@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce_contact.estimator import ContactEstimator
-from finforce_contact.localization.section import cut_outline
+from finforce_contact.section import cut_outline
 from finforce_contact.loop import ForceLoop
 from finforce_contact.mesh.object_mesh import ObjectMesh
 from finforce_contact.parameters import ContactSettings
