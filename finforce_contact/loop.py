@@ -211,6 +211,6 @@ class ForceLoop:
         self.given = self._resting.complete(contact, observation.stamp)
         found = perf_counter()
         solution = self.force.update(observation, self.given)
-        self._resting.note(solution)
+        self._resting.note(solution, observation.stamp)
         self.contact_ms, self.force_ms = 1e3 * (found - begin), 1e3 * (perf_counter() - found)
         return solution

@@ -13,7 +13,7 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 
 from finforce.camera_topics import COMPRESSED_DEPTH
 from finforce.health import IDLE, Health, Idling, Level, Outcome, Report, Skips, StampGate
-from finforce.messages import SECOND, CameraStream, stamp_of
+from finforce.messages import SECOND, stamp_of
 from finforce.ros import node as ros
 from finforce.settings import check_bounds
 from finforce.transforms import pose_numbers
@@ -37,9 +37,7 @@ class _ContactOutputs:
         skips: whether what nobody subscribes to is left out.
     """
 
-    def __init__(
-        self, stage: ros.Stage, parameters: ContactParameters, session: ContactSession, skips: Skips
-    ) -> None:
+    def __init__(self, stage: ros.Stage, parameters: ContactParameters, session: ContactSession, skips: Skips) -> None:
         cloud, sides = ros.PointCloud2, parameters.sides
         self._camera, self._jaws, self._skips = session.stream, parameters.jaw_frame, skips
         self._candidates = session.jaws[sides[0]].loop.estimator.jaw.candidates[:, 2]

@@ -283,7 +283,7 @@ class IfeaSolverNode(ros.ImageNode):
                 self._restart("the stamps went back: a new recording")
             contact = self.resting.complete(self.contacts.at(stamp), observation.stamp)
             self.last = solution = self.estimator.update(observation, contact)
-            self.resting.note(solution)
+            self.resting.note(solution, observation.stamp)
             self.gate.check_age(stamp, self.now())
             self.idling.note(stamp, self.estimator.is_idle and self.skips.allows(IDLE))
             if not solution.trusted:
@@ -358,5 +358,6 @@ class IfeaSolverNode(ros.ImageNode):
         mean, stddev = self.estimator.friction
         friction = f"{mean:.2f} ± {stddev:.2f}, cone used to {100.0 * abs(self.estimator.mobilised):.0f} %"
         tared = {"tared": str(self.estimator.tared), "friction": friction}
+        tared["touch probability"] = f"{self.estimator.touch_probability:.2f}"
         health = self.health[self.parameters.jaw_name]
         return health.report(alarms, describe_solution(self.last) | tared | self.skips.describe())

@@ -90,8 +90,7 @@ def is_out_of_reach(contact: Contact, face_x: float) -> bool:
     outline = contact.outline
     if outline is None or contact.touching is not False:
         return False
-    nearest = min(float(polygon[:, 0].min()) for polygon in outline.placed())
-    return nearest - face_x > AWAY + _SIGMAS * float(outline.stddev[0])
+    return outline.nearest - face_x > AWAY + _SIGMAS * float(outline.stddev[0])
 
 
 class Solution(NamedTuple):
@@ -287,6 +286,11 @@ class ObjectOutline:
             raise ContactError(
                 f"outline with across {self.across}, expected a place along y and a standard deviation above zero [m]"
             )
+
+    @property
+    def nearest(self) -> float:
+        """Least x of the outline [m], jaw frame."""
+        return min(float(polygon[:, 0].min()) for polygon in self.placed())
 
     def placed(self) -> tuple[NDArray, ...]:
         """Return the polygons (n, 2) [m] in x and z of the jaw frame."""

@@ -1,5 +1,7 @@
 """The contact of a grasp at rest, whose object may be hidden from whoever finds its pose."""
 
+from math import inf, isfinite, nan
+
 from finforce_ifea.observation import Contact, Solution
 
 # A pressure centre that moves by no more than this along x [m] for so long [s] is that of a grasp at rest.
@@ -17,19 +19,19 @@ class RestingContact:
     def reset(self) -> None:
         """Forget the contact."""
         self._contact: Contact | None = None
-        self._x, self._since, self._until = float("nan"), 0.0, float("-inf")
+        self._x, self._since, self._told, self._until = nan, 0.0, -inf, -inf
 
     def complete(self, contact: Contact | None, stamp: float) -> Contact | None:
         """Return the contact of an image [s], the last one where there is none and the grasp was at rest."""
         if contact is not None:
-            self._contact = contact
+            self._contact, self._told = contact, stamp
             return contact
         return self._contact if stamp <= self._until else None
 
-    def note(self, solution: Solution) -> None:
-        """Take what the solver made of an image with this contact."""
+    def note(self, solution: Solution, stamp: float) -> None:
+        """Take what the solver made of an image [s]."""
         x = float(solution.contact_point[0])
-        if not abs(x - self._x) <= _REST_MOTION:  # neither is what is not a number
-            self._x, self._since = x, solution.stamp
-        if x == x and solution.stamp - self._since >= _REST_TIME:
-            self._until = solution.stamp + _KEPT
+        if not abs(x - self._x) <= _REST_MOTION:  # no number, without contact, has moved
+            self._x, self._since = x, stamp
+        if isfinite(x) and self._told >= self._since and stamp - self._since >= _REST_TIME:
+            self._until = stamp + _KEPT

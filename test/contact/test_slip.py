@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from finforce_contact.slip import SlipWatch, TouchedFace, face_at
 from finforce_contact.parameters import ContactSettings
+from finforce_contact.slip import SlipWatch, TouchedFace, face_at
 
 SETTINGS = ContactSettings()
 FACE = TouchedFace(point=np.array([0.012, 0.0, 0.040]), tangent=np.array([0.0, 0.0, 1.0]))
