@@ -49,8 +49,9 @@ class ContactEstimate:
         return self.contact is not None and bool(self.contact.touching)
 
 
-_JAW_SAMPLES = 100
-_SURROUNDED = 0.5
+# Vertices looked at, and share of them, those farthest behind the face, that no pressed object reaches.
+_JAW_SAMPLES, _BACK = 300, 1.0 / 3.0
+_SURROUNDED = 0.5  # share of these that lies within an object around the jaw
 # An object with its origin farther off [m] is out of reach.
 _OUT_OF_REACH = 1.0
 _REASONS = ("solved", "no_object", "no_pose", "surrounded", "out_of_reach", "late pose", "odd pose")
@@ -75,8 +76,7 @@ class ContactEstimator:
         self.jaw, self.settings = jaw, settings or ContactSettings()
         parse_symmetry(self.settings.symmetry)
         self.face = build_inner_face(jaw, self.settings.mesh)
-        nodes = self.face.mesh.nodes
-        self._samples = nodes[np.unique(np.linspace(0, len(nodes) - 1, _JAW_SAMPLES).astype(int))]
+        self._back = _sample_back(jaw, self.face.mesh.nodes)
         self._poses, self._slips = PoseFilter(self.settings), SlipWatch(self.settings)
         self.set_object(mesh)
 
@@ -207,11 +207,11 @@ class ContactEstimator:
         )
 
     def _surrounds_jaw(self, T: NDArray, section: ObjectSection) -> bool:
-        """Return whether most of the jaw lies within the object."""
-        inside = np.abs((self._samples - T[:3, 3]) @ T[:3, :3] - self._centre) < self._half
+        """Return whether most of the jaw's back lies within the object."""
+        inside = np.abs((self._back - T[:3, 3]) @ T[:3, :3] - self._centre) < self._half
         if inside.all(axis=1).mean() < _SURROUNDED:
             return False
-        points = np.ascontiguousarray(self._samples[:, ::2])
+        points = np.ascontiguousarray(self._back[:, ::2])
         return count_inside(points, section.edges) > _SURROUNDED * len(points)
 
     def _follow_face(self, height: float, touching: bool) -> None:
@@ -243,3 +243,10 @@ class ContactEstimator:
         return ContactEstimate(
             stamp=stamp, status=status, message=message, contact=None if status == "no_pose" else nothing
         )
+
+
+def _sample_back(jaw: Jaw, nodes: NDArray) -> NDArray:
+    """Return some of a jaw's vertices (n, 3) [m] far behind its inner face, which no pressed object reaches."""
+    samples = nodes[np.unique(np.linspace(0, len(nodes) - 1, _JAW_SAMPLES).astype(int))]
+    behind = jaw.face.read(samples[:, 2]) - samples[:, 0]
+    return samples[behind >= np.quantile(behind, 1.0 - _BACK)]

@@ -127,7 +127,7 @@ class ContactEstimatorNode(ros.ImageNode):
         Raises:
             MissingDependencyError: a message type is not installed.
         """
-        stage, session, source = self.stage, self.session, self.parameters.pose_source
+        stage, source = self.stage, self.parameters.pose_source
         self.objects = None
         if self.parameters.tracks:
             camera, group = self.session.camera, MutuallyExclusiveCallbackGroup()

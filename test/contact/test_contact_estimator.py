@@ -123,6 +123,12 @@ class TestWhatIsNotKnown:
         assert "around the jaw" in estimate.message
         assert estimator.counts["surrounded"] == 1
 
+    @pytest.mark.parametrize("depth", [8, 12, 15])
+    def test_large_object_deep_in_the_jaw_is_not_around_it(self, depth):
+        estimator = estimator_of(box((0.05, 0.06, 0.1)))
+        estimator.take_pose(0.0, pose(FACE + 0.025 - depth * MM, 0.042))
+        assert estimator.update(0.0).touching
+
     def test_cup_around_the_jaw_is_one_that_it_can_touch(self):
         walls = joined(box((0.003, 0.05, 0.1), (-0.03, 0, 0)), box((0.003, 0.05, 0.1), (0.02, 0, 0)))
         estimator = estimator_of(walls)
