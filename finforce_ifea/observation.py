@@ -16,8 +16,8 @@ from finforce_ifea.errors import ContactError
 from finforce_ifea.jaw.jaw import Jaw
 
 TRUSTED = ("ok", "unloaded")
-# Standard deviations of a force from which it shows that the object touches: on bench recordings it does in 0 to 3 % of the
-# images of an unloaded jaw.
+# Standard deviations of a force from which it shows that the object touches: on bench recordings it does in 0 to 3 % of
+# the images of an unloaded jaw.
 _TOUCHING = 0.5
 _UNIT = 1e-3  # by which the length of a unit vector may be off
 # Images are at least so long apart [s]; what comes sooner is the same one, stamped again.
