@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from time import perf_counter
-from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,11 +15,12 @@ from finforce.messages import SECOND
 from finforce_contact.estimator import ContactEstimate, ContactEstimator
 from finforce_contact.mesh.object_mesh import ObjectMesh
 from finforce_ifea.observation import Contact, Observation, Solution, is_out_of_reach
+from finforce_ifea.resting import RestingContact
 
 if TYPE_CHECKING:
     from finforce_ifea.estimator import ForceEstimator
 
-ValueT = TypeVar("ValueT")
+Surface = Callable[[], NDArray | None]  # gives the jaw's deformed vertices (n, 3) [m], None where nobody knows them
 
 
 class TimedEstimate(NamedTuple):
@@ -27,9 +28,6 @@ class TimedEstimate(NamedTuple):
 
     stamp: int
     estimate: ContactEstimate
-
-
-Wrench = tuple[NDArray, NDArray]  # force (3,) [N] and torque (3,) [N m] about the jaw's origin
 
 
 class ContactSource(Protocol):
@@ -43,11 +41,8 @@ class ContactSource(Protocol):
     name: str
     estimate: ContactEstimate | None
 
-    def contact_at(self, stamp: int) -> Contact | None:
-        """Return the contact of an image [ns]; None when nothing is known."""
-
-    def learn(self, stamp: int, surface: NDArray, wrench: Wrench | None) -> None:
-        """Take what the solver made of that image: vertices (n, 3) [m], jaw frame, and a wrench that is trusted."""
+    def contact_at(self, stamp: int, surface: Surface | None = None) -> Contact | None:
+        """Return the contact of an image [ns]; None when nothing is known; see `ContactLoop.update`."""
 
 
 class GivenContact:
@@ -58,19 +53,13 @@ class GivenContact:
     def __init__(self, contact: Contact | None, name: str = "given") -> None:
         self.contact, self.name = contact, name
 
-    def contact_at(self, stamp: int) -> Contact | None:
+    def contact_at(self, stamp: int, surface: Surface | None = None) -> Contact | None:
         """Return it."""
         return self.contact
 
-    def learn(self, stamp: int, surface: NDArray, wrench: Wrench | None) -> None:
-        """Learn nothing."""
-
 
 class ContactLoop:
-    """The contact estimator of one jaw in the loop with the solver of that jaw.
-
-    The contact of an image is found with the object's last pose, on the deformed jaw that the solver found in the image
-    before. Offline and live run this same loop; live, its ends are topics.
+    """The contact estimator of one jaw, fed with stamps in nanoseconds; offline and live use this same one.
 
     Attributes:
         estimator: of this jaw.
@@ -78,20 +67,16 @@ class ContactLoop:
 
     Args:
         estimator: of this jaw.
-        max_age: greatest distance between the stamps of an image and of the surface and wrench used for it [ns].
     """
 
     name = "estimate"
 
-    def __init__(self, estimator: ContactEstimator, *, max_age: int = 200_000_000) -> None:
+    def __init__(self, estimator: ContactEstimator) -> None:
         self.estimator = estimator
-        self._max_age = max_age
         self._start()
 
     def _start(self) -> None:
         self.last: TimedEstimate | None = None
-        self._surface: tuple[int, NDArray] | None = None
-        self._wrench: tuple[int, Wrench] | None = None
         self._posed: int | None = None
 
     def reset(self) -> None:
@@ -122,11 +107,6 @@ class ContactLoop:
         contact = self.estimate.contact if self.estimate else None
         return contact is not None and is_out_of_reach(contact, self.estimator.jaw.inner_face_x)
 
-    @property
-    def is_idle(self) -> bool:
-        """Whether nothing happens: the object is held still, or out of reach."""
-        return self.estimator.still or self.is_out_of_reach
-
     def take_pose(
         self, stamp: int, T_jaw_object: NDArray, covariance: NDArray | None = None, camera: NDArray | None = None
     ) -> None:
@@ -145,53 +125,31 @@ class ContactLoop:
             self.estimator.take_pose(SECOND * stamp, T_jaw_object, covariance, camera=camera)
             self._posed = stamp
 
-    @property
-    def has_pose(self) -> bool:
-        """Whether a pose of the object has come."""
-        return self._posed is not None
+    def update(self, stamp: int, surface: Surface | None = None) -> TimedEstimate | None:
+        """Return the contact of an image; None when it is not newer than the last.
 
-    def keep_surface(self, stamp: int, surface: NDArray) -> None:
-        """Keep the deformed vertices (n, 3) [m] that the solver found in an image [ns]."""
-        self._surface = stamp, surface
-
-    def take_wrench(self, stamp: int, wrench: Wrench) -> None:
-        """Keep force (3,) [N] and torque (3,) [N m] of an image [ns]."""
-        self._wrench = stamp, wrench
-
-    def update(self, stamp: int) -> TimedEstimate | None:
-        """Return the contact of an image [ns]; None when it is not newer than the last.
+        Args:
+            stamp: of the image [ns].
+            surface: asked for the deformed jaw by mode "paper", which takes it as undeformed where nobody answers.
 
         Raises:
             MeshError: the surface is not that of the jaw's mesh.
         """
         if self.last is not None and stamp <= self.last.stamp:
             return None
-        surface, wrench = self._fresh(self._surface, stamp), self._fresh(self._wrench, stamp)
-        self.last = TimedEstimate(stamp, self.estimator.update(SECOND * stamp, surface, wrench))
+        vertices = surface() if surface is not None and self.estimator.needs_surface else None
+        self.last = TimedEstimate(stamp, self.estimator.update(SECOND * stamp, vertices))
         return self.last
-
-    def _fresh(self, kept: tuple[int, ValueT] | None, stamp: int) -> ValueT | None:
-        return kept[1] if kept and abs(stamp - kept[0]) <= self._max_age else None
 
     @property
     def estimate(self) -> ContactEstimate | None:
         """What the estimator said last."""
         return self.last.estimate if self.last else None
 
-    def contact_at(self, stamp: int) -> Contact | None:
+    def contact_at(self, stamp: int, surface: Surface | None = None) -> Contact | None:
         """Return the contact of an image [ns]; see `update`."""
-        self.update(stamp)
+        self.update(stamp, surface)
         return self.last.estimate.contact
-
-    def learn(self, stamp: int, surface: NDArray, wrench: Wrench | None) -> None:
-        """Keep what the solver made of an image [ns], for the next one."""
-        self.keep_surface(stamp, surface)
-        if wrench is not None:
-            self.take_wrench(stamp, wrench)
-
-    def has_surface(self) -> bool:
-        """Say whether the last contact was found on the deformed jaw; else the undeformed one stood for it."""
-        return self.last is not None and self._fresh(self._surface, self.last.stamp) is not None
 
     def pose_age(self) -> float:
         """Return the time from the object's last pose to the last contact [s], NaN before the first."""
@@ -201,7 +159,7 @@ class ContactLoop:
 
 
 class ForceLoop:
-    """Contact and force of one jaw, image after image: where the contact comes from and the solver feed each other.
+    """Contact and force of one jaw, image after image.
 
     Attributes:
         contact: where the contact comes from.
@@ -218,7 +176,13 @@ class ForceLoop:
     def __init__(self, contact: ContactEstimator | ContactSource, force: ForceEstimator) -> None:
         self.contact = ContactLoop(contact) if isinstance(contact, ContactEstimator) else contact
         self.force, self.given = force, None
+        self._resting = RestingContact()
         self.contact_ms = self.force_ms = 0.0
+
+    def forget(self) -> None:
+        """Forget what earlier images told of jaw and force; the object's pose stays."""
+        self.force.forget()
+        self._resting.reset()
 
     def take_pose(self, stamp: float, T_jaw_object: NDArray) -> None:
         """Take the object's pose (4, 4) [m] in the jaw frame, in an image [s].
@@ -243,13 +207,10 @@ class ForceLoop:
         begin = perf_counter()
         for pose in poses:
             self.take_pose(*pose)
-        stamp = round(observation.stamp / SECOND)
-        self.given = self.contact.contact_at(stamp)
+        contact = self.contact.contact_at(round(observation.stamp / SECOND), self.force.surface)
+        self.given = self._resting.complete(contact, observation.stamp)
         found = perf_counter()
         solution = self.force.update(observation, self.given)
-        solved = perf_counter()
-        wrench = (solution.force, solution.torque) if solution.trusted else None
-        self.contact.learn(stamp, self.force.surface(), wrench)
-        self.force_ms = 1e3 * (solved - found)
-        self.contact_ms = 1e3 * (perf_counter() - begin) - self.force_ms
+        self._resting.note(solution, observation.stamp)
+        self.contact_ms, self.force_ms = 1e3 * (found - begin), 1e3 * (perf_counter() - found)
         return solution

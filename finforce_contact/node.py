@@ -1,4 +1,4 @@
-"""The contact estimator node: poses, surfaces and images in, contacts out."""
+"""The contact estimator node: poses and images in, contacts and outlines out."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 
 from finforce.camera_topics import COMPRESSED_DEPTH
 from finforce.health import IDLE, Health, Idling, Level, Outcome, Report, Skips, StampGate
-from finforce.messages import SECOND, CameraStream, stamp_of
+from finforce.messages import SECOND, stamp_of
 from finforce.ros import node as ros
 from finforce.settings import check_bounds
 from finforce.transforms import pose_numbers
 from finforce_contact.estimator import ContactEstimate
-from finforce_contact.localization.touch import Slip
 from finforce_contact.loop import TimedEstimate
 from finforce_contact.mesh.object_mesh import describe_mesh
 from finforce_contact.parameters import ContactParameters, ContactSettings, TrackerSettings
 from finforce_contact.pose.source import StampedPose
 from finforce_contact.session import ContactSession, detections_type
-from finforce_ifea.messages import columns_from_outline
+from finforce_contact.slip import Slip
+from finforce_ifea.messages import columns_from_contact, columns_from_outline
 
 
 class _ContactOutputs:
@@ -33,13 +33,14 @@ class _ContactOutputs:
     Args:
         stage: makes publishers and watches them.
         parameters: which jaws, and whether the object's poses are found here.
-        stream: of the camera.
+        session: knows the camera's stream and the jaws.
         skips: whether what nobody subscribes to is left out.
     """
 
-    def __init__(self, stage: ros.Stage, parameters: ContactParameters, stream: CameraStream, skips: Skips) -> None:
+    def __init__(self, stage: ros.Stage, parameters: ContactParameters, session: ContactSession, skips: Skips) -> None:
         cloud, sides = ros.PointCloud2, parameters.sides
-        self._camera, self._jaws, self._skips = stream, parameters.jaw_frame, skips
+        self._camera, self._jaws, self._skips = session.stream, parameters.jaw_frame, skips
+        self._candidates = session.jaws[sides[0]].loop.estimator.jaw.candidates[:, 2]
         self.contact = {side: stage.publisher(cloud, f"{side}/contact", ros.RESULT) for side in sides}
         self.outline = {side: stage.publisher(cloud, f"{side}/object_outline", ros.RESULT) for side in sides}
         self.slip = {side: stage.publisher(ros.TwistStamped, f"{side}/slip", ros.RESULT) for side in sides}
@@ -51,15 +52,9 @@ class _ContactOutputs:
         header = ros.Header(stamp=ros.stamp_message(timed.stamp), frame_id=self._jaws(side))
         # the outline goes first: the solver looks for it when the contact comes
         if ros.is_wanted(self.outline[side], self._skips):
-            ros.send_cloud(self.outline[side], header, columns_from_outline(timed.estimate.outline))
+            ros.send_cloud(self.outline[side], header, columns_from_outline(timed.estimate.contact.outline))
         if ros.is_wanted(self.contact[side], self._skips):
-            estimate = timed.estimate
-            columns = ros.xyz_columns(estimate.points) | {
-                "candidate": np.asarray(estimate.candidates, dtype=np.uint16),
-                "touching": np.full(len(estimate.weights), estimate.touching, dtype=np.uint8),
-                "weight": np.asarray(estimate.weights, dtype=np.float32),
-            }
-            ros.send_cloud(self.contact[side], header, columns)
+            ros.send_cloud(self.contact[side], header, columns_from_contact(timed.estimate.contact, self._candidates))
         self._send_slip(side, timed.estimate.slip)
 
     def _send_slip(self, side: str, slip: Slip | None) -> None:
@@ -101,12 +96,13 @@ class ContactEstimatorNode(ros.ImageNode):
         self.sides, age = parameters.sides, parameters.max_age
         self.skips = Skips(parameters.skip_off)
         ros.warn_first_start()
-        self.session = ContactSession(parameters, contact, tracker, self.skips)
+        self.session = ContactSession(parameters, contact, tracker)
+        self._follows_surface = contact.mode == "paper"
         self.gates = {side: StampGate(age) for side in self.sides}
         self.health = {side: Health(source=f"{side}/jaw_pose", stale_after=age) for side in self.sides}
         ros.follow_settings(self, parameters, self._take_changes)
         self.stage = ros.Stage(self, pipeline)
-        self.out = _ContactOutputs(self.stage, parameters, self.session.stream, self.skips)
+        self.out = _ContactOutputs(self.stage, parameters, self.session, self.skips)
         with self.rejections():
             self.get_logger().info(self.session.load_mesh(parameters))
         self._serve()
@@ -131,7 +127,7 @@ class ContactEstimatorNode(ros.ImageNode):
         Raises:
             MissingDependencyError: a message type is not installed.
         """
-        stage, session, source = self.stage, self.session, self.parameters.pose_source
+        stage, source = self.stage, self.parameters.pose_source
         self.objects = None
         if self.parameters.tracks:
             camera, group = self.session.camera, MutuallyExclusiveCallbackGroup()
@@ -145,12 +141,8 @@ class ContactEstimatorNode(ros.ImageNode):
         else:
             self.objects = stage.subscription(detections_type(), "object_detections", self._on_object, ros.SENSOR)
         for side in self.sides:
-            for kind, name, take in (
-                (ros.WrenchStamped, "wrench", session.take_wrench),
-                (ros.PointCloud2, "surface", session.take_surface),
-            ):
-                keep = partial(self._on_solver, side, take)
-                stage.subscription(kind, f"{side}/{name}", keep, ros.SENSOR)
+            if self._follows_surface:
+                stage.subscription(ros.PointCloud2, f"{side}/surface", partial(self._on_surface, side), ros.SENSOR)
             find = partial(self._on_jaw_pose, side)
             stage.subscription(ros.PoseStamped, f"{side}/jaw_pose", find, ros.BUFFERED, can_wait=True)
 
@@ -182,14 +174,13 @@ class ContactEstimatorNode(ros.ImageNode):
                 self.get_logger().warning("the stamps jumped back: poses and contacts are cleared")
             self.idling[side].end()
             self._send(side, began, self.session.take_jaw_pose(side, pose))
-            self.idling[side].note(stamp, self.session.jaws[side].loop.is_idle and self.skips.allows(IDLE))
+            self.idling[side].note(stamp, self.session.jaws[side].loop.is_out_of_reach and self.skips.allows(IDLE))
 
-    def _on_solver(self, side: str, take: Callable[[str, Any], list[TimedEstimate]], message: Any) -> None:
-        """Keep what a jaw's solver says, and find the contact of an image that has no jaw pose of its own."""
-        began = perf_counter()
+    def _on_surface(self, side: str, cloud: ros.PointCloud2) -> None:
+        """Keep a jaw's deformed surface."""
         with self.rejections(side):
-            self._check_ahead(message)
-            self._send(side, began, take(side, message))
+            self._check_ahead(cloud)
+            self.session.keep_surface(side, cloud)
 
     def _on_object(self, message: Any) -> None:
         """Use the object's pose that another node has found."""
@@ -259,11 +250,8 @@ def describe(session: ContactSession, side: str) -> dict[str, str]:
         estimate = loop.last.estimate
         values |= {
             "status": estimate.status,
-            "contacts": str(len(estimate.points)),
             "pose age [ms]": f"{1e3 * loop.pose_age():.0f}",
-            "jaw surface": "deformed" if loop.has_surface() else "undeformed: no fresh surface",
             "slip": describe_slip(estimate.slip),
-            "last skipped": estimate.skipped or "nothing",
         }
     counts = loop.estimator.counts.items()
     return values | {"work": ", ".join(f"{count} {reason}" for reason, count in counts if count) or "none"}

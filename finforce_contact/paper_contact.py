@@ -7,21 +7,19 @@ from numpy.typing import NDArray
 
 from finforce.triangle_surface import solid_from_triangles, triangles_of_solid
 from finforce_contact.errors import ObjectMeshError
-from finforce_contact.localization.outline_localizer import (
-    ContactLocation,
-    ContactPatch,
-    ContactScene,
-    InnerFace,
-    Localizer,
-)
+from finforce_contact.location import ContactLocation, InnerFace, Localizer
 from finforce_contact.mesh.object_mesh import ObjectMesh, to_manifold
+from finforce_contact.section import ObjectSection
+from finforce_ifea.errors import MeshError
 from finforce_ifea.jaw.jaw import Jaw
+from finforce_ifea.jaw.mesh import VolumeMesh
 
 if TYPE_CHECKING:
     from manifold3d import Manifold
 
 
 OFFSET = 1e-3  # [m] by which the object is pushed into the surface before contact (Eq. 2)
+_MOST_BENT = 0.6  # no jaw bends by more than this share of its length
 
 
 class IntersectionLocalizer(Localizer):
@@ -33,6 +31,8 @@ class IntersectionLocalizer(Localizer):
     image keeps the last location, as in the paper. An object that is deeper than slight contact stays where it is: to
     draw it back to the surface as it was before it bent would part the two for good.
     """
+
+    needs_surface = True
 
     def __init__(self, jaw: Jaw, face: InnerFace, mesh: ObjectMesh) -> None:
         """Build the object's solid.
@@ -48,7 +48,7 @@ class IntersectionLocalizer(Localizer):
                 "mode 'estimate'"
             )
         self._candidates = jaw.candidates[:, 1:]
-        self._mesh, self._face = face.mesh, face
+        self._mesh, self._front = face.mesh, face.front
         self._object = solid
         self._vertices = np.ascontiguousarray(mesh.vertices)
         self.reset()
@@ -56,33 +56,59 @@ class IntersectionLocalizer(Localizer):
     def reset(self) -> None:
         """Start anew, apart."""
         self._status = False
-        self._last: ContactPatch | None = None
+        self._height: float | None = None
 
-    def locate(self, scene: ContactScene) -> ContactLocation | None:
-        """Return the contact, None before any was found."""
-        shift = self._slight_contact(scene.T) - scene.T[0, 3] if not self._status else 0.0
-        T = scene.T.copy()
+    def locate(self, T: NDArray, section: ObjectSection | None, surface: NDArray | None) -> ContactLocation | None:
+        """Return the contact, None before any was found; see `Localizer.locate`.
+
+        Raises:
+            MeshError: The surface is not that of the jaw's mesh.
+        """
+        surface = self._mesh.nodes if surface is None else check_surface(surface, self._mesh)
+        shift = self._slight_contact(T) - T[0, 3] if not self._status else 0.0
+        T = T.copy()
         T[0, 3] += min(shift, 0.0)
-        centre = intersect(self._object, T, scene.surface, self._mesh.surface)
+        centre = intersect(self._object, T, surface, self._mesh.surface)
         self._status = centre is not None
         if centre is not None:
-            nearest = int(((scene.surface - centre) ** 2).sum(axis=1).argmin())
+            nearest = int(((surface - centre) ** 2).sum(axis=1).argmin())
             projected = self._mesh.nodes[nearest, 1:]
             chosen = int(((self._candidates - projected) ** 2).sum(axis=1).argmin())
-            self._last = ContactPatch(heights=self._candidates[chosen, 1:], weights=np.ones(1))
-        if self._last is None:
+            self._height = float(self._candidates[chosen, 1])
+        if self._height is None:
             return None
-        height = float(self._last.heights[0])
-        bend = float(np.interp(height, self._face.heights, self._face.x - scene.line[:, 0]))
-        return ContactLocation(
-            patch=self._last, gap=float("nan"), bend=bend, touching=bool(self._status and shift >= 0.0)
-        )
+        return ContactLocation(height=self._height, touching=bool(self._status and shift >= 0.0))
 
     def _slight_contact(self, T: NDArray) -> float:
         """Return t_x = l_0 + l_bd / 2 [m] (Eq. 2), corrected for objects whose origin is not in their middle."""
         turned = self._vertices @ T[0, :3]
         low, high = turned.min(), turned.max()
-        return float(self._face.front - OFFSET + 0.5 * (high - low) - 0.5 * (high + low))
+        return float(self._front - OFFSET + 0.5 * (high - low) - 0.5 * (high + low))
+
+
+def check_surface(surface: NDArray, mesh: VolumeMesh) -> NDArray:
+    """Return a deformed surface (n, 3) [m] as floats, if it belongs to the jaw's mesh.
+
+    Raises:
+        MeshError: Another number of vertices than the mesh has, coordinates that are not finite, or vertices
+            farther from their places at rest than a jaw can bend.
+    """
+    surface = np.ascontiguousarray(surface, dtype=float)
+    if surface.shape != mesh.nodes.shape:
+        raise MeshError(
+            f"a deformed surface of shape {surface.shape}, expected {mesh.nodes.shape}, the jaw's mesh; "
+            "give both sides the same jaw file, calibration and mesh setting (coarse, default or fine)"
+        )
+    moved = np.abs(surface - mesh.nodes).max()
+    most = _MOST_BENT * float(np.ptp(mesh.nodes, axis=0).max())
+    if not moved <= most:  # neither is what is not a number
+        if not np.isfinite(surface).all():
+            raise MeshError("a deformed surface with vertices that are not finite; drop it at its source")
+        raise MeshError(
+            f"a deformed surface with a vertex {1e3 * moved:.3g} mm from its place at rest, expected "
+            f"{1e3 * most:.0f} mm at most; is it in metres, in the frame of the jaw and in the order of the mesh?"
+        )
+    return surface
 
 
 def intersect(solid: "Manifold", T: NDArray, surface: NDArray, triangles: NDArray) -> NDArray | None:

@@ -37,7 +37,7 @@ class ContactSettings(Bounded):
         "Method of finding the contact: estimate, paper (Algorithm 1) or closest (nearest point)",
         choices=MODES,
     )
-    mesh: str = setting("default", "Mesh density of a drawn jaw, as in the solver", choices=MESHES)
+    mesh: str = setting("default", "Mesh density of a drawn jaw, with mode paper as in the solver", choices=MESHES)
     pose_noise: float = setting(0.3e-3, "Initial noise of object positions (1 sigma)", "m", 1e-6, 0.05)
     rotation_noise: float = setting(6e-3, "Initial noise of object rotations (1 sigma)", "rad", 1e-5, 0.5)
     pose_bias: float = setting(0.5e-3, "Constant error of object positions (1 sigma)", "m", 0.0, 0.05)
@@ -46,7 +46,7 @@ class ContactSettings(Bounded):
     symmetry: str = setting(
         "auto", "Object symmetry: auto, none, or turns such as 'x_180 z_full' about the axes of the mesh's frame"
     )
-    pose_timeout: float = setting(1.0, "Maximum object pose age, unless the grasp is at rest", "s", 0.01, 60.0)
+    pose_timeout: float = setting(1.0, "Maximum object pose age", "s", 0.01, 60.0)
 
 
 @dataclass(frozen=True, kw_only=True)

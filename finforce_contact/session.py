@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from finforce.camera import ImageError
 from finforce.errors import FinforceError, MissingDependencyError, ObservationError
-from finforce.health import Skips
 from finforce.messages import (
     SECOND,
     CameraStream,
@@ -23,42 +22,40 @@ from finforce.messages import (
     decode_keypoints,
     pose_from_message,
     stamp_of,
-    wrench_from_message,
 )
 from finforce.transforms import invert_pose
 from finforce_contact.errors import ReconstructionError
 from finforce_contact.estimator import ContactEstimator
 from finforce_contact.loop import ContactLoop, TimedEstimate
 from finforce_contact.mesh.object_mesh import ObjectMesh, describe_mesh, load_object_mesh
+from finforce_contact.paper_contact import check_surface
 from finforce_contact.parameters import ContactParameters, ContactSettings, TrackerSettings, load_generated, load_jaws
 from finforce_contact.pose.source import DepthFeed, ExternalPoseSource, StampedPose
 from finforce_contact.pose.tracker import ObjectPose
 
 
 class JawContact:
-    """The contact loop of one jaw, with poses in the camera's frame.
-
-    A jaw pose makes the contact of its image due. Images without one, where poses are rarer than key points, are due
-    with the surface that the solver found in them.
+    """The contact loop of one jaw, with poses in the camera's frame; a jaw pose makes the contact of its image due.
 
     Attributes:
-        loop: contact estimator and what the solver said last.
+        loop: contact estimator and what it said last.
 
     Args:
         estimator: of this jaw.
         tolerance: greatest distance between the stamps of jaw pose and object pose [ns].
-        max_age: greatest distance between the stamps of an image and of the surface and wrench used for it [ns].
+        max_age: greatest distance between the stamps of an image and of the surface used for it [ns].
     """
 
     def __init__(self, estimator: ContactEstimator, *, tolerance: int, max_age: int) -> None:
-        self.loop, self._pairing = ContactLoop(estimator, max_age=max_age), PosePairing(tolerance)
+        self.loop, self._pairing, self._max_age = ContactLoop(estimator), PosePairing(tolerance), max_age
         self._jaw: NDArray | None = None
+        self._surface: Stamped | None = None
 
     def reset(self) -> None:
         """Forget everything but the object's mesh."""
         self.loop.reset()
         self._pairing.reset()
-        self._jaw = None
+        self._jaw = self._surface = None
 
     def set_object(self, mesh: ObjectMesh | None) -> None:
         """Take another object; its pose is not known yet.
@@ -69,21 +66,19 @@ class JawContact:
         self.loop.set_object(mesh)
         self._pairing.reset()
 
-    def take_surface(self, stamp: int, surface: NDArray) -> list[TimedEstimate]:
-        """Take the deformed vertices (n, 3) [m] of an image [ns]; return the contacts that are known now.
+    def keep_surface(self, stamp: int, surface: NDArray) -> None:
+        """Keep the deformed vertices (n, 3) [m] of an image [ns], for the paper's method.
 
         Raises:
             MeshError: the surface is not that of the jaw's mesh.
         """
-        self.loop.keep_surface(stamp, surface)
-        return self._due(stamp) if self.loop.has_pose and not self._pairing.holds_back(stamp) else []
+        self._surface = Stamped(stamp, check_surface(surface, self.loop.estimator.face.mesh))
 
     def take_jaw_pose(self, stamp: int, T_camera_jaw: NDArray) -> list[TimedEstimate]:
         """Take the jaw's pose (4, 4) in an image [ns]; return the contacts that are known now.
 
         Raises:
             PoseError: a pose of the object in the jaw frame makes no sense.
-            MeshError: the surface is not that of the jaw's mesh.
         """
         return self._follow(self._pairing.add_jaw(stamp, T_camera_jaw))
 
@@ -126,7 +121,9 @@ class JawContact:
         return None if step.T_jaw_object is None else invert_pose(motion) @ step.T_jaw_object
 
     def _due(self, stamp: int) -> list[TimedEstimate]:
-        estimate = self.loop.update(stamp)
+        kept = self._surface
+        surface = kept.value if kept and abs(stamp - kept.stamp) <= self._max_age else None
+        estimate = self.loop.update(stamp, lambda: surface)
         return [estimate] if estimate else []
 
 
@@ -225,11 +222,6 @@ class PosePairing:
         found = self._poses.find(OBJECT, stamp)
         return [self._step(self._poses.entries(PASSED)[-1], found, is_due=False)] if found else []
 
-    def holds_back(self, stamp: int) -> bool:
-        """Say whether an image [ns] waits for its object pose, or was passed over."""
-        waits = self._waiting and self._poses.belong(self._poses.entries(JAW)[-1].stamp, stamp)
-        return waits or any(entry.stamp == stamp for entry in self._poses.entries(PASSED))
-
     def _step(self, jaw: Stamped, pose: Stamped | None, *, is_due: bool = True) -> PoseStep:
         """Return the step of a jaw's inverted pose and the object's pose with its covariance."""
         T_camera_object, covariance = pose.value if pose else (None, None)
@@ -251,22 +243,15 @@ class ContactSession:
         parameters: of the node.
         contact: settings of the contact estimators.
         tracker: settings of the pose tracker.
-        skips: rules of what need not be done; all of them when absent.
 
     Raises:
         FinforceError: the jaw cannot be used.
     """
 
-    def __init__(
-        self,
-        parameters: ContactParameters,
-        contact: ContactSettings,
-        tracker: TrackerSettings,
-        skips: Skips | None = None,
-    ) -> None:
+    def __init__(self, parameters: ContactParameters, contact: ContactSettings, tracker: TrackerSettings) -> None:
         tolerance, max_age = round(parameters.pose_tolerance / SECOND), round(parameters.max_age / SECOND)
         self.jaws = {
-            side: JawContact(ContactEstimator(jaw, settings=contact, skips=skips), tolerance=tolerance, max_age=max_age)
+            side: JawContact(ContactEstimator(jaw, settings=contact), tolerance=tolerance, max_age=max_age)
             for side, jaw in load_jaws(parameters).items()
         }
         self.mesh: ObjectMesh | None = None
@@ -373,22 +358,15 @@ class ContactSession:
         with self._lock:
             return self.jaws[side].take_object_pose(found.stamp, found.pose.T_camera_object, found.pose.covariance)
 
-    def take_surface(self, side: str, cloud: Any) -> list[TimedEstimate]:
-        """Take a jaw's deformed surface; return its contacts that are known now.
+    def keep_surface(self, side: str, cloud: Any) -> None:
+        """Keep a jaw's deformed surface, for the paper's method.
 
         Raises:
             FinforceError: frame, fields, number or place of the vertices are wrong.
         """
         surface = surface_from_cloud(cloud, self._frames(side))
         with self._lock:
-            return self.jaws[side].take_surface(stamp_of(cloud), surface)
-
-    def take_wrench(self, side: str, message: Any) -> list[TimedEstimate]:
-        """Take the wrench on a jaw, with which no contact is due; raises ObservationError for frame or numbers."""
-        wrench = wrench_from_message(message, self._frames(side))
-        with self._lock:
-            self.jaws[side].loop.take_wrench(stamp_of(message), wrench)
-        return []
+            self.jaws[side].keep_surface(stamp_of(cloud), surface)
 
     def pass_over(self, side: str, message: Any) -> None:
         """Leave the image of a jaw's PoseStamped without a contact on that jaw."""

@@ -48,7 +48,7 @@ UNITS = {
     "contact_source": "",  # what gave the contact
     "contact_height": "m",  # weighted mean on the undeformed surface of the contact that the image was solved with
     "true_height": "m",  # of the pressure centre of the measured force
-    "touching": "",  # whether object and jaw were reported as touching once the image was solved
+    "touching": "",  # whether the object touches, as the solver decides
     "contact_status": "",  # the contact estimator's own word
     "contact_ms": "ms",  # of the contact estimator
     "points_x": "m, each contact point",

@@ -30,6 +30,7 @@ from finforce_ifea.observation import (
 from finforce_ifea.relaxation import Relaxation
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tare import TareKeeper
+from finforce_ifea.touch import find_touch_probability
 from finforce_ifea.tracking.contact_state import (
     BUMPED,
     LARGEST_RESIDUAL,
@@ -126,6 +127,7 @@ class ForceEstimator:
         self._bits, self._changed = b"", 0.0
         self._followed: float | None = None  # stamp of the last image that a tracker took
         self._contact: Contact | None = None
+        self._pressed: ContactState | None = None  # of the last image, if its force is told
         self._at_rest = self.is_idle = False
         self._relaxed: float | None = None
         self._taring.reset()
@@ -159,6 +161,13 @@ class ForceEstimator:
     def mobilised(self) -> float:
         """How far the object makes use of its friction, by the way that it has gone, from -1 to 1."""
         return self._tracked.slips.mobilised
+
+    @property
+    def touch_probability(self) -> float:
+        """Probability that the object touched in the last image, 0 where no force was found."""
+        if self._pressed is None:
+            return 0.0
+        return find_touch_probability(self._pressed, self._contact, self.jaw.inner_face_x)
 
     def warm_up(self) -> None:
         """Compile what is compiled on first use, once in a process for each finger, and leave no trace."""
@@ -198,7 +207,7 @@ class ForceEstimator:
         if contact is not None and contact is not self._contact:
             check_contact(contact, self.jaw)
             self._follow(contact)
-        self._contact = contact
+        self._contact, self._pressed = contact, None
         self._stamp = observation.stamp
         bits = np.asarray(observation.points).tobytes()
         if bits != self._bits:
@@ -355,6 +364,7 @@ class ForceEstimator:
 
     def _solution(self, state: ContactState, used: NDArray) -> Solution:
         """Return the force that belongs to a contact, and how good it is."""
+        self._pressed = state
         error = hypot(self._force_error, state["location_error"], _EXTRAPOLATED * state["extrapolation"])
         vectors, dt = np.empty((7, 3)), self._pass_time()
         self._untold.update(np.zeros(3), dt)

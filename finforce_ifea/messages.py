@@ -69,6 +69,17 @@ def contact_from_cloud(cloud: Any, frame: str, *, free: bool) -> Contact:
     return Contact(points=points, weights=weights, touching=touching if len(points) else False, free=free)
 
 
+def columns_from_contact(contact: Contact, candidates: NDArray) -> dict[str, NDArray]:
+    """Return the columns of a contact, with the nearest of the jaw's candidates by their heights (c,) [m]."""
+    points = np.asarray(contact.points, np.float32)
+    nearest = np.abs(candidates - contact.points[:, 2, None]).argmin(axis=1)
+    return dict(zip("xyz", points.T, strict=True)) | {
+        "candidate": nearest.astype(np.uint16),
+        "touching": np.full(len(points), bool(contact.touching), np.uint8),
+        "weight": np.asarray(contact.weights, np.float32),
+    }
+
+
 def outline_from_cloud(cloud: Any, frame: str, previous: ObjectOutline | None) -> ObjectOutline | None:
     """Return the object's outline of a sensor_msgs/PointCloud2, None when it has no rows.
 

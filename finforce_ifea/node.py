@@ -34,6 +34,7 @@ from finforce_ifea.messages import (
 )
 from finforce_ifea.observation import Observation, Solution
 from finforce_ifea.parameters import NodeParameters, build_estimator
+from finforce_ifea.resting import RestingContact
 from finforce_ifea.settings import EstimatorSettings
 
 if TYPE_CHECKING:
@@ -205,7 +206,7 @@ class IfeaSolverNode(ros.ImageNode):
         health = Health(source=f"{parameters.jaw_name}/keypoints", stale_after=parameters.max_age)
         self.health[parameters.jaw_name] = health
         self.pairing = ForcePairing(parameters.jaw_name)
-        self.idling = Idling()
+        self.idling, self.resting = Idling(), RestingContact()
         self.waiting: tuple[PointCloud2, float] | None = None  # key points without their contact, and when they came
         self.last: Solution | None = None
         self.stage = ros.Stage(self, pipeline)
@@ -280,7 +281,9 @@ class IfeaSolverNode(ros.ImageNode):
             observation = observation_from_cloud(cloud, self.frame, gravity)
             if self.gate.enter(stamp, self.now()):
                 self._restart("the stamps went back: a new recording")
-            self.last = solution = self.estimator.update(observation, self.contacts.at(stamp))
+            contact = self.resting.complete(self.contacts.at(stamp), observation.stamp)
+            self.last = solution = self.estimator.update(observation, contact)
+            self.resting.note(solution, observation.stamp)
             self.gate.check_age(stamp, self.now())
             self.idling.note(stamp, self.estimator.is_idle and self.skips.allows(IDLE))
             if not solution.trusted:
@@ -344,6 +347,7 @@ class IfeaSolverNode(ros.ImageNode):
 
     def _restart(self, reason: str) -> str:
         self.estimator.reset()
+        self.resting.reset()
         self.get_logger().warning(f"{reason}; the estimator restarts")
         return reason
 
@@ -354,5 +358,6 @@ class IfeaSolverNode(ros.ImageNode):
         mean, stddev = self.estimator.friction
         friction = f"{mean:.2f} ± {stddev:.2f}, cone used to {100.0 * abs(self.estimator.mobilised):.0f} %"
         tared = {"tared": str(self.estimator.tared), "friction": friction}
+        tared["touch probability"] = f"{self.estimator.touch_probability:.2f}"
         health = self.health[self.parameters.jaw_name]
         return health.report(alarms, describe_solution(self.last) | tared | self.skips.describe())

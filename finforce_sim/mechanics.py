@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.gripper_frames import BENCH_ORIGIN_X
-from finforce_contact.localization.section import cut_outline
+from finforce_contact.section import cut_outline
 from finforce_ifea.contact_mechanics.indenter import OutlineIndenter, PenaltyContact, flat_profile
 from finforce_ifea.contact_mechanics.pressed_jaw import build_contact_surface, limit_step, profile_surface
 from finforce_ifea.fem.model import JawModel

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ import numpy as np
 from finforce.errors import PoseError
 from finforce.health import Idling
 from finforce.messages import SECOND
-from finforce_contact.loop import ContactLoop, ContactSource, GivenContact
+from finforce_contact.loop import ContactLoop, ContactSource, GivenContact, Surface
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.scoring import ONSET_FORCE
 from finforce_eval.recordings.objects import ObjectTrack, find_mesh, has_object, mean_pose, require_mesh, track_object
@@ -43,7 +43,7 @@ class RecordedContact(ContactLoop):
         self._idling = idling
         self.name, self._track, self._next = name, track, 0
 
-    def contact_at(self, stamp: int) -> Contact | None:
+    def contact_at(self, stamp: int, surface: Surface | None = None) -> Contact | None:
         """Give the poses that have arrived by an image [ns] to the estimator, and return its contact.
 
         Raises:
@@ -53,11 +53,11 @@ class RecordedContact(ContactLoop):
             self._take_recorded(self._next)
             self._next += 1
         if self._idling is None:
-            return super().contact_at(stamp)
+            return super().contact_at(stamp, surface)
         if self._idling.passes(stamp):
             return self.last.estimate.contact
-        contact = super().contact_at(stamp)
-        self._idling.note(stamp, self.is_idle)
+        contact = super().contact_at(stamp, surface)
+        self._idling.note(stamp, self.is_out_of_reach)
         return contact
 
     def _take_recorded(self, index: int) -> None:
@@ -83,7 +83,7 @@ def build_source(
         choice: what was asked for.
         recording: it tells height, or mesh and poses.
         jaw: the jaw of that side, as calibrated.
-        mesh: mesh density of the solver, whose surface the contact estimator gets.
+        mesh: mesh density of the solver, whose surface the paper's method gets.
         as_live: whether images are passed over as by the contact estimator's node.
 
     Raises:
@@ -153,8 +153,7 @@ def first_touch(choice: ContactChoice, recording: Recording, jaw: Jaw, mesh: str
     estimate = estimator.update(stamp)
     if estimate.contact is None or not len(estimate.contact.points):
         raise RecordingError(f"{recording.name}: no location of first touch: {estimate.message or estimate.status}")
-    point = np.average(estimate.contact.points, axis=0, weights=estimate.contact.weights)
-    return Contact(points=point[None], weights=np.ones(1), touching=False, free=True, outline=estimate.contact.outline)
+    return replace(estimate.contact, touching=False, free=True)
 
 
 def _before_load(track: ObjectTrack, recording: Recording, side: str) -> ObjectTrack:

@@ -199,7 +199,7 @@ def find_forces(
             continue
         passed[index] = idling.passes(stamp)
         if passed[index]:
-            source.contact_at(stamp)  # its node has rules of its own
+            source.contact_at(stamp, estimator.surface)  # its node has rules of its own
             rows.append(run.row("", ""))
             continue
         rows.append(run.answer(index, strict))
@@ -264,7 +264,7 @@ class _JawRun:
         """
         loop, observation = self._loop, self._track.observation(index)
         if self._updates > 1:
-            loop.force.forget()
+            loop.forget()
             if observation.stddev is None:
                 observation = replace(observation, stddev=np.full(observation.points.shape, PICKED_STDDEV))
         for number in range(self._updates):
@@ -273,7 +273,7 @@ class _JawRun:
         row |= {"step_ms": loop.force_ms, "contact_ms": loop.contact_ms}
         row |= {"used": solution.keypoints_used, "residual": solution.residual}
         if loop.contact.estimate is not None:
-            row |= {"touching": bool(loop.contact.estimate.touching), "contact_status": loop.contact.estimate.status}
+            row |= {"touching": solution.touching, "contact_status": loop.contact.estimate.status}
         if self._lines is not None:
             line = self._lines.points[index], self._lines.directions[index]
             row["true_height"] = self._face.cut(loop.force.surface(), *line)

@@ -17,6 +17,7 @@ from finforce_eval.evaluation.pressure_centre import InnerSurface, true_lines
 from finforce_eval.recordings.tracks import Recording
 from finforce_eval.table import ForceSeries, stddev_along
 from finforce_ifea.messages import contact_from_cloud
+from finforce_ifea.observation import is_touch
 from finforce_keypoints.geometry.jaw_localizer import REASONS, JawKeypoints
 
 
@@ -82,7 +83,7 @@ class ReplayLog:
         contact, row = contact_from_cloud(message, f"{side}_jaw", free=False), self.rows[side][self._stamp(message)]
         if len(contact.points):
             row["contact_height"] = float(np.average(contact.points[:, 2], weights=contact.weights))
-        row |= {"touching": bool(contact.touching), "contact_status": "live"}
+        row["contact_status"] = "live"
 
     def take_pose(self, side: str, message: Any) -> None:
         """Keep the pose of a jaw that the detector found."""
@@ -155,19 +156,24 @@ def live_result(
     rows = [log.rows[side].get(stamp, {}) for stamp in track.stamps.tolist()]
     force, stddev = (np.array([row.get(name, nothing) for row in rows]) for name in ("force", "force_stddev"))
     seen = np.isfinite(track.points).all(axis=2) & (track.likelihood >= likelihood_threshold)
+    magnitude_stddev = stddev_along(force, stddev)
+    contact = {}
+    if any("contact_status" in row for row in rows):
+        touching = is_touch(np.linalg.norm(force, axis=1), magnitude_stddev)
+        contact = _contact_columns(recording, side, rows, estimator) | {"touching": touching}
     return ForceSeries.build(
         recording.name,
         side,
         track.stamps,
         force=force,
-        magnitude_stddev=stddev_along(force, stddev),
+        magnitude_stddev=magnitude_stddev,
         force_stddev=stddev if np.isfinite(stddev).any() else None,
         used=seen,
         status=np.where(np.isfinite(force).all(axis=1), "ok", "no wrench"),
         message="",
         step_ms=np.array([row.get("step_ms", np.nan) for row in rows]),
         **recording.phases_at(track.stamps),
-        **(_contact_columns(recording, side, rows, estimator) if any("touching" in row for row in rows) else {}),
+        **contact,
         true_force=truth_columns(recording, side)["true_force"],
         **sight_columns(recording, side),
     )
@@ -185,7 +191,6 @@ def _contact_columns(recording: Recording, side: str, rows: list[dict[str, Any]]
         "contact_source": "live",
         "contact_height": np.array([row.get("contact_height", np.nan) for row in rows]),
         "true_height": np.array(truth),
-        "touching": np.array([row.get("touching", False) for row in rows]),
         "contact_status": np.array([row.get("contact_status", "") for row in rows]),
     }
 

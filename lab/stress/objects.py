@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce_contact.estimator import ContactEstimator
-from finforce_contact.localization.section import cut_outline
 from finforce_contact.loop import ForceLoop
 from finforce_contact.mesh.object_mesh import ObjectMesh
 from finforce_contact.parameters import ContactSettings
+from finforce_contact.section import cut_outline
 from finforce_ifea.errors import ContactError
 from finforce_ifea.observation import Solution
 from lab.presses import PressState, RigidOutline, circle, press_jaw

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from finforce.errors import PoseError
 from finforce.triangle_surface import chain_loops
-from finforce_contact.localization.section import cut_outline
 from finforce_contact.mesh.object_mesh import prepare_object_mesh, to_manifold
+from finforce_contact.section import cut_outline
 
 # 0.02 mm of simplification and as much for the facets of round objects.
 TOLERANCE = 4e-5

@@ -1,5 +1,7 @@
 """Claims about pairing the poses of jaw and object by image, and about what one jaw makes of them."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -62,7 +64,6 @@ def test_when_object_poses_cease_one_image_waits_and_no_other():
         pairing.add_jaw(k * FRAME, np.eye(4))
         pairing.add_object(k * FRAME, np.eye(4))
     assert due(pairing.add_jaw(3 * FRAME, np.eye(4))) == []
-    assert pairing.holds_back(3 * FRAME) and not pairing.holds_back(2 * FRAME)
     assert due(pairing.add_jaw(4 * FRAME, np.eye(4))) == [3 * FRAME, 4 * FRAME]
     assert due(pairing.add_jaw(5 * FRAME, np.eye(4))) == [5 * FRAME]
 
@@ -117,6 +118,9 @@ def test_a_covariance_turns_with_the_axes():
 class FakeEstimator:
     """Keeps what it is given."""
 
+    needs_surface = True
+    face = SimpleNamespace(mesh=SimpleNamespace(nodes=np.zeros((4, 3))))
+
     def __init__(self):
         self.poses, self.updates = [], []
         self.filter = PoseFilter(ContactSettings())
@@ -131,8 +135,8 @@ class FakeEstimator:
         self.poses.append((stamp, T_jaw_object, covariance, camera))
         self.filter.update(stamp, T_jaw_object)
 
-    def update(self, stamp, surface=None, wrench=None):
-        self.updates.append((stamp, surface, wrench))
+    def update(self, stamp, surface=None):
+        self.updates.append((stamp, surface))
         return ContactEstimate(stamp=stamp, status="apart", message="")
 
 
@@ -141,15 +145,12 @@ def jaw():
     return JawContact(FakeEstimator(), tolerance=MS, max_age=200 * MS)
 
 
-def test_surface_and_wrench_are_used_while_they_are_fresh(jaw):
-    surface, wrench = np.zeros((4, 3)), (np.ones(3), np.zeros(3))
-    jaw.take_surface(0, surface)
-    jaw.loop.take_wrench(0, wrench)
+def test_a_surface_is_used_while_it_is_fresh(jaw):
+    jaw.keep_surface(0, np.zeros((4, 3)))
     jaw.take_jaw_pose(200 * MS, np.eye(4))
     jaw.take_jaw_pose(201 * MS, np.eye(4))
-    (_, first, pulled), (_, later, none) = jaw.loop.estimator.updates
-    assert first is surface and pulled is wrench
-    assert later is None and none is None
+    (_, first), (_, later) = jaw.loop.estimator.updates
+    assert first.shape == (4, 3) and later is None
 
 
 def test_the_object_stays_where_it_is_while_the_jaw_closes(jaw):
@@ -187,22 +188,10 @@ def test_the_camera_stands_where_the_jaw_sees_it(jaw):
 
 
 def test_one_image_is_answered_once(jaw):
-    surface = np.zeros((4, 3))
     jaw.take_object_pose(0, np.eye(4))
     assert len(jaw.take_jaw_pose(0, np.eye(4))) == 1
-    assert jaw.take_surface(0, surface) == []
-    assert len(jaw.take_surface(FRAME, surface)) == 1
-    assert jaw.take_surface(FRAME, surface) == []
-
-
-def test_an_image_that_waits_for_its_pose_is_not_answered_by_its_surface(jaw):
-    for k in range(3):
-        jaw.take_jaw_pose(k * FRAME, np.eye(4))
-        jaw.take_object_pose(k * FRAME, np.eye(4))
-    jaw.take_jaw_pose(3 * FRAME, np.eye(4))
-    assert jaw.take_surface(3 * FRAME, np.zeros((4, 3))) == []
-    (answer,) = jaw.take_object_pose(3 * FRAME, np.eye(4))
-    assert answer.stamp == 3 * FRAME and jaw.loop.estimator.updates[-1][1] is not None
+    assert jaw.take_jaw_pose(0, np.eye(4)) == []
+    assert len(jaw.take_jaw_pose(FRAME, np.eye(4))) == 1
 
 
 def test_the_age_of_the_pose_is_that_at_the_last_answer(jaw):

@@ -3,21 +3,21 @@
 import numpy as np
 import pytest
 
-from finforce_contact.localization.touch import SlipWatch, TouchedFace, face_at
 from finforce_contact.parameters import ContactSettings
+from finforce_contact.slip import SlipWatch, TouchedFace, face_at
 
 SETTINGS = ContactSettings()
 FACE = TouchedFace(point=np.array([0.012, 0.0, 0.040]), tangent=np.array([0.0, 0.0, 1.0]))
 
 
-def watch(way, rate=30.0, noise=0.15e-3, seed=0, face=lambda t: FACE):
+def watch(way, rate=30.0, noise=0.15e-3, seed=0, closing=lambda t: 0.0):
     """What a watch says of an object that has moved by way(t) (3,) [m], seen with noise [m] at a rate [Hz]."""
     random, eyes, said = np.random.default_rng(seed), SlipWatch(SETTINGS), []
     eyes.follow(0.040)
     for number in range(int(6.0 * rate)):
         t, T = number / rate, np.eye(4)
         T[:3, 3] = np.array([0.03, 0.0, 0.04]) + way(t) + noise * random.standard_normal(3)
-        said.append(eyes.update(t, T, face(t)))
+        said.append(eyes.update(t, T, FACE, closing=closing(t)))
     return said
 
 
@@ -58,11 +58,18 @@ def test_outliers_are_no_slip():
 
 
 def test_a_closing_jaw_is_no_slip():
-    def face(t):
-        point = np.array([0.012 - 4e-3 * max(0.0, t - 3.0), 0.0, 0.040 - 1e-3 * max(0.0, t - 3.0)])
-        return TouchedFace(point=point, tangent=FACE.tangent)
+    """The object goes deeper by 6 mm/s, and the other jaw moves it along the face by 2 mm/s."""
+    moves = np.array([-6e-3, 0.0, -2e-3])
+    said = watch(lambda t: moves * max(0.0, t - 3.0), closing=lambda t: moves[0] * (t > 3.0))
+    assert not any(s.sliding for s in said)
 
-    assert not any(s.sliding for s in watch(lambda t: np.zeros(3), face=face))
+
+def test_a_slip_along_a_bent_face_is_no_closing_jaw():
+    """The face leans by 20 degrees where the object slides at 20 mm/s."""
+    moves = 20e-3 * np.array([-np.sin(np.radians(20.0)), 0.0, np.cos(np.radians(20.0))])
+    said = watch(lambda t: moves * max(0.0, t - 3.0), closing=lambda t: moves[0] * (t > 3.0))
+    assert said[-1].sliding
+    assert said[-1].velocity[2] == pytest.approx(moves[2], abs=4.0 * said[-1].stddev)
 
 
 def test_an_object_that_came_to_rest_slides_no_more():
@@ -82,10 +89,9 @@ def test_gaps_and_release_begin_anew():
     assert eyes.slip is None
 
 
-def test_the_face_is_found_at_its_material_height():
+def test_the_face_is_found_at_a_height():
     heights = np.linspace(0.0, 0.08, 81)
-    line = np.stack([0.014 - 0.1 * heights, heights], axis=1)
-    face = face_at(line, heights, 0.0405)
+    face = face_at(np.stack([0.014 - 0.1 * heights, heights], axis=1), 0.0405)
     np.testing.assert_allclose(face.point, [0.014 - 0.00405, 0.0, 0.0405])
     np.testing.assert_allclose(face.tangent, np.array([-0.1, 0.0, 1.0]) / np.hypot(0.1, 1.0))
 

@@ -25,7 +25,6 @@ TOPICS = {
     "/left/contact": PointCloud2,
     "/left/object_outline": PointCloud2,
     "/right/wrench": WrenchStamped,
-    "/left/wrench": WrenchStamped,
     "/left/jaw_pose": PoseStamped,
     "/object_pose": PoseStamped,
     f"{CAMERA}/color/image_raw": Image,

@@ -17,7 +17,8 @@ WORDS = {
     "gripper_driver": ("-p", "port:=/dev/null"),
 }
 EVERY_NODE = {"/diagnostics", "/parameter_events", "/rosout", "/tf", "/clock"}
-OPTIONAL = {("in", "object_detections"), ("in", "object_mask")}  # with another pose_source
+# with another pose_source, and with contact.mode paper
+OPTIONAL = {("in", "object_detections"), ("in", "object_mask"), ("in", "<jaw>/surface")}
 OWN = re.compile("parameter|type_description")
 
 

@@ -143,6 +143,10 @@ class FakeSolution:
     def trusted(self):
         return self.status in ("ok", "unloaded")
 
+    @property
+    def touching(self):
+        return self.status == "ok"
+
 
 class FakeEstimator:
     """Answers with `forces[k]` at its k-th step; None is a step without a trusted answer."""
@@ -188,7 +192,7 @@ class FakeContactEstimator:
     """Puts the contact at the height of the object it knows, from its first update on; notes every call in order."""
 
     jaw = SimpleNamespace(inner_face_x=0.014)
-    still = False
+    needs_surface = True
 
     def __init__(self, touching=lambda update: True):
         self.calls = []
@@ -198,8 +202,8 @@ class FakeContactEstimator:
         self.calls.append(("pose", stamp, T_jaw_object))
         self._pose = T_jaw_object
 
-    def update(self, stamp, surface=None, wrench=None):
-        self.calls.append(("update", stamp, surface, wrench))
+    def update(self, stamp, surface=None):
+        self.calls.append(("update", stamp, surface))
         self._updates += 1
         if self._pose is None:
             return FakeEstimate(None, False, "no_pose", "no pose yet")

@@ -99,10 +99,10 @@ def test_images_that_the_detector_does_not_send_have_no_key_points(probe, record
     assert len(detect_keypoints(recording, StillAt(recording)).jaws["left"].keypoints.stamps) == 12
 
 
-def test_of_an_object_that_stands_still_the_contact_of_a_tenth_of_a_second_is_kept():
+def test_of_an_object_out_of_reach_the_contact_of_a_tenth_of_a_second_is_kept(monkeypatch):
+    monkeypatch.setattr(RecordedContact, "is_out_of_reach", True)
     poses = ObjectTrack(stamps=START + PERIOD * np.arange(12), poses=np.tile(np.eye(4), (12, 1, 1)))
     estimator = FakeContactEstimator()
-    estimator.still = True
     source = RecordedContact(estimator, poses, idling=Idling())
     contacts = [source.contact_at(int(stamp)) for stamp in poses.stamps]
     calls = [name for name, *_ in estimator.calls]

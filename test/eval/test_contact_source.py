@@ -40,33 +40,26 @@ def test_poses_up_to_an_image_come_before_its_contact_and_later_ones_wait():
     assert len(fake.calls) == 3 + 60
 
 
-def test_first_update_knows_no_surface_and_the_others_that_of_the_image_before():
+def test_update_is_given_the_surface_of_the_image_before():
     _, solver, fake = run(make_track(0))
     updates = [call for call in fake.calls if call[0] == "update"]
-    assert updates[0][2] is None
-    assert updates[0][1] == pytest.approx(START * 1e-9)
-    for count, (_, stamp, surface, _) in enumerate(updates[1:], 1):
+    for count, (_, stamp, surface) in enumerate(updates):
         assert stamp == pytest.approx((START + PERIOD * count) * 1e-9, abs=1e-6)
         # the fake's surface moves by 1 mm with every image that it has seen
         np.testing.assert_allclose(surface[:, 0].max(), 0.014 + 1e-3 * count)
     assert len(solver.contacts) == 60
 
 
+def test_surface_is_left_alone_where_nobody_looks_at_it(monkeypatch):
+    monkeypatch.setattr(FakeContactEstimator, "needs_surface", False)
+    _, _, fake = run(make_track(0))
+    assert all(call[2] is None for call in fake.calls if call[0] == "update")
+
+
 def test_image_is_solved_with_the_contact_of_its_own_pose():
     _, solver, _ = run(make_track(0, 5))
     heights = [float(np.average(c.points[:, 2], weights=c.weights)) for c in solver.contacts]
     np.testing.assert_allclose(heights[:7], [0.04] * 5 + [0.041] * 2)
-
-
-def test_the_last_trusted_wrench_is_given():
-    _, _, fake = run(make_track(0), lost=[3])
-    wrenches = [call[3] for call in fake.calls if call[0] == "update"]
-    assert wrenches[0] is None
-    assert all(wrench is not None for wrench in wrenches[1:])
-    np.testing.assert_array_equal(wrenches[4][0], wrenches[3][0])
-    force, torque = wrenches[10]
-    np.testing.assert_array_equal(force, make_recording().jaws["left"].truth.force[9])
-    np.testing.assert_array_equal(torque, [0.0, -0.04, 0.0])
 
 
 def test_nothing_is_given_to_the_solver_before_the_first_pose():
@@ -78,9 +71,9 @@ def test_nothing_is_given_to_the_solver_before_the_first_pose():
     assert np.isfinite(result.column("contact_height")[10:]).all()
 
 
-def test_touching_is_that_of_the_contact_found_on_the_image():
-    result, *_ = run(make_track(0), touching=lambda update: update > 20)
-    assert result.column("touching").tolist() == [False] * 21 + [True] * 39
+def test_touching_is_what_the_solver_says():
+    result, *_ = run(make_track(0), lost=range(20), touching=lambda update: update > 40)
+    assert result.column("touching").tolist() == [False] * 20 + [True] * 40
 
 
 def test_times_of_solver_and_contact_are_kept_apart():

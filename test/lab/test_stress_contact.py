@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from finforce_contact.localization.section import cut_outline
+from finforce_contact.section import cut_outline
 from finforce_ifea.contact_mechanics.indenter import build_outline, expect_object
 from finforce_ifea.errors import ContactError
 from finforce_ifea.observation import Contact, ObjectOutline

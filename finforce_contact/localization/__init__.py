@@ -1,1 +1,0 @@
-"""Where the object's outline meets the deformed inner face."""
