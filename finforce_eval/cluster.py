@@ -13,16 +13,20 @@ import sys
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
+from functools import cache
+from hashlib import sha256
 from importlib.util import find_spec
 from pathlib import Path
 from queue import Empty, Queue
 from time import monotonic
 from typing import TYPE_CHECKING, Any
 
+from tqdm import tqdm
+
 from finforce.errors import one_line
 from finforce.optional import import_library
 from finforce_eval.errors import ClusterError
-from finforce_eval.machine import commit, version
+from finforce_eval.machine import version
 
 if TYPE_CHECKING:
     from finforce_eval.tasks import EngineOptions, Line, Manifest, Task
@@ -30,10 +34,12 @@ if TYPE_CHECKING:
 LOOK_PERIOD = 2.0  # between two looks at a cluster where no task ends [s]
 ANSWER_TIMEOUT = 30.0  # of whatever a scheduler is asked [s]
 CLOSE_TIMEOUT = 5.0  # of leaving a cluster, which may be gone [s]
-NO_WORKERS_TIMEOUT = "10 minutes"  # unless Dask's own setting says otherwise; batch systems start workers late
+IDLE_TIMEOUT = "10 minutes"  # unless Dask's own setting says otherwise; batch systems start workers late
 _TIMEOUT_SETTING = "distributed.scheduler.no-workers-timeout"
 _LOCAL_SETTINGS = {
     "distributed.scheduler.allowed-failures": 1,  # on this machine a worker dies of its task
+    # A worker that takes longer to start anew is not replaced at all; on a busy machine it takes 15 s, Dask's own value.
+    "distributed.deploy.lost-worker-timeout": "10 minutes",
     # A worker that pauses waits for memory to become free, which here belongs to the set-ups that it keeps.
     "distributed.worker.memory.pause": False,
     "distributed.worker.memory.spill": False,
@@ -50,7 +56,8 @@ class Order:
 
     Attributes:
         task: pickled; unpickled after the checks.
-        sources: version and commit of finforce.
+        package: that the task's work is in.
+        sources: of it and of finforce.
         folder: working directory, from which relative paths start.
         mark: file in the output folder.
         run_id: its content.
@@ -58,6 +65,7 @@ class Order:
     """
 
     task: bytes
+    package: str
     sources: str
     folder: str
     mark: str
@@ -66,7 +74,7 @@ class Order:
 
     def find_fault(self, threads: int) -> str:
         """Return why a worker with so many threads cannot do the task, as a predicate; "" where it can."""
-        found, shared = describe_sources(), "expected a file system that all workers share"
+        found, shared = describe_sources(self.package), "expected a file system that all workers share"
         if found != self.sources:
             return f"has finforce {found}, expected {self.sources}: install that, and restart the worker"
         if threads != 1:
@@ -81,9 +89,12 @@ class Order:
         return ""
 
 
-def describe_sources() -> str:
-    """Return version and commit of finforce in this process."""
-    return f"{version()} (commit {commit()})"
+@cache
+def describe_sources(package: str) -> str:
+    """Return the version of finforce and a hash of its modules, and of those of a package beside it such as `lab`."""
+    files = {path for name in ("finforce*", package) for path in _CHECKOUT.glob(f"{name}/**/*.py")}
+    digest = sha256(b"".join(path.read_bytes() for path in sorted(files)))
+    return f"{version()} (modules {digest.hexdigest()[:8]})"
 
 
 def describe_files(paths: Iterator[str | Path] | Sequence[str | Path]) -> dict[str, tuple[int, int]]:
@@ -151,16 +162,16 @@ class _Cluster:
         import dask
 
         self._client, self._name, self._manifest = client, name, manifest
-        patience = dask.config.get(_TIMEOUT_SETTING, None) or NO_WORKERS_TIMEOUT
-        self._patience, self._last_worker = dask.utils.parse_timedelta(patience), monotonic()
+        self._idle_timeout = dask.utils.parse_timedelta(dask.config.get(_TIMEOUT_SETTING, None) or IDLE_TIMEOUT)
+        self._last_sign, self._warned = monotonic(), False
 
     def run(self, tasks: Sequence[Task]) -> Generator[Line, None, list[Task]]:
-        """Yield the lines of tasks as these end, and return the tasks that Dask gave up because their workers died."""
+        """Yield the lines of tasks as these end, and return the tasks whose workers died too often."""
         from distributed import CancelledError, KilledWorker, TimeoutError
 
         orders, ended, given_up = [self._make_order(task) for task in tasks], Queue(), []
-        packed, sources = [pickle.dumps(order) for order in orders], describe_sources()
-        futures = self._client.map(_make_entrance(), packed, sources=sources, pure=False)
+        packed = [pickle.dumps(order) for order in orders]
+        futures = self._client.map(_make_entrance(), packed, sources=orders[0].sources, pure=False)
         left = {future.key: each for future, *each in zip(futures, tasks, orders, strict=True)}
         for future in futures:
             future.add_done_callback(ended.put)
@@ -170,12 +181,9 @@ class _Cluster:
             task, order = left[future.key]
             try:
                 line = future.result(timeout=ANSWER_TIMEOUT)
-            except TimeoutError:  # its worker died before it gave the result: another one is at it
-                future.add_done_callback(ended.put)
-                continue
             except CancelledError:
                 raise self._lost() from None
-            except KilledWorker:
+            except (KilledWorker, TimeoutError):  # the latter once a worker died before it gave its result
                 line = None
                 given_up.append(task)
             except Exception as error:
@@ -189,9 +197,11 @@ class _Cluster:
 
     def _make_order(self, task: Task) -> Order:
         """Return the order of a task."""
+        package = task.work.__module__.partition(".")[0]
         return Order(
             task=pickle.dumps(task),
-            sources=describe_sources(),
+            package=package,
+            sources=describe_sources(package),
             folder=os.getcwd(),
             mark=str(self._manifest.lock.resolve()),
             run_id=self._manifest.run_id,
@@ -206,22 +216,27 @@ class _Cluster:
         """
         while True:
             with suppress(Empty):
-                return ended.get(timeout=LOOK_PERIOD)
+                future = ended.get(timeout=LOOK_PERIOD)
+                self._last_sign = monotonic()
+                return future
             self._look()
 
     def _look(self) -> None:
-        """Check that the scheduler answers, and has had a worker lately."""
+        """Check that the scheduler answers, and that a worker was at a task lately."""
         from distributed import TimeoutError
 
         try:
             found = self._client.sync(self._client.scheduler.identity, callback_timeout=ANSWER_TIMEOUT)
         except (OSError, TimeoutError, AttributeError) as error:  # of a client that has closed itself
             raise self._lost() from error
-        if any(map(_can_work, found["workers"].values())):
-            self._last_worker = monotonic()
-        if monotonic() - self._last_worker > self._patience:
-            text = f"{self._name}: no worker for {self._patience:g} s; expected some: dask worker {found['address']}"
-            raise ClusterError(f"{text} --nthreads 1")
+        if any(map(_is_busy, found["workers"].values())):
+            self._last_sign = monotonic()
+        if not found["workers"] and not self._warned:
+            self._warned = True
+            tqdm.write(f"note: {self._name}: no worker yet; waits for {self._idle_timeout:g} s", file=sys.stderr)
+        if monotonic() - self._last_sign > self._idle_timeout:
+            text = f"{self._name}: none of {len(found['workers'])} workers was at a task for {self._idle_timeout:g} s"
+            raise ClusterError(f"{text}; expected some that are: dask worker {found['address']} --nthreads 1")
 
     def _lost(self) -> ClusterError:
         """Return the error of a scheduler that does not answer any more."""
@@ -229,9 +244,9 @@ class _Cluster:
         return ClusterError(f"{self._name}: the scheduler is gone; {kept}")
 
 
-def _can_work(worker: Mapping[str, Any]) -> bool:
-    """Say whether a worker takes tasks, or is at one."""
-    return worker["status"] == "running" or bool(worker["metrics"].get("task_counts", {}).get("executing"))
+def _is_busy(worker: Mapping[str, Any]) -> bool:
+    """Say whether a worker is at a task."""
+    return bool(worker["metrics"].get("task_counts", {}).get("executing"))
 
 
 def _holds(file: Path, text: str) -> bool:

@@ -21,6 +21,7 @@ from finforce_eval.machine import version, without_nan
 
 OK, FAILED = "ok", "failed"
 _LARGEST_MEMORY = 1e6  # [GB]
+_OLD_MANIFESTS = "manifest*.jsonl"  # names in earlier versions, also of parts of a run
 Line = dict[str, Any]
 
 
@@ -96,12 +97,9 @@ class EngineOptions:
             raise OptionError(f"--scheduler and --workers {self.workers}: expected one of the two")
 
 
-_OLD_NAMES = "manifest*.jsonl"  # of earlier versions, also of parts of a run
-
-
 def is_manifest(path: Path) -> bool:
     """Say whether a file has the name of a manifest."""
-    return (path.name == Manifest.NAME or path.match(_OLD_NAMES)) and path.is_file()
+    return (path.name == Manifest.NAME or path.match(_OLD_MANIFESTS)) and path.is_file()
 
 
 class Manifest:
@@ -141,7 +139,7 @@ class Manifest:
     def read(self) -> dict[str, Line]:
         """Return the last line of every task by its name; a line that was cut off is none."""
         lines: dict[str, Line] = {}
-        for path in (*sorted(self.path.parent.glob(_OLD_NAMES)), self.path):
+        for path in (*sorted(self.path.parent.glob(_OLD_MANIFESTS)), self.path):
             for text in path.read_text(encoding="utf-8").splitlines() if path.exists() else ():
                 try:
                     line = json.loads(text)
