@@ -38,8 +38,9 @@ IDLE_TIMEOUT = "10 minutes"  # unless Dask's own setting says otherwise; batch s
 _TIMEOUT_SETTING = "distributed.scheduler.no-workers-timeout"
 _LOCAL_SETTINGS = {
     "distributed.scheduler.allowed-failures": 1,  # on this machine a worker dies of its task
-    # A worker that takes longer to start anew is not replaced at all; on a busy machine it takes 15 s, Dask's own value.
+    # Dask does not replace a worker that takes longer to start anew than this, by default 15 s.
     "distributed.deploy.lost-worker-timeout": "10 minutes",
+    "distributed.worker.multiprocessing-method": "forkserver",  # starts anew in 1 s, not in 10
     # A worker that pauses waits for memory to become free, which here belongs to the set-ups that it keeps.
     "distributed.worker.memory.pause": False,
     "distributed.worker.memory.spill": False,
@@ -315,6 +316,7 @@ def _start_workers(options: EngineOptions, count: int) -> Iterator[Any]:
             n_workers=min(options.workers or dask.system.CPU_COUNT, count),
             threads_per_worker=1,
             memory_limit=int(options.memory * _GIGABYTE),
+            env=dict(os.environ),
             security=True,
             silence_logs=logging.CRITICAL,
             dashboard_address="127.0.0.1:0" if find_spec("bokeh") else None,

@@ -1,4 +1,4 @@
-"""Claims about tasks on a Dask cluster: whatever dies, all are done, none twice, as one process does them; no end waits."""
+"""Claims about tasks on a Dask cluster: whatever dies, all are done, none twice, as in one process; nothing hangs."""
 
 import json
 import os
@@ -213,9 +213,13 @@ def test_a_recording_that_changes_during_the_run_costs_itself_only(tmp_path, mon
 
 
 def test_a_cluster_without_workers_is_left_after_a_time_that_dask_knows(tmp_path, capsys):
-    with cluster(tmp_path / "cluster") as made, dask.config.set({adapter._TIMEOUT_SETTING: "1s"}):
-        with pytest.raises(ClusterError, match=f"{made.address}: none of 0 workers .* for 1 s; .*: dask worker tcp://"):
-            run_all(squares(3), tmp_path / "out", scheduler=made.address)
+    said = "none of 0 workers was at a task for 1 s; expected some that are: dask worker tcp://"
+    with (
+        cluster(tmp_path / "cluster") as made,
+        dask.config.set({adapter._TIMEOUT_SETTING: "1s"}),
+        pytest.raises(ClusterError, match=said),
+    ):
+        run_all(squares(3), tmp_path / "out", scheduler=made.address)
     assert "no worker yet; waits for 1 s" in capsys.readouterr().err
 
 
