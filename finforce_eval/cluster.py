@@ -35,6 +35,7 @@ LOOK_PERIOD = 2.0  # between two looks at a cluster where no task ends [s]
 ANSWER_TIMEOUT = 30.0  # of whatever a scheduler is asked [s]
 CLOSE_TIMEOUT = 5.0  # of leaving a cluster, which may be gone [s]
 IDLE_TIMEOUT = "10 minutes"  # unless Dask's own setting says otherwise; batch systems start workers late
+MOST_FILES = 100  # whose state is sent with a task; folders of pictures and replay buffers have thousands
 _TIMEOUT_SETTING = "distributed.scheduler.no-workers-timeout"
 _LOCAL_SETTINGS = {
     "distributed.scheduler.allowed-failures": 1,  # on this machine a worker dies of its task
@@ -206,7 +207,7 @@ class _Cluster:
             folder=os.getcwd(),
             mark=str(self._manifest.lock.resolve()),
             run_id=self._manifest.run_id,
-            files=describe_files(task.files),
+            files=describe_files(task.files[:MOST_FILES]),
         )
 
     def _wait(self, ended: Queue) -> Any:

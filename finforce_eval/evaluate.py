@@ -54,7 +54,7 @@ def evaluate_many(
         given["settings"] = hash_settings(settings)
         files = list_files(path)
         key = hash_settings(settings, files)
-        files += map(Path, settings["files"])
+        files = [*map(Path, settings["files"]), *files]
         tasks.append(Task(name=name, key=key, work=evaluate_task, given=given, output=target, files=files))
     with manifest.alone():
         lines = run_tasks(tasks, engine, manifest)

@@ -35,7 +35,7 @@ class Task:
         work: a function of a module, which another process can import; returns figures.
         given: what `work` is called with.
         output: file or folder that is there once it is done; "" without one.
-        files: that it reads, which a worker of a cluster must see as they are here.
+        files: that it reads, of which a worker of a cluster must see the first ones as they are here.
     """
 
     name: str

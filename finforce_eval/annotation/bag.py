@@ -54,7 +54,7 @@ def bag_task(name: str, source: Path, target: Path, options: argparse.Namespace,
     files = list_files(source)
     key = hash_settings({**settings, "episode": options.episode}, files)
     given = {"source": source, "target": target, "options": options, "settings": hash_settings(settings), "key": key}
-    files += map(Path, settings["files"])
+    files = [*map(Path, settings["files"]), *files]
     return Task(name=name, key=key, work=annotate_bag, given=given, output=str(target), files=files)
 
 

@@ -67,7 +67,7 @@ def episode_tasks(folder: Path, parts: Path, options: argparse.Namespace) -> lis
         key = hash_settings(settings | {"episode": episode.index}, files)
         given = {"recording": recording, "target": target, "options": options, "settings": hash_settings(settings)}
         about = {"name": recording.name, "key": key, "output": str(target)}
-        files += map(Path, settings["files"])
+        files = [*map(Path, settings["files"]), *files]
         tasks.append(Task(work=annotate_episode, given=given | {"key": key}, files=files, **about))
     return tasks
 

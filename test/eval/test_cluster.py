@@ -24,7 +24,7 @@ from finforce_eval.recordings.recording import DEMO, read_recording
 from finforce_eval.recordings.writer import write_recording
 from finforce_eval.tasks import EngineOptions, Manifest, run_tasks
 
-RECORDINGS, SECONDS = 6, 4
+RECORDINGS, SECONDS = 4, 4
 
 
 @pytest.fixture(scope="module")
