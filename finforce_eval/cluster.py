@@ -10,7 +10,7 @@ import logging
 import os
 import pickle
 import sys
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
@@ -32,7 +32,8 @@ if TYPE_CHECKING:
     from finforce_eval.tasks import EngineOptions, Line, Manifest, Task
 
 LOOK_PERIOD = 2.0  # between two looks at a cluster where no task ends [s]
-ANSWER_TIMEOUT = 30.0  # of whatever a scheduler is asked [s]
+ANSWER_TIMEOUT = 60.0  # of whatever a scheduler is asked [s]
+START_TIMEOUT = 600.0  # of the workers of this machine, beside whatever else it does [s]
 CLOSE_TIMEOUT = 5.0  # of leaving a cluster, which may be gone [s]
 IDLE_TIMEOUT = "10 minutes"  # unless Dask's own setting says otherwise; batch systems start workers late
 MOST_FILES = 100  # whose state is sent with a task; folders of pictures and replay buffers have thousands
@@ -99,7 +100,7 @@ def describe_sources(package: str) -> str:
     return f"{version()} (modules {digest.hexdigest()[:8]})"
 
 
-def describe_files(paths: Iterator[str | Path] | Sequence[str | Path]) -> dict[str, tuple[int, int]]:
+def describe_files(paths: Iterable[str | Path]) -> dict[str, tuple[int, int]]:
     """Return size [bytes] and time of change [s] by absolute path, without files that cannot be read."""
     states = {}
     for path in paths:
@@ -238,7 +239,7 @@ class _Cluster:
             tqdm.write(f"note: {self._name}: no worker yet; waits for {self._idle_timeout:g} s", file=sys.stderr)
         if monotonic() - self._last_sign > self._idle_timeout:
             text = f"{self._name}: none of {len(found['workers'])} workers was at a task for {self._idle_timeout:g} s"
-            raise ClusterError(f"{text}; expected some that are: dask worker {found['address']} --nthreads 1")
+            raise ClusterError(f"{text}; expected some, as `dask worker` starts them")
 
     def _lost(self) -> ClusterError:
         """Return the error of a scheduler that does not answer any more."""
@@ -309,18 +310,22 @@ def _close(client: Any) -> None:
 def _start_workers(options: EngineOptions, count: int) -> Iterator[Any]:
     """Yield a cluster of this machine, which only its own processes can speak to."""
     import dask
-    from distributed import LocalCluster
+    from distributed import LocalCluster, TimeoutError
 
-    with (
-        dask.config.set(_LOCAL_SETTINGS),
-        LocalCluster(
-            n_workers=min(options.workers or dask.system.CPU_COUNT, count),
-            threads_per_worker=1,
-            memory_limit=int(options.memory * _GIGABYTE),
-            env=dict(os.environ),
-            security=True,
-            silence_logs=logging.CRITICAL,
-            dashboard_address="127.0.0.1:0" if find_spec("bokeh") else None,
-        ) as cluster,
-    ):
-        yield cluster
+    import_library("cryptography", "a cluster of this machine", "'finforce[dask]'")
+    with ExitStack() as stack:
+        stack.enter_context(dask.config.set(_LOCAL_SETTINGS))
+        try:
+            cluster = LocalCluster(
+                n_workers=min(options.workers or dask.system.CPU_COUNT, count),
+                threads_per_worker=1,
+                memory_limit=int(options.memory * _GIGABYTE),
+                env=dict(os.environ),
+                death_timeout=START_TIMEOUT,
+                security=True,
+                silence_logs=logging.CRITICAL,
+                dashboard_address="127.0.0.1:0" if find_spec("bokeh") else None,
+            )
+        except (OSError, RuntimeError, TimeoutError) as error:
+            raise ClusterError(f"workers of this machine: they do not start: {one_line(error)}") from error
+        yield stack.enter_context(cluster)
