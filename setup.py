@@ -70,8 +70,7 @@ setup(
         "tqdm",  # progress bars
         "pandas",  # tables of forces over time and of figures, with named columns
         "pyarrow",  # these tables in Parquet files
-        "joblib",  # many recordings at once, in processes of which one that dies costs itself
-        "psutil",  # CPU time and memory of processes; joblib starts a process anew whose memory grows
+        "psutil",  # CPU time and memory of processes
     ],
     extras_require={
         # ROS 2 Jazzy for machines without it; Python 3.10 to 3.13 on x86_64
@@ -85,12 +84,15 @@ setup(
         "can": ["python-can>=4.3"],  # other CAN adapters than SLCAN ones: SocketCAN and more
         "lerobot": ["av"],  # videos of LeRobot datasets, by the library that they are made with
         "zarr": ["numcodecs"],  # UMI's chunks; the library zarr itself takes a missing chunk for zeros, a force of none
+        # many recordings on the workers of this machine or of a cluster, with its dashboard; TLS between the former
+        "dask": ["dask[distributed,diagnostics]>=2025.1", "cryptography"],
         "completion": ["argcomplete"],  # of the command line, by the shell
         "view": ["rerun-sdk"],  # a viewer of pictures, shapes and curves over time
         # training of key point networks; without a GPU, torch's own index has a build of a tenth of the size
         "train": ["torch", "onnx"],
         "test": ["pytest", "pytest-xdist", "pytest-timeout", "hypothesis", "onnx", "python-can>=4.3,!=4.6.0", "xacro"]
-        + ["cascadio", "ezdxf", "svgelements", "av", "rerun-sdk", "playwright", "argcomplete", "numcodecs"],
+        + ["cascadio", "ezdxf", "svgelements", "av", "rerun-sdk", "playwright", "argcomplete", "numcodecs"]
+        + ["dask[distributed]>=2025.1", "cryptography"],
         "lint": ["ruff", "import-linter"],
     },
     entry_points={

@@ -26,5 +26,9 @@ class OutOfBoundsError(RecordingError):
     """A recording would take more memory or time than one of its size does."""
 
 
+class ClusterError(FinforceError, RuntimeError):
+    """A cluster cannot be reached, has no worker that can do a task, or was lost."""
+
+
 class OptionError(FinforceError, ValueError):
     """A command-line option has a value that means nothing here."""

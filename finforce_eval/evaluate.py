@@ -17,7 +17,7 @@ from finforce_eval.evaluation.setup import EvaluationSetup, describe_options, pr
 from finforce_eval.recordings.bags import list_files, name_recordings
 from finforce_eval.recordings.tracks import Recording
 from finforce_eval.table import ForceSeries, read_table, write_table
-from finforce_eval.tasks import OK, EngineOptions, Manifest, Task, choose_shard, hash_settings, run_tasks
+from finforce_eval.tasks import OK, EngineOptions, Manifest, Task, hash_settings, run_tasks
 
 
 def evaluate_all(recordings: Sequence[Recording], setup: EvaluationSetup) -> Evaluation:
@@ -47,20 +47,22 @@ def evaluate_many(
         FinforceError: not one could be evaluated.
     """
     settings = describe_options(options)
-    manifest, tasks = Manifest(folder, options.shard), []
-    for name, path in choose_shard(name_recordings(options.bags, "/"), options.shard):
+    manifest, tasks = Manifest(folder), []
+    for name, path in name_recordings(options.bags, "/"):
         target = str(folder / f"{name.replace('/', '_')}.parquet")
         given = {"name": name, "path": str(path), "target": target, "options": options}
         given["settings"] = hash_settings(settings)
-        key = hash_settings(settings, list_files(path))
-        tasks.append(Task(name=name, key=key, work=evaluate_task, given=given, output=target))
+        files = list_files(path)
+        key = hash_settings(settings, files)
+        files = [*map(Path, settings["files"]), *files]
+        tasks.append(Task(name=name, key=key, work=evaluate_task, given=given, output=target, files=files))
     with manifest.alone():
         lines = run_tasks(tasks, engine, manifest)
     failed = {line["name"]: line["error"] for line in lines if line["status"] != OK}
     for line in lines:
         print_notes(line["name"], line["figures"].get("notes", ()))
     if len(failed) == len(lines):
-        raise RecordingError(next(iter(failed.values()), f"--shard {options.shard}: no recording is left for it"))
+        raise RecordingError(next(iter(failed.values())))
     evaluation, _ = read_evaluations(Path(task.output) for task in tasks if task.name not in failed)
     return evaluation, failed
 

@@ -7,6 +7,7 @@ import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import numpy as np
 import pandas as pd
@@ -225,7 +226,7 @@ def write_table(path: Path, series: Sequence[ForceSeries], about: Mapping[str, A
     units = {name: UNITS.get(name, VECTORS.get(name[:-2], "")) for name in table.schema.names}
     fields = [field.with_metadata({"unit": units[field.name]}) for field in table.schema]
     metadata = {**(table.schema.metadata or {}), _ABOUT: json.dumps(dict(about)).encode()}
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    part = path.with_name(f".{path.name}.{uuid4().hex}.part")
     try:
         pq.write_table(table.cast(pa.schema(fields, metadata=metadata)), part)
         os.replace(part, path)

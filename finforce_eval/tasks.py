@@ -1,28 +1,28 @@
-"""A task per recording: carried out here or in processes, each done once even if a run is killed."""
+"""A task per recording: carried out here or on a cluster, each done once even if a run is killed."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import os
-import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from multiprocessing import current_process
 from pathlib import Path
+from threading import current_thread, main_thread
 from time import perf_counter
-from typing import Any, TypeVar
+from typing import Any
+from uuid import uuid4
 
 from finforce.errors import FinforceError, one_line
 from finforce_eval.errors import OptionError
 from finforce_eval.machine import version, without_nan
 
 OK, FAILED = "ok", "failed"
-DIED = "the process that was at it died: out of memory, or killed"
-_GIGABYTE, _LARGEST_MEMORY = 1 << 30, 1e6
+_LARGEST_MEMORY = 1e6  # [GB]
+_OLD_MANIFESTS = "manifest*.jsonl"  # names in earlier versions, also of parts of a run
 Line = dict[str, Any]
-T = TypeVar("T")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,6 +35,7 @@ class Task:
         work: a function of a module, which another process can import; returns figures.
         given: what `work` is called with.
         output: file or folder that is there once it is done; "" without one.
+        files: that it reads, of which a worker of a cluster must see the first ones as they are here.
     """
 
     name: str
@@ -42,6 +43,7 @@ class Task:
     work: Callable[..., Mapping[str, Any]]
     given: Mapping[str, Any] = field(default_factory=dict)
     output: str = ""
+    files: Sequence[Path] = ()
 
     def is_done(self, line: Mapping[str, Any] | None) -> bool:
         """Say whether a line of the manifest tells that the task is done, and what it made is still there."""
@@ -74,26 +76,30 @@ class Task:
 
 @dataclass(frozen=True, kw_only=True)
 class EngineOptions:
-    """How many tasks are carried out at once; raises OptionError where that cannot be.
+    """Where tasks are carried out; raises OptionError where that cannot be.
 
     Attributes:
-        workers: processes; 1: this one, 0: one for each processor.
-        memory: that a task may have in a process of its own [GB]; 0: any.
+        workers: processes on this machine; 1: this one, 0: one for each processor.
+        memory: that each of several processes may have [GB]; 0: any.
+        scheduler: address of a Dask scheduler, whose workers do the tasks; "" without one.
     """
 
     workers: int = 1
     memory: float = 4.0
+    scheduler: str = ""
 
     def __post_init__(self) -> None:
         if self.workers < 0:
             raise OptionError(f"--workers {self.workers}: expected the number of recordings at once, or 0")
         if not 0.0 <= self.memory < _LARGEST_MEMORY:
             raise OptionError(f"--memory {self.memory}: expected gigabytes, or 0")
+        if self.scheduler and self.workers != 1:
+            raise OptionError(f"--scheduler and --workers {self.workers}: expected one of the two")
 
 
 def is_manifest(path: Path) -> bool:
     """Say whether a file has the name of a manifest."""
-    return path.match("manifest*.jsonl") and path.is_file()
+    return (path.name == Manifest.NAME or path.match(_OLD_MANIFESTS)) and path.is_file()
 
 
 class Manifest:
@@ -101,36 +107,39 @@ class Manifest:
 
     Args:
         folder: of the outputs; made if need be.
-        shard: "i/n" of a run that does a part only; each part has a file of its own.
     """
 
-    def __init__(self, folder: Path, shard: str = "") -> None:
-        ending = f".{shard.replace('/', '-of-')}" if shard else ""
-        self.path, self._lock = folder / f"manifest{ending}.jsonl", folder / f".lock{ending}"
+    NAME = "_manifest.jsonl"  # readers of a folder of Parquet files pass over an underscore
+
+    def __init__(self, folder: Path) -> None:
+        self.path, self.lock, self.run_id = folder / self.NAME, folder / ".lock", uuid4().hex
         folder.mkdir(parents=True, exist_ok=True)
 
     @contextmanager
     def alone(self) -> Iterator[None]:
-        """Keep other runs from this part of the outputs.
+        """Keep other runs from the outputs; the file of the lock holds which run has it.
 
         Raises:
             OptionError: another run is at it.
         """
         import fcntl
 
-        with self._lock.open("w") as lock:
+        with self.lock.open("a+") as lock:
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as error:
+            except BlockingIOError as error:
                 folder = self.path.parent
                 raise OptionError(f"{folder}: another run writes there; expected a folder of its own") from error
+            lock.truncate(0)
+            lock.write(self.run_id)
+            lock.flush()
+            os.fsync(lock.fileno())
             yield
 
     def read(self) -> dict[str, Line]:
-        """Return the last line of every task, of any part, by its name; a line that was cut off is none."""
+        """Return the last line of every task by its name; a line that was cut off is none."""
         lines: dict[str, Line] = {}
-        others = set(self.path.parent.glob("manifest*.jsonl")) - {self.path}
-        for path in (*sorted(others), self.path):
+        for path in (*sorted(self.path.parent.glob(_OLD_MANIFESTS)), self.path):
             for text in path.read_text(encoding="utf-8").splitlines() if path.exists() else ():
                 try:
                     line = json.loads(text)
@@ -157,16 +166,20 @@ def run_tasks(tasks: Sequence[Task], options: EngineOptions, manifest: Manifest,
 
     Args:
         tasks: with names of their own.
-        options: how many at once.
+        options: where.
         manifest: where lines are kept; what it holds as done with the same key is not done again.
         unit: what a task is, for the bar.
+
+    Raises:
+        MissingDependencyError: a cluster is asked for, and Dask is not installed.
+        ClusterError: the cluster cannot be used, or was lost.
     """
     before = manifest.read()
     lines = {task.name: before[task.name] for task in tasks if task.is_done(before.get(task.name))}
     left = [task for task in tasks if task.name not in lines]
-    with progress_bar(len(tasks), unit) as bar:
+    with progress_bar(len(tasks), unit) as bar, closing(_run_all(left, options, manifest)) as ended:
         bar.update(len(lines))
-        for line in map(Task.run, left) if options.workers == 1 else _run_in_processes(left, options):
+        for line in ended:
             manifest.append(line)
             lines[line["name"]] = line
             bar.set_postfix_str(f"{sum(each['status'] == FAILED for each in lines.values())} failed")
@@ -174,11 +187,21 @@ def run_tasks(tasks: Sequence[Task], options: EngineOptions, manifest: Manifest,
     return [lines[task.name] for task in tasks]
 
 
+def _run_all(tasks: Sequence[Task], options: EngineOptions, manifest: Manifest) -> Iterator[Line]:
+    """Yield the lines of tasks as these end."""
+    if not tasks or (options.workers == 1 and not options.scheduler):
+        yield from map(Task.run, tasks)
+        return
+    from finforce_eval.cluster import run_in_cluster
+
+    yield from run_in_cluster(tasks, options, manifest)
+
+
 def progress_bar(total: int, unit: str, name: str = "") -> Any:
-    """Return a progress bar on a terminal; none in the process of a task, whose bars would overwrite each other."""
+    """Return a progress bar on a terminal; none on a worker, whose bars would overwrite those of others."""
     from tqdm import tqdm
 
-    hidden = None if current_process().name == "MainProcess" else True
+    hidden = None if current_process().name == "MainProcess" and current_thread() is main_thread() else True
     return tqdm(total=total, unit=unit, desc=name or None, disable=hidden, leave=False)
 
 
@@ -189,49 +212,3 @@ def hash_settings(settings: Mapping[str, Any], files: Sequence[Path] = ()) -> st
         state = path.stat()
         digest.update(f"|{path}|{state.st_size}|{state.st_mtime_ns}".encode())
     return digest.hexdigest()[:16]
-
-
-def choose_shard(items: Sequence[T], shard: str) -> list[T]:
-    """Return the part of a list that a shard "i/n" is to do; all of it for "".
-
-    Raises:
-        OptionError: another text, or no such part.
-    """
-    if not shard:
-        return list(items)
-    found = re.fullmatch(r"(\d{1,6})/(\d{1,6})", shard)
-    number, count = (int(part) for part in found.groups()) if found else (0, 0)
-    if not 1 <= number <= count:
-        raise OptionError(f"--shard {shard}: expected i/n with 1 <= i <= n, as 3/16")
-    return list(items[number - 1 :: count])
-
-
-def _run_limited(task: Task, gigabytes: float) -> Line:
-    """Return the line of a task that may have so much memory, from now on in this process."""
-    if gigabytes > 0.0:
-        import resource
-
-        hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
-        resource.setrlimit(resource.RLIMIT_DATA, (int(gigabytes * _GIGABYTE), hard))
-    return task.run()
-
-
-def _run_in_processes(tasks: Sequence[Task], options: EngineOptions) -> Iterator[Line]:
-    """Yield lines as joblib's processes end their tasks; one that dies costs the task that it was at."""
-    from joblib import Parallel, delayed
-    from joblib.externals.loky.process_executor import TerminatedWorkerError
-
-    left, alone = {task.name: task for task in tasks}, False
-    while left:
-        pool = Parallel(n_jobs=options.workers or -1, return_as="generator_unordered", batch_size=1)
-        batch = list(left.values())[: 1 if alone else None]
-        try:
-            for line in pool(delayed(_run_limited)(task, options.memory) for task in batch):
-                del left[line["name"]]
-                yield line
-            alone = False
-        except TerminatedWorkerError:
-            # which task it was is not known: the first one is tried again by itself, then all others as before
-            if alone:
-                yield left.pop(batch[0].name).line(DIED)
-            alone = not alone

@@ -9,6 +9,7 @@ import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from glob import escape
 from pathlib import Path
 from tempfile import mkdtemp
 from typing import Any
@@ -50,9 +51,11 @@ def bag_task(name: str, source: Path, target: Path, options: argparse.Namespace,
 
     `settings` are what `describe_options` says of the options. Where there is no such recording, the task says so.
     """
-    key = hash_settings({**settings, "episode": options.episode}, list_files(source))
+    files = list_files(source)
+    key = hash_settings({**settings, "episode": options.episode}, files)
     given = {"source": source, "target": target, "options": options, "settings": hash_settings(settings), "key": key}
-    return Task(name=name, key=key, work=annotate_bag, given=given, output=str(target))
+    files = [*map(Path, settings["files"]), *files]
+    return Task(name=name, key=key, work=annotate_bag, given=given, output=str(target), files=files)
 
 
 def annotate_bag(source: Path, target: Path, options: argparse.Namespace, settings: str, key: str) -> dict[str, Any]:
@@ -69,10 +72,8 @@ def annotate_bag(source: Path, target: Path, options: argparse.Namespace, settin
         FinforceError: the recording cannot be read, or no forces be found in it.
         OSError: the folder cannot be written.
     """
-    with suppress(OSError, ValueError, KeyError, TypeError):
-        note = json.loads((target / NOTE).read_text(encoding="utf-8"))
-        if note["key"] == key:
-            return note["figures"]
+    if (done := _read_figures(target, key)) is not None:
+        return done
     setup, keypoints = share_setup(settings, options), parse_source(options)
     recording = keypoints.read(source)
     setup.contacts.check(recording)
@@ -88,17 +89,29 @@ def annotate_bag(source: Path, target: Path, options: argparse.Namespace, settin
         raise RecordingError(f"{target.name}: {'; '.join((*notes, why))}")
     figures = without_nan(_describe(jaws, recording) | {"notes": notes})
     about = {"key": key, "figures": figures, "settings": dict(setup.about), "version": version()}
-    with new_folder(target) as folder:
-        if is_frames(source):
-            folder.mkdir()
-            write_table(folder / TABLE, list(jaws.values()), about)
-        else:
-            messages = ForceMessages(jaws, combine_jaws(jaws))
-            write_annotated(recording, bag_source(recording.source), messages, folder, side_file=options.side_file)
-        if options.video:
-            write_video(folder / VIDEO, recording, jaws)
-        (folder / NOTE).write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
+    try:
+        with new_folder(target) as folder:
+            if is_frames(source):
+                folder.mkdir()
+                write_table(folder / TABLE, list(jaws.values()), about)
+            else:
+                messages = ForceMessages(jaws, combine_jaws(jaws))
+                write_annotated(recording, bag_source(recording.source), messages, folder, side_file=options.side_file)
+            if options.video:
+                write_video(folder / VIDEO, recording, jaws)
+            (folder / NOTE).write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
+    except (RecordingError, OSError):
+        if _read_figures(target, key) is None:  # else a worker that was taken for dead has done the same meanwhile
+            raise
     return figures
+
+
+def _read_figures(target: Path, key: str) -> dict[str, Any] | None:
+    """Return the figures of a recording that a task with this key has annotated; None where none has."""
+    with suppress(OSError, ValueError, KeyError, TypeError):
+        note = json.loads((target / NOTE).read_text(encoding="utf-8"))
+        return note["figures"] if note["key"] == key else None
+    return None
 
 
 def _describe(jaws: Mapping[str, ForceSeries], recording: Recording) -> dict[str, Any]:
@@ -283,6 +296,8 @@ def new_folder(target: Path) -> Iterator[Path]:
     try:
         yield part / target.name
         os.replace(part / target.name, target)
+        for left in target.parent.glob(f".{escape(target.name)}.{'?' * 8}.part"):  # of attempts that were killed
+            shutil.rmtree(left, ignore_errors=True)
     except (FinforceError, OSError, KeyboardInterrupt):
         raise
     except Exception as error:  # sqlite3 has its own classes for a full disk

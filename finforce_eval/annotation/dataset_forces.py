@@ -66,8 +66,9 @@ def episode_tasks(folder: Path, parts: Path, options: argparse.Namespace) -> lis
         files = [path for path in (episode.video, episode.data) if path is not None]
         key = hash_settings(settings | {"episode": episode.index}, files)
         given = {"recording": recording, "target": target, "options": options, "settings": hash_settings(settings)}
-        name = recording.name
-        tasks.append(Task(name=name, key=key, work=annotate_episode, given=given | {"key": key}, output=str(target)))
+        about = {"name": recording.name, "key": key, "output": str(target)}
+        files = [*map(Path, settings["files"]), *files]
+        tasks.append(Task(work=annotate_episode, given=given | {"key": key}, files=files, **about))
     return tasks
 
 

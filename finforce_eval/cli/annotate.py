@@ -20,13 +20,13 @@ from finforce_eval.evaluation.setup import describe_options, print_notes
 from finforce_eval.recordings.bags import is_buffer, name_recordings
 from finforce_eval.recordings.dataset import is_dataset
 from finforce_eval.recordings.umi import count_episodes
-from finforce_eval.tasks import OK, Line, Manifest, Task, choose_shard, run_tasks
+from finforce_eval.tasks import OK, Line, Manifest, Task, run_tasks
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
     parser.add_argument("bags", nargs="+", metavar="BAG", help=BAG_HELP)
-    text = "output folder, with one folder per recording and manifest.jsonl (annotated)"
+    text = "output folder, with one folder per recording and _manifest.jsonl (annotated)"
     parser.add_argument("--out", default="annotated", metavar="DIR", help=text)
     text = "bags only: write the new messages without a copy of the recording"
     parser.add_argument("--side-file", action="store_true", help=text)
@@ -41,7 +41,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> CommandResult:
     """Annotate recordings and print a line for each; status 2 where one of them failed."""
-    out, manifest = Path(options.out), Manifest(Path(options.out), options.shard)
+    out, manifest = Path(options.out), Manifest(Path(options.out))
     named = name_recordings(options.bags, "_")
     if options.source in (None, IMAGES):
         _set_unless_given(options, "threads=1")  # a core for each recording, whatever the engine
@@ -49,10 +49,8 @@ def run(options: argparse.Namespace) -> CommandResult:
     if datasets:
         if options.video:
             raise OptionError("--video: not for LeRobot datasets; expected recordings, videos or folders of pictures")
-        if options.shard:
-            raise OptionError(f"--shard {options.shard}: a dataset is written as one; give its folder to one job")
         options.jaws = options.jaws or "both"
-    bags = choose_shard([(name, path) for name, path in named if name not in datasets], options.shard)
+    bags = [(name, path) for name, path in named if name not in datasets]
     settings = describe_options(options)
     with manifest.alone():
         tasks = [task for name, path in bags for task in _tasks_of(name, path, options, settings)]

@@ -9,6 +9,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from finforce_eval.cli.parser import BAG_HELP, CommandResult, add_engine_options, add_run_options, read_engine
+from finforce_eval.errors import OptionError
 from finforce_eval.evaluate import evaluate_many
 from finforce_eval.evaluation.setup import make_setup
 from finforce_eval.evaluation.tables import evaluation_json, format_tables
@@ -28,7 +29,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     text = "skip the images that the nodes skip: nothing moved, or the object is out of reach"
     results.add_argument("--as-live", action="store_true", help=text)
     results.add_argument("--report", metavar="DIR", help="write a page with figures to this folder")
-    text = "write a Parquet table of every recording (one row per image and jaw) and manifest.jsonl, with which "
+    text = "write a Parquet table of every recording (one row per image and jaw) and _manifest.jsonl, with which "
     text += "a killed run resumes; finforce report shows the tables, finforce compare compares two folders"
     results.add_argument("--out", metavar="DIR", help=text)
     add_engine_options(parser)
@@ -37,6 +38,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> CommandResult:
     """Evaluate recordings: print the table, write the report; status 2 where one of them failed."""
     setup, engine = make_setup(options), read_engine(options)
+    if engine.scheduler and not options.out:
+        raise OptionError(f"--scheduler {engine.scheduler}: expected --out DIR, too, which all workers see")
     with ExitStack() as stack:
         folder = Path(options.out or stack.enter_context(TemporaryDirectory(prefix="finforce_")))
         evaluation, failed = evaluate_many(options, engine, folder)

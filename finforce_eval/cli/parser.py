@@ -160,22 +160,22 @@ def length_mm(text: str) -> float:
 
 
 def add_engine_options(command: argparse.ArgumentParser) -> None:
-    """Add what says how many recordings are worked at."""
+    """Add what says where recordings are worked at."""
     parser = command.add_argument_group("many recordings")
-    text = "recordings processed in parallel, each in its own process; 0: one per core (1)"
+    text = "recordings processed in parallel, by Dask workers on this machine; 0: one per core (1: without Dask)"
     parser.add_argument("--workers", type=int, default=1, metavar="N", help=text)
-    text = "memory limit of a parallel task [GB]; 0: none (4)"
+    text = "memory limit of each of these workers [GB]; 0: none (4)"
     parser.add_argument("--memory", type=float, default=4.0, metavar="GB", help=text)
-    text = "process the I-th of N parts of the recordings, for batch systems"
-    parser.add_argument("--shard", default="", metavar="I/N", help=text)
+    text = "process the recordings on the workers of a Dask scheduler, such as tcp://host:8786"
+    parser.add_argument("--scheduler", default="", metavar="ADDRESS", help=text)
 
 
 def read_engine(options: argparse.Namespace) -> EngineOptions:
     """Return what `add_engine_options` added.
 
     Raises:
-        OptionError: a number is out of its bounds.
+        OptionError: a number is out of its bounds, or two contradict each other.
     """
     from finforce_eval.tasks import EngineOptions
 
-    return EngineOptions(workers=options.workers, memory=options.memory)
+    return EngineOptions(workers=options.workers, memory=options.memory, scheduler=options.scheduler)

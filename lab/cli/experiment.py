@@ -70,10 +70,7 @@ def run(options: argparse.Namespace) -> CommandResult:
     _, module = EXPERIMENTS[options.name]
     experiment: Experiment = getattr(import_module(f"lab.experiments.{module}"), options.name.upper())
     report, chosen = Path(options.report), read_options(options)
-    figures = run_experiment(experiment, chosen, report, read_engine(options), options.shard)
-    if figures is None:
-        print(f"Part {options.shard} is done; without --shard all parts are put on a page")
-        return CommandResult()
+    figures = run_experiment(experiment, chosen, report, read_engine(options))
     print(format_figures(figures))
     print(f"Page: {report / experiment.name / PAGE}")
     return CommandResult({experiment.name: figures_json(figures)})

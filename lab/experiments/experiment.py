@@ -25,11 +25,11 @@ from finforce_eval.evaluation.scoring import Evaluation
 from finforce_eval.evaluation.setup import EvaluationSetup, hash_files
 from finforce_eval.figures.figures import new_figure, style_axes
 from finforce_eval.machine import commit, version, write_figures
-from finforce_eval.recordings.bags import bag_source
+from finforce_eval.recordings.bags import bag_source, list_files
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.tracks import Recording
 from finforce_eval.table import AXES
-from finforce_eval.tasks import OK, EngineOptions, Manifest, Task, choose_shard, hash_settings, run_tasks
+from finforce_eval.tasks import OK, EngineOptions, Manifest, Task, hash_settings, run_tasks
 from finforce_ifea.jaw.calibration import load_calibration
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.settings import EstimatorSettings
@@ -202,9 +202,14 @@ def run_case(experiment: Experiment, options: RunOptions, case: Case, folder: st
     return {**case.settings.get("words", {}), **experiment.run(options, case, Path(folder))}
 
 
+def _list_inputs(settings: Mapping[str, Any]) -> list[Path]:
+    """Return the files that a case reads: of its recording, its jaw and its calibration, if it has some."""
+    return [*map(Path, settings.get("files", ())), *(list_files(Path(settings["bag"])) if "bag" in settings else ())]
+
+
 def run_experiment(
-    experiment: Experiment, options: RunOptions, report: Path, engine: EngineOptions | None = None, shard: str = ""
-) -> Figures | None:
+    experiment: Experiment, options: RunOptions, report: Path, engine: EngineOptions | None = None
+) -> Figures:
     """Run what is not done yet of an experiment, and write `NAME.json`, pictures and a page into `report/NAME`.
 
     A case that fails is told of, costs itself only, and is tried again by the next run.
@@ -214,30 +219,33 @@ def run_experiment(
         options: how.
         report: folder of all experiments.
         engine: where the cases are run; here, one after the other, without.
-        shard: "i/n" to run a part of the cases only, without a page.
 
     Returns:
-        What the cases say together; None of a part of them.
+        What the cases say together.
 
     Raises:
         FinforceError: the cases cannot be listed, or none of them gave figures.
     """
     folder = report / experiment.name
     cases = experiment.list_cases(options)
-    manifest = Manifest(folder, shard)
+    manifest = Manifest(folder)
     given = [{"experiment": experiment, "options": options, "case": case, "folder": str(folder)} for case in cases]
     code = {"version": version(), "commit": commit()}
     tasks = [
-        Task(name=case.name, key=hash_settings(code | dict(case.settings)), work=run_case, given=each)
+        Task(
+            name=case.name,
+            key=hash_settings(code | dict(case.settings)),
+            work=run_case,
+            given=each,
+            files=_list_inputs(case.settings),
+        )
         for case, each in zip(cases, given, strict=True)
     ]
     with manifest.alone():
-        lines = run_tasks(choose_shard(tasks, shard), engine or EngineOptions(), manifest, unit="case")
+        lines = run_tasks(tasks, engine or EngineOptions(), manifest, unit="case")
     failed = {line["name"]: line["error"] for line in lines if line["status"] != OK}
     for name, error in failed.items():
         print(f"failed: {name}: {error}", file=sys.stderr)
-    if shard:
-        return None
     figures = {line["name"]: line["figures"] for line in lines if line["status"] == OK}
     if not figures:
         raise FinforceError(f"{experiment.name}: not one of {len(cases)} cases gave figures; the first: "

@@ -158,20 +158,21 @@ def _count_pictures(path: Path) -> int:
         return len(content["finger"])
 
 
-def make_all(tasks: Sequence[Task], engine: EngineOptions, folder: Path, shard: str, unit: str) -> list[dict[str, Any]]:
+def make_all(tasks: Sequence[Task], engine: EngineOptions, folder: Path, unit: str) -> list[dict[str, Any]]:
     """Make what is not made yet, and return the lines of all tasks.
 
     Args:
         tasks: each makes a file.
         engine: where they are carried out.
-        folder: of the files, and of a manifest that lets several runs share the work, or go on where one was killed.
-        shard: "i/n" of a run that does a part only.
+        folder: of the files, and of a manifest that lets a run go on where one was killed.
         unit: what a task is, for the bar.
 
     Raises:
         TrainingError: one of them failed; which, and how many.
     """
-    lines = run_tasks(tasks, engine, Manifest(folder, shard), unit=unit)
+    manifest = Manifest(folder)
+    with manifest.alone():
+        lines = run_tasks(tasks, engine, manifest, unit=unit)
     failed = [line for line in lines if line["status"] != OK]
     if failed:
         raise TrainingError(f"{len(failed)} of {len(lines)} failed, {failed[0]['name']} with: {failed[0]['error']}")

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from finforce.camera import CameraIntrinsics, project
 from finforce.optional import import_cv2
 from finforce_eval.cli.parser import add_engine_options, read_engine, whole_number
-from finforce_eval.tasks import EngineOptions, Task, choose_shard
+from finforce_eval.tasks import EngineOptions, Task
 from finforce_keypoints.geometry.side_picture import PlaneGrid
 from finforce_keypoints.geometry.template import MARK_RADIUS, SideShape, draw_template, fit_grid
 from finforce_sim.objects import OBJECT_NAMES, build_object
@@ -415,7 +415,7 @@ def write_shard(seeds: Sequence[int], path: str, held: float = HELD) -> dict[str
 
 
 def make_shards(
-    seeds: range, folder: Path, name: str, engine: EngineOptions, shard: str = "", fingers: int = 32, held: float = HELD
+    seeds: range, folder: Path, name: str, engine: EngineOptions, fingers: int = 32, held: float = HELD
 ) -> None:
     """Render the pictures of fingers and write them as `NAME_SEED.npz`, several fingers a file.
 
@@ -424,11 +424,11 @@ def make_shards(
     """
     parts = [seeds[begin : begin + fingers] for begin in range(0, len(seeds), fingers)]
     tasks = []
-    for part in choose_shard(parts, shard):
+    for part in parts:
         path = str(folder / f"{name}_{part[-1]:09d}.npz")
         given = {"seeds": list(part), "path": path, "held": held}
         tasks.append(Task(name=Path(path).stem, key=str(part), work=write_shard, given=given, output=path))
-    make_all(tasks, engine, folder, shard, "file")
+    make_all(tasks, engine, folder, "file")
 
 
 def main() -> None:
@@ -439,9 +439,7 @@ def main() -> None:
         "--fingers", type=whole_number(0, 10**9), default=1500, help="for training (1500), 8 pictures each"
     )
     parser.add_argument("--validation", type=whole_number(0, 10**9), default=100, help="fingers for validation (100)")
-    parser.add_argument(
-        "--first", type=whole_number(0, 10**9), default=0, help="seed of the first finger, to share the work (0)"
-    )
+    parser.add_argument("--first", type=whole_number(0, 10**9), default=0, help="seed of the first finger (0)")
     parser.add_argument(
         "--held", type=read_share, default=HELD, help=f"share of pictures of a grasp from the wrist ({HELD})"
     )
@@ -453,8 +451,10 @@ def main() -> None:
             if count:
                 start = first + options.first
                 seeds = range(start, start + count)
-                make_shards(seeds, options.folder, name, engine, options.shard, held=options.held)
+                make_shards(seeds, options.folder, name, engine, held=options.held)
 
 
 if __name__ == "__main__":
-    main()
+    from lab.training.scenes import main as run  # under the name by which the workers of a cluster find its functions
+
+    run()

@@ -28,7 +28,6 @@ KEYS = {
     "shapely": "python3-shapely",
     "matplotlib": "python3-matplotlib",
     "tqdm": "python3-tqdm",
-    "joblib": "python3-joblib",
     "psutil": "python3-psutil",
 }
 # packages of ROS that launch files start, and that a user asks for by an argument

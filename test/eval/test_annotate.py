@@ -14,14 +14,14 @@ from eval_fakes import cut, evaluate_recording
 from process_fakes import running
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
-from task_fakes import square
+from task_fakes import squares
 
 from finforce_eval.annotation import bag as annotated_bag
 from finforce_eval.cli.main import main
 from finforce_eval.evaluation.setup import make_setup
 from finforce_eval.recordings.recording import DEMO, read_recording
 from finforce_eval.recordings.writer import write_recording
-from finforce_eval.tasks import EngineOptions, Manifest, Task, choose_shard, run_tasks
+from finforce_eval.tasks import EngineOptions, Manifest, run_tasks
 
 TYPES = get_typestore(Stores.ROS2_JAZZY)
 SECONDS = 4
@@ -55,7 +55,7 @@ def decoded(folder, topic):
 
 
 def lines_of(out):
-    return [json.loads(text) for text in (out / "manifest.jsonl").read_text().splitlines()]
+    return [json.loads(text) for text in (out / "_manifest.jsonl").read_text().splitlines()]
 
 
 @pytest.fixture(scope="module")
@@ -169,7 +169,7 @@ def test_a_bad_recording_costs_itself_only_and_a_second_run_does_what_is_left(so
     assert annotate(out, bad, source, "--contact", "fixed:40") == 2  # other settings: what is there is another's
     assert "exists already" in capsys.readouterr().err
     assert (out / source.name / "metadata.yaml").stat().st_mtime_ns == written
-    (out / "manifest.jsonl").unlink()
+    (out / "_manifest.jsonl").unlink()
     assert annotate(out, source) == 0
     assert (out / source.name / "metadata.yaml").stat().st_mtime_ns == written
     assert [line["name"] for line in lines_of(out)] == [source.name]
@@ -191,49 +191,13 @@ def test_a_full_disk_leaves_nothing(source, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(annotated_bag, "_copy_others", refuse)
     assert annotate(tmp_path / "out", source) == 2
     assert "No space left on device" in capsys.readouterr().err
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [".lock", "manifest.jsonl"]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [".lock", "_manifest.jsonl"]
 
 
 def test_two_runs_do_not_write_in_one_folder(source, tmp_path, capsys):
     with Manifest(tmp_path).alone():
         assert annotate(tmp_path, source) == 2
     assert "another run writes there" in capsys.readouterr().err
-
-
-def test_shards_are_all_and_none_twice():
-    items = list(range(17))
-    parts = [choose_shard(items, f"{number}/5") for number in range(1, 6)]
-    assert sorted(sum(parts, [])) == items
-    assert choose_shard(items, "") == items
-
-
-@pytest.mark.parametrize("shard", ["0/3", "4/3", "1", "a/b", "1/0", "-1/2", "1/9999999"])
-def test_a_shard_that_is_none_is_refused(shard, tmp_path, source, capsys):
-    assert annotate(tmp_path, source, f"--shard={shard}") == 2
-    assert "expected i/n" in capsys.readouterr().err
-
-
-def squares(count, **given):
-    return [Task(name=str(n), key=f"k{n}", work=square, given={"number": n, **given}) for n in range(count)]
-
-
-def results(lines):
-    return [{name: line[name] for name in ("name", "key", "status", "figures")} for line in lines]
-
-
-def test_processes_agree_with_this_one(tmp_path):
-    tasks = squares(9, fail=(3,))
-    expected = run_tasks(tasks, EngineOptions(), Manifest(tmp_path / "here"))
-    found = run_tasks(tasks, EngineOptions(workers=2), Manifest(tmp_path / "there"))
-    assert results(found) == results(expected)
-    assert found[3]["status"] == "failed" and "no 3" in found[3]["error"]
-    assert {line["figures"].get("square") for line in found} == {None, 0, 1, 4, 16, 25, 36, 49, 64}
-
-
-def test_a_process_that_dies_costs_its_own_task_only(tmp_path):
-    lines = run_tasks(squares(3, die=(1,)), EngineOptions(workers=2), Manifest(tmp_path))
-    assert [line["status"] for line in lines] == ["ok", "failed", "ok"]
-    assert "died" in lines[1]["error"]
 
 
 def test_a_line_that_was_cut_off_is_done_again(tmp_path):
@@ -276,11 +240,32 @@ def test_a_run_that_is_killed_loses_nothing_and_its_successor_does_nothing_twice
         assert [entry for entry in messages(out / name) if entry[0] in topics] == messages(bag)
 
 
-@pytest.mark.parametrize("words", [["--workers", "-1"], ["--memory", "nan"], ["--memory=-1"], ["--memory", "inf"]])
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--workers", "-1"],
+        ["--memory", "nan"],
+        ["--memory=-1"],
+        ["--memory", "inf"],
+        ["--workers", "2", "--scheduler", "a"],
+    ],
+)
 def test_engines_that_cannot_be_are_refused(words, source, tmp_path, capsys):
     assert annotate(tmp_path, source, *words) == 2
     assert "expected" in capsys.readouterr().err
     assert not (tmp_path / source.name).exists()
+
+
+def test_a_manifest_of_an_earlier_version_is_read(tmp_path):
+    tasks, before = squares(4), Manifest(tmp_path / "before")
+    done = run_tasks(tasks, EngineOptions(), before)
+    (tmp_path / "after").mkdir()
+    text = before.path.read_text().splitlines(keepends=True)
+    (tmp_path / "after" / "manifest.jsonl").write_text("".join(text[:2]))
+    (tmp_path / "after" / "manifest.2-of-2.jsonl").write_text(text[2])
+    after = Manifest(tmp_path / "after")
+    assert run_tasks(tasks, EngineOptions(), after) == done[:3] + run_tasks(tasks, EngineOptions(), after)[3:]
+    assert [line["name"] for line in lines_of(tmp_path / "after")] == ["3"]
 
 
 def test_a_changed_calibration_is_another_setting(source, tmp_path, capsys):

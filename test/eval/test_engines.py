@@ -71,11 +71,11 @@ def test_files_of_a_data_set_are_made_once_and_what_fails_is_named(tmp_path):
             for number, path in paths.items()
         ]
 
-    engine = EngineOptions(workers=2)
+    engine = EngineOptions()
     with pytest.raises(TrainingError, match="1 of 5 failed, 3 with: three cannot be made"):
-        make_all(tasks(range(5)), engine, tmp_path, "", "file")
+        make_all(tasks(range(5)), engine, tmp_path, "file")
     before = (tmp_path / "2.txt").stat().st_mtime_ns
     (tmp_path / "1.txt").unlink()
-    lines = make_all(tasks((0, 1, 2, 4)), engine, tmp_path, "", "file")
+    lines = make_all(tasks((0, 1, 2, 4)), engine, tmp_path, "file")
     assert sum(line["figures"]["numbers"] for line in lines) == 4
     assert (tmp_path / "2.txt").stat().st_mtime_ns == before and (tmp_path / "1.txt").exists()

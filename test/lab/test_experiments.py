@@ -45,10 +45,10 @@ class Counting:
     def __init__(self, names=("one", "two", "three"), settings=None, stop_after=99):
         self.names, self.settings, self.stop_after, self.ran = names, settings or {}, stop_after, []
 
-    def carry_out(self, report, engine=None, shard=""):
+    def carry_out(self, report, engine=None):
         own = {name: getattr(self, name) for name in ("list_cases", "run", "find")}
         made = Experiment(name="count", title="Counting", about="It counts.", **own)
-        return run_experiment(made, RunOptions(), report, engine, shard)
+        return run_experiment(made, RunOptions(), report, engine)
 
     def list_cases(self, options):
         return [Case(name=name, settings=self.settings) for name in self.names]
@@ -82,7 +82,7 @@ def test_a_run_that_was_killed_goes_on_where_it_was(tmp_path):
 
 def test_a_line_that_was_cut_off_is_run_again_and_others_stay(tmp_path):
     Counting().carry_out(tmp_path)
-    log = tmp_path / "count" / "manifest.jsonl"
+    log = tmp_path / "count" / "_manifest.jsonl"
     log.write_text(log.read_text()[:-20])
     again = Counting()
     again.carry_out(tmp_path)
@@ -143,17 +143,6 @@ def test_a_case_that_fails_costs_itself_only_and_is_named(tmp_path, capsys):
 def test_nothing_but_failures_is_an_error(tmp_path):
     with pytest.raises(FinforceError, match="not one of 1 cases gave figures.*it is bad"):
         Counting(names=("bad",)).carry_out(tmp_path)
-
-
-def test_parts_are_put_on_a_page_by_a_run_of_all(tmp_path):
-    first, second, whole = Counting(), Counting(), Counting()
-    assert first.carry_out(tmp_path, shard="1/2") is None
-    assert not (tmp_path / "count" / "count.json").exists()
-    second.carry_out(tmp_path, shard="2/2")
-    whole.carry_out(tmp_path)
-    assert (first.ran, second.ran, whole.ran) == (["one", "three"], ["two"], [])
-    rows = json.loads((tmp_path / "count" / "count.json").read_text())["count"]["rows"]["Letters"]
-    assert sum(row["letters"] for row in rows) == 11
 
 
 def first_table(figures):
