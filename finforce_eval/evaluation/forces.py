@@ -18,6 +18,7 @@ from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.gripper import with_distances
 from finforce_eval.evaluation.pressure_centre import InnerSurface, true_lines
 from finforce_eval.evaluation.scoring import ONSET_FORCE, compare_detection, match_samples, match_truth
+from finforce_eval.recordings.objects import read_friction
 from finforce_eval.recordings.tracks import DetectionTrack, Recording
 from finforce_eval.table import AXES, ForceSeries
 from finforce_eval.tasks import progress_bar
@@ -91,12 +92,14 @@ def estimate_forces(
     sides = sides or list(recording.jaws)
     for side in sides:
         check_keypoint_count(recording, side, setup.jaw)
-    both, found = len(sides) == len(SIDES), {}
+    both, found, friction = len(sides) == len(SIDES), {}, read_friction(recording)
     how = {"strict": strict, "as_live": setup.as_live, "stills": setup.stills, "progress": progress, "watch": watch}
     for side in sides:
         own = setup.side(side)
         source = GivenContact(None) if _is_unseen(recording, side) else own.source(recording)
-        found[side] = find_forces(recording, own.jaw, source, own.estimator(both), side, **how)
+        estimator = own.estimator(both)
+        estimator.expect_friction(friction)
+        found[side] = find_forces(recording, own.jaw, source, estimator, side, **how)
     return with_distances(found, recording) if both else found
 
 

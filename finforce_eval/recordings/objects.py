@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from math import isfinite
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,6 +19,7 @@ from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.tracks import PoseTrack, Recording
 from finforce_ifea.observation import Observation
+from finforce_ifea.tracking.friction import Coefficient
 
 # A pose of the object and one of the jaw are of the same image up to this distance of their stamps [ns].
 PAIRED = 50_000_000
@@ -67,6 +69,29 @@ def require_mesh(recording: Recording, object_file: str | None = None) -> Path:
     name = recording.case.get("mesh")
     found = f"the mesh '{name}' of its case.json is not there" if name else "no mesh in a case.json next to it"
     raise RecordingError(f"{recording.name}: no object mesh: {found}; give --object MESH or --contact fixed:Z_MM")
+
+
+# The largest coefficient of friction that a `case.json` may state [-].
+LARGEST_FRICTION = 2.0
+
+
+def read_friction(recording: Recording) -> Coefficient | None:
+    """Return the friction of the object on the finger as the `case.json` states it; None where it is unknown.
+
+    Raises:
+        RecordingError: it is no object of two numbers in their bounds.
+    """
+    stated = recording.case.get("friction")
+    if stated is None:
+        return None
+    values = [stated.get(name) for name in ("mean", "stddev")] if isinstance(stated, Mapping) else []
+    are_numbers = len(values) == 2 and all(type(value) in (int, float) and isfinite(value) for value in values)
+    if not (are_numbers and 0.0 <= values[0] <= LARGEST_FRICTION and 0.0 < values[1] <= LARGEST_FRICTION):
+        raise RecordingError(
+            f"{recording.name}: friction {stated!r} in its case.json, expected "
+            f'{{"mean": from 0 to {LARGEST_FRICTION:g}, "stddev": above 0, at most {LARGEST_FRICTION:g}}}'
+        )
+    return Coefficient(float(values[0]), float(values[1]))
 
 
 def has_object(recording: Recording, side: str) -> bool:
