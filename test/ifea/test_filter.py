@@ -1,0 +1,287 @@
+"""The filter of a contact: its algebra beside the textbook's, its friction beside an independent program's.
+
+data/rubbed_bench.npz holds key points [mm] and forces [N] of CalculiX 2.20 for a cylinder of 25 mm pressed 8 mm deep
+and back with a coefficient of friction of 0.3.
+"""
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from estimator_fakes import BENCH, PERIOD, circle, contact_with
+
+from finforce_ifea.contact_mechanics.friction import constant_traction
+from finforce_ifea.contact_mechanics.indenter import RoundIndenter
+from finforce_ifea.contact_mechanics.pressed_jaw import limit_step
+from finforce_ifea.estimator import ForceEstimator
+from finforce_ifea.filter.filter import innovate, reduce_covariance, update
+from finforce_ifea.filter.friction_path import NODES, TractionHypotheses
+from finforce_ifea.filter.jump import BUMPED, MISPLACED
+from finforce_ifea.filter.measurement import FREEDOM, weigh
+from finforce_ifea.filter.process import FREE_DEPTH, expect_state, find_decay, predict
+from finforce_ifea.filter.slip_path import SlipPath
+from finforce_ifea.filter.state import (
+    APPARENT,
+    CAMERA,
+    CONTACT,
+    DEPTH,
+    TRACTION,
+    offset_entries,
+    relative_entries,
+    state_size,
+)
+from finforce_ifea.jaw.calibration import Calibration, load_calibration
+from finforce_ifea.mechanics import build_chosen
+from finforce_ifea.observation import Observation
+from finforce_ifea.settings import EstimatorSettings
+from finforce_ifea.tracking.friction import Coefficient
+
+RUBBED = np.load(Path(__file__).parents[1] / "data" / "rubbed_bench.npz")
+HEIGHTS = {"lower": 0.020, "middle": 0.040, "upper": 0.060}
+COUNT = 4
+SIZE = state_size(COUNT)
+COLUMNS = [*CONTACT, TRACTION, *CAMERA, APPARENT]
+
+
+@cache
+def mechanics():
+    return build_chosen(load_calibration("bench").apply(BENCH), EstimatorSettings())
+
+
+def draw(seed=0):
+    """A random measurement of three of four key points: H in short and in full, P, R, x, innovation."""
+    random, rows = np.random.default_rng(seed), np.array([0, 1, 2, 3, 6, 7])
+    H, u = random.standard_normal((6, 8)), np.repeat(random.uniform(0.0, 1.0, 3), 2)
+    full = np.zeros((6, SIZE))
+    full[:, COLUMNS] = H
+    for row, entry in enumerate(rows):
+        full[row, offset_entries(COUNT).start + entry] = 1.0
+        full[row, relative_entries(COUNT).start + entry] = u[row]
+    root = random.standard_normal((SIZE, SIZE))
+    R = np.stack([each @ each.T + 0.1 * np.eye(2) for each in random.standard_normal((3, 2, 2))])
+    x, nu = random.standard_normal((2, SIZE)), random.standard_normal((2, 6))
+    return H, rows, u, full, root @ root.T, R, x, nu
+
+
+def block(R):
+    """A matrix of blocks (m, 2, 2) on the diagonal."""
+    out = np.zeros((2 * len(R), 2 * len(R)))
+    for k, each in enumerate(R):
+        out[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = each
+    return out
+
+
+class TestUpdate:
+    def test_it_is_the_textbooks(self):
+        H, rows, u, full, P, R, x, nu = draw()
+        S = full @ P @ full.T + block(R)
+        K = P @ full.T @ np.linalg.inv(S)
+        means, weights, A, own = update(x, np.log([0.3, 0.7]), H, rows, u, P, R, nu)
+        np.testing.assert_allclose(means, x + nu @ K.T, rtol=1e-8)
+        np.testing.assert_allclose(reduce_covariance(P, A), P - K @ S @ K.T, rtol=1e-7, atol=1e-7)
+        np.testing.assert_allclose(own, (K @ block(R) @ K.T)[:4, :4], rtol=1e-7, atol=1e-10)
+        likelihoods = np.array([0.3, 0.7]) * np.exp(-0.5 * np.einsum("ia,ab,ib->i", nu, np.linalg.inv(S), nu))
+        np.testing.assert_allclose(np.exp(weights), likelihoods / likelihoods.sum(), rtol=1e-8)
+
+    def test_the_innovation_has_the_covariance_of_prediction_and_noise(self):
+        H, rows, u, full, P, R, _, _ = draw(1)
+        HP, S = innovate(H, rows, u, P, R)
+        np.testing.assert_allclose(HP, full @ P, rtol=1e-10)
+        np.testing.assert_allclose(S, full @ P @ full.T + block(R), rtol=1e-10)
+
+
+class TestProcess:
+    def test_a_prior_counts_once_and_for_ever(self):
+        m, V = expect_state(SIZE, np.ones(2), np.full(2, 4.0), np.full(COUNT, 1e-8), np.zeros(COUNT), 0.01, np.ones(3))
+        x, P = np.zeros((2, SIZE)), np.diag(V)
+        for _ in range(50):
+            predict(x, P, find_decay(SIZE, COUNT, 100.0, 0.1, bumped=False), m, V, np.ones(SIZE))
+        np.testing.assert_allclose(x[:, 1:], np.tile(m[1:], (2, 1)), atol=1e-9)
+        np.testing.assert_allclose(np.diag(P)[1:], V[1:], rtol=1e-9)
+        assert P[DEPTH, DEPTH] == FREE_DEPTH**2
+
+    def test_nothing_changes_in_no_time_without_motion_but_the_depth(self):
+        m, V = expect_state(SIZE, np.ones(2), np.full(2, 4.0), np.full(COUNT, 1e-8), np.zeros(COUNT), 0.01, np.ones(3))
+        x, P = np.random.default_rng(0).standard_normal((2, SIZE)), 0.5 * np.diag(V)
+        before = x.copy()
+        predict(x, P, find_decay(SIZE, COUNT, 0.0, 0.0, bumped=False), m, V, np.ones(SIZE))
+        np.testing.assert_allclose(x, before, rtol=1e-12)
+        np.testing.assert_allclose(np.diag(P)[1:], 0.5 * V[1:])
+
+
+class TestJump:
+    @pytest.mark.parametrize("jump", [BUMPED, MISPLACED], ids=["bumped", "misplaced"])
+    def test_it_is_told_where_the_innovation_is_beyond_chance_alone(self, jump):
+        information, score = np.zeros((8, 8)), np.zeros(8)
+        for column, stddev in zip(jump.columns, jump.stddev, strict=True):
+            information[column, column] = 100.0 / stddev**2
+            score[column] = information[column, column] * 0.1 * stddev
+        assert jump.log_odds(information, score) < 0.0
+        assert jump.log_odds(information, 10.0 * score) > 0.0
+
+
+class TestWeights:
+    def test_a_gross_error_has_no_weight_and_chance_has_all(self):
+        noise, square = np.tile((0.2e-3) ** 2 * np.eye(2), (2, 1, 1)), np.zeros(2)
+        weights = weigh(np.array([[0.2e-3, 0.0], [10e-3, 0.0]]), noise, square)
+        assert weights[0] == 1.0
+        assert weights[1] == pytest.approx((FREEDOM + 3.0) / (FREEDOM + 2500.0))
+
+
+def press(contact, x, ratio, q):
+    """Equilibrium in a state (3,) at a traction ratio: unknowns and linearisation."""
+    for _ in range(60):
+        pressed = contact.linearize(q, x, constant_traction(ratio))
+        if not pressed.touches:
+            q = q + contact.approach(q, pressed.correction, x)
+            continue
+        q = q + limit_step(contact.model, pressed.correction)
+        if pressed.size < 1e-4:
+            break
+    return q, contact.linearize(q, x, constant_traction(ratio))
+
+
+def incline(force):
+    """Angle of a force off -x [degrees], positive towards the base."""
+    return float(np.degrees(np.arctan2(-force[..., 2], -force[..., 0])))
+
+
+class TestSlipPath:
+    @pytest.mark.parametrize("name", HEIGHTS)
+    def test_the_force_leans_as_in_the_independent_program_there_and_back(self, name):
+        contact, height = mechanics().contact, HEIGHTS[name]
+        contact.set_indenter(RoundIndenter())
+        path, q, before, errors = SlipPath(np.array([0.3])), contact.begin(height), 0.02e-3, []
+        depths, forces = 1e-3 * RUBBED[f"25_{name}_depth"], RUBBED[f"25_{name}_force"]
+        for depth, force in zip(depths, forces, strict=True):
+            for at in np.linspace(before, depth, max(2, round(abs(depth - before) / 0.1e-3) + 1))[1:]:
+                x = np.array([at, np.log(12.5e-3), height])
+                q, _ = press(contact, x, path.ratios[0], q)
+                path.move(contact, q, x, np.array([[at - before, 0.0]]))
+                before = at
+            q, pressed = press(contact, x, path.ratios[0], q)
+            if depth >= 4e-3:
+                errors.append(incline(pressed.force) - incline(force))
+        assert np.sqrt(np.mean(np.square(errors))) < 4.0  # of a cone of 33 degrees
+        contact.set_indenter(RoundIndenter())
+
+    def test_the_ratio_never_leaves_the_cone(self):
+        contact, path = mechanics().contact, SlipPath(np.array([0.1, 0.3, 0.5]))
+        contact.set_indenter(RoundIndenter())
+        q = contact.begin(0.040)
+        for depth in (0.5e-3, 1e-3, 2e-3, 3e-3):
+            x = np.array([depth, np.log(12.5e-3), 0.040])
+            q, _ = press(contact, x, 0.0, q)
+        path.move(contact, q, x, np.tile([5e-3, 0.0], (3, 1)))
+        np.testing.assert_allclose(path.ratios, [0.1, 0.3, 0.5])
+        path.move(contact, q, x, np.tile([-0.1e-3, 0.0], (3, 1)))
+        assert (path.ratios < [0.1, 0.3, 0.5]).all()
+        assert (path.ratios > [-0.1, -0.3, -0.5]).all()
+
+
+class TestHypotheses:
+    def test_friction_is_known_as_it_was_stated(self):
+        stated = TractionHypotheses(Coefficient(0.5, 0.1), "no")
+        mean, stddev = stated.estimate(np.exp(stated.prior))
+        assert (mean, stddev) == (pytest.approx(0.5), pytest.approx(0.1, rel=0.1))
+
+    def test_what_friction_cannot_bear_only_something_else_can_hold(self):
+        smooth, rough = (TractionHypotheses(Coefficient(mean, 0.03), "either") for mean in (0.0, 0.6))
+        held = []
+        for each in (smooth, rough):
+            each.upright = 0.3
+            held.append(float(np.exp(each.bound_held(each.prior)[-1])))
+        assert held[0] < 1e-3
+        assert held[1] == pytest.approx(0.5, abs=0.01)
+
+    def test_jaws_alone_need_no_path(self):
+        only = TractionHypotheses(Coefficient(0.5, 0.2), "yes")
+        assert not only.follows_path
+        assert len(only.prior) == len(only.ratios) == 1
+
+    def test_the_weights_of_the_grid_and_the_jaws_add_to_one(self):
+        either = TractionHypotheses(Coefficient(0.4, 0.2), "either")
+        assert len(either.prior) == NODES + 1
+        assert np.exp(either.prior).sum() == pytest.approx(1.0)
+
+
+# Without relaxation: the truth here is quasi-static.
+CALIBRATION = Calibration(**{**load_calibration("bench").__dict__, "relaxation": ()})
+NOISE = np.array([0.2e-3, 0.2e-3, 0.45e-3])
+
+
+def run(name, steps=18, hold=12, shift=None, tracker="filter", **settings):
+    """Force, deviation and truth along the path of a rubbed cylinder, as (n, 3) each, with the estimator.
+
+    Key points are moved by `shift` [m] once the object is deepest.
+    """
+    estimator = ForceEstimator(
+        BENCH, settings=EstimatorSettings(tracker=tracker, **settings).resolve_held(both=False), calibration=CALIBRATION
+    )
+    random, height, rows, image = np.random.default_rng(5), HEIGHTS[name], [], 0
+    rest = 1e-3 * RUBBED["keypoints0"]
+    offset = estimator.jaw.keypoints - rest
+    depths = np.r_[0.0, 1e-3 * RUBBED[f"25_{name}_depth"][:steps]]
+    shapes = np.concatenate([rest[None], 1e-3 * RUBBED[f"25_{name}_keypoints"][:steps]])
+    forces = np.concatenate([np.zeros((1, 3)), RUBBED[f"25_{name}_force"][:steps]])
+    moved = np.zeros(3)
+
+    contact = contact_with(circle(12.5e-3), height)
+
+    def see(points, truth):
+        nonlocal image
+        seen = points + offset + NOISE * random.standard_normal(points.shape) + moved
+        solution = estimator.update(Observation(stamp=image * PERIOD, points=seen), contact)
+        image += 1
+        rows.append((solution.force, solution.force_stddev, truth, np.full(3, solution.trusted)))
+
+    for _ in range(60):
+        see(rest, np.zeros(3))
+    for step in range(1, len(depths)):
+        ramp = max(1, round(abs(depths[step] - depths[step - 1]) / 2e-3 / PERIOD))
+        for share in np.linspace(0.0, 1.0, ramp + 1)[1:]:
+            mix = [(1.0 - share) * each[step - 1] + share * each[step] for each in (shapes, forces)]
+            see(*mix)
+        if shift is not None and depths[step] == depths.max():
+            moved = np.asarray(shift)
+        for _ in range(hold):
+            see(shapes[step], forces[step])
+    force, stddev, truth, trusted = (np.array(each) for each in zip(*rows, strict=True))
+    return force, stddev, truth, trusted[:, 0].astype(bool), estimator
+
+
+class TestFirstGrasp:
+    def test_unknown_friction_is_in_the_deviation_of_a_first_loading(self):
+        count = int(RUBBED["25_middle_depth"].argmax()) + 1
+        force, stddev, truth, trusted, _ = run("middle", count)
+        loaded = trusted & (np.linalg.norm(truth, axis=1) > 0.3)
+        assert loaded.sum() > 100
+        assert (np.abs(force - truth)[loaded][:, [0, 2]] < 3.0 * stddev[loaded][:, [0, 2]]).mean() > 0.98
+
+    def test_a_way_back_tells_the_coefficient(self):
+        force, _, truth, trusted, estimator = run("middle")
+        assert estimator.friction.mean == pytest.approx(0.3, abs=3.0 * estimator.friction.stddev)
+        assert estimator.friction.stddev < 0.15
+        back = trusted & (np.arange(len(force)) > len(force) // 2) & (np.linalg.norm(truth, axis=1) > 0.5)
+        assert np.sqrt(np.mean((force - truth)[back][:, 2] ** 2)) < 0.3
+
+    def test_stated_friction_leaves_less_uncertain(self):
+        count = int(RUBBED["25_middle_depth"].argmax()) + 1
+        _, unknown, _, trusted, _ = run("middle", count)
+        _, stated, _, _, _ = run("middle", count, friction=0.3, friction_stddev=0.03)
+        late = trusted & (np.arange(len(trusted)) > len(trusted) - 20)
+        assert stated[late, 2].mean() < 0.7 * unknown[late, 2].mean()
+
+
+class TestBumpedCamera:
+    def test_a_bump_under_load_costs_no_answer_and_no_honesty(self):
+        count = int(RUBBED["25_middle_depth"].argmax()) + 1
+        shift = [0.8e-3, 0.0, -0.6e-3]
+        force, stddev, truth, trusted, _ = run(
+            "middle", count, hold=25, shift=shift, friction=0.3, friction_stddev=0.05
+        )
+        after = np.arange(len(force)) >= len(force) - 24
+        assert trusted[after].mean() > 0.9
+        within = np.abs(force - truth)[after & trusted][:, [0, 2]] < 3.0 * stddev[after & trusted][:, [0, 2]]
+        assert within.mean() > 0.9
