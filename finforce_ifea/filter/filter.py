@@ -101,7 +101,7 @@ def solve_lower(L, B):
 
 @njit(**_OPTIONS)
 def update(x, log_weights, H, rows, u, P, R, nu):
-    """Return updated means (N, n) and log weights (N,), A (m, n) with P <- P - A^T A, and K R K^T of four entries.
+    """Return updated means (N, n), log weights (N,), A (m, n) with P <- P - A^T A, L (m, m), and K R K^T (4, 4).
 
     Args:
         x: predicted means (N, n).
@@ -120,7 +120,7 @@ def update(x, log_weights, H, rows, u, P, R, nu):
     for i in range(len(x)):
         weights[i] = log_weights[i] - 0.5 * (white[:, i] ** 2).sum()
     top = weights.max()
-    return updated, weights - top - np.log(np.exp(weights - top).sum()), A, _spread_noise(A, L, R)
+    return updated, weights - top - np.log(np.exp(weights - top).sum()), A, L, _spread_noise(A, L, R)
 
 
 @njit(**_OPTIONS)

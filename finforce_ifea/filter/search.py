@@ -16,7 +16,7 @@ from finforce_ifea.contact_mechanics.friction import Traction, constant_traction
 from finforce_ifea.contact_mechanics.pressed_jaw import PressedState, RigidContact, limit_step
 from finforce_ifea.filter.filter import project_columns, reduce_covariance, update
 from finforce_ifea.filter.friction_path import LARGEST_RATIO, TractionHypotheses
-from finforce_ifea.filter.jump import BUMPED, MISPLACED
+from finforce_ifea.filter.jump import BUMPED, MISPLACED, CameraWatch
 from finforce_ifea.filter.measurement import linearize, take_noise, weigh, weigh_innovations, whiten
 from finforce_ifea.filter.process import (
     CAMERA_SHIFT,
@@ -97,6 +97,7 @@ class FilterSearch(ContactSearch):
         """Prepare the filter for `count` key points."""
         super().__init__(count, settings)
         self._size, self._count = state_size(count), count
+        self._watch = CameraWatch(self._size)
         self.hypotheses = TractionHypotheses(Coefficient(settings.friction, settings.friction_stddev), settings.held)
 
     def begin(self, contact: RigidContact, mean: NDArray) -> None:
@@ -105,6 +106,7 @@ class FilterSearch(ContactSearch):
         self.x: NDArray | None = None
         self._V: NDArray | None = None
         self._smooth, self._misplaced, self._bumped = 0.0, False, False
+        self._watch.reset()
         self.hypotheses.reset()
 
     def forget(self, mean: NDArray) -> None:
@@ -200,6 +202,7 @@ class FilterSearch(ContactSearch):
         self.track.predict(dt)
         self.x[:, DEPTH] += self.track.x - self.weights @ self.x[:, DEPTH]
         predict(self.x, self.P, a, m, V, growth)
+        self._watch.predict(a * growth)
 
     def _begin_state(self) -> tuple[NDArray, NDArray]:
         """Start the filter where the contact begins; return mean and variance (n,) of the state."""
@@ -242,7 +245,7 @@ class FilterSearch(ContactSearch):
             if weight is None:
                 weight = self._detect_jumps(H, rows, u, self.weights @ nu, noise, square)
             R = noise / weight[:, None, None]
-            means, log_weights, A, own = update(self.x, self.log_weights, H, rows, u, self.P, R, nu)
+            means, log_weights, A, L, own = update(self.x, self.log_weights, H, rows, u, self.P, R, nu)
             w = np.exp(log_weights)
             mean = w @ means
             left = (known - project_columns(H, rows, u, mean[None])[0] - w @ expected).reshape(-1, 2)
@@ -261,7 +264,10 @@ class FilterSearch(ContactSearch):
             settled = self._is_settled(moved, missing) and at.pressed.size < _SETTLED_CORRECTION
         if at is None:
             return False
+        bump = self._watch.update(H, rows, u, A, L, self.weights @ nu) if settled else None
         self.x, self.P = means, reduce_covariance(self.P, A)
+        if bump is not None:
+            self.x, self.P, self._bumped = self.x + bump[0], self.P + bump[1], True
         self.log_weights = np.maximum(log_weights, _LEAST_WEIGHT)
         self.log_weights -= np.log(np.exp(self.log_weights).sum())
         self.q, self._modes, self.positions = q, at.pressed.modes[:, :3], at.positions
@@ -304,6 +310,7 @@ class FilterSearch(ContactSearch):
         if odds[jump] <= 0.0:
             return weigh(nu.reshape(-1, 2), blocks, square)
         self.P[jump.entries, jump.entries] += jump.stddev**2
+        self._watch.reset()
         self._bumped |= jump is BUMPED
         self._misplaced |= jump is MISPLACED
         return weight

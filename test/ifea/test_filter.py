@@ -77,9 +77,10 @@ class TestUpdate:
         H, rows, u, full, P, R, x, nu = draw()
         S = full @ P @ full.T + block(R)
         K = P @ full.T @ np.linalg.inv(S)
-        means, weights, A, own = update(x, np.log([0.3, 0.7]), H, rows, u, P, R, nu)
+        means, weights, A, L, own = update(x, np.log([0.3, 0.7]), H, rows, u, P, R, nu)
         np.testing.assert_allclose(means, x + nu @ K.T, rtol=1e-8)
         np.testing.assert_allclose(reduce_covariance(P, A), P - K @ S @ K.T, rtol=1e-7, atol=1e-7)
+        np.testing.assert_allclose(L @ L.T, S, rtol=1e-9)
         np.testing.assert_allclose(own, (K @ block(R) @ K.T)[:4, :4], rtol=1e-7, atol=1e-10)
         likelihoods = np.array([0.3, 0.7]) * np.exp(-0.5 * np.einsum("ia,ab,ib->i", nu, np.linalg.inv(S), nu))
         np.testing.assert_allclose(np.exp(weights), likelihoods / likelihoods.sum(), rtol=1e-8)
@@ -275,9 +276,10 @@ class TestFirstGrasp:
 
 
 class TestBumpedCamera:
-    def test_a_bump_under_load_costs_no_answer_and_no_honesty(self):
+    @pytest.mark.parametrize("size", [0.5, 1.0])
+    def test_a_bump_under_load_costs_no_answer_and_no_honesty(self, size):
         count = int(RUBBED["25_middle_depth"].argmax()) + 1
-        shift = [0.8e-3, 0.0, -0.6e-3]
+        shift = 1e-3 * size * np.array([0.8, 0.0, -0.6])
         force, stddev, truth, trusted, _ = run(
             "middle", count, hold=25, shift=shift, friction=0.3, friction_stddev=0.05
         )
