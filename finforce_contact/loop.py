@@ -49,6 +49,9 @@ class ContactSource(Protocol):
     def learn(self, stamp: int, surface: NDArray, wrench: Wrench | None) -> None:
         """Take what the solver made of that image: vertices (n, 3) [m], jaw frame, and a wrench that is trusted."""
 
+    def reset(self) -> None:
+        """Forget all images."""
+
 
 class GivenContact:
     """One contact for all images; None for none."""
@@ -64,6 +67,9 @@ class GivenContact:
 
     def learn(self, stamp: int, surface: NDArray, wrench: Wrench | None) -> None:
         """Learn nothing."""
+
+    def reset(self) -> None:
+        """Forget nothing."""
 
 
 class ContactLoop:

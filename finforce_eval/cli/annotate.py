@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from shutil import rmtree
@@ -12,13 +12,15 @@ from typing import Any
 
 from finforce.errors import FinforceError, one_line
 from finforce_eval.annotation.bag import bag_task, new_folder
-from finforce_eval.annotation.dataset_forces import episode_tasks, write_dataset
+from finforce_eval.annotation.dataset_copy import write_copy
+from finforce_eval.annotation.dataset_forces import episode_tasks, plain_columns, write_dataset
 from finforce_eval.cli.parser import BAG_HELP, CommandResult, add_engine_options, add_run_options, read_engine
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.keypoint_source import IMAGES
 from finforce_eval.evaluation.setup import describe_options, print_notes
+from finforce_eval.policy import COLUMNS, FEATURE, FORCE, INTO, PREFIX
 from finforce_eval.recordings.bags import is_buffer, name_recordings
-from finforce_eval.recordings.dataset import is_dataset
+from finforce_eval.recordings.dataset import is_dataset, open_dataset
 from finforce_eval.recordings.umi import count_episodes
 from finforce_eval.tasks import OK, Line, Manifest, Task, choose_shard, run_tasks
 
@@ -33,16 +35,33 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     text = "draw key points and forces into the images, too: forces.mp4; not for LeRobot datasets"
     parser.add_argument("--video", action="store_true", help=text)
     parser.add_argument("--images", dest="color", help=argparse.SUPPRESS)
-    text = "datasets only: prefix of the new features (observation)"
-    parser.add_argument("--prefix", default="observation", metavar="NAME", help=text)
+    _add_policy_options(parser)
     add_run_options(parser)
     add_engine_options(parser)
+
+
+def _add_policy_options(command: argparse.ArgumentParser) -> None:
+    """Add what policies get of the forces."""
+    parser = command.add_argument_group("datasets for policies")
+    text = (
+        "where policies find the forces: appended to observation.state, in a feature observation.force of their own, "
+    )
+    text += "which many policies do not read, or nowhere (feature)"
+    parser.add_argument("--into", default=FEATURE, choices=INTO, help=text)
+    text = f"numbers that go there, of {', '.join(COLUMNS)}, each group with a flag valid ({FORCE})"
+    parser.add_argument("--columns", nargs="+", default=[FORCE], choices=COLUMNS, metavar="NAME", help=text)
+    text = f"prefix of the new names ({PREFIX})"
+    parser.add_argument("--prefix", default=PREFIX, metavar="NAME", help=text)
+    text = "copy LeRobot datasets without what annotate has added to them, and look at no image"
+    parser.add_argument("--remove", action="store_true", help=text)
 
 
 def run(options: argparse.Namespace) -> CommandResult:
     """Annotate recordings and print a line for each; status 2 where one of them failed."""
     out, manifest = Path(options.out), Manifest(Path(options.out), options.shard)
     named = name_recordings(options.bags, "_")
+    if options.remove:
+        return _remove_forces(named, out)
     if options.source in (None, IMAGES):
         _set_unless_given(options, "threads=1")  # a core for each recording, whatever the engine
     datasets = {name: path for name, path in named if is_dataset(path)}
@@ -115,7 +134,28 @@ def _run_dataset(name: str, path: Path, options: argparse.Namespace, manifest: M
         folder.mkdir()
         write_dataset(path, parts, folder, options)
     rmtree(parts)
+    if options.into == FEATURE:
+        text = (
+            f"ACT, diffusion and others do not read observation.{options.prefix}; --into state lets every policy see it"
+        )
+        print_notes(name, [text])
     return lines
+
+
+def _remove_forces(named: Sequence[tuple[str, Path]], out: Path) -> CommandResult:
+    """Copy datasets without what annotate has added to them, and print what that was."""
+    removed: dict[str, list[str]] = {}
+    for name, path in named:
+        if not is_dataset(path):
+            raise OptionError(f"--remove: {path} is no LeRobot dataset; the original of a recording is unchanged")
+        dataset = open_dataset(path, None)
+        columns = plain_columns(dataset)
+        with new_folder(out / name) as folder:
+            folder.mkdir()
+            write_copy(dataset, folder, columns)
+        removed[name] = list(columns)
+        print(f"{name}: without {', '.join(columns) or 'anything: it has no forces'}, in {out / name}")
+    return CommandResult({"removed": removed})
 
 
 def _print_outcome(line: dict[str, Any]) -> None:

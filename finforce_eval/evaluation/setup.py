@@ -24,7 +24,7 @@ from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_ifea.settings import EstimatorSettings
 
 # Options that change nothing in the forces of a recording.
-_OUTSIDE = ("bags", "out", "workers", "memory", "shard", "run", "prefix", "json", "report")
+_OUTSIDE = ("bags", "out", "workers", "memory", "shard", "run", "prefix", "into", "columns", "remove", "json", "report")
 
 
 @dataclass(frozen=True, kw_only=True)
