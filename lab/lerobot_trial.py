@@ -57,18 +57,11 @@ SCENES = [
 IMAGES, FPS, HEIGHT = 90, 30, 41.7  # of an episode, Hz, mm of the rod above the clamped base
 WRIST, DEPTH = "observation.images.wrist", "observation.images.wrist_depth"
 FARTHEST = 0.5  # m, white in a picture of depths
-COMMON = [
-    "--policy.device=cpu",
-    "--policy.push_to_hub=false",
-    "--policy.pretrained_backbone_weights=null",
-    "--wandb.enable=false",
-    "--dataset.video_backend=pyav",
-    "--dataset.use_imagenet_stats=false",
-    "--batch_size=2",
-    "--num_workers=0",
-    "--log_freq=1",
-    "--eval_freq=0",
-]
+COMMON = (
+    "--policy.device=cpu --policy.push_to_hub=false --policy.pretrained_backbone_weights=null --wandb.enable=false "
+    "--dataset.video_backend=pyav --dataset.use_imagenet_stats=false --batch_size=2 --num_workers=0 --log_freq=1 "
+    "--eval_freq=0"
+)
 POLICIES = {  # as small as they can be
     "act": "--policy.dim_model=32 --policy.n_heads=2 --policy.dim_feedforward=32 --policy.n_encoder_layers=1 "
     "--policy.n_vae_encoder_layers=1 --policy.chunk_size=8 --policy.n_action_steps=8",
@@ -190,7 +183,12 @@ def train(dataset: Path, policy: str, steps: int, out: Path) -> list[float]:
     """Return the losses of the steps of a training by `lerobot-train`; NaN where it ended early."""
     shutil.rmtree(out, ignore_errors=True)
     out.parent.mkdir(parents=True, exist_ok=True)
-    words = [f"--policy.type={policy}", *POLICIES[policy].split(), *COMMON, f"--steps={steps}", f"--save_freq={steps}"]
+    words = [
+        f"--policy.type={policy}",
+        *f"{COMMON} {POLICIES[policy]}".split(),
+        f"--steps={steps}",
+        f"--save_freq={steps}",
+    ]
     words += ["--dataset.repo_id=trial/grasps", f"--dataset.root={dataset}", f"--output_dir={out}"]
     log = out.with_suffix(".log")
     child = multiprocessing.get_context("fork").Process(target=_train, args=(words, log))  # imports take half a minute
