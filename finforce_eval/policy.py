@@ -31,6 +31,7 @@ class PolicyForces:
 
     Attributes:
         names: of the numbers in a row.
+        groups: by their names, the number of each group's flag, behind its own numbers.
 
     Args:
         sides: jaws.
@@ -52,6 +53,8 @@ class PolicyForces:
         groups = {group: names for group, names in groups.items() if names}
         self.names = tuple(n for group, names in groups.items() for n in (*names, f"{prefix}.{group}.valid"))
         self._sizes = {group: len(names) for group, names in groups.items()}
+        ends = np.cumsum([size + 1 for size in self._sizes.values()]) - 1
+        self.groups = {f"{prefix}.{group}": end for group, end in zip(groups, ends.tolist(), strict=True)}
         self.reset()
 
     def reset(self) -> None:

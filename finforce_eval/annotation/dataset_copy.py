@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -77,7 +77,7 @@ def write_copy(dataset: Dataset, target: Path, columns: Mapping[str, Column]) ->
         OSError: the folder cannot be written.
     """
     folder, changed = dataset.folder, {each.data for each in dataset.episodes}
-    _copy_rest(folder, target, changed)
+    copy_files(folder, target, changed, lambda path: path.suffix == ".mp4")
     for path in sorted(changed):
         own = [each for each in dataset.episodes if each.data == path]
         _write_rows(path, target / path.relative_to(folder), own, columns)
@@ -94,14 +94,14 @@ def _change_entries(entries: dict[str, Any], changed: Mapping[str, Any]) -> None
         del entries[name]
 
 
-def _copy_rest(folder: Path, target: Path, changed: set[Path]) -> None:
-    """Copy all files of a dataset but those that are written anew; videos as links, where that is possible."""
+def copy_files(folder: Path, target: Path, changed: Collection[Path], is_linked: Callable[[Path], bool]) -> None:
+    """Copy all files of a folder but those that are written anew; some as hard links, where that is possible."""
     for path in sorted(folder.rglob("*")):
         if not path.is_file() or path in changed:
             continue
         copy = target / path.relative_to(folder)
         copy.parent.mkdir(parents=True, exist_ok=True)
-        if path.suffix == ".mp4":
+        if is_linked(path):
             with suppress(OSError):
                 os.link(path.resolve(), copy)
                 continue

@@ -12,16 +12,17 @@ from typing import Any
 
 from finforce.errors import FinforceError, one_line
 from finforce_eval.annotation.bag import bag_task, new_folder
+from finforce_eval.annotation.buffer_copy import write_buffer
 from finforce_eval.annotation.dataset_copy import write_copy
 from finforce_eval.annotation.dataset_forces import episode_tasks, plain_columns, write_dataset
 from finforce_eval.cli.parser import BAG_HELP, CommandResult, add_engine_options, add_run_options, read_engine
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.keypoint_source import IMAGES
 from finforce_eval.evaluation.setup import describe_options, print_notes
-from finforce_eval.policy import COLUMNS, FEATURE, FORCE, INTO, PREFIX
+from finforce_eval.policy import COLUMNS, FEATURE, FORCE, INTO, NONE, PREFIX
 from finforce_eval.recordings.bags import is_buffer, name_recordings
 from finforce_eval.recordings.dataset import is_dataset, open_dataset
-from finforce_eval.recordings.umi import count_episodes
+from finforce_eval.recordings.umi import count_episodes, is_replay_buffer
 from finforce_eval.tasks import OK, Line, Manifest, Task, choose_shard, run_tasks
 
 
@@ -78,6 +79,7 @@ def run(options: argparse.Namespace) -> CommandResult:
         lines = run_tasks(tasks, read_engine(options), manifest)
         for line in lines:
             _print_outcome(line)
+        _write_buffers(named, out, options)
         for name, path in datasets.items():
             try:
                 lines += _run_dataset(name, path, options, manifest)
@@ -100,6 +102,20 @@ def _tasks_of(name: str, path: Path, options: argparse.Namespace, settings: Mapp
         bag_task(each, path, Path(options.out) / each, argparse.Namespace(**vars(options) | {"episode": n}), settings)
         for each, n in episodes.items()
     ]
+
+
+def _write_buffers(named: Sequence[tuple[str, Path]], out: Path, options: argparse.Namespace) -> None:
+    """Copy replay buffers some of whose episodes have forces, with these; a copy that is there stays."""
+    for name, path in named:
+        count, target = 0, out / path.name
+        with suppress(FinforceError):
+            count = count_episodes(path) if is_replay_buffer(path) else 0
+        parts = [out / f"{name}_{number:06d}" for number in range(count)]
+        if options.into == NONE or options.shard or target.exists() or not any(part.exists() for part in parts):
+            continue
+        with new_folder(target) as copy:
+            written = write_buffer(path, copy, parts, options.columns, options.prefix)
+        print(f"{target}: forces in {written} of {count} episodes")
 
 
 def _has_force(line: Line) -> bool:
