@@ -190,7 +190,7 @@ def train(dataset: Path, policy: str, steps: int, out: Path) -> list[float]:
         f"--save_freq={steps}",
     ]
     words += ["--dataset.repo_id=trial/grasps", f"--dataset.root={dataset}", f"--output_dir={out}"]
-    log = out.with_suffix(".log")
+    log = out.with_name(f"{out.name}.log")
     child = multiprocessing.get_context("fork").Process(target=_train, args=(words, log))  # imports take half a minute
     child.start()
     child.join()
