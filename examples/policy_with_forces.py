@@ -1,4 +1,4 @@
-"""Record grasps with an SO-101 and LeRobot, train a policy on their forces, and run it: `policy_with_forces.py record`."""
+"""Record with an SO-101, train a policy on forces, run it: `policy_with_forces.py record annotate train run`."""
 
 import subprocess
 import sys

@@ -49,7 +49,8 @@ class PolicyForces:
         infixes = [infix for column, infix in ((FORCE, ""), (STDDEV, "stddev.")) if column in columns]
         self._columns = columns
         groups = {side: [f"{prefix}.{side}.{infix}{axis}" for infix in infixes for axis in AXES] for side in sides}
-        groups |= {GRASP: [f"{prefix}.{GRASP}"] if GRASP in columns else []}
+        grasp = [f"{prefix}.{GRASP}", *([f"{prefix}.{GRASP}.{STDDEV}"] if STDDEV in columns else [])]
+        groups |= {GRASP: grasp if GRASP in columns else []}
         groups = {group: names for group, names in groups.items() if names}
         self.names = tuple(n for group, names in groups.items() for n in (*names, f"{prefix}.{group}.valid"))
         self._sizes = {group: len(names) for group, names in groups.items()}
@@ -61,37 +62,49 @@ class PolicyForces:
         """Forget the last answers; for a new episode."""
         self._last = {group: np.zeros(size) for group, size in self._sizes.items()}
 
-    def update(self, force: Mapping[str, NDArray], stddev: Mapping[str, NDArray], grasp: float) -> NDArray[np.float32]:
+    def update(
+        self, force: Mapping[str, NDArray], stddev: Mapping[str, NDArray], grasp: Sequence[float]
+    ) -> NDArray[np.float32]:
         """Return the row (n,) of an image.
 
         Args:
             force: side -> force (3,) [N]; NaN, or no entry, without an answer.
             stddev: side -> one standard deviation (3,) [N].
-            grasp: grasp force [N], or NaN.
+            grasp: grasp force and its standard deviation [N], or NaN.
         """
         row = []
-        for group in self._sizes:
-            values = np.array([grasp]) if group == GRASP else self._vectors(group, force, stddev)
-            valid = values is not None and bool(np.isfinite(values).all())
+        for group, size in self._sizes.items():
+            values = np.asarray(grasp)[:size] if group == GRASP else self._vectors(group, force, stddev)
+            valid = bool(np.isfinite(values).all())
             if valid:
                 self._last[group] = values
             row += [*self._last[group], float(valid)]
         return np.array(row, dtype=np.float32)
 
-    def _vectors(self, side: str, force: Mapping[str, NDArray], stddev: Mapping[str, NDArray]) -> NDArray | None:
-        """Return the numbers of a jaw that are included; None without an answer."""
+    def _vectors(self, side: str, force: Mapping[str, NDArray], stddev: Mapping[str, NDArray]) -> NDArray:
+        """Return the numbers of a jaw that are included; NaN without an answer."""
         if side not in force or not np.isfinite(force[side]).all():
-            return None
+            return np.full(self._sizes[side], np.nan)
         chosen = [given[side] for column, given in ((FORCE, force), (STDDEV, stddev)) if column in self._columns]
         return np.concatenate(chosen)
 
     def rows_of(self, series: Mapping[str, ForceSeries], grasp: NDArray) -> NDArray[np.float32]:
-        """Return the rows (m, n) of an episode's images, from its forces by side and its grasp forces (m,) [N]."""
+        """Return the rows (m, n) of an episode's images.
+
+        Args:
+            series: forces by side.
+            grasp: grasp forces and their standard deviations (m, 2) [N].
+        """
         self.reset()
         force = {side: each.force for side, each in series.items()}
         stddev = {side: each.column("force_stddev") for side, each in series.items()}
-        rows = [self.update(_at(index, force), _at(index, stddev), float(value)) for index, value in enumerate(grasp)]
+        rows = [self.update(_at(index, force), _at(index, stddev), pair) for index, pair in enumerate(grasp)]
         return np.array(rows, dtype=np.float32).reshape(len(grasp), len(self.names))
+
+
+def grasp_columns(gripper: ForceSeries) -> NDArray[np.float64]:
+    """Return the grasp forces and their standard deviations (n, 2) [N] of a series by `combine_jaws`."""
+    return np.stack([gripper.column(name).astype(float) for name in ("grasp_force", "grasp_stddev")], axis=1)
 
 
 def _at(index: int, columns: Mapping[str, NDArray]) -> dict[str, NDArray]:
@@ -149,4 +162,5 @@ class ForceInput:
             self.last = self._sensor.skip(stamp, str(error))
         told = {side: jaw for side, jaw in self.last.jaws.items() if jaw.trusted}
         force = {side: jaw.force for side, jaw in told.items()}
-        return self._forces.update(force, {side: jaw.force_stddev for side, jaw in told.items()}, self.last.grasp)
+        stddev = {side: jaw.force_stddev for side, jaw in told.items()}
+        return self._forces.update(force, stddev, (self.last.grasp, self.last.grasp_stddev))

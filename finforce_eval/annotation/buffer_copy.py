@@ -17,7 +17,7 @@ from finforce_eval.annotation.bag import TABLE
 from finforce_eval.annotation.dataset_copy import copy_files
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.gripper import combine_jaws
-from finforce_eval.policy import PolicyForces
+from finforce_eval.policy import PolicyForces, grasp_columns
 from finforce_eval.recordings.umi import CAMERA, find_episodes
 from finforce_eval.recordings.zarr_store import ZarrStore
 from finforce_eval.table import read_table
@@ -52,7 +52,7 @@ def write_buffer(path: Path, target: Path, parts: Sequence[Path], columns: Seque
     forces, rows = PolicyForces(sides, columns, prefix), []
     for table, (begin, end) in zip(tables, spans.tolist(), strict=True):
         series = {one.side: one for one in table}
-        grasp = combine_jaws(series).column("grasp_force").astype(float) if series else np.full(end - begin, np.nan)
+        grasp = grasp_columns(combine_jaws(series)) if series else np.full((end - begin, 2), np.nan)
         rows.append(forces.rows_of(series, grasp))
         if len(rows[-1]) != end - begin:
             raise RecordingError(f"{path.name}: {len(rows[-1])} forces for {end - begin} pictures of {CAMERA}")

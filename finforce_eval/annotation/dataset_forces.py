@@ -18,7 +18,17 @@ from finforce_eval.evaluation.forces import NOT_FOUND, estimate_forces, no_force
 from finforce_eval.evaluation.gripper import combine_jaws
 from finforce_eval.evaluation.keypoint_source import parse_source, sides_of
 from finforce_eval.evaluation.setup import describe_options, read_contacts, share_setup
-from finforce_eval.policy import NONE, STATE, STATE_FEATURE, PolicyForces, check_prefix
+from finforce_eval.policy import (
+    FORCE,
+    GRASP,
+    NONE,
+    STATE,
+    STATE_FEATURE,
+    STDDEV,
+    PolicyForces,
+    check_prefix,
+    grasp_columns,
+)
 from finforce_eval.recordings.dataset import Dataset, open_dataset, recording_of
 from finforce_eval.recordings.frames import choose_camera
 from finforce_eval.recordings.tracks import Recording
@@ -144,11 +154,10 @@ def write_dataset(folder: Path, parts: Path, target: Path, options: argparse.Nam
     for each in dataset.episodes:
         series = {one.side: one for one in read_table(part_of(parts, each.index))[0]}
         told[each.index] = _features_of(series, prefix, sides)
-        grasp = series["gripper"].column("grasp_force").astype(float)
-        taken[each.index] = forces.rows_of({side: series[side] for side in sides}, grasp)
+        taken[each.index] = forces.rows_of({side: series[side] for side in sides}, grasp_columns(series["gripper"]))
     columns = plain_columns(dataset)
     for name, rows in next(iter(told.values()), {}).items():
-        names = AXES if rows.shape[1] == len(AXES) else None
+        names = {2: (FORCE, STDDEV), 3: AXES}.get(rows.shape[1])
         each_rows = {index: features[name] for index, features in told.items()}
         columns[name] = Column(entry=describe(rows, names, {_MARK: {}}), rows=each_rows)
     if options.into == STATE:
@@ -221,14 +230,16 @@ def _check_names(dataset: Dataset, options: argparse.Namespace) -> None:
 
 
 def _features_of(series: Mapping[str, ForceSeries], prefix: str, sides: Sequence[str]) -> Features:
-    """Return what is known of the forces of an episode, by names that LeRobot hands to no policy."""
+    """Return what is known of the forces of an episode, by names that LeRobot hands to no policy.
+
+    NaN stands in vectors alone: where pandas rewrites a file, as LeRobot does, it makes missing values of other NaN.
+    """
     features, words = {}, []
     for side in sides:
         features[f"{prefix}.{side}"] = series[side].force
         features[f"{prefix}.{side}.stddev"] = series[side].column("force_stddev")
         words.append([f"{side}: {reason}" if reason else "" for reason in no_force_reasons(series[side])])
-    grasp = series["gripper"].column("grasp_force").astype(float)[:, None]
-    features[f"{prefix}.grasp"] = grasp
-    features[f"{prefix}.valid"] = np.isfinite(grasp)
+    features[f"{prefix}.{GRASP}"] = grasp = grasp_columns(series["gripper"])
+    features[f"{prefix}.valid"] = np.isfinite(grasp[:, :1])
     reasons = ["; ".join(filter(None, row)) for row in zip(*words, strict=True)]
     return features | {f"{prefix}.reason": np.array(reasons, dtype=object)[:, None]}

@@ -16,23 +16,23 @@ from finforce_eval.sensor import GripperForces
 from finforce_eval.table import ForceSeries
 from finforce_ifea.observation import blank_solution
 
-NOTHING = np.full(3, np.nan)
+NOTHING, UNKNOWN = np.full(3, np.nan), (np.nan, np.nan)
 
 
 def test_a_row_repeats_the_last_answer_and_says_that_it_is_none():
     forces = PolicyForces(("left",))
     rows = [
-        forces.update({"left": force}, {"left": np.ones(3)}, np.nan)
+        forces.update({"left": force}, {"left": np.ones(3)}, UNKNOWN)
         for force in (NOTHING, np.array([-1.0, 0.0, 0.5]), NOTHING)
     ]
     np.testing.assert_array_equal(rows, [[0, 0, 0, 0], [-1, 0, 0.5, 1], [-1, 0, 0.5, 0]])
     forces.reset()
-    np.testing.assert_array_equal(forces.update({}, {}, np.nan), np.zeros(4))
+    np.testing.assert_array_equal(forces.update({}, {}, UNKNOWN), np.zeros(4))
 
 
 def test_every_group_has_its_own_flag():
     forces = PolicyForces(("left", "right"), ("force", "grasp"))
-    row = dict(zip(forces.names, forces.update({"right": np.ones(3)}, {}, np.nan), strict=True))
+    row = dict(zip(forces.names, forces.update({"right": np.ones(3)}, {}, UNKNOWN), strict=True))
     assert [name for name, value in row.items() if value] == [
         f"force.right.{name}" for name in ("x", "y", "z", "valid")
     ]
@@ -46,11 +46,12 @@ def test_rows_of_an_episode_are_those_of_its_images_one_by_one():
     columns = {"force": force, "force_stddev": stddev}
     series = {"left": ForceSeries.build("case", "left", np.arange(20), **columns)}
     forces = PolicyForces(("left",), ("force", "stddev", "grasp"))
-    rows = forces.rows_of(series, np.linalg.norm(force, axis=1))
+    grasp = np.stack([np.linalg.norm(force, axis=1), np.where(np.isnan(force[:, 0]), np.nan, 0.1)], axis=1)
+    rows = forces.rows_of(series, grasp)
     assert rows.dtype == np.float32 and np.isfinite(rows).all() and not rows[:2].any()
     np.testing.assert_array_equal(rows[7, :6], rows[6, :6])
     np.testing.assert_array_equal(rows[:, 6], np.isfinite(force[:, 0]))
-    np.testing.assert_array_equal(forces.rows_of(series, np.linalg.norm(force, axis=1)), rows)  # from the start again
+    np.testing.assert_array_equal(forces.rows_of(series, grasp), rows)  # from the start again
 
 
 @pytest.mark.parametrize(
@@ -79,7 +80,9 @@ class FakeSensor:
         self.stamps.append(stamp)
         solution = blank_solution(stamp, "ok", "", np.ones(3, bool))
         solution = solution._replace(force=np.array([-float(rgb.max()), 0.0, 0.0]), force_stddev=np.ones(3))
-        return GripperForces(stamp=stamp, jaws={"left": solution}, status="ok", grasp=float(rgb.max()))
+        return GripperForces(
+            stamp=stamp, jaws={"left": solution}, status="ok", grasp=float(rgb.max()), grasp_stddev=0.1
+        )
 
     def skip(self, stamp, reason):
         return GripperForces(stamp=stamp, jaws={}, status=reason)
