@@ -222,17 +222,18 @@ def run_step(run: Run, trained: Path, camera: CameraIntrinsics, pose: list[float
         sides=SIDES if run.jaws == "both" else (run.jaws,),
         fps=FPS,
     )
+    pipeline = _reload(step, trained / "pipeline")
     dataset, policy = open_dataset(run.dataset, WRIST), _Policy(trained / "checkpoints/last/pretrained_model")
     features = dataset.info["features"]
     names, differences, actions, busy = features[STATE_FEATURE]["names"], [], [], 0.0
     for each in dataset.episodes:
-        step.reset()
+        pipeline.reset()
         state = np.array(rows_of(read_parquet(each.data), each, run.name)[STATE_FEATURE].to_pylist())
         frames = decode_video(each.video, run.name, each.begin - 0.5 / FPS)
         for row, picture in zip(state, islice(frames, each.length), strict=True):
             robot = dict(zip(names[: -len(step.names)], row.tolist(), strict=False))
             begin = process_time()
-            observation = step.observation({"wrist": picture, **robot})
+            observation = pipeline({"wrist": picture, **robot})
             busy += process_time() - begin
             differences.append(np.abs([observation[name] for name in names] - row).max())
             if len(differences) % 10 == 0:
@@ -246,6 +247,16 @@ def run_step(run: Run, trained: Path, camera: CameraIntrinsics, pose: list[float
         "of a core/(ms/image)": 1e3 * share,
         "of a core at 30 Hz/%": 100.0 * 30.0 * share,
     }
+
+
+def _reload(step: ForceProcessorStep, folder: Path) -> Any:
+    """Return a pipeline for the observations of a robot, with a step that was written to a file and read again."""
+    from lerobot.processor import RobotProcessorPipeline
+    from lerobot.processor.converters import observation_to_transition, transition_to_observation
+
+    ends = {"to_transition": observation_to_transition, "to_output": transition_to_observation}
+    RobotProcessorPipeline(steps=[step], name="robot", **ends).save_pretrained(folder)
+    return RobotProcessorPipeline.from_pretrained(folder, "robot.json", **ends)
 
 
 class _Policy:

@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 
 from finforce.files import FileError, check_inside, check_plain
 from finforce_eval.annotation.dataset_copy import Column, describe, write_copy
-from finforce_eval.errors import RecordingError
+from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.forces import NOT_FOUND, estimate_forces, no_force_reasons, why_unanswered
 from finforce_eval.evaluation.gripper import combine_jaws
 from finforce_eval.evaluation.keypoint_source import parse_source, sides_of
 from finforce_eval.evaluation.setup import describe_options, read_contacts, share_setup
+from finforce_eval.evaluation.tare_source import borrow_tares, parse_tare_source
 from finforce_eval.policy import (
     FORCE,
     GRASP,
@@ -51,16 +52,22 @@ def episode_tasks(folder: Path, parts: Path, options: argparse.Namespace) -> lis
     _check_files(dataset)
     _check_names(dataset, options)
     settings, tasks = describe_options(options), []
+    tare = parse_tare_source(options.tare_from)
+    unloaded = [each for each in dataset.episodes if tare is not None and each.index == tare.episode]
+    if tare is not None and tare.episode is not None and not unloaded:
+        raise OptionError(f"--tare-from {tare.episode}: {folder.name} has no such episode")
+    other = recording_of(dataset, unloaded[0], camera, sides_of(options)) if unloaded else None
     for episode in dataset.episodes:
         recording = recording_of(dataset, episode, camera, sides_of(options))
         if not tasks:
             read_contacts(options).check(recording)
         target = part_of(parts, episode.index)
-        files = [path for path in (episode.video, episode.data) if path is not None]
+        files = [path for each in (episode, *unloaded) for path in (each.video, each.data) if path is not None]
         key = hash_settings(settings | {"episode": episode.index}, files)
-        given = {"recording": recording, "target": target, "options": options, "settings": hash_settings(settings)}
+        given = {"recording": recording, "other": other, "target": target, "options": options, "key": key}
+        given |= {"settings": hash_settings(settings)}
         name = recording.name
-        tasks.append(Task(name=name, key=key, work=annotate_episode, given=given | {"key": key}, output=str(target)))
+        tasks.append(Task(name=name, key=key, work=annotate_episode, given=given, output=str(target)))
     return tasks
 
 
@@ -93,12 +100,13 @@ def part_of(parts: Path, index: int) -> Path:
 
 
 def annotate_episode(
-    recording: Recording, target: Path, options: argparse.Namespace, settings: str, key: str
+    recording: Recording, other: Recording | None, target: Path, options: argparse.Namespace, settings: str, key: str
 ) -> dict[str, Any]:
     """Find the forces of one episode, write them and return figures; what is there already is not done again.
 
     Args:
         recording: the episode.
+        other: the episode of `--tare-from`, if it names one.
         target: file of the forces.
         options: of the command `annotate`.
         settings: hash of them and of the files that they name.
@@ -115,7 +123,8 @@ def annotate_episode(
     images, notes = recording.images, []
     try:
         seen = keypoints.apply(recording)
-        found, notes = estimate_forces(seen, setup), list(seen.notes)
+        tares, notes = borrow_tares(parse_tare_source(options.tare_from), seen, other, keypoints, setup)
+        found, notes = estimate_forces(seen, setup, tares=tares), [*seen.notes, *notes]
     except RecordingError as error:
         if _NO_KEYPOINTS not in str(error):
             raise
@@ -232,14 +241,18 @@ def _check_names(dataset: Dataset, options: argparse.Namespace) -> None:
 def _features_of(series: Mapping[str, ForceSeries], prefix: str, sides: Sequence[str]) -> Features:
     """Return what is known of the forces of an episode, by names that LeRobot hands to no policy.
 
-    NaN stands in vectors alone: where pandas rewrites a file, as LeRobot does, it makes missing values of other NaN.
+    Numbers without an answer are 0, not NaN: pandas, by which LeRobot merges and converts datasets, makes missing
+    values of NaN, and LeRobot cannot read these.
     """
     features, words = {}, []
     for side in sides:
-        features[f"{prefix}.{side}"] = series[side].force
-        features[f"{prefix}.{side}.stddev"] = series[side].column("force_stddev")
+        solved = series[side].solved[:, None]
+        features[f"{prefix}.{side}"] = np.where(solved, series[side].force, 0.0)
+        features[f"{prefix}.{side}.stddev"] = np.where(solved, series[side].column("force_stddev"), 0.0)
+        features[f"{prefix}.{side}.valid"] = solved
         words.append([f"{side}: {reason}" if reason else "" for reason in no_force_reasons(series[side])])
-    features[f"{prefix}.{GRASP}"] = grasp = grasp_columns(series["gripper"])
+    grasp = grasp_columns(series["gripper"])
+    features[f"{prefix}.{GRASP}"] = np.nan_to_num(grasp)
     features[f"{prefix}.valid"] = np.isfinite(grasp[:, :1])
     reasons = ["; ".join(filter(None, row)) for row in zip(*words, strict=True)]
     return features | {f"{prefix}.reason": np.array(reasons, dtype=object)[:, None]}

@@ -36,6 +36,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     text = "draw key points and forces into the images, too: forces.mp4; not for LeRobot datasets"
     parser.add_argument("--video", action="store_true", help=text)
     parser.add_argument("--images", dest="color", help=argparse.SUPPRESS)
+    text = "take the key points' offsets from the first images of another episode, or from another time on, as 12.5s, "
+    text += "of the same session: the first 1.5 s get forces, too (the first images)"
+    parser.add_argument("--tare-from", metavar="EPISODE|SECONDS", help=text)
     _add_policy_options(parser)
     add_run_options(parser)
     add_engine_options(parser)
