@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from finforce.camera import CameraIntrinsics, decode_depth
 from finforce.camera_file import build_camera, camera_numbers, read_camera
+from finforce.errors import ObservationError
 from finforce.gripper_frames import SIDES, read_extrinsics
 from finforce.transforms import check_pose, invert_pose, pose_numbers
 from finforce_contact.estimator import ContactEstimator
@@ -146,7 +148,8 @@ class ForceSensor:
     def skip(self, stamp: float, reason: str) -> GripperForces:
         """Return the forces in an image [s] that `update` has rejected: none. Time passes for the estimators."""
         for loop in self._loops.values():
-            self._solve(loop, None, stamp, None)
+            with suppress(ObservationError):  # of a jaw that has taken the image before the other one rejected it
+                self._solve(loop, None, stamp, None)
         return GripperForces(stamp=stamp, jaws={}, status=reason)
 
     def reset(self) -> None:

@@ -279,6 +279,17 @@ def test_names_of_others_are_kept_and_those_of_policies_refused(small, scene, tm
     assert "observation.state: none; expected a row of floats, or --into feature" in capsys.readouterr().err
 
 
+def test_an_episode_has_forces_from_its_first_frame_with_the_tare_of_another(datasets, scene, tmp_path, capsys):
+    assert annotate(tmp_path, datasets / "v2.1", scene, "--tare-from", "1", "--into", "none") == 0
+    assert "left jaw: tare of episode 1, offsets up to" in capsys.readouterr().err
+    short = [row for row in rows_of(tmp_path / "v2.1") if row["episode_index"] == 0]
+    assert len(short) == SHORT and all(row["force.valid"] for row in short)
+    assert max(abs(row["force.left"][0]) for row in short) < 0.15  # N; nothing is held yet
+    assert not any(name.startswith("observation.force") for name in short[0])
+    assert annotate(tmp_path / "out", datasets / "v2.1", scene, "--tare-from", "7") == 2
+    assert "--tare-from 7: v2.1 has no such episode" in capsys.readouterr().err
+
+
 @pytest.fixture
 def broken(small, tmp_path):
     return shutil.copytree(small, tmp_path / "broken")
