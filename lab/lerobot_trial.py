@@ -54,7 +54,9 @@ SCENES = [
     )
     for seed in (101, 102)
 ]
-IMAGES, FPS, HEIGHT = 90, 30, 41.7  # of an episode, Hz, mm of the rod above the clamped base
+IMAGES = 90  # of an episode: the jaws hold the rod for the last half second
+FPS = 30  # Hz of the simulated camera
+HEIGHT = 41.7  # mm of the rod above the clamped base
 WRIST, DEPTH = "observation.images.wrist", "observation.images.wrist_depth"
 FARTHEST = 0.5  # m, white in a picture of depths
 COMMON = (
@@ -81,8 +83,23 @@ class Episode:
     opening: NDArray[np.float32]
 
 
-def render() -> tuple[list[Episode], CameraIntrinsics, list[float]]:
-    """Return simulated grasps, their camera, and its pose in the gripper."""
+@dataclass(frozen=True, kw_only=True)
+class Session:
+    """Simulated grasps, their camera, and its pose in the gripper: x, y, z [m], qx, qy, qz, qw."""
+
+    episodes: list[Episode]
+    camera: CameraIntrinsics
+    pose: list[float]
+
+    @property
+    def intrinsics(self) -> list[float]:
+        """Numbers of the camera as `--intrinsics` takes them."""
+        camera = self.camera
+        return [camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion.tolist()]
+
+
+def render() -> Session:
+    """Return the session, from the cache of scenes if it is there."""
     episodes = []
     for scene in SCENES:
         recording = read_recording(find_scene(scene))
@@ -97,7 +114,8 @@ def render() -> tuple[list[Episode], CameraIntrinsics, list[float]]:
                 opening=np.array(opening, dtype=np.float32),
             )
         )
-    return episodes, recording.images.camera, recording.case["T_gripper_camera"]
+    pose = recording.case["T_gripper_camera"]
+    return Session(episodes=episodes, camera=recording.images.camera, pose=pose)
 
 
 def create_v30(folder: Path, episodes: list[Episode], *, has_depth: bool) -> None:
@@ -161,11 +179,10 @@ def write_video(path: Path, pictures: list[NDArray[np.uint8]]) -> None:
         container.mux(stream.encode())
 
 
-def annotate(source: Path, out: Path, camera: CameraIntrinsics, pose: list[float], *words: str) -> Path:
+def annotate(source: Path, out: Path, session: Session, *words: str) -> Path:
     """Return the annotated copy of a dataset."""
-    numbers = [str(number) for number in (camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion)]
-    given = [f"--extrinsics={','.join(map(str, pose))}", "--contact", f"fixed:{HEIGHT}", "--calibration", "twin"]
-    given += ["--color", WRIST, "--intrinsics", *numbers, *words]
+    given = [f"--extrinsics={','.join(map(str, session.pose))}", "--contact", f"fixed:{HEIGHT}"]
+    given += ["--calibration", "twin", "--color", WRIST, "--intrinsics", *map(str, session.intrinsics), *words]
     if finforce(["annotate", str(source), "--out", str(out), *given]):
         raise SystemExit(f"{source} could not be annotated")
     return out / source.name
@@ -210,14 +227,14 @@ def _train(words: list[str], log: Path) -> None:
         lerobot_train()
 
 
-def run_step(run: Run, trained: Path, camera: CameraIntrinsics, pose: list[float]) -> dict[str, Any]:
+def run_step(run: Run, trained: Path, session: Session) -> dict[str, Any]:
     """Return how the step on the pictures of a dataset agrees with its state, and whether its policy can use it."""
     step = ForceProcessorStep(
         camera="wrist",
         contact_height=1e-3 * HEIGHT,
         jaw="bench",
-        intrinsics=[camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion],
-        extrinsics=pose,
+        intrinsics=session.intrinsics,
+        extrinsics=session.pose,
         calibration="twin",
         sides=SIDES if run.jaws == "both" else (run.jaws,),
         fps=FPS,
@@ -303,25 +320,24 @@ class Run:
         return row | {"first loss": losses[0], "last loss": losses[-1], "losses": losses}
 
 
-def prepare(out: Path) -> Iterator[Run]:
+def prepare(out: Path, session: Session) -> Iterator[Run]:
     """Make the datasets and yield the trainings."""
-    episodes, camera, pose = render()
     for has_depth in (False, True):
         name = "depth" if has_depth else "color"
         plain, old = out / "plain" / name, out / "v21" / name
-        create_v30(plain, episodes, has_depth=has_depth)
+        create_v30(plain, session.episodes, has_depth=has_depth)
         create_v21(plain, old)
         datasets = [Run(dataset=plain, layout="v3.0", jaws="", has_depth=has_depth, forces=NONE, policy="")]
         for layout, jaws in product(("v3.0", "v2.1"), ("both", "left")):
             source = plain if layout == "v3.0" else old
             words = ("--jaws", jaws, "--into", STATE)
-            target = annotate(source, out / f"{layout}-{jaws}", camera, pose, *words)
+            target = annotate(source, out / f"{layout}-{jaws}", session, *words)
             if layout == "v2.1":
                 convert(target)
             run = Run(dataset=target, layout=layout, jaws=jaws, has_depth=has_depth, forces=STATE, policy="")
             datasets.append(run)
         if not has_depth:
-            kept = annotate(plain, out / "feature", camera, pose, "--into", FEATURE)
+            kept = annotate(plain, out / "feature", session, "--into", FEATURE)
             datasets.append(replace(datasets[1], dataset=kept, forces=FEATURE))
             zeros = erase_forces(datasets[1].dataset, out / "zeros")
             datasets.append(replace(datasets[1], dataset=zeros, forces="zeros"))
@@ -343,15 +359,15 @@ def run_trial(out: Path, steps: int) -> Figures:
     """Return the losses without and with forces, and how datasets and step agree."""
     import lerobot.scripts.lerobot_train  # noqa: F401  (trainings are forks, which need not import it again)
 
-    runs, rows = list(prepare(out)), []
+    session = render()
+    runs, rows = list(prepare(out, session)), []
     for run in tqdm(runs, unit="training"):
         rows.append(run.describe(train(run.dataset, run.policy, steps, out / "trained" / run.name)))
     losses = {(row["policy"], row["depth camera"]): row["losses"] for row in rows if row["forces"] == NONE}
     for row in rows:
         row["as without forces"] = row["losses"] == losses[row["policy"], row["depth camera"]]
-    _, camera, pose = render()
     steps_run = [
-        {"layout": run.layout, "jaws": run.jaws, **run_step(run, out / "trained" / run.name, camera, pose)}
+        {"layout": run.layout, "jaws": run.jaws, **run_step(run, out / "trained" / run.name, session)}
         for run in runs
         if run.forces == STATE and run.policy == "act" and not run.has_depth
     ]
