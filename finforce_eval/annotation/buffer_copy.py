@@ -20,7 +20,7 @@ from finforce_eval.evaluation.gripper import combine_jaws
 from finforce_eval.policy import PolicyForces, grasp_columns
 from finforce_eval.recordings.umi import CAMERA, find_episodes
 from finforce_eval.recordings.zarr_store import ZarrStore
-from finforce_eval.table import read_table
+from finforce_eval.table import ForceSeries, read_table
 
 _METADATA = ".zmetadata"  # of all arrays at once, where somebody has consolidated it
 
@@ -47,11 +47,10 @@ def write_buffer(path: Path, target: Path, parts: Sequence[Path], columns: Seque
     """
     store = ZarrStore(path)
     spans = find_episodes(store)[1]
-    tables = [read_table(part / TABLE)[0] if (part / TABLE).is_file() else [] for part in parts]
-    sides = [side for side in SIDES if any(one.side == side for table in tables for one in table)] or SIDES
+    tables = [_read_forces(part / TABLE) if (part / TABLE).is_file() else {} for part in parts]
+    sides = [side for side in SIDES if any(side in table for table in tables)] or SIDES
     forces, rows = PolicyForces(sides, columns, prefix), []
-    for table, (begin, end) in zip(tables, spans.tolist(), strict=True):
-        series = {one.side: one for one in table}
+    for series, (begin, end) in zip(tables, spans.tolist(), strict=True):
         grasp = grasp_columns(combine_jaws(series)) if series else np.full((end - begin, 2), np.nan)
         rows.append(forces.rows_of(series, grasp))
         if len(rows[-1]) != end - begin:
@@ -62,6 +61,12 @@ def write_buffer(path: Path, target: Path, parts: Sequence[Path], columns: Seque
         raise RecordingError(f"{path.name}: has data/{same[0]} already; expected another --prefix")
     _write(path, target, _encode(store, arrays))
     return sum(map(bool, tables))
+
+
+def _read_forces(path: Path) -> dict[str, ForceSeries]:
+    """Return the forces by side of a table, whose jaws may be one case."""
+    sides = {side: one for one in read_table(path)[0] for side in np.unique(one.column("side")).tolist()}
+    return {side: one.at(one.column("side") == side) for side, one in sides.items()}
 
 
 def _split(forces: PolicyForces, rows: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:

@@ -12,10 +12,14 @@ pytest.importorskip("av")
 parquet = pytest.importorskip("pyarrow.parquet")
 
 from eval_fakes import QUICK_GRASP  # noqa: E402
-from lerobot_fakes import CAMERA, write_dataset  # noqa: E402
+from lerobot_fakes import CAMERA, FPS, write_dataset  # noqa: E402
 
 from finforce_eval.cli.main import main  # noqa: E402
+from finforce_eval.policy import ForceInput, PolicyForces  # noqa: E402
+from finforce_eval.recordings.dataset import open_dataset  # noqa: E402
+from finforce_eval.recordings.frames import decode_video  # noqa: E402
 from finforce_eval.recordings.recording import read_recording  # noqa: E402
+from finforce_eval.sensor import ForceSensor  # noqa: E402
 from lab.bench.chain import true_grasp  # noqa: E402
 from lab.scenes import find_scene  # noqa: E402
 
@@ -207,6 +211,29 @@ def test_the_state_has_the_forces_at_its_end_under_their_names(version, datasets
     schema = parquet.read_schema(next((extended / version / "data").rglob("*.parquet")))
     known = json.loads(schema.metadata[b"huggingface"])["info"]["features"]
     assert known["observation.state"]["length"] == 10 and schema.names[0] == "observation.state"
+
+
+@pytest.mark.parametrize("warm", [False, True])
+def test_the_same_images_give_the_numbers_of_the_dataset_one_by_one(warm, extended, scene):
+    camera = scene[0].images.camera
+    sensor = ForceSensor(
+        "bench",
+        camera=[camera.fx, camera.fy, camera.cx, camera.cy],
+        extrinsics=scene[0].case["T_gripper_camera"],
+        contact_height=1e-3 * HEIGHT,
+        calibration="twin",
+        detector={"threads": 1, "depth": "none"},
+        is_video=True,
+    )
+    if warm:
+        sensor.warm_up()
+    source, dataset = ForceInput(sensor, PolicyForces(), FPS), open_dataset(extended / "v2.1", CAMERA)
+    for episode in dataset.episodes:
+        source.reset()
+        rows = parquet.read_table(episode.data)["observation.state"].to_pylist()
+        for row, picture in zip(rows, decode_video(episode.video, "one"), strict=True):
+            np.testing.assert_allclose(source.update(picture), row[2:], rtol=0.0, atol=1e-6)  # N
+    assert source.last.status == "ok"
 
 
 def same_content(one, other):

@@ -208,7 +208,7 @@ def write_forces(folder, sides, count, begin):
     force = np.tile([-1.0, 0.0, 0.5], (count, 1)) * np.arange(begin, begin + count)[:, None]
     force[:2] = np.nan
     columns = {"force": force, "force_stddev": np.abs(force), "torque": force, "scored": True, "magnitude_stddev": 0.1}
-    series = [ForceSeries.build("case", side, np.arange(count), **columns).renamed(f"case/{side}") for side in sides]
+    series = [ForceSeries.build("case", side, np.arange(count), **columns) for side in sides]
     folder.mkdir(parents=True)
     write_table(folder / "forces.parquet", series, {"key": "1"})
     return folder
