@@ -89,7 +89,8 @@ def _encode(store: ZarrStore, arrays: Mapping[str, NDArray]) -> dict[str, bytes]
         files[f"data/{key}/.zarray"] = json.dumps(about, indent=4).encode()
         files[f"data/{key}/{'.'.join('0' * values.ndim)}"] = np.ascontiguousarray(values).tobytes()
         metadata["metadata"][f"data/{key}/.zarray"] = about
-    return files | ({_METADATA: json.dumps(metadata, indent=4).encode()} if known else {})
+    # sorted, as zarr expects the arrays of a group one after the other
+    return files | ({_METADATA: json.dumps(metadata, indent=4, sort_keys=True).encode()} if known else {})
 
 
 def _write(path: Path, target: Path, files: Mapping[str, bytes]) -> None:

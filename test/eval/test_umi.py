@@ -268,13 +268,14 @@ def test_episodes_without_forces_have_no_answer_and_of_another_length_are_refuse
 
 def test_metadata_of_all_arrays_at_once_know_the_new_ones(buffer, tmp_path):
     if buffer.is_dir():
-        (buffer / ".zmetadata").write_text('{"metadata": {".zgroup": {"zarr_format": 2}}}')
+        (buffer / ".zmetadata").write_text('{"metadata": {".zgroup": {"zarr_format": 2}, "meta": {}}}')
     else:
         with zipfile.ZipFile(buffer, "a") as file:
-            file.writestr(".zmetadata", '{"metadata": {".zgroup": {"zarr_format": 2}}}')
+            file.writestr(".zmetadata", '{"metadata": {".zgroup": {"zarr_format": 2}, "meta": {}}}')
     target = tmp_path / f"copy{buffer.name.removeprefix('dataset')}"
     parts = [tmp_path / "none", write_forces(tmp_path / "1", ("left",), 6, 5)]
     buffer_copy.write_buffer(buffer, target, parts, ("force",), "force")
     known = json.loads(ZarrStore(target).find(".zmetadata"))["metadata"]
     assert known["data/robot0_force_left/.zarray"]["shape"] == [10, 3] and ".zgroup" in known
+    assert list(known) == sorted(known)
     assert "robot0_force" not in ZarrStore(buffer).find(".zmetadata").decode()
