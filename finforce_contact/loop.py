@@ -44,6 +44,9 @@ class ContactSource(Protocol):
     def contact_at(self, stamp: int, surface: Surface | None = None) -> Contact | None:
         """Return the contact of an image [ns]; None when nothing is known; see `ContactLoop.update`."""
 
+    def reset(self) -> None:
+        """Forget all images."""
+
 
 class GivenContact:
     """One contact for all images; None for none."""
@@ -56,6 +59,9 @@ class GivenContact:
     def contact_at(self, stamp: int, surface: Surface | None = None) -> Contact | None:
         """Return it."""
         return self.contact
+
+    def reset(self) -> None:
+        """Forget nothing."""
 
 
 class ContactLoop:

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from finforce.camera import CameraIntrinsics, decode_depth
 from finforce.camera_file import build_camera, camera_numbers, read_camera
+from finforce.errors import ObservationError
 from finforce.gripper_frames import SIDES, read_extrinsics
 from finforce.transforms import check_pose, invert_pose, pose_numbers
 from finforce_contact.estimator import ContactEstimator
@@ -71,6 +74,9 @@ class ForceSensor:
         object_mesh: mesh of the object in metres, or its file; `update` then needs its poses. Give one of these two.
         calibration: of the finger; None for the material of the jaw file.
         sides: jaws in the images.
+        detector: parameters of the detector that differ from their defaults, as `--detector` names them.
+        settings: of the estimator, likewise, as `--set` names them.
+        is_video: whether images went through a video encoder, after which a scene at rest repeats itself to the bit.
 
     Raises:
         FinforceError: one of these cannot be used.
@@ -87,6 +93,9 @@ class ForceSensor:
         object_mesh: str | Path | ObjectMesh | None = None,
         calibration: str | Path | Calibration | None = None,
         sides: Sequence[str] = SIDES,
+        detector: Mapping[str, Any] | None = None,
+        settings: Mapping[str, Any] | None = None,
+        is_video: bool = False,
     ) -> None:
         if (contact_height is None) == (object_mesh is None):
             raise OptionError("expected contact_height [m] or object_mesh, one of the two")
@@ -94,14 +103,15 @@ class ForceSensor:
             raise OptionError("expected rig, or camera and extrinsics, one of the two")
         if rig is not None:
             found = read_rig(rig)
-            records = build_records(found.detector_parameters())
+            parameters = found.detector_parameters()
             jaw, camera = jaw or found.jaw, found.intrinsics
         else:
-            records = build_records({"T_gripper_camera": pose_numbers(read_extrinsics(extrinsics))})
+            parameters = {"T_gripper_camera": pose_numbers(read_extrinsics(extrinsics))}
         self.camera = camera
         jaws = {side: load_jaw(jaw or "bench", side) for side in sides}
-        self._detector = build_detector(jaws, records.parameters, records.settings)
-        settings = EstimatorSettings().resolve_held(both=len(sides) == len(SIDES))
+        records = build_records({**parameters, **(detector or {})})
+        self._detector = build_detector(jaws, *records, watched=not is_video)
+        settings = EstimatorSettings(**(settings or {})).resolve_held(both=len(sides) == len(SIDES))
         mesh = None if object_mesh is None else load_object_mesh(object_mesh)
         self._loops: dict[str, ForceLoop] = {}
         for side, own in jaws.items():
@@ -132,19 +142,51 @@ class ForceSensor:
             depth = decode_depth(depth, "16UC1" if np.asarray(depth).dtype.kind in "iu" else "32FC1")
         seen = self._detector.detect(RgbdImage(stamp=stamp, color=rgb, depth=depth, camera=self.camera))
         T = None if T_camera_object is None else check_pose(T_camera_object, "T_camera_object")
-        found = {side: self._solve(self._loops[side], points, T) for side, points in seen.items()}
-        return combine_solutions(stamp, {side: found.get(side) for side in self._loops})
+        found = {side: self._solve(loop, seen.get(side), stamp, T) for side, loop in self._loops.items()}
+        return combine_solutions(stamp, {side: found[side] if side in seen else None for side in found})
 
-    def _solve(self, loop: ForceLoop, seen: JawKeypoints, T_camera_object: NDArray | None) -> Solution:
-        """Return the force on one jaw."""
-        points = np.where(seen.valid[:, None], seen.points, np.nan)
-        stddev = np.where(np.isfinite(points), seen.stddev, np.nan)
-        observation = Observation(
-            stamp=seen.stamp, points=points, likelihood=seen.likelihood, stddev=stddev, shared=seen.shared
-        )
-        if T_camera_object is None:
+    def skip(self, stamp: float, reason: str) -> GripperForces:
+        """Return the forces in an image [s] that `update` has rejected: none. Time passes for the estimators."""
+        for loop in self._loops.values():
+            with suppress(ObservationError):  # of a jaw that has taken the image before the other one rejected it
+                self._solve(loop, None, stamp, None)
+        return GripperForces(stamp=stamp, jaws={}, status=reason)
+
+    def reset(self) -> None:
+        """Forget everything that images have shown, the tare included; for a new recording or episode."""
+        self._detector.reset()
+        for loop in self._loops.values():
+            loop.force.forget()
+            loop.contact.reset()
+
+    def warm_up(self) -> None:
+        """Compile and load all that images need, so that the first one waits for nothing; forget what was seen."""
+        self._detector.warm_up()
+        for loop in self._loops.values():
+            loop.force.warm_up()
+        self.reset()
+
+    def _solve(
+        self, loop: ForceLoop, seen: JawKeypoints | None, stamp: float, T_camera_object: NDArray | None
+    ) -> Solution:
+        """Return the force on one jaw, which may not have been found."""
+        observation = observe_jaw(seen, stamp, len(loop.force.jaw.keypoints))
+        if seen is None or T_camera_object is None:
             return loop.update(observation)
-        return loop.update(observation, [(seen.stamp, invert_pose(seen.T_camera_jaw) @ T_camera_object)])
+        return loop.update(observation, [(stamp, invert_pose(seen.T_camera_jaw) @ T_camera_object)])
+
+
+def observe_jaw(seen: JawKeypoints | None, stamp: float, count: int) -> Observation:
+    """Return what an estimator is given of a jaw of so many key points in an image [s]; None: it was not found.
+
+    Coordinates have single precision, as in the nodes' messages.
+    """
+    if seen is None:
+        nothing = np.full((count, 3), np.nan)
+        return Observation(stamp=stamp, points=nothing, likelihood=np.zeros(count), stddev=nothing)
+    points = np.where(seen.valid[:, None], seen.points, np.nan).astype(np.float32).astype(np.float64)
+    stddev = np.where(np.isfinite(points), seen.stddev, np.nan)
+    return Observation(stamp=stamp, points=points, likelihood=seen.likelihood, stddev=stddev, shared=seen.shared)
 
 
 def combine_solutions(stamp: float, found: Mapping[str, Solution | None]) -> GripperForces:

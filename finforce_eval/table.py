@@ -64,6 +64,7 @@ UNITS = {
     "jaw_distance": "m",  # between the jaws, as it was seen
     "true_jaw_distance": "m",
     "grasp_force": "N",  # of the gripper: the smaller of the jaws' forces
+    "grasp_stddev": "N",
 }
 _ABOUT = b"finforce"
 _LISTS = {name for name, unit in UNITS.items() if "each" in unit}

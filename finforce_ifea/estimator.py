@@ -29,7 +29,7 @@ from finforce_ifea.observation import (
 )
 from finforce_ifea.relaxation import Relaxation
 from finforce_ifea.settings import EstimatorSettings
-from finforce_ifea.tare import TareKeeper
+from finforce_ifea.tare import Tare, TareKeeper
 from finforce_ifea.touch import find_touch_probability
 from finforce_ifea.tracking.contact_state import (
     BUMPED,
@@ -43,10 +43,11 @@ from finforce_ifea.tracking.contact_state import (
 from finforce_ifea.tracking.contact_tracker import ContactTracker
 from finforce_ifea.tracking.friction import SMOOTH, Coefficient
 from finforce_ifea.tracking.given_contact import GivenContactTracker
-from finforce_ifea.tracking.influence import ReachWatch
+from finforce_ifea.tracking.influence import OffsetChange, ReachWatch, split_change
 from finforce_ifea.tracking.lateral_load import measure_torsion
 
 _LONGEST_GAP = 1.0
+_FEWEST_COMPARED = 3
 _TOLERANCE = 1e-3
 # A detector may repeat the key points of a jaw that stands still, and looks again every 4 s; longer is stale [s].
 _STALE = 5.0
@@ -180,6 +181,27 @@ class ForceEstimator:
     def tared(self) -> bool:
         """Whether the key points' offsets are known."""
         return self._taring.tared
+
+    @property
+    def offsets(self) -> Tare:
+        """Offsets and noise of the key points; see `tare`."""
+        return self._taring.tare
+
+    def adopt_tare(self, tare: Tare) -> None:
+        """Take the offsets that another part of the session has shown, with jaw and camera mounted in the same way."""
+        self._taring.adopt(tare)
+
+    def compare_offsets(self, tare: Tare) -> OffsetChange:
+        """Return by how much the offsets differ from those of a tare, in key points that both have.
+
+        Raises:
+            NotEnoughDataError: they have too few in common.
+        """
+        own = self._taring.tare
+        both = (own.counts > 0) & (tare.counts > 0)
+        if both.sum() < _FEWEST_COMPARED:
+            raise NotEnoughDataError(f"{both.sum()} key points in both tares, expected {_FEWEST_COMPARED} at least")
+        return split_change(self._tracked.rest_modes()[both], (own.offsets - tare.offsets)[both])
 
     @property
     def surface_triangles(self) -> NDArray:

@@ -298,6 +298,10 @@ class TareKeeper:
             self._stddevs.clear()
             self._open = True
 
+    def adopt(self, tare: Tare) -> None:
+        """Take the offsets of other images; they are not averaged with what comes."""
+        self.tare, self._open = tare, False
+
     def begin(self) -> None:
         """Tare for the first time if that is due; a jaw that looks loaded goes on without.
 

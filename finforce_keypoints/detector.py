@@ -109,6 +109,8 @@ class KeypointDetector:
         for part in (*self._jaws.values(), self._image_watch, self._still_watch, self._tags):
             if part is not None:
                 part.reset()
+        if hasattr(self._pixel_detector, "reset"):  # one that remembers the picture before
+            self._pixel_detector.reset()
         self._stamp: float | None = None
         self._looks, self._shares = dict.fromkeys(self._jaws, 0), dict.fromkeys(self._jaws, 0.0)
         self._scale = DepthScale(error=0.0, stddev=self.settings.scale_stddev)

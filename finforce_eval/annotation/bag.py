@@ -21,14 +21,15 @@ from finforce.errors import FinforceError, one_line
 from finforce.files import FileError, check_inside
 from finforce.messages import read_stamp
 from finforce_eval.annotation.video import write_video
-from finforce_eval.errors import RecordingError, UnseenError
+from finforce_eval.errors import OptionError, RecordingError, UnseenError
 from finforce_eval.evaluation.forces import estimate_forces, no_force_reasons, share_reached, why_unanswered
 from finforce_eval.evaluation.gripper import combine_jaws
-from finforce_eval.evaluation.keypoint_source import parse_source
+from finforce_eval.evaluation.keypoint_source import KeypointSource, parse_source
 from finforce_eval.evaluation.setup import share_setup
+from finforce_eval.evaluation.tare_source import borrow_tares, parse_tare_source
 from finforce_eval.evaluation.unseen import describe_unseen, explain_unseen
 from finforce_eval.machine import version, without_nan
-from finforce_eval.recordings.bags import NO_DIGEST, BagReader, bag_source, is_frames, list_files, open_bag
+from finforce_eval.recordings.bags import NO_DIGEST, BagReader, bag_source, is_buffer, is_frames, list_files, open_bag
 from finforce_eval.recordings.tracks import Recording
 from finforce_eval.recordings.writer import (
     Entry,
@@ -82,9 +83,12 @@ def annotate_bag(source: Path, target: Path, options: argparse.Namespace, settin
         recording = keypoints.apply(recording)
     except UnseenError as error:
         raise RecordingError("; ".join((str(error), *explain_unseen(recording, keypoints)))) from error
-    jaws = estimate_forces(recording, setup)
+    tare = parse_tare_source(options.tare_from)
+    other = None if tare is None or tare.episode is None else _read_episode(source, tare.episode, keypoints)
+    tares, compared = borrow_tares(tare, recording, other, keypoints, setup)
+    jaws = estimate_forces(recording, setup, tares=tares)
     why = why_unanswered(jaws.values())
-    notes = [*describe_unseen(recording, keypoints, jaws), *recording.notes]
+    notes = [*describe_unseen(recording, keypoints, jaws), *recording.notes, *compared]
     if why:
         raise RecordingError(f"{target.name}: {'; '.join((*notes, why))}")
     figures = without_nan(_describe(jaws, recording) | {"notes": notes})
@@ -112,6 +116,13 @@ def _read_figures(target: Path, key: str) -> dict[str, Any] | None:
         note = json.loads((target / NOTE).read_text(encoding="utf-8"))
         return note["figures"] if note["key"] == key else None
     return None
+
+
+def _read_episode(source: Path, episode: int, keypoints: KeypointSource) -> Recording:
+    """Return another episode of a buffer; raises OptionError where a recording is no buffer."""
+    if not is_buffer(source):
+        raise OptionError(f"--tare-from {episode}: {source.name} has no episodes; expected seconds, as 12.5s")
+    return replace(keypoints, choice=replace(keypoints.choice, episode=episode)).read(source)
 
 
 def _describe(jaws: Mapping[str, ForceSeries], recording: Recording) -> dict[str, Any]:

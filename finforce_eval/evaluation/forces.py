@@ -26,6 +26,7 @@ from finforce_eval.tasks import progress_bar
 if TYPE_CHECKING:
     from finforce_eval.evaluation.setup import EvaluationSetup
     from finforce_ifea.estimator import ForceEstimator
+    from finforce_ifea.tare import Tare
 
 _VECTORS = ("force", "torque", "force_stddev", "torque_stddev", "contact_location", "contact_point")
 _NUMBERS = ("magnitude_stddev", "residual", "step_ms", "contact_ms", "contact_height", "true_height")
@@ -75,6 +76,7 @@ def estimate_forces(
     strict: bool = False,
     progress: Callable[[int], Any] = lambda images: None,
     watch: Callable[[str, int, ForceEstimator], Any] | None = None,
+    tares: Mapping[str, Tare] | None = None,
 ) -> dict[str, ForceSeries]:
     """Return the forces on some jaws of a recording that has key points, and the distance of two.
 
@@ -85,6 +87,7 @@ def estimate_forces(
         strict: an image that is refused ends the run, else it has no force and says why.
         progress: called with the number of images done since its last call.
         watch: called with side, stamp [ns] and estimator after every image.
+        tares: offsets of the key points by side, where others than those of the first images are wanted.
 
     Raises:
         FinforceError: the key points are another jaw's, or the contact cannot be known.
@@ -99,6 +102,8 @@ def estimate_forces(
         source = GivenContact(None) if _is_unseen(recording, side) else own.source(recording)
         estimator = own.estimator(both)
         estimator.expect_friction(friction)
+        if tares:
+            estimator.adopt_tare(tares[side])
         found[side] = find_forces(recording, own.jaw, source, estimator, side, **how)
     return with_distances(found, recording) if both else found
 

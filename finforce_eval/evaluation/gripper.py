@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import numpy as np
 import pandas as pd
@@ -35,7 +35,8 @@ def combine_jaws(jaws: Mapping[str, ForceSeries]) -> ForceSeries:
         jaws: by side; both, or the only one. Where both have distances, see `with_distances`, torques are known.
 
     Returns:
-        Net force and torque about the gripper's origin, their truth, and the grasp force; NaN where a jaw has none.
+        Net force and torque about the gripper's origin, their truth, and the grasp force with its standard deviation;
+        NaN where a jaw has none.
     """
     stamps = np.unique(np.concatenate([each.stamps for each in jaws.values()]))
     first = next(iter(jaws.values()))
@@ -50,12 +51,20 @@ def combine_jaws(jaws: Mapping[str, ForceSeries]) -> ForceSeries:
         force=found["manipulation"],
         torque=found["torque"],
         grasp_force=found["grasp"][:, 0],
+        grasp_stddev=_weakest_stddev(jaws.values(), found["grasp"][:, 0]),
         true_force=true["manipulation"],
         true_torque=true["torque"],
         # the jaws' frames are turned about z by half a turn: their axes are those of the gripper
         force_stddev=np.sqrt(np.sum([each.column("force_stddev") ** 2 for each in jaws.values()], axis=0)),
         scored=np.all([each.table["scored"].fillna(False).astype(bool) for each in jaws.values()], axis=0),
     )
+
+
+def _weakest_stddev(jaws: Collection[ForceSeries], grasp: NDArray) -> NDArray:
+    """Return the standard deviation (n,) [N] of the smaller force, which is the grasp force (n,) [N]."""
+    weakest = np.argmin([np.nan_to_num(each.magnitude) for each in jaws], axis=0)
+    stddev = np.choose(weakest, [each.column("magnitude_stddev").astype(float) for each in jaws])
+    return np.where(np.isfinite(grasp), stddev, np.nan)
 
 
 def _combine(jaws: Mapping[str, ForceSeries], prefix: str) -> dict[str, NDArray]:

@@ -24,7 +24,9 @@ from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_ifea.settings import EstimatorSettings
 
 # Options that change nothing in the forces of a recording.
-_OUTSIDE = ("bags", "out", "workers", "memory", "scheduler", "run", "prefix", "json", "report")
+_OUTSIDE = (
+    "bags", "out", "workers", "memory", "scheduler", "run", "prefix", "into", "columns", "remove", "json", "report",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,7 +34,7 @@ class EvaluationSetup:
     """The set-up of an offline run; its estimators are built and compiled once for all recordings.
 
     With `as_live` the images are left out that the nodes of contact and force leave out; with `stills` every image is
-    one by itself.
+    one by itself; `tares` are those by side that were found for other recordings, by their names.
     """
 
     jaw: Jaw
@@ -42,6 +44,7 @@ class EvaluationSetup:
     about: Mapping[str, str]
     as_live: bool = False
     stills: bool = False
+    tares: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
     _sides: dict[str, EvaluationSetup] = field(default_factory=dict, init=False, repr=False, compare=False)
     _estimators: dict[bool, ForceEstimator] = field(default_factory=dict, init=False, repr=False, compare=False)
 

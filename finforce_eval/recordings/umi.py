@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from finforce.gripper_frames import HALF_TURN, SIDES
 from finforce.messages import NANOSECONDS
 from finforce_eval.errors import RecordingError
+from finforce_eval.recordings.bags import is_buffer
 from finforce_eval.recordings.frames import FrameImages, choose_camera
 from finforce_eval.recordings.images import ImageChoice
 from finforce_eval.recordings.tracks import Recording, WrenchTrack
@@ -30,10 +31,15 @@ _FEEBLE = 0.1  # N of these that tell nothing
 
 def count_episodes(path: Path) -> int:
     """Return how many episodes a buffer has; raises RecordingError where it is none of UMI or UMI-FT."""
-    return len(_find_episodes(ZarrStore(path))[0])
+    return len(find_episodes(ZarrStore(path))[0])
 
 
-def _find_episodes(store: ZarrStore) -> tuple[list[str], NDArray]:
+def is_replay_buffer(path: Path) -> bool:
+    """Say whether a path is a buffer whose episodes follow each other in the same arrays, as UMI's."""
+    return is_buffer(path) and ZarrStore(path).find(f"{ENDS}/.zarray") is not None
+
+
+def find_episodes(store: ZarrStore) -> tuple[list[str], NDArray]:
     """Return the group of the arrays of each episode, and its first row and the row after its last in them (n, 2)."""
     groups = [name for name in store.list_members("data") if name.startswith("episode_")]
     if groups:
@@ -53,7 +59,7 @@ def read_buffer(path: Path, choice: ImageChoice, sides: Sequence[str] = ()) -> R
         OptionError: its camera is not described.
     """
     store = ZarrStore(path)
-    groups, spans = _find_episodes(store)
+    groups, spans = find_episodes(store)
     if choice.episode >= len(groups):
         raise RecordingError(f"{path.name}: no episode {choice.episode}; expected 0 to {len(groups) - 1}")
     group, (begin, end) = groups[choice.episode], spans[choice.episode].tolist()

@@ -8,7 +8,7 @@ moves the points, their deviations e_k [m] from the tared jaw and the covariance
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -152,6 +152,21 @@ def explain_offsets(modes: NDArray, tare: Tare, offset_stddev: float) -> float:
     seen = tare.counts > 0
     gain, stddev = _fit_load(modes[seen], np.sqrt(offset_stddev**2 + tare.offset_variance(0.0)[seen]))
     return float(gain @ tare.offsets[seen][:, [0, 2]].ravel() / stddev)
+
+
+class OffsetChange(NamedTuple):
+    """Root mean square over the key points of what a load explains of a change of offsets, and of the rest [m]."""
+
+    bend: float
+    shift: float
+
+
+def split_change(modes: NDArray, change: NDArray) -> OffsetChange:
+    """Return what one mode (K, 2), in x and z, explains of a change (K, 3) [m] of the places of key points."""
+    mode, plane = modes.ravel(), change[:, [0, 2]].ravel()
+    bend = mode * (mode @ plane) / (mode @ mode)
+    rest = np.r_[plane - bend, change[:, 1]]
+    return OffsetChange(*(float(np.sqrt(np.sum(part**2) / len(change))) for part in (bend, rest)))
 
 
 # The jaw is at rest while it seems pressed by less than this [m], in one frame or in so many standard deviations of

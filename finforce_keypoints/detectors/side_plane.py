@@ -86,6 +86,10 @@ class SidePlaneDetector:
         self._rest = {side: find_rest(jaw) for side, jaw in jaws.items()}
         self._mounts = mounts or {side: JawMount() for side in jaws}
         self._seen = {side: self._mounts[side].seen_points(jaw) for side, jaw in jaws.items()}
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget where the points were, and begin anew with the first of the shifts."""
         self._kept: dict[tuple[str, int], _View] = {}
         self._turn = 0
         self._camera: CameraIntrinsics | None = None

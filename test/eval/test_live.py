@@ -140,9 +140,9 @@ def test_a_rig_stands_for_jaw_camera_and_extrinsics(tmp_path, monkeypatch):
     seen = []
     monkeypatch.setattr(sensors, "ForceEstimator", lambda jaw, **given: SimpleNamespace(jaw=jaw))
     monkeypatch.setattr(sensors, "ForceLoop", lambda contact, force: None)
-    monkeypatch.setattr(sensors, "build_detector", lambda *given: seen.append(given))
+    monkeypatch.setattr(sensors, "build_detector", lambda *given, **_: seen.append(given))
     sensor = ForceSensor(rig=tmp_path / "rig.yaml", contact_height=0.04, sides=("left",))
-    ((jaws, parameters, settings),) = seen
+    ((jaws, parameters, settings, _),) = seen
     assert jaws["left"].name == "bench" and sensor.camera.width == 64
     assert parameters.left_turn == (0.0, 0.05, 0.0) and parameters.covered == ("left/inner_1",)
     assert parameters.T_gripper_camera == pytest.approx(RIG.T_gripper_camera)

@@ -10,11 +10,14 @@ import pytest
 from finforce.errors import MissingDependencyError
 from finforce.gripper_frames import ROBOT_CAMERA
 from finforce.messages import NANOSECONDS
+from finforce_eval.annotation import buffer_copy
 from finforce_eval.cli.main import main
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.scoring import match_truth
 from finforce_eval.recordings.images import ImageChoice
 from finforce_eval.recordings.recording import read_recording
+from finforce_eval.recordings.zarr_store import ZarrStore
+from finforce_eval.table import ForceSeries, write_table
 from finforce_keypoints.rig import Rig, RigCamera
 
 CAMERA = RigCamera(width=64, height=48, fx=50.0, fy=50.0, cx=32.0, cy=24.0, model="plumb_bob")
@@ -198,3 +201,81 @@ def test_compressed_chunks_are_decoded_and_a_missing_library_is_named(tmp_path, 
     monkeypatch.setitem(sys.modules, "imagecodecs", None)
     with pytest.raises(MissingDependencyError, match="JPEG XL, needs imagecodecs: pip install imagecodecs"):
         list(read_recording(path, CHOICE).images)
+
+
+def write_forces(folder, sides, count, begin):
+    """A table of forces as `annotate` writes it, of an episode whose first images have none."""
+    force = np.tile([-1.0, 0.0, 0.5], (count, 1)) * np.arange(begin, begin + count)[:, None]
+    force[:2] = np.nan
+    columns = {"force": force, "force_stddev": np.abs(force), "torque": force, "scored": True, "magnitude_stddev": 0.1}
+    series = [ForceSeries.build("case", side, np.arange(count), **columns) for side in sides]
+    folder.mkdir(parents=True)
+    write_table(folder / "forces.parquet", series, {"key": "1"})
+    return folder
+
+
+@pytest.fixture(params=["folder", "zip"])
+def buffer(request, tmp_path):
+    path = write_buffer(tmp_path / "dataset.zarr")
+    if request.param == "folder":
+        return path
+    with zipfile.ZipFile(tmp_path / "dataset.zarr.zip", "w") as file:
+        for each in path.rglob("*"):
+            file.write(each, each.relative_to(path))
+    return tmp_path / "dataset.zarr.zip"
+
+
+def files_of(path):
+    if path.is_file():
+        with zipfile.ZipFile(path) as file:
+            return {name: file.read(name) for name in file.namelist() if not name.endswith("/")}
+    return {str(each.relative_to(path)): each.read_bytes() for each in path.rglob("*") if each.is_file()}
+
+
+def test_a_copy_of_a_buffer_has_the_forces_of_every_picture_and_is_else_the_same(buffer, tmp_path):
+    parts = [
+        write_forces(tmp_path / "0", ("left", "right"), 4, 1),
+        write_forces(tmp_path / "1", ("left", "right"), 6, 5),
+    ]
+    target = tmp_path / f"copy{buffer.name.removeprefix('dataset')}"
+    assert buffer_copy.write_buffer(buffer, target, parts, ("force", "grasp"), "force") == 2
+    before, after = files_of(buffer), files_of(target)
+    assert {name: after[name] for name in before} == before
+    added = {f"data/robot0_force_{name}" for name in ("left", "right", "grasp")}
+    added |= {f"{name}_valid" for name in added}
+    assert {name.rpartition("/")[0] for name in after.keys() - before.keys()} == added
+    about = json.loads(after["data/robot0_force_left/.zarray"])
+    assert about["shape"] == [10, 3] and about["dtype"] == "<f4" and about["compressor"] is None
+    left = np.frombuffer(after["data/robot0_force_left/0.0"], "<f4").reshape(10, 3)
+    np.testing.assert_array_equal(left[:, 0], [0, 0, -3, -4, 0, 0, -7, -8, -9, -10])  # none of the episode before
+    valid = np.frombuffer(after["data/robot0_force_left_valid/0"], "<f4")
+    np.testing.assert_array_equal(valid, [0, 0, 1, 1, 0, 0, 1, 1, 1, 1])
+    grasp = ZarrStore(target).open_array("data/robot0_force_grasp", (10, 1), "f").read()
+    np.testing.assert_allclose(grasp[valid > 0, 0], np.linalg.norm(left[valid > 0], axis=1), rtol=1e-6)
+    with pytest.raises(RecordingError, match="has data/robot0_force_grasp already; expected another --prefix"):
+        buffer_copy.write_buffer(target, tmp_path / "again", parts, ("grasp",), "force")
+
+
+def test_episodes_without_forces_have_no_answer_and_of_another_length_are_refused(buffer, tmp_path):
+    target = tmp_path / f"copy{buffer.name.removeprefix('dataset')}"
+    parts = [tmp_path / "none", write_forces(tmp_path / "1", ("left",), 6, 5)]
+    assert buffer_copy.write_buffer(buffer, target, parts, ("force",), "force") == 1
+    valid = ZarrStore(target).open_array("data/robot0_force_left_valid", (10,), "f").read()
+    np.testing.assert_array_equal(valid, [0, 0, 0, 0, 0, 0, 1, 1, 1, 1])
+    with pytest.raises(RecordingError, match="6 forces for 4 pictures"):
+        buffer_copy.write_buffer(buffer, tmp_path / "wrong", parts[::-1], ("force",), "force")
+
+
+def test_metadata_of_all_arrays_at_once_know_the_new_ones(buffer, tmp_path):
+    if buffer.is_dir():
+        (buffer / ".zmetadata").write_text('{"metadata": {".zgroup": {"zarr_format": 2}, "meta": {}}}')
+    else:
+        with zipfile.ZipFile(buffer, "a") as file:
+            file.writestr(".zmetadata", '{"metadata": {".zgroup": {"zarr_format": 2}, "meta": {}}}')
+    target = tmp_path / f"copy{buffer.name.removeprefix('dataset')}"
+    parts = [tmp_path / "none", write_forces(tmp_path / "1", ("left",), 6, 5)]
+    buffer_copy.write_buffer(buffer, target, parts, ("force",), "force")
+    known = json.loads(ZarrStore(target).find(".zmetadata"))["metadata"]
+    assert known["data/robot0_force_left/.zarray"]["shape"] == [10, 3] and ".zgroup" in known
+    assert list(known) == sorted(known)
+    assert "robot0_force" not in ZarrStore(buffer).find(".zmetadata").decode()

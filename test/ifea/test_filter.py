@@ -281,9 +281,9 @@ class TestBumpedCamera:
         count = int(RUBBED["25_middle_depth"].argmax()) + 1
         shift = 1e-3 * size * np.array([0.8, 0.0, -0.6])
         force, stddev, truth, trusted, _ = run(
-            "middle", count, hold=25, shift=shift, friction=0.3, friction_stddev=0.05
+            "middle", count, hold=45, shift=shift, friction=0.3, friction_stddev=0.05
         )
-        after = np.arange(len(force)) >= len(force) - 24
+        after = np.arange(len(force)) >= len(force) - 44
         assert trusted[after].mean() > 0.9
         within = np.abs(force - truth)[after & trusted][:, [0, 2]] < 3.0 * stddev[after & trusted][:, [0, 2]]
         assert within.mean() > 0.9
