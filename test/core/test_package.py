@@ -19,6 +19,7 @@ SOURCES = sorted(ROOT.glob("finforce*/**/*.py"))
 ROS = {"rclpy", "builtin_interfaces", "rcl_interfaces", "rosgraph_msgs", "std_srvs"}
 ROS |= {f"{name}_msgs" for name in ("diagnostic", "geometry", "sensor", "std", "visualization")}
 LAUNCH = {"launch", "launch_ros", "ament_index_python"}  # only where a full ROS 2 is
+ADAPTERS = {"dask": "cluster.py", "distributed": "cluster.py"}  # of extras
 MODULES = {"PIL": "pillow", "serial": "pyserial", "yaml": "pyyaml", "cv2": "opencv-contrib-python-headless"}
 
 
@@ -80,9 +81,14 @@ def test_name_version_and_licence_agree(described, manifest):
 def test_every_library_that_is_imported_is_required_and_no_other(described):
     ours = {path.stem for path in ROOT.glob("finforce*")}
     names = set().union(*(imported(path) for path in SOURCES))
-    libraries = names - set(sys.stdlib_module_names) - ours - ROS - LAUNCH
+    libraries = names - set(sys.stdlib_module_names) - ours - ROS - LAUNCH - set(ADAPTERS)
     required = {re.split(r"[<>=\[; ]", text)[0] for text in described["install_requires"]} - {"open3d-cpu"}
     assert {MODULES.get(name, name) for name in libraries} == required
+
+
+@pytest.mark.parametrize("library", ADAPTERS)
+def test_an_optional_library_is_imported_in_its_adapter_alone(library):
+    assert [path.name for path in SOURCES if library in imported(path)] == [ADAPTERS[library]]
 
 
 def test_every_ros_package_that_is_imported_is_in_the_manifest(manifest):

@@ -6,11 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from contact_fakes import JAW, cylinder
-from estimator_fakes import BENCH, CALIBRATION, PERIOD, magnitudes, ramp, record
+from estimator_fakes import BENCH, CALIBRATION, magnitudes, ramp, record
 
 from finforce.health import ALL, IDLE, RULES, STILL, Idling, SkippingError, Skips
-from finforce_contact.estimator import ContactEstimator
 from finforce_ifea.estimator import ForceEstimator
 from finforce_ifea.observation import AWAY, Contact, ObjectOutline, is_out_of_reach
 from finforce_ifea.settings import EstimatorSettings
@@ -152,26 +150,3 @@ class TestAnObjectOutOfReach:
 
     def test_before_the_tare_nothing_is_idle(self):
         assert not watched()[1][:44].any()
-
-
-class TestContactThatNeedNotBeLookedFor:
-    def follow(self, off, gap, noise):
-        """Mean heights (n,) [m] and touch (n,) of a cylinder whose pose trembles before the undeformed jaw."""
-        estimator = ContactEstimator(JAW, mesh=cylinder(), skips=Skips(off))
-        random, heights, touching = np.random.default_rng(3), [], []
-        for frame in range(40):
-            T = np.eye(4)
-            T[:3, 3] = [JAW.inner_face_x + RADIUS + gap, 0.0, HEIGHT] + noise * random.standard_normal(3)
-            estimator.take_pose(frame * PERIOD, T)
-            found = estimator.update(frame * PERIOD)
-            heights.append(np.average(found.points[:, 2], weights=found.weights))
-            touching.append(found.touching)
-        return estimator, np.array(heights), np.array(touching)
-
-    def test_the_place_stays_within_what_may_move(self):
-        estimator, heights, touching = self.follow((), 1e-3, 5e-6)
-        looked, reference, known = self.follow((ALL,), 1e-3, 5e-6)
-        assert np.abs(heights - reference).max() < 0.05e-3
-        assert (touching == known).all()
-        assert int(estimator.skips.describe()["skipped: nothing moved"]) > 20
-        assert looked.counts["solved"] == 40 and looked.skips.describe()["skipped: nothing moved"] == "off"

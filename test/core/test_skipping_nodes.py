@@ -146,7 +146,7 @@ class TestContactEstimator:
                 self.image(bench, NEAR_GAP, now + TENTH * k // 3)
             bench.probe.spin(0.05)
             found = bench.node.session.jaws["left"].loop.last.estimate
-        return float(np.average(found.points[:, 2], weights=found.weights))
+        return float(np.average(found.contact.points[:, 2], weights=found.contact.weights))
 
     def test_the_place_is_the_same_with_the_rules_and_without(self):
         places = [self.find_place(off) for off in ("", ALL)]
