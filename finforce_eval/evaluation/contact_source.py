@@ -153,7 +153,9 @@ def first_touch(choice: ContactChoice, recording: Recording, jaw: Jaw, mesh: str
     estimate = estimator.update(stamp)
     if estimate.contact is None or not len(estimate.contact.points):
         raise RecordingError(f"{recording.name}: no location of first touch: {estimate.message or estimate.status}")
-    return replace(estimate.contact, touching=False, free=True)
+    found = estimate.contact
+    point = np.average(found.points, axis=0, weights=found.weights)
+    return Contact(points=point[None], weights=np.ones(1), touching=False, free=True, outline=found.outline)
 
 
 def _before_load(track: ObjectTrack, recording: Recording, side: str) -> ObjectTrack:
