@@ -159,7 +159,9 @@ def live_result(
     magnitude_stddev = stddev_along(force, stddev)
     contact = {}
     if any("contact_status" in row for row in rows):
-        touching = is_touch(np.linalg.norm(force, axis=1), magnitude_stddev)
+        told = np.isfinite(force).all(axis=1)
+        newest = np.maximum.accumulate(np.where(told, np.arange(len(told)), 0))  # what was told last still holds
+        touching = (told & is_touch(np.linalg.norm(force, axis=1), magnitude_stddev))[newest]
         contact = _contact_columns(recording, side, rows, estimator) | {"touching": touching}
     return ForceSeries.build(
         recording.name,
