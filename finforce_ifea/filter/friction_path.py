@@ -10,8 +10,10 @@ from finforce_ifea.contact_mechanics.pressed_jaw import RigidContact
 from finforce_ifea.filter.slip_path import SlipPath
 from finforce_ifea.tracking.friction import Coefficient
 
-# Coefficients of friction that are weighed against each other.
+# Coefficients of friction that are weighed against each other, and the deviation of a coefficient up to which one is
+# enough: that is within what no friction explains.
 NODES = 9
+_WELL_KNOWN = 0.05
 # They cover the expected coefficient by so many standard deviations, up to the largest [-].
 _SPAN = 2.5
 _LARGEST = 1.2
@@ -43,10 +45,11 @@ class TractionHypotheses:
     What the jaws alone hold does not move along the finger: friction balances the inclination of their faces.
 
     Attributes:
-        mu: coefficients of friction (NODES,) [-].
+        mu: coefficients of friction (M,) [-].
         upright: traction ratio of an object that only the jaws hold [-].
         motion: of the object along the path since it was last asked for [m].
         stddev: of the traction ratio by errors of the path [-].
+        unweighed: standard deviation of the coefficient of friction that no hypothesis stands for [-].
     """
 
     def __init__(self, friction: Coefficient, held: str) -> None:
@@ -57,10 +60,14 @@ class TractionHypotheses:
     def expect(self, friction: Coefficient) -> None:
         """Expect another coefficient of friction."""
         mean, stddev = friction
-        low = max(mean - _SPAN * stddev, 0.0)
-        high = max(min(mean + _SPAN * stddev, _LARGEST), low + 1e-3)
-        self.mu = np.linspace(low, high, NODES)
-        prior = np.exp(-0.5 * ((self.mu - mean) / max(stddev, 1e-6)) ** 2) + 1e-300
+        self.unweighed = stddev if stddev <= _WELL_KNOWN else 0.0
+        if self.unweighed:
+            self.mu, self._cell, prior = np.array([mean]), 0.0, np.ones(1)
+        else:
+            low = max(mean - _SPAN * stddev, 0.0)
+            self.mu = np.linspace(low, max(min(mean + _SPAN * stddev, _LARGEST), low + 1e-3), NODES)
+            self._cell = float(self.mu[1] - self.mu[0])
+            prior = np.exp(-0.5 * ((self.mu - mean) / stddev) ** 2) + 1e-300
         self._prior = prior / prior.sum()
         self._path = SlipPath(self.mu)
         self.reset()
@@ -99,26 +106,23 @@ class TractionHypotheses:
         """Return the coefficient of friction for the weights of the hypotheses (N,)."""
         if not self.follows_path:
             return Coefficient(0.0, np.inf)
-        own = weights[:NODES] / max(weights[:NODES].sum(), 1e-300)
+        own = weights[: len(self.mu)] / max(weights[: len(self.mu)].sum(), 1e-300)
         mean = float(own @ self.mu)
-        return Coefficient(mean, float(np.sqrt(max(own @ self.mu**2 - mean**2, 0.0) + self._cell_variance)))
-
-    @property
-    def _cell_variance(self) -> float:
-        return float(self.mu[1] - self.mu[0]) ** 2 / 12.0
+        between = max(float(own @ self.mu**2) - mean**2, 0.0)
+        return Coefficient(mean, float(np.sqrt(between + self._cell**2 / 12.0 + self.unweighed**2)))
 
     def spread_cells(self, weights: NDArray) -> float:
         """Return the variance of kappa within the cells of the grid, for the weights of the hypotheses (N,)."""
-        if not self.follows_path:
+        if not self.follows_path or len(self.mu) < 2:
             return 0.0
         slopes = np.gradient(np.clip(self._path.ratios, -LARGEST_RATIO, LARGEST_RATIO), self.mu)
-        return float(weights[:NODES] @ slopes**2) * self._cell_variance
+        return float(weights[: len(self.mu)] @ slopes**2) * self._cell**2 / 12.0
 
     def bound_held(self, log_weights: NDArray) -> NDArray:
         """Return the weights (N,), that of "held" less what friction does not bear: P(mu > |kappa|)."""
         if not 0.0 < self._held < 1.0:
             return log_weights
-        step = self.mu[1] - self.mu[0]
+        step = max(self._cell, 2.0 * self.unweighed)
         bears = self._prior @ np.clip((self.mu + 0.5 * step - abs(self.upright)) / step, 0.0, 1.0)
         bears = float(np.log(max(bears, _LEAST_PROBABILITY)))
         weighed = log_weights.copy()
@@ -151,7 +155,7 @@ class TractionHypotheses:
             track: of the depth.
             weights: of the hypotheses (N,).
         """
-        places, own = places[:NODES], weights[:NODES] / max(weights[:NODES].sum(), 1e-300)
+        places, own = places[: len(self.mu)], weights[: len(self.mu)] / max(weights[: len(self.mu)].sum(), 1e-300)
         if self._anchor is None:
             self._anchor = places.copy()
         motion = places - self._anchor

@@ -188,7 +188,7 @@ class FilterSearch(ContactSearch):
             variance,
             self.points["offset_variance"],
             np.hypot(bent[:, 0], bent[:, 2]),
-            TRACTION_FLOOR**2 + (TRACTION_SHARE * mu) ** 2 + path**2,
+            TRACTION_FLOOR**2 + (TRACTION_SHARE * mu) ** 2 + path**2 + self.hypotheses.unweighed**2,
             camera**2,
         )
 
