@@ -11,36 +11,49 @@ multiple-model estimator).
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
-from finforce_ifea.filter.state import (
-    APPARENT,
-    CAMERA_TURN,
-    CAMERA_X,
-    CAMERA_Z,
-    DEPTH,
-    HEIGHT,
-    SHAPE,
-    SHARED,
-    TRACTION,
-)
+from finforce_ifea.filter.measurement import weigh
+from finforce_ifea.filter.state import SHARED, TRACTION
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
-# Columns of a row of H that are not zero beside those of its own key point.
-_COLUMNS = np.array([DEPTH, SHAPE, HEIGHT, TRACTION, CAMERA_X, CAMERA_Z, CAMERA_TURN, APPARENT])
+# Log probability below which no hypothesis falls, so that it can come back.
+_LEAST_WEIGHT = -9.0
+
+
+class Posterior(NamedTuple):
+    """What an image leaves.
+
+    Attributes:
+        x: means of the hypotheses (N, n).
+        log_weights: of the hypotheses (N,).
+        mean: of the state over the hypotheses (n,).
+        A: with P <- P - A^T A (2 m, n).
+        L: Cholesky factor of S (2 m, 2 m).
+        nu: mean innovation (2 m,) [m].
+        own: covariance of the first four entries by the noise of this image alone, K R K^T (4, 4).
+        left: residuals of the key points (m, 2) [m].
+        weight: of the key points by these residuals (m,).
+    """
+
+    x: NDArray
+    log_weights: NDArray
+    mean: NDArray
+    A: NDArray
+    L: NDArray
+    nu: NDArray
+    own: NDArray
+    left: NDArray
+    weight: NDArray
 
 
 @njit(**_OPTIONS)
 def multiply_rows(H, rows, u, P):
-    """Return H P (m, n).
-
-    Args:
-        H: rows of the measurement matrix by `_COLUMNS` (m, 8).
-        rows: number of each row among all rows of key points, 2 k + axis (m,).
-        u: displacement of each row's key point [m] (m,).
-        P: covariance (n, n).
-    """
+    """Return H P (2 m, n); see `Measurement` for the arguments."""
     m, n = len(rows), len(P)
     offset, relative = SHARED, SHARED + (n - SHARED) // 2
     out = np.empty((m, n))
@@ -48,33 +61,32 @@ def multiply_rows(H, rows, u, P):
         own, r = P[offset + rows[i]], P[relative + rows[i]]
         for j in range(n):
             out[i, j] = own[j] + u[i] * r[j]
-        for c in range(len(_COLUMNS)):
+        for c in range(SHARED):
             h = H[i, c]
             if h != 0.0:
-                row = P[_COLUMNS[c]]
                 for j in range(n):
-                    out[i, j] += h * row[j]
+                    out[i, j] += h * P[c, j]
     return out
 
 
 @njit(**_OPTIONS)
 def project_columns(H, rows, u, A):
-    """Return A H^T (k, m) for rows A (k, n) of a matrix."""
+    """Return A H^T (k, 2 m) for rows A (k, n) of a matrix; see `Measurement` for the other arguments."""
     m, n = len(rows), A.shape[1]
     offset, relative = SHARED, SHARED + (n - SHARED) // 2
     out = np.empty((len(A), m))
     for k in range(len(A)):
         for i in range(m):
             total = A[k, offset + rows[i]] + u[i] * A[k, relative + rows[i]]
-            for c in range(len(_COLUMNS)):
-                total += H[i, c] * A[k, _COLUMNS[c]]
+            for c in range(SHARED):
+                total += H[i, c] * A[k, c]
             out[k, i] = total
     return out
 
 
 @njit(**_OPTIONS)
 def innovate(H, rows, u, P, R):
-    """Return H P (m, n) and S = H P H^T + R (m, m), R in blocks of two rows (m // 2, 2, 2)."""
+    """Return H P (2 m, n) and S = H P H^T + R (2 m, 2 m); see `Measurement` for the arguments."""
     HP = multiply_rows(H, rows, u, P)
     S = project_columns(H, rows, u, HP)
     for k in range(len(R)):
@@ -82,6 +94,16 @@ def innovate(H, rows, u, P, R):
             for b in range(2):
                 S[2 * k + a, 2 * k + b] += R[k, a, b]
     return HP, S
+
+
+@njit(**_OPTIONS)
+def expect_innovations(measured, ratios, x):
+    """Return the innovations (N, 2 m) [m] of hypotheses with traction ratios (N,) and means (N, n)."""
+    nu = project_columns(measured.H, measured.rows, measured.u, x)
+    for i in range(len(x)):
+        for j in range(len(measured.z)):
+            nu[i, j] = measured.z[j] - nu[i, j] - measured.H[j, TRACTION] * ratios[i]
+    return nu
 
 
 @njit(**_OPTIONS)
@@ -100,33 +122,59 @@ def solve_lower(L, B):
 
 
 @njit(**_OPTIONS)
-def update(x, log_weights, H, rows, u, P, R, nu):
-    """Return updated means (N, n), log weights (N,), A (m, n) with P <- P - A^T A, L (m, m), and K R K^T (4, 4).
+def divide_noise(R, weight):
+    """Return the noise (m, 2, 2) of key points with weights (m,)."""
+    out = R.copy()
+    for k in range(len(R)):
+        out[k] /= weight[k]
+    return out
+
+
+@njit(**_OPTIONS)
+def update(measured, weight, ratios, x, log_weights, P):
+    """Return the posterior of one image.
 
     Args:
+        measured: by the key points.
+        weight: of the key points (m,).
+        ratios: traction ratio of each hypothesis (N,).
         x: predicted means (N, n).
         log_weights: (N,).
-        H: see `multiply_rows`.
-        rows: see `multiply_rows`.
-        u: see `multiply_rows`.
         P: predicted covariance (n, n).
-        R: noise (m // 2, 2, 2) [m^2].
-        nu: innovations of the hypotheses (N, m) [m].
     """
-    HP, S = innovate(H, rows, u, P, R)
+    R, nu = divide_noise(measured.R, weight), expect_innovations(measured, ratios, x)
+    HP, S = innovate(measured.H, measured.rows, measured.u, P, R)
     L = np.linalg.cholesky(S)
-    A, white = solve_lower(L, HP), solve_lower(L, nu.T.copy())
-    updated, weights = x + np.dot(white.T.copy(), A), np.empty(len(x))
-    for i in range(len(x)):
-        weights[i] = log_weights[i] - 0.5 * (white[:, i] ** 2).sum()
-    top = weights.max()
-    return updated, weights - top - np.log(np.exp(weights - top).sum()), A, L, _spread_noise(A, L, R)
+    A, white = solve_lower(L, HP), solve_lower(L, np.ascontiguousarray(nu.T))
+    updated, before = x + np.dot(np.ascontiguousarray(white.T), A), np.exp(log_weights)
+    log_weights = normalize(log_weights - 0.5 * (white**2).sum(axis=0))
+    w = np.exp(log_weights)
+    left = np.dot(w, expect_innovations(measured, ratios, updated)).reshape(-1, 2)
+    return Posterior(
+        updated,
+        log_weights,
+        np.dot(w, updated),
+        A,
+        L,
+        np.dot(before, nu),
+        _spread_noise(A, L, R),
+        left,
+        weigh(left, measured.R, measured.square),
+    )
+
+
+@njit(**_OPTIONS)
+def normalize(log_weights):
+    """Return log weights (N,) whose weights add up to 1, none of them below the least."""
+    out = log_weights - log_weights.max()
+    out = np.maximum(out - np.log(np.exp(out).sum()), _LEAST_WEIGHT)
+    return out - np.log(np.exp(out).sum())
 
 
 @njit(**_OPTIONS)
 def reduce_covariance(P, A):
     """Return P - A^T A, symmetric."""
-    out = P - np.dot(A.T.copy(), A)
+    out = P - np.dot(np.ascontiguousarray(A.T), A)
     return 0.5 * (out + out.T)
 
 

@@ -9,47 +9,112 @@ and its covariance S,
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from finforce_ifea.filter.filter import project_columns, solve_lower
-from finforce_ifea.filter.state import CAMERA, DEPTH, HEIGHT
+from finforce_ifea.filter.filter import (
+    Posterior,
+    divide_noise,
+    expect_innovations,
+    innovate,
+    project_columns,
+    solve_lower,
+)
+from finforce_ifea.filter.measurement import Measurement, find_depth_jump, weigh
+from finforce_ifea.filter.state import CAMERA_TURN, CAMERA_X, CAMERA_Z, DEPTH, HEIGHT, TRACTION
+
+_OPTIONS = {"cache": True, "error_model": "numpy"}
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Jump:
+class Jump(NamedTuple):
     """Entries of the state that may jump together.
 
     Attributes:
         entries: of x (j,).
-        columns: of H in `measurement.linearize` (j,).
         stddev: 1 sigma of the jump (j,).
         probability: of a jump in one image [-].
     """
 
     entries: NDArray
-    columns: NDArray
     stddev: NDArray
     probability: float
 
-    def log_odds(self, information: NDArray, score: NDArray) -> float:
-        """Return the log odds of the jump for H^T S^-1 H (8, 8) and H^T S^-1 nu (8,)."""
-        known, y, Q = information[self.columns[:, None], self.columns], score[self.columns], self.stddev**2
-        gain = 0.5 * float(y @ np.linalg.solve(np.diag(1.0 / Q) + known, y))
-        cost = 0.5 * float(np.linalg.slogdet(np.eye(len(Q)) + Q[:, None] * known)[1])
-        return float(np.log(self.probability / (1.0 - self.probability))) + gain - cost
 
-
+_SHIFT = np.array([CAMERA_X, CAMERA_Z, CAMERA_TURN])
 # The camera was bumped, by a millimetre and half a degree.
-BUMPED = Jump(entries=CAMERA, columns=np.array([4, 5, 6]), stddev=np.array([1e-3, 1e-3, 10e-3]), probability=1e-5)
+BUMPED = Jump(_SHIFT, np.array([1e-3, 1e-3, 10e-3]), 1e-5)
 # The object touches elsewhere than stated, anywhere within 30 mm.
-MISPLACED = Jump(entries=np.array([HEIGHT]), columns=np.array([2]), stddev=np.array([30e-3]), probability=1e-4)
-# The same as it shows over some images only, by less.
-_NUDGED = Jump(entries=CAMERA, columns=np.arange(3), stddev=np.array([0.4e-3, 0.4e-3, 4e-3]), probability=1e-4)
+MISPLACED = Jump(np.array([HEIGHT]), np.array([30e-3]), 1e-4)
+# An object that only the jaws hold was lifted or set down.
+LIFTED = Jump(np.array([TRACTION]), np.array([0.3]), 1e-4)
+# The camera was bumped by less, as it shows over some images only.
+_NUDGED = Jump(_SHIFT, np.array([0.4e-3, 0.4e-3, 4e-3]), 1e-4)
 # Log odds against a jump since the first image, its prior left out, after which the test begins anew.
 _UNLIKELY = -3.0
+NONE = -1
+
+
+@njit(**_OPTIONS)
+def find_log_odds(jump, information, score):
+    """Return the log odds of a jump for H^T S^-1 H (SHARED, SHARED) and H^T S^-1 nu (SHARED,)."""
+    k = len(jump.entries)
+    known, y = np.eye(k), np.empty(k)
+    for i in range(k):
+        y[i] = jump.stddev[i] * score[jump.entries[i]]
+        for j in range(k):
+            known[i, j] += jump.stddev[i] * information[jump.entries[i], jump.entries[j]] * jump.stddev[j]
+    L = np.linalg.cholesky(known)
+    white = solve_lower(L, y.reshape(-1, 1))
+    gain, cost = 0.5 * (white**2).sum(), np.log(np.diag(L)).sum()
+    return np.log(jump.probability / (1.0 - jump.probability)) + gain - cost
+
+
+@njit(**_OPTIONS)
+def detect_jump(measured, ratios, x, log_weights, P, jumps, possible):
+    """Widen P where part of the state has jumped; return weights of the key points (m,) and which jump, or `NONE`.
+
+    A motion of the object, which is no jump, is taken out first to weigh the key points.
+
+    Args:
+        measured: see `update`.
+        ratios: see `update`.
+        x: see `update`.
+        log_weights: see `update`.
+        P: see `update`; changed.
+        jumps: that may be (J,).
+        possible: which of them are possible now (J,).
+    """
+    H, rows, u, R = measured.H, measured.rows, measured.u, measured.R
+    nu = np.dot(np.exp(log_weights), expect_innovations(measured, ratios, x))
+    _, S = innovate(H, rows, u, P, R)
+    blocks = np.empty_like(R)
+    for i in range(len(R)):
+        blocks[i] = S[2 * i : 2 * i + 2, 2 * i : 2 * i + 2]
+    moved = nu - H[:, DEPTH] * find_depth_jump(H, R, nu)
+    weight = weigh(moved.reshape(-1, 2), blocks, measured.square)
+    extra = divide_noise(R, weight) - R
+    for i in range(len(R)):
+        S[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] += extra[i]
+    L = np.linalg.cholesky(S)
+    white_H, white = solve_lower(L, H), solve_lower(L, nu.reshape(-1, 1))
+    rows_H = np.ascontiguousarray(white_H.T)
+    information, score = np.dot(rows_H, white_H), np.dot(rows_H, white)[:, 0].copy()
+    found, most, index, entries, stddev = NONE, 0.0, 0, jumps[0].entries, jumps[0].stddev
+    for jump in jumps:
+        if possible[index]:
+            odds = find_log_odds(jump, information, score)
+            if odds > most:
+                found, most = index, odds
+                entries, stddev = jump.entries, jump.stddev
+        index += 1
+    if found == NONE:
+        return weigh(nu.reshape(-1, 2), blocks, measured.square), found
+    for i in range(len(entries)):
+        P[entries[i], entries[i]] += stddev[i] ** 2
+    return weight, found
 
 
 class CameraWatch:
@@ -66,39 +131,39 @@ class CameraWatch:
 
     def reset(self) -> None:
         """Begin with the next image."""
-        self._F = np.zeros((self._size, len(CAMERA)))
+        self._F = np.zeros((self._size, len(_SHIFT)))
         self._information, self._score = np.zeros((3, 3)), np.zeros(3)
 
     def predict(self, f: NDArray) -> None:
         """Take the transition of the state, a factor for each entry (n,)."""
         self._F *= f[:, None]
 
-    def update(
-        self, H: NDArray, rows: NDArray, u: NDArray, A: NDArray, L: NDArray, nu: NDArray
-    ) -> tuple[NDArray, NDArray] | None:
-        """Take an image; once the camera was bumped, return the change of the mean (n,) and of P (n, n).
-
-        Args:
-            H: see `multiply_rows`.
-            rows: see `multiply_rows`.
-            u: see `multiply_rows`.
-            A: L^-1 H P (m, n).
-            L: Cholesky factor of S (m, m).
-            nu: innovation (m,) [m].
-        """
-        G = solve_lower(L, H[:, BUMPED.columns] - project_columns(H, rows, u, np.ascontiguousarray(self._F.T)).T)
-        self._information += G.T @ G
-        self._score += G.T @ solve_lower(L, nu.reshape(-1, 1))[:, 0]
-        self._F += A.T @ G
-        odds, prior = _NUDGED.log_odds(self._information, self._score), np.log(_NUDGED.probability)
+    def update(self, measured: Measurement, posterior: Posterior) -> tuple[NDArray, NDArray] | None:
+        """Take an image; once the camera was bumped, return the change of the mean (n,) and of P (n, n)."""
+        odds = _watch(measured, posterior, self._F, self._information, self._score)
         if odds <= 0.0:
-            if odds - prior < _UNLIKELY:
+            if odds - np.log(_NUDGED.probability) < _UNLIKELY:
                 self.reset()
             return None
         V = np.linalg.inv(np.diag(_NUDGED.stddev**-2.0) + self._information)
         D = -self._F
-        D[CAMERA, np.arange(3)] += 1.0
+        D[_SHIFT, np.arange(3)] += 1.0
         D[DEPTH] = 0.0
         jump = D @ (V @ self._score), D @ V @ D.T
         self.reset()
         return jump
+
+
+@njit(**_OPTIONS)
+def _watch(measured, posterior, F, information, score):
+    """Return the log odds of a bump by one more image; F (n, 3), information (3, 3) and score (3,) are updated."""
+    projected = project_columns(measured.H, measured.rows, measured.u, np.ascontiguousarray(F.T))
+    G = solve_lower(posterior.L, measured.H[:, CAMERA_X : CAMERA_TURN + 1] - projected.T)
+    GT = np.ascontiguousarray(G.T)
+    information += np.dot(GT, G)
+    score += np.dot(GT, solve_lower(posterior.L, posterior.nu.reshape(-1, 1)))[:, 0]
+    F += np.dot(np.ascontiguousarray(posterior.A.T), G)
+    k = len(score)
+    whole, y = np.zeros((CAMERA_TURN + 1, CAMERA_TURN + 1)), np.zeros(CAMERA_TURN + 1)
+    whole[CAMERA_X : CAMERA_X + k, CAMERA_X : CAMERA_X + k], y[CAMERA_X : CAMERA_X + k] = information, score
+    return find_log_odds(_NUDGED, whole, y)

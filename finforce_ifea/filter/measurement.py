@@ -13,10 +13,24 @@ divide the covariance of a point whose squared normalised residual is D_k^2 (see
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
-from finforce_ifea.filter.filter import innovate, solve_lower
+from finforce_ifea.filter.state import (
+    APPARENT,
+    CAMERA_STRETCH,
+    CAMERA_TURN,
+    CAMERA_X,
+    CAMERA_Z,
+    DEPTH,
+    HEIGHT,
+    SHAPE,
+    SHARED,
+    TRACTION,
+)
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
 
@@ -26,18 +40,54 @@ FREEDOM = 4.0
 LATERAL_ERROR = 0.1e-3
 
 
+class Measurement(NamedTuple):
+    """Two rows, x and z, of each of m key points of an image, linearised about a state.
+
+    Attributes:
+        H: derivatives by the shared entries of the state (2 m, SHARED).
+        rows: number of each row among all rows of key points, 2 k + axis (2 m,).
+        u: displacement of each row's key point [m] (2 m,).
+        z: measured positions less the part of the linearised ones that does not depend on x (2 m,) [m].
+        R: noise (m, 2, 2) [m^2].
+        square: squared normalised residuals along y (m,).
+    """
+
+    H: NDArray
+    rows: NDArray
+    u: NDArray
+    z: NDArray
+    R: NDArray
+    square: NDArray
+
+
 @njit(**_OPTIONS)
-def linearize(points, seen, positions, motions):
-    """Return H (2 m, 8), |u| (2 m,) [m], residuals (m, 2) [m], and squared normalised ones along y (m,).
+def find_seen(points):
+    """Return which key points can be used (m,)."""
+    seen = np.empty(len(points), np.int64)
+    count = 0
+    for k in range(len(points)):
+        measured = points[k].measured
+        if np.isfinite(measured[0] + measured[1] + measured[2]) and points[k].trust > 0.0:
+            seen[count] = k
+            count += 1
+    return seen[:count].copy()
+
+
+@njit(**_OPTIONS)
+def observe(points, seen, positions, motions, at, ratio):
+    """Return the measurement by key points.
 
     Args:
         points: all key points of the image (K,), see `KEYPOINT`.
         seen: those that are used (m,).
         positions: of the mechanics (K, 3) [m].
         motions: their derivatives by depth, shape, height and traction ratio (K, 3, 4).
+        at: depth, shape and height at which the mechanics stands (3,).
+        ratio: traction ratio at which it stands.
     """
     m = len(seen)
-    H, u, left, square = np.zeros((2 * m, 8)), np.empty(2 * m), np.empty((m, 2)), np.empty(m)
+    H, rows, u, z = np.zeros((2 * m, SHARED)), np.empty(2 * m, np.int64), np.empty(2 * m), np.empty(2 * m)
+    R, square = np.empty((m, 2, 2)), np.empty(m)
     for i in range(m):
         k = seen[i]
         point, p = points[k], positions[k]
@@ -45,27 +95,18 @@ def linearize(points, seen, positions, motions):
         square[i] = lateral * lateral / (point.width_variance / point.trust + point.offset_variance + LATERAL_ERROR**2)
         size = np.hypot(p[0] - point.rest[0], p[2] - point.rest[2])
         for a in range(2):
-            row = 2 * i + a
-            left[i, a] = point.measured[2 * a] - p[2 * a] - point.gain[a] * lateral
-            u[row] = size
-            for c in range(4):
-                H[row, c] = motions[k, 2 * a, c]
-            H[row, 7] = motions[k, 2 * a, 3]
-        H[2 * i, 4], H[2 * i + 1, 5] = 1.0, 1.0
-        H[2 * i, 6], H[2 * i + 1, 6] = p[2], -p[0]
-    return H, u, left, square
-
-
-@njit(**_OPTIONS)
-def take_noise(points, seen):
-    """Return the covariance (m, 2, 2) [m^2] in the plane of key points that are used (m,)."""
-    noise = np.empty((len(seen), 2, 2))
-    for i in range(len(seen)):
-        point = points[seen[i]]
-        for a in range(2):
+            row, motion = 2 * i + a, motions[k, 2 * a]
+            rows[row], u[row] = 2 * k + a, size
+            H[row, DEPTH], H[row, SHAPE], H[row, HEIGHT] = motion[0], motion[1], motion[2]
+            H[row, TRACTION] = H[row, APPARENT] = motion[3]
+            z[row] = point.measured[2 * a] - p[2 * a] - point.gain[a] * lateral + motion[3] * ratio
+            z[row] += motion[0] * at[0] + motion[1] * at[1] + motion[2] * at[2]
             for b in range(2):
-                noise[i, a, b] = point.tare_noise[a, b] / point.trust
-    return noise
+                R[i, a, b] = point.tare_noise[a, b] / point.trust
+        H[2 * i, CAMERA_X], H[2 * i + 1, CAMERA_Z] = 1.0, 1.0
+        H[2 * i, CAMERA_TURN], H[2 * i + 1, CAMERA_TURN] = p[2], -p[0]
+        H[2 * i + 1, CAMERA_STRETCH] = p[2]
+    return Measurement(H, rows, u, z, R, square)
 
 
 @njit(**_OPTIONS)
@@ -81,37 +122,19 @@ def weigh(left, covariance, square):
 
 
 @njit(**_OPTIONS)
-def weigh_innovations(H, rows, u, P, noise, nu, square):
-    """Return weights (m,) of key points by the forecast, which may be off by a motion of the object.
-
-    The median of the motions that the points ask for one by one is taken out first.
-    """
-    _, S = innovate(H, rows, u, P, noise)
-    m = len(noise)
-    blocks, asked, information = np.empty((m, 2, 2)), np.empty(m), np.empty(m)
+def find_depth_jump(H, R, nu):
+    """Return the median [m] of the depths that the key points ask for one by one, by H, R and the innovation nu."""
+    m = len(R)
+    asked, information = np.empty(m), np.empty(m)
     for i in range(m):
-        blocks[i] = S[2 * i : 2 * i + 2, 2 * i : 2 * i + 2]
-        a, b, c = noise[i, 0, 0], noise[i, 0, 1], noise[i, 1, 1]
-        h0, h1, r0, r1 = H[2 * i, 0], H[2 * i + 1, 0], nu[2 * i], nu[2 * i + 1]
+        a, b, c = R[i, 0, 0], R[i, 0, 1], R[i, 1, 1]
+        h0, h1, r0, r1 = H[2 * i, DEPTH], H[2 * i + 1, DEPTH], nu[2 * i], nu[2 * i + 1]
         det = a * c - b * b
         information[i] = (c * h0 * h0 - 2.0 * b * h0 * h1 + a * h1 * h1) / det
         asked[i] = (c * h0 * r0 - b * (h0 * r1 + h1 * r0) + a * h1 * r1) / det / max(information[i], 1e-300)
-    order, total, jump = np.argsort(asked), 0.0, 0.0
-    for i in order:
+    total, half = 0.0, 0.5 * information.sum()
+    for i in np.argsort(asked):
         total += information[i]
-        if total >= 0.5 * information.sum():
-            jump = asked[i]
-            break
-    left = np.empty((m, 2))
-    for i in range(m):
-        for a in range(2):
-            left[i, a] = nu[2 * i + a] - H[2 * i + a, 0] * jump
-    return weigh(left, blocks, square), blocks
-
-
-@njit(**_OPTIONS)
-def whiten(H, rows, u, P, R, nu):
-    """Return L^-1 H (2 m, 8) and L^-1 nu (2 m,) with S = L L^T the covariance of the innovation nu (2 m,)."""
-    _, S = innovate(H, rows, u, P, R)
-    L = np.linalg.cholesky(S)
-    return solve_lower(L, H), solve_lower(L, nu.reshape(-1, 1))[:, 0].copy()
+        if total >= half:
+            return asked[i]
+    return 0.0

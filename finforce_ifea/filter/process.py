@@ -10,27 +10,20 @@ with the motion delta of the object, so that a prior counts once and never again
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from finforce_ifea.filter.state import (
-    APPARENT,
-    CAMERA,
-    DEPTH,
-    HEIGHT,
-    SHAPE,
-    TRACTION,
-    offset_entries,
-    relative_entries,
-)
+from finforce_ifea.filter.state import APPARENT, CAMERA_STRETCH, CAMERA_X, DEPTH, HEIGHT, SHAPE, SHARED, TRACTION
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
 
 # 1 sigma of the depth in an image before it is seen [m]: wider than any motion between two images.
 FREE_DEPTH = 2e-3
 # Time over which the error of an object's pose stays the same [s]; trackers see an object from one side.
-OBJECT_TIME = 10.0
+OBJECT_TIME = 30.0
 # Error of the mechanics at a key point, 1 sigma: constant [m], of a shape [-], and of all shapes [-], the last two
 # relative to the displacement: the default mesh is within 1 % of an independent program.
 MODEL_FLOOR = 0.02e-3
@@ -53,50 +46,77 @@ APPARENT_TIME = 10.0
 CAMERA_SHIFT = 0.02e-3
 CAMERA_TURN_STDDEV = 0.3e-3
 CAMERA_TIME = 20.0
-# Time over which a bumped camera stays where it is [s].
+# The same of a bumped camera.
+BUMPED_SHIFT = 1e-3
+BUMPED_TURN = 10e-3
 BUMPED_TIME = 1e4
+# 1 sigma of turn [rad] and stretch [-] of a jaw whose place in the picture is uncertain, and the time over which it is
+# off alike [s].
+PLACE_TURN = 0.07
+PLACE_STRETCH = 0.02
+PLACE_TIME = 1.0
 
 
-def expect_state(
-    size: int,
-    mean: NDArray,
-    variance: NDArray,
-    offset_variance: NDArray,
-    displacement: NDArray,
-    traction_variance: float,
-    camera_variance: NDArray,
-) -> tuple[NDArray, NDArray]:
+class Expectation(NamedTuple):
+    """What the state returns to.
+
+    Attributes:
+        mean: of shape and height (2,).
+        variance: of both (2,).
+        traction_variance: of the traction ratio beyond friction.
+        camera_variance: of the camera's motion (4,).
+        camera_time: over which that stays the same [s].
+    """
+
+    mean: NDArray
+    variance: NDArray
+    traction_variance: float
+    camera_variance: NDArray
+    camera_time: float
+
+
+@njit(**_OPTIONS)
+def expect_state(expected, offset_variance, displacement):
     """Return mean m (n,) and variance V (n,) to which the state returns.
 
     Args:
-        size: n.
-        mean: of shape and height (2,).
-        variance: of both (2,).
+        expected: see `Expectation`.
         offset_variance: of the key points' offsets (K,) [m^2].
         displacement: of the key points (K,) [m].
-        traction_variance: of the traction ratio beyond friction.
-        camera_variance: of the camera's motion (3,).
     """
-    m, V, count = np.zeros(size), np.zeros(size), len(displacement)
-    m[SHAPE], m[HEIGHT] = mean
-    V[SHAPE], V[HEIGHT] = variance
-    V[TRACTION], V[APPARENT] = traction_variance, APPARENT_TRACTION**2
-    V[CAMERA] = camera_variance
-    V[offset_entries(count)] = np.repeat(offset_variance + MODEL_FLOOR**2 + (MODEL_SHAPE * displacement) ** 2, 2)
-    V[relative_entries(count)] = MODEL_RELATIVE**2
+    count = len(displacement)
+    n = SHARED + 4 * count
+    m, V = np.zeros(n), np.zeros(n)
+    m[SHAPE : HEIGHT + 1], V[SHAPE : HEIGHT + 1] = expected.mean, expected.variance
+    V[TRACTION], V[APPARENT] = expected.traction_variance, APPARENT_TRACTION**2
+    V[CAMERA_X : CAMERA_STRETCH + 1] = expected.camera_variance
+    for k in range(count):
+        own = offset_variance[k] + MODEL_FLOOR**2 + (MODEL_SHAPE * displacement[k]) ** 2
+        V[SHARED + 2 * k] = V[SHARED + 2 * k + 1] = own
+    V[SHARED + 2 * count :] = MODEL_RELATIVE**2
     return m, V
 
 
-def find_decay(size: int, keypoints: int, dt: float, motion: float, *, bumped: bool) -> NDArray:
-    """Return a (n,) after a time dt [s] and a motion of the object [m]; `bumped` after the camera was."""
-    a = np.ones(size)
-    a[[SHAPE, HEIGHT]] = np.exp(-dt / OBJECT_TIME)
+@njit(**_OPTIONS)
+def find_decay(keypoints, dt, motion, camera_time):
+    """Return a (n,) after a time dt [s] and a motion of the object [m]."""
+    a = np.ones(SHARED + 4 * keypoints)
+    a[SHAPE] = a[HEIGHT] = np.exp(-dt / OBJECT_TIME)
     a[TRACTION] = np.exp(-motion / TRACTION_LENGTH - dt / MODEL_TIME)
     a[APPARENT] = np.exp(-dt / APPARENT_TIME)
-    a[CAMERA] = np.exp(-dt / (BUMPED_TIME if bumped else CAMERA_TIME))
-    a[offset_entries(keypoints)] = np.exp(-motion / MODEL_LENGTH - dt / MODEL_TIME)
-    a[relative_entries(keypoints)] = np.exp(-dt / RELATIVE_TIME)
+    a[CAMERA_X : CAMERA_STRETCH + 1] = np.exp(-dt / camera_time)
+    a[SHARED : SHARED + 2 * keypoints] = np.exp(-motion / MODEL_LENGTH - dt / MODEL_TIME)
+    a[SHARED + 2 * keypoints :] = np.exp(-dt / RELATIVE_TIME)
     return a
+
+
+@njit(**_OPTIONS)
+def find_growth(before, after, keypoints):
+    """Return the ratio (n,) of the stationary standard deviations of the offsets after and before a step, else 1."""
+    growth = np.ones(len(after))
+    for i in range(SHARED, SHARED + 2 * keypoints):
+        growth[i] = np.sqrt(after[i] / before[i])
+    return growth
 
 
 @njit(**_OPTIONS)

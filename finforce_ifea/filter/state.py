@@ -1,22 +1,23 @@
 """Layout of the filter's state vector x (n,) and of its covariance P (n, n).
 
-    x = (d, s, h, dk, c_x, c_z, c_phi, e, o_1 ... o_K, r_1 ... r_K)
+    x = (d, s, h, dk, c_x, c_z, c_phi, c_s, e, o_1 ... o_K, r_1 ... r_K)
 
 d is the depth of the object [m], s its shape (logarithm of the radius, or tilt [rad]) and h its height [m]; dk is the
-traction ratio beyond what friction explains [-]; (c_x, c_z) [m] and c_phi [rad] are the shift and turn of the camera
-since the tare; e is the traction ratio that errors of the mechanics look like [-]. Each key point has, along x and z,
-an offset o [m] and an error r of the mechanics relative to the point's displacement [-].
+traction ratio beyond what friction explains [-]; (c_x, c_z) [m] and c_phi [rad] are the shift and turn of the jaw in
+the camera's view since the tare, and c_s [-] is its stretch along z; e is the traction ratio that errors of the
+mechanics look like [-]. Each key point has, along x and z, an offset o [m] and an error r of the mechanics relative to
+the point's displacement [-].
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-DEPTH, SHAPE, HEIGHT, TRACTION, CAMERA_X, CAMERA_Z, CAMERA_TURN, APPARENT = range(8)
+DEPTH, SHAPE, HEIGHT, TRACTION, CAMERA_X, CAMERA_Z, CAMERA_TURN, CAMERA_STRETCH, APPARENT = range(9)
 # Entries that no single key point owns.
-SHARED = 8
+SHARED = 9
 CONTACT = np.array([DEPTH, SHAPE, HEIGHT])
-CAMERA = np.array([CAMERA_X, CAMERA_Z, CAMERA_TURN])
+CAMERA = np.array([CAMERA_X, CAMERA_Z, CAMERA_TURN, CAMERA_STRETCH])
 
 
 def state_size(keypoints: int) -> int:

@@ -16,16 +16,20 @@ from finforce_ifea.tracking.friction import Coefficient
 class FilterTracker(ContactTracker):
     """Takes the place of `ContactTracker`: objects, mechanics and lateral loads are its own.
 
-    Friction is a state with a prior that every image updates. What it does not know yet: a lifted weight, and key
-    points that share a motion because the place of the jaw is uncertain.
+    Friction is a state with a prior that every image updates.
     """
 
     search_type = FilterSearch
     _search: FilterSearch
+    _tare: Tare | None = None
 
     def update(self, points: NDArray, tare: Tare, dt: float, observation: Observation) -> ContactState | None:
         """See `ContactTracker.update`."""
         search, measured = self._search, points - tare.offsets
+        if tare is not self._tare:
+            self._tare = tare
+            search.restart()
+        search.expectation["shared"] = observation.shared
         planar = measured - self._lateral.motions if self._is_known else measured
         self._fill(planar, tare, tare.point_noise(observation.stddev))
         most = FULL_ITERATIONS if self._fidelity else self.settings.iterations

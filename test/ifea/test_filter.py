@@ -15,22 +15,13 @@ from finforce_ifea.contact_mechanics.friction import constant_traction
 from finforce_ifea.contact_mechanics.indenter import RoundIndenter
 from finforce_ifea.contact_mechanics.pressed_jaw import limit_step
 from finforce_ifea.estimator import ForceEstimator
-from finforce_ifea.filter.filter import innovate, reduce_covariance, update
+from finforce_ifea.filter.filter import expect_innovations, innovate, reduce_covariance, update
 from finforce_ifea.filter.friction_path import NODES, TractionHypotheses
-from finforce_ifea.filter.jump import BUMPED, MISPLACED
-from finforce_ifea.filter.measurement import FREEDOM, weigh
-from finforce_ifea.filter.process import FREE_DEPTH, expect_state, find_decay, predict
+from finforce_ifea.filter.jump import BUMPED, LIFTED, MISPLACED, find_log_odds
+from finforce_ifea.filter.measurement import FREEDOM, Measurement, weigh
+from finforce_ifea.filter.process import CAMERA_TIME, FREE_DEPTH, Expectation, expect_state, find_decay, predict
 from finforce_ifea.filter.slip_path import SlipPath
-from finforce_ifea.filter.state import (
-    APPARENT,
-    CAMERA,
-    CONTACT,
-    DEPTH,
-    TRACTION,
-    offset_entries,
-    relative_entries,
-    state_size,
-)
+from finforce_ifea.filter.state import DEPTH, SHARED, TRACTION, offset_entries, relative_entries, state_size
 from finforce_ifea.jaw.calibration import Calibration, load_calibration
 from finforce_ifea.mechanics import build_chosen
 from finforce_ifea.observation import Observation
@@ -41,7 +32,6 @@ RUBBED = np.load(Path(__file__).parents[1] / "data" / "rubbed_bench.npz")
 HEIGHTS = {"lower": 0.020, "middle": 0.040, "upper": 0.060}
 COUNT = 4
 SIZE = state_size(COUNT)
-COLUMNS = [*CONTACT, TRACTION, *CAMERA, APPARENT]
 
 
 @cache
@@ -50,18 +40,18 @@ def mechanics():
 
 
 def draw(seed=0):
-    """A random measurement of three of four key points: H in short and in full, P, R, x, innovation."""
+    """A random measurement of three of four key points, H in full, P, and means of two hypotheses."""
     random, rows = np.random.default_rng(seed), np.array([0, 1, 2, 3, 6, 7])
-    H, u = random.standard_normal((6, 8)), np.repeat(random.uniform(0.0, 1.0, 3), 2)
+    H, u = random.standard_normal((6, SHARED)), np.repeat(random.uniform(0.0, 1.0, 3), 2)
     full = np.zeros((6, SIZE))
-    full[:, COLUMNS] = H
+    full[:, :SHARED] = H
     for row, entry in enumerate(rows):
         full[row, offset_entries(COUNT).start + entry] = 1.0
         full[row, relative_entries(COUNT).start + entry] = u[row]
     root = random.standard_normal((SIZE, SIZE))
     R = np.stack([each @ each.T + 0.1 * np.eye(2) for each in random.standard_normal((3, 2, 2))])
-    x, nu = random.standard_normal((2, SIZE)), random.standard_normal((2, 6))
-    return H, rows, u, full, root @ root.T, R, x, nu
+    measured = Measurement(H, rows, u, random.standard_normal(6), R, np.zeros(3))
+    return measured, full, root @ root.T, random.standard_normal((2, SIZE))
 
 
 def block(R):
@@ -74,52 +64,58 @@ def block(R):
 
 class TestUpdate:
     def test_it_is_the_textbooks(self):
-        H, rows, u, full, P, R, x, nu = draw()
-        S = full @ P @ full.T + block(R)
+        measured, full, P, x = draw()
+        S, ratios = full @ P @ full.T + block(measured.R), np.array([-0.2, 0.3])
         K = P @ full.T @ np.linalg.inv(S)
-        means, weights, A, L, own = update(x, np.log([0.3, 0.7]), H, rows, u, P, R, nu)
-        np.testing.assert_allclose(means, x + nu @ K.T, rtol=1e-8)
-        np.testing.assert_allclose(reduce_covariance(P, A), P - K @ S @ K.T, rtol=1e-7, atol=1e-7)
-        np.testing.assert_allclose(L @ L.T, S, rtol=1e-9)
-        np.testing.assert_allclose(own, (K @ block(R) @ K.T)[:4, :4], rtol=1e-7, atol=1e-10)
+        nu = measured.z - x @ full.T - np.outer(ratios, measured.H[:, TRACTION])
+        np.testing.assert_allclose(expect_innovations(measured, ratios, x), nu, rtol=1e-9)
+        post = update(measured, np.ones(3), ratios, x, np.log([0.3, 0.7]), P)
+        np.testing.assert_allclose(post.x, x + nu @ K.T, rtol=1e-8)
+        np.testing.assert_allclose(reduce_covariance(P, post.A), P - K @ S @ K.T, rtol=1e-7, atol=1e-7)
+        np.testing.assert_allclose(post.L @ post.L.T, S, rtol=1e-9)
+        np.testing.assert_allclose(post.own, (K @ block(measured.R) @ K.T)[:4, :4], rtol=1e-7, atol=1e-10)
         likelihoods = np.array([0.3, 0.7]) * np.exp(-0.5 * np.einsum("ia,ab,ib->i", nu, np.linalg.inv(S), nu))
-        np.testing.assert_allclose(np.exp(weights), likelihoods / likelihoods.sum(), rtol=1e-8)
+        likelihoods = np.maximum(likelihoods / likelihoods.sum(), np.exp(-9.0))
+        np.testing.assert_allclose(np.exp(post.log_weights), likelihoods / likelihoods.sum(), rtol=1e-6)
 
     def test_the_innovation_has_the_covariance_of_prediction_and_noise(self):
-        H, rows, u, full, P, R, _, _ = draw(1)
-        HP, S = innovate(H, rows, u, P, R)
+        measured, full, P, _ = draw(1)
+        HP, S = innovate(measured.H, measured.rows, measured.u, P, measured.R)
         np.testing.assert_allclose(HP, full @ P, rtol=1e-10)
-        np.testing.assert_allclose(S, full @ P @ full.T + block(R), rtol=1e-10)
+        np.testing.assert_allclose(S, full @ P @ full.T + block(measured.R), rtol=1e-10)
+
+
+EXPECTED = Expectation(np.ones(2), np.full(2, 4.0), 0.01, np.ones(4), CAMERA_TIME)
 
 
 class TestProcess:
     def test_a_prior_counts_once_and_for_ever(self):
-        m, V = expect_state(SIZE, np.ones(2), np.full(2, 4.0), np.full(COUNT, 1e-8), np.zeros(COUNT), 0.01, np.ones(3))
+        m, V = expect_state(EXPECTED, np.full(COUNT, 1e-8), np.zeros(COUNT))
         x, P = np.zeros((2, SIZE)), np.diag(V)
         for _ in range(50):
-            predict(x, P, find_decay(SIZE, COUNT, 100.0, 0.1, bumped=False), m, V, np.ones(SIZE))
+            predict(x, P, find_decay(COUNT, 100.0, 0.1, CAMERA_TIME), m, V, np.ones(SIZE))
         np.testing.assert_allclose(x[:, 1:], np.tile(m[1:], (2, 1)), atol=1e-9)
         np.testing.assert_allclose(np.diag(P)[1:], V[1:], rtol=1e-9)
         assert P[DEPTH, DEPTH] == FREE_DEPTH**2
 
     def test_nothing_changes_in_no_time_without_motion_but_the_depth(self):
-        m, V = expect_state(SIZE, np.ones(2), np.full(2, 4.0), np.full(COUNT, 1e-8), np.zeros(COUNT), 0.01, np.ones(3))
+        m, V = expect_state(EXPECTED, np.full(COUNT, 1e-8), np.zeros(COUNT))
         x, P = np.random.default_rng(0).standard_normal((2, SIZE)), 0.5 * np.diag(V)
         before = x.copy()
-        predict(x, P, find_decay(SIZE, COUNT, 0.0, 0.0, bumped=False), m, V, np.ones(SIZE))
+        predict(x, P, find_decay(COUNT, 0.0, 0.0, CAMERA_TIME), m, V, np.ones(SIZE))
         np.testing.assert_allclose(x, before, rtol=1e-12)
         np.testing.assert_allclose(np.diag(P)[1:], 0.5 * V[1:])
 
 
 class TestJump:
-    @pytest.mark.parametrize("jump", [BUMPED, MISPLACED], ids=["bumped", "misplaced"])
+    @pytest.mark.parametrize("jump", [BUMPED, MISPLACED, LIFTED], ids=["bumped", "misplaced", "lifted"])
     def test_it_is_told_where_the_innovation_is_beyond_chance_alone(self, jump):
-        information, score = np.zeros((8, 8)), np.zeros(8)
-        for column, stddev in zip(jump.columns, jump.stddev, strict=True):
+        information, score = np.zeros((SHARED, SHARED)), np.zeros(SHARED)
+        for column, stddev in zip(jump.entries, jump.stddev, strict=True):
             information[column, column] = 100.0 / stddev**2
             score[column] = information[column, column] * 0.1 * stddev
-        assert jump.log_odds(information, score) < 0.0
-        assert jump.log_odds(information, 10.0 * score) > 0.0
+        assert find_log_odds(jump, information, score) < 0.0
+        assert find_log_odds(jump, information, 10.0 * score) > 0.0
 
 
 class TestWeights:

@@ -1,0 +1,98 @@
+"""What the state of the filter says of force and contact."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from finforce_ifea.filter.state import CAMERA_X, CAMERA_Z, DEPTH, HEIGHT, SHARED, TRACTION
+from finforce_ifea.tracking.contact_search import LOADED_DEPTH, TOUCH_DEPTH
+
+_OPTIONS = {"cache": True, "error_model": "numpy"}
+# Error of the force's direction [-]: it is considered and never estimated.
+_MISDIRECTED = 0.03
+# Below this depth the force goes linearly to zero [m].
+_LEAST_DEPTH = 3e-5
+# Weight at which a key point still agrees.
+_AGREES = 0.25
+
+
+@njit(**_OPTIONS)
+def read_out(state, force, modes, x, log_weights, P, shift, reduction, at, ratios, ratio, spread):
+    """Fill in force and covariance of the hypotheses.
+
+    Args:
+        state: see `CONTACT_STATE`.
+        force: of the mechanics where it was linearised (3,) [N].
+        modes: its derivatives by depth, shape, height and traction ratio (3, 4).
+        x: means of the hypotheses (N, n).
+        log_weights: of the hypotheses (N,).
+        P: covariance (n, n).
+        shift: from the depth in x to that of the mechanics [m].
+        reduction: of the covariance of the first four entries by smoothing (4, 4).
+        at: depth, shape and height of the linearisation (3,).
+        ratios: traction ratio of each hypothesis (N,).
+        ratio: that of the linearisation.
+        spread: variance of the traction ratio within the hypotheses.
+    """
+    state, w, count = state[()], np.exp(log_weights), len(x)
+    forces, found, kappa = np.zeros((count, 3)), np.zeros(3), 0.0
+    for i in range(count):
+        offset = (x[i, 0] + shift - at[0], x[i, 1] - at[1], x[i, 2] - at[2], ratios[i] + x[i, TRACTION] - ratio)
+        for a in range(3):
+            forces[i, a] = force[a]
+            for c in range(4):
+                forces[i, a] += modes[a, c] * offset[c]
+            found[a] += w[i] * forces[i, a]
+        kappa += w[i] * (ratios[i] + x[i, TRACTION])
+    covariance = np.dot(modes, np.dot(P[:4, :4] + reduction, np.ascontiguousarray(modes.T)))
+    for a in range(3):
+        for b in range(3):
+            covariance[a, b] += (spread + _MISDIRECTED**2) * modes[a, 3] * modes[b, 3]
+            for i in range(count):
+                covariance[a, b] += w[i] * (forces[i, a] - found[a]) * (forces[i, b] - found[b])
+    continued, size, along = min(1.0, max(0.0, state.depth / _LEAST_DEPTH)), 0.0, 0.0
+    for a in range(3):
+        state.force[a], state.pressing[a] = continued * found[a], force[a]
+        size += state.force[a] ** 2
+        for b in range(3):
+            state.covariance[a, b] = covariance[a, b]
+            state.force_modes[a, b] = 1.0 if a == b else 0.0
+            along += state.force[a] * covariance[a, b] * state.force[b]
+    state.magnitude = np.sqrt(size)
+    state.stddev = np.sqrt(max(along / size if size > 0.0 else covariance[0, 0], 0.0))
+    state.depth_variance, state.height_stddev = P[DEPTH, DEPTH], np.sqrt(P[HEIGHT, HEIGHT])
+    state.traction_ratio = kappa
+    state.sound = state.sound and np.isfinite(covariance.sum() + found.sum())
+    state.quiet, state.loaded = state.depth < TOUCH_DEPTH, state.depth > LOADED_DEPTH
+
+
+@njit(**_OPTIONS)
+def judge_points(state, points, seen, mean, V, left, weight, expected_height):
+    """Fill in how well the key points agree.
+
+    Args:
+        state: see `CONTACT_STATE`.
+        points: all key points of the image (K,), see `KEYPOINT`; get their weights.
+        seen: those that were used (m,).
+        mean: of the state (n,).
+        V: its stationary variance (n,).
+        left: residuals (m, 2) [m].
+        weight: of the key points (m,).
+        expected_height: of the contact [m].
+    """
+    state, squares = state[()], 0.0
+    for k in range(len(points)):
+        points[k].weight = 0.0
+    for i in range(len(seen)):
+        points[seen[i]].weight = weight[i]
+        squares += weight[i] * (left[i, 0] ** 2 + left[i, 1] ** 2)
+    state.residual = np.sqrt(squares / (2.0 * weight.sum()))
+    state.used = state.known = len(seen)
+    state.agreed = (weight > _AGREES).sum()
+    misfit, offsets = 0.0, 2 * len(points)
+    for i in range(SHARED, SHARED + offsets):
+        misfit += mean[i] ** 2 / V[i]
+    state.misfit = np.sqrt(misfit / offsets)
+    state.offset = mean[HEIGHT] - expected_height
+    state.motion = np.hypot(mean[CAMERA_X], mean[CAMERA_Z])
