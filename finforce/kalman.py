@@ -2,7 +2,8 @@
 
 At rest x drifts as a random walk; in motion it has a speed v whose changes are white. The object starts and stops at
 random times. Means and covariances of both models are mixed before each step by the transition matrix, and each model
-is weighted by the likelihood of its innovation (Blom and Bar-Shalom, 1988).
+is weighted by the likelihood of its innovation (Blom and Bar-Shalom, 1988). Once a jump explains an innovation better
+than both, the position begins anew.
 """
 
 from __future__ import annotations
@@ -26,6 +27,8 @@ class MotionNoise(NamedTuple):
         start: variance of the speed at which motion begins [1/s^2].
         rest_time: mean time of rest [s].
         motion_time: mean time of motion [s].
+        jump: variance of a jump of the position.
+        jump_probability: of one in a step [-].
     """
 
     drift: float
@@ -33,6 +36,8 @@ class MotionNoise(NamedTuple):
     start: float
     rest_time: float
     motion_time: float
+    jump: float = 0.0
+    jump_probability: float = 0.0
 
 
 class Track:
@@ -90,12 +95,12 @@ class Track:
     def expect(self, z: float, R: float) -> float:
         """Return the position that a measured one z of a variance R would leave."""
         state = self._state.copy()
-        _correct(state, z, R)
+        _correct(state, z, R, self.noise)
         return float(state[0] * state[1] + (1.0 - state[0]) * state[2])
 
     def update(self, z: float, R: float) -> None:
         """Take a measured position z of a variance R."""
-        _correct(self._state, z, R)
+        _correct(self._state, z, R, self.noise)
 
 
 @njit(**_OPTIONS)
@@ -133,9 +138,13 @@ def _advance(s, dt, drift, acceleration):
 
 
 @njit(**_OPTIONS)
-def _correct(s, z, R):
+def _correct(s, z, R, noise):
     """Take a measured position z of a variance R into a state (8,)."""
     nu0, nu1, S0, S1 = z - s[1], z - s[2], s[4] + R, s[5] + R
+    likely = s[0] * _density(nu0, S0) + (1.0 - s[0]) * _density(nu1, S1)
+    if noise.jump_probability * _density(nu0, s[4] + noise.jump + R) > (1.0 - noise.jump_probability) * likely:
+        s[:] = np.array([0.5, z, z, 0.0, R, R, 0.0, noise.start])
+        return
     odds = 0.5 * (nu0 * nu0 / S0 - nu1 * nu1 / S1) + 0.5 * np.log(S0 / S1)
     motion = (1.0 - s[0]) * np.exp(min(max(odds, -50.0), 50.0))
     s[0] = s[0] / (s[0] + motion)
@@ -147,3 +156,9 @@ def _correct(s, z, R):
     s[5] *= R / S1
     s[6] -= gain * cross
     s[7] -= speed_gain * cross
+
+
+@njit(**_OPTIONS)
+def _density(nu, S):
+    """Return the normal density of a number nu of variance S, without the factor that all have."""
+    return np.exp(-0.5 * nu * nu / S) / np.sqrt(S) if S > 0.0 else 0.0

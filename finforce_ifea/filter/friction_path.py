@@ -53,8 +53,8 @@ class TractionHypotheses:
     """
 
     def __init__(self, friction: Coefficient, held: str) -> None:
-        """Expect an object of a coefficient of friction; `held` is "no", "yes" or "either"."""
-        self._held = {"yes": 1.0, "no": 0.0}.get(held, _HELD)
+        """Expect an object of a coefficient of friction; `held` as in `EstimatorSettings`."""
+        self._held = {"yes": 1.0, "either": _HELD}.get(held, 0.0)
         self.expect(friction)
 
     def expect(self, friction: Coefficient) -> None:

@@ -50,22 +50,34 @@ BUMPED = Jump(_SHIFT, np.array([1e-3, 1e-3, 10e-3]), 1e-5)
 MISPLACED = Jump(np.array([HEIGHT]), np.array([30e-3]), 1e-4)
 # An object that only the jaws hold was lifted or set down.
 LIFTED = Jump(np.array([TRACTION]), np.array([0.3]), 1e-4)
-# The camera was bumped by less, as it shows over some images only.
-_NUDGED = Jump(_SHIFT, np.array([0.4e-3, 0.4e-3, 4e-3]), 1e-4)
+# The camera was bumped by less, and the object touches elsewhere, as they show over some images only.
+NUDGED = Jump(_SHIFT, np.array([0.4e-3, 0.4e-3, 4e-3]), 1e-4)
+OFFSET = Jump(np.array([HEIGHT]), np.array([15e-3]), 1e-4)
 # Log odds against a jump since the first image, its prior left out, after which the test begins anew.
 _UNLIKELY = -3.0
 NONE = -1
 
 
 @njit(**_OPTIONS)
-def find_log_odds(jump, information, score):
-    """Return the log odds of a jump for H^T S^-1 H (SHARED, SHARED) and H^T S^-1 nu (SHARED,)."""
-    k = len(jump.entries)
-    known, y = np.eye(k), np.empty(k)
+def select_entries(entries, information, score):
+    """Return those entries (j,) of information (SHARED, SHARED) and score (SHARED,) as (j, j) and (j,)."""
+    k = len(entries)
+    own, part = np.empty((k, k)), np.empty(k)
     for i in range(k):
-        y[i] = jump.stddev[i] * score[jump.entries[i]]
+        part[i] = score[entries[i]]
         for j in range(k):
-            known[i, j] += jump.stddev[i] * information[jump.entries[i], jump.entries[j]] * jump.stddev[j]
+            own[i, j] = information[entries[i], entries[j]]
+    return own, part
+
+
+@njit(**_OPTIONS)
+def weigh_jump(jump, information, score):
+    """Return the log odds of a jump for I (j, j) and y (j,) of its entries."""
+    k = len(score)
+    known, y = np.eye(k), jump.stddev * score
+    for i in range(k):
+        for j in range(k):
+            known[i, j] += jump.stddev[i] * information[i, j] * jump.stddev[j]
     L = np.linalg.cholesky(known)
     white = solve_lower(L, y.reshape(-1, 1))
     gain, cost = 0.5 * (white**2).sum(), np.log(np.diag(L)).sum()
@@ -105,7 +117,8 @@ def detect_jump(measured, ratios, x, log_weights, P, jumps, possible):
     found, most, index, entries, stddev = NONE, 0.0, 0, jumps[0].entries, jumps[0].stddev
     for jump in jumps:
         if possible[index]:
-            odds = find_log_odds(jump, information, score)
+            own, part = select_entries(jump.entries, information, score)
+            odds = weigh_jump(jump, own, part)
             if odds > most:
                 found, most = index, odds
                 entries, stddev = jump.entries, jump.stddev
@@ -117,53 +130,54 @@ def detect_jump(measured, ratios, x, log_weights, P, jumps, possible):
     return weight, found
 
 
-class CameraWatch:
-    """Tells small bumps of the camera from the innovations of several images: generalised likelihood ratio.
+class JumpWatch:
+    """Tells small jumps from the innovations of several images: generalised likelihood ratio.
 
     With F the response of the state's mean so far to a unit jump at the first image, the innovations have the mean
-    G b, G = H (E - F), where E selects the camera's entries (Willsky and Jones, 1976).
+    G b, G = H (E - F), where E selects the entries that jump (Willsky and Jones, 1976).
     """
 
-    def __init__(self, size: int) -> None:
-        """Watch the camera of a filter whose state has n = size entries."""
-        self._size = size
+    def __init__(self, jump: Jump, size: int) -> None:
+        """Watch for a jump of a state that has n = size entries."""
+        self._jump, self._size = jump, size
         self.reset()
 
     def reset(self) -> None:
         """Begin with the next image."""
-        self._F = np.zeros((self._size, len(_SHIFT)))
-        self._information, self._score = np.zeros((3, 3)), np.zeros(3)
+        count = len(self._jump.entries)
+        self._F = np.zeros((self._size, count))
+        self._information, self._score = np.zeros((count, count)), np.zeros(count)
 
     def predict(self, f: NDArray) -> None:
         """Take the transition of the state, a factor for each entry (n,)."""
         self._F *= f[:, None]
 
     def update(self, measured: Measurement, posterior: Posterior) -> tuple[NDArray, NDArray] | None:
-        """Take an image; once the camera was bumped, return the change of the mean (n,) and of P (n, n)."""
-        odds = _watch(measured, posterior, self._F, self._information, self._score)
+        """Take an image; once it has jumped, return the change of the mean (n,) and of P (n, n)."""
+        jump = self._jump
+        odds = _watch(measured, posterior, jump, self._F, self._information, self._score)
         if odds <= 0.0:
-            if odds - np.log(_NUDGED.probability) < _UNLIKELY:
+            if odds - np.log(jump.probability) < _UNLIKELY:
                 self.reset()
             return None
-        V = np.linalg.inv(np.diag(_NUDGED.stddev**-2.0) + self._information)
+        V = np.linalg.inv(np.diag(jump.stddev**-2.0) + self._information)
         D = -self._F
-        D[_SHIFT, np.arange(3)] += 1.0
+        D[jump.entries, np.arange(len(jump.entries))] += 1.0
         D[DEPTH] = 0.0
-        jump = D @ (V @ self._score), D @ V @ D.T
+        change = D @ (V @ self._score), D @ V @ D.T
         self.reset()
-        return jump
+        return change
 
 
 @njit(**_OPTIONS)
-def _watch(measured, posterior, F, information, score):
-    """Return the log odds of a bump by one more image; F (n, 3), information (3, 3) and score (3,) are updated."""
-    projected = project_columns(measured.H, measured.rows, measured.u, np.ascontiguousarray(F.T))
-    G = solve_lower(posterior.L, measured.H[:, CAMERA_X : CAMERA_TURN + 1] - projected.T)
+def _watch(measured, posterior, jump, F, information, score):
+    """Return the log odds of a jump by one more image; F (n, j), information (j, j) and score (j,) are updated."""
+    G = -project_columns(measured.H, measured.rows, measured.u, np.ascontiguousarray(F.T)).T.copy()
+    for j in range(len(jump.entries)):
+        G[:, j] += measured.H[:, jump.entries[j]]
+    G = solve_lower(posterior.L, G)
     GT = np.ascontiguousarray(G.T)
     information += np.dot(GT, G)
     score += np.dot(GT, solve_lower(posterior.L, posterior.nu.reshape(-1, 1)))[:, 0]
     F += np.dot(np.ascontiguousarray(posterior.A.T), G)
-    k = len(score)
-    whole, y = np.zeros((CAMERA_TURN + 1, CAMERA_TURN + 1)), np.zeros(CAMERA_TURN + 1)
-    whole[CAMERA_X : CAMERA_X + k, CAMERA_X : CAMERA_X + k], y[CAMERA_X : CAMERA_X + k] = information, score
-    return find_log_odds(_NUDGED, whole, y)
+    return weigh_jump(jump, information, score)

@@ -23,7 +23,7 @@ _OPTIONS = {"cache": True, "error_model": "numpy"}
 # 1 sigma of the depth in an image before it is seen [m]: wider than any motion between two images.
 FREE_DEPTH = 2e-3
 # Time over which the error of an object's pose stays the same [s]; trackers see an object from one side.
-OBJECT_TIME = 30.0
+OBJECT_TIME = 10.0
 # Error of the mechanics at a key point, 1 sigma: constant [m], of a shape [-], and of all shapes [-], the last two
 # relative to the displacement: the default mesh is within 1 % of an independent program.
 MODEL_FLOOR = 0.02e-3

@@ -17,7 +17,7 @@ from finforce_ifea.contact_mechanics.friction import Traction, constant_traction
 from finforce_ifea.contact_mechanics.pressed_jaw import PressedState, RigidContact, limit_step
 from finforce_ifea.filter.filter import Posterior, reduce_covariance, update
 from finforce_ifea.filter.friction_path import LARGEST_RATIO, TractionHypotheses
-from finforce_ifea.filter.jump import BUMPED, LIFTED, MISPLACED, CameraWatch, detect_jump
+from finforce_ifea.filter.jump import BUMPED, LIFTED, MISPLACED, NUDGED, OFFSET, JumpWatch, detect_jump
 from finforce_ifea.filter.measurement import Measurement, find_seen, observe
 from finforce_ifea.filter.process import (
     BUMPED_SHIFT,
@@ -47,9 +47,16 @@ from finforce_ifea.tracking.held_weight import find_upright_ratio
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
 # Process noise of the depth: drift at rest [m/s^0.5], changes of the speed in motion [m/s^1.5], speed at which motion
-# starts [m/s], mean times of rest and motion [s]: jaws close at millimetres per second, and stop.
+# starts [m/s], mean times of rest and motion [s]: jaws close at millimetres per second, and stop. Jumps [m] are images
+# that were missed, or another object.
 _DEPTH_NOISE = MotionNoise(
-    drift=(0.01e-3) ** 2, acceleration=0.004**2, start=(5e-3) ** 2, rest_time=3.0, motion_time=1.0
+    drift=(0.01e-3) ** 2,
+    acceleration=0.004**2,
+    start=(5e-3) ** 2,
+    rest_time=3.0,
+    motion_time=1.0,
+    jump=(5e-3) ** 2,
+    jump_probability=1e-3,
 )
 # 1 sigma of the depth at the beginning [m].
 _FIRST_DEPTH = 0.1e-3
@@ -95,7 +102,7 @@ class FilterSearch(ContactSearch):
         """Prepare the filter for `count` key points."""
         super().__init__(count, settings)
         self._size, self._count = state_size(count), count
-        self._watch = CameraWatch(self._size)
+        self._watches = [JumpWatch(jump, self._size) for jump in (NUDGED, OFFSET)]
         self.hypotheses = TractionHypotheses(Coefficient(settings.friction, settings.friction_stddev), settings.held)
 
     def begin(self, contact: RigidContact, mean: NDArray) -> None:
@@ -124,7 +131,11 @@ class FilterSearch(ContactSearch):
     def restart(self) -> None:
         """Start anew where the contact is now, as after another tare."""
         self.x, self._bumped, self._smooth = None, False, 0.0
-        self._watch.reset()
+        self._forget_innovations()
+
+    def _forget_innovations(self) -> None:
+        for watch in self._watches:
+            watch.reset()
 
     def expect_friction(self, friction: Coefficient) -> None:
         """Expect an object of another coefficient of friction, of which nothing was seen."""
@@ -210,7 +221,8 @@ class FilterSearch(ContactSearch):
         self.track.predict(dt)
         self.x[:, DEPTH] += self.track.x - self.weights @ self.x[:, DEPTH]
         predict(self.x, self.P, a, m, V, growth)
-        self._watch.predict(a * growth)
+        for watch in self._watches:
+            watch.predict(a * growth)
 
     def find(
         self, contact: RigidContact, traction: Traction, probe: Any, dt: float, *, iterations: int, is_sudden: bool
@@ -275,7 +287,7 @@ class FilterSearch(ContactSearch):
         possible = True, loaded and not self._misplaced, loaded and self.settings.may_be_held
         weight, found = detect_jump(measured, ratios, self.x, self.log_weights, self.P, _JUMPS, possible)
         if found >= 0:
-            self._watch.reset()
+            self._forget_innovations()
             self._bumped |= _JUMPS[found] is BUMPED
             self._misplaced |= _JUMPS[found] is MISPLACED
         return weight
@@ -283,9 +295,14 @@ class FilterSearch(ContactSearch):
     def _conclude(self, measured: Measurement, posterior: Posterior, *, is_settled: bool) -> None:
         """Take over what an image leaves."""
         self.x, self.P = posterior.x, reduce_covariance(self.P, posterior.A)
-        bump = self._watch.update(measured, posterior) if is_settled else None
-        if bump is not None:
-            self.x, self.P, self._bumped = self.x + bump[0], self.P + bump[1], True
+        for watch, is_possible in zip(self._watches, (True, not self._misplaced), strict=True):
+            change = watch.update(measured, posterior) if is_settled and is_possible else None
+            if change is not None:
+                self.x, self.P = self.x + change[0], self.P + change[1]
+                self._bumped |= watch is self._watches[0]
+                self._misplaced |= watch is self._watches[1]
+                self._forget_innovations()
+                break
         self.log_weights = posterior.log_weights
 
     def _smooth_depth(self, posterior: Posterior) -> NDArray:

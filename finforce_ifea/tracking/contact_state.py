@@ -222,6 +222,8 @@ def measure_along(force: NDArray, modes: NDArray, covariance: NDArray) -> float:
 
 # Share of a force that nobody has seen along z.
 UNSEEN_ALONG = 0.3
+# Root mean square error of a length by a variance across it, as a share of the variance over the length: sqrt(3) / 2.
+_CURVED = 0.87
 
 
 @njit(**_OPTIONS)
@@ -279,7 +281,9 @@ def compute_force(state, relaxation, untold, dt, error, stiffness_error, out):
         else:
             arm[a] = undeformed[a] = normal[a] = np.nan
     scaled, left = (stiffness_error * magnitude) ** 2, _measure_length(untold) ** 2
-    return magnitude, np.sqrt(fit**2 + wrong + scaled + along**2 + state.hidden**2 + left)
+    across = max(stddev[0] ** 2 + stddev[2] ** 2 - fit**2 - wrong - scaled - left, 0.0)
+    turned = (_CURVED * across / max(magnitude + fit, 1e-300)) ** 2
+    return magnitude, np.sqrt(fit**2 + wrong + scaled + along**2 + state.hidden**2 + left + turned)
 
 
 @njit(**_OPTIONS)

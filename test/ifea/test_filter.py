@@ -17,7 +17,7 @@ from finforce_ifea.contact_mechanics.pressed_jaw import limit_step
 from finforce_ifea.estimator import ForceEstimator
 from finforce_ifea.filter.filter import expect_innovations, innovate, reduce_covariance, update
 from finforce_ifea.filter.friction_path import NODES, TractionHypotheses
-from finforce_ifea.filter.jump import BUMPED, LIFTED, MISPLACED, find_log_odds
+from finforce_ifea.filter.jump import BUMPED, LIFTED, MISPLACED, weigh_jump
 from finforce_ifea.filter.measurement import FREEDOM, Measurement, weigh
 from finforce_ifea.filter.process import CAMERA_TIME, FREE_DEPTH, Expectation, expect_state, find_decay, predict
 from finforce_ifea.filter.slip_path import SlipPath
@@ -110,12 +110,10 @@ class TestProcess:
 class TestJump:
     @pytest.mark.parametrize("jump", [BUMPED, MISPLACED, LIFTED], ids=["bumped", "misplaced", "lifted"])
     def test_it_is_told_where_the_innovation_is_beyond_chance_alone(self, jump):
-        information, score = np.zeros((SHARED, SHARED)), np.zeros(SHARED)
-        for column, stddev in zip(jump.entries, jump.stddev, strict=True):
-            information[column, column] = 100.0 / stddev**2
-            score[column] = information[column, column] * 0.1 * stddev
-        assert find_log_odds(jump, information, score) < 0.0
-        assert find_log_odds(jump, information, 10.0 * score) > 0.0
+        information = np.diag(100.0 / jump.stddev**2)
+        score = information @ (0.1 * jump.stddev)
+        assert weigh_jump(jump, information, score) < 0.0
+        assert weigh_jump(jump, information, 10.0 * score) > 0.0
 
 
 class TestWeights:
