@@ -33,9 +33,9 @@ class EstimatorSettings:
     gate: float = setting(
         4.5, "residual at which a key point has a quarter of its weight", "sigma", 1.0, 100.0, parameter=False
     )
-    friction: float = setting(0.45, "expected coefficient of friction of an unknown object", "1", 0.0, 2.0)
+    friction: float = setting(0.4, "expected coefficient of friction of a rough object", "1", 0.0, 2.0)
     friction_stddev: float = setting(
-        0.25, "standard deviation of that coefficient (1 sigma)", "1", 1e-3, 2.0, parameter=False
+        0.2, "standard deviation of that coefficient (1 sigma)", "1", 1e-3, 2.0, parameter=False
     )
     smooth_share: float = setting(
         0.65,

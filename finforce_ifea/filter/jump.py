@@ -55,7 +55,7 @@ NUDGED = Jump(_SHIFT, np.array([0.4e-3, 0.4e-3, 4e-3]), 1e-4)
 OFFSET = Jump(np.array([HEIGHT]), np.array([15e-3]), 1e-4)
 # Log odds against a jump since the first image, its prior left out, after which the test begins anew.
 _UNLIKELY = -3.0
-NONE = -1
+NO_JUMP = -1
 
 
 @njit(**_OPTIONS)
@@ -86,7 +86,7 @@ def weigh_jump(jump, information, score):
 
 @njit(**_OPTIONS)
 def detect_jump(measured, ratios, x, log_weights, P, jumps, possible):
-    """Widen P where part of the state has jumped; return weights of the key points (m,) and which jump, or `NONE`.
+    """Widen P where part of the state has jumped; return weights of the key points (m,) and which jump, or `NO_JUMP`.
 
     A motion of the object, which is no jump, is taken out first to weigh the key points.
 
@@ -114,16 +114,15 @@ def detect_jump(measured, ratios, x, log_weights, P, jumps, possible):
     white_H, white = solve_lower(L, H), solve_lower(L, nu.reshape(-1, 1))
     rows_H = np.ascontiguousarray(white_H.T)
     information, score = np.dot(rows_H, white_H), np.dot(rows_H, white)[:, 0].copy()
-    found, most, index, entries, stddev = NONE, 0.0, 0, jumps[0].entries, jumps[0].stddev
-    for jump in jumps:
+    found, most, entries, stddev = NO_JUMP, 0.0, jumps[0].entries, jumps[0].stddev
+    for index, jump in enumerate(jumps):
         if possible[index]:
             own, part = select_entries(jump.entries, information, score)
             odds = weigh_jump(jump, own, part)
             if odds > most:
                 found, most = index, odds
                 entries, stddev = jump.entries, jump.stddev
-        index += 1
-    if found == NONE:
+    if found == NO_JUMP:
         return weigh(nu.reshape(-1, 2), blocks, measured.square), found
     for i in range(len(entries)):
         P[entries[i], entries[i]] += stddev[i] ** 2

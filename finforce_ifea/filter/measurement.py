@@ -36,6 +36,9 @@ _OPTIONS = {"cache": True, "error_model": "numpy"}
 
 # Degrees of freedom of a key point's noise [-].
 FREEDOM = 4.0
+# Weight up to which a key point is a gross error, and what is left of it: nothing that would matter.
+_GROSS = 0.1
+NO_WEIGHT = 1e-9
 # Error of the mechanics along y, one sigma [m].
 LATERAL_ERROR = 0.1e-3
 
@@ -117,7 +120,8 @@ def weigh(left, covariance, square):
         r0, r1 = left[i]
         a, b, c = covariance[i, 0, 0], covariance[i, 0, 1], covariance[i, 1, 1]
         distance = (c * r0 * r0 - 2.0 * b * r0 * r1 + a * r1 * r1) / (a * c - b * b) + square[i]
-        weights[i] = min(1.0, (FREEDOM + 3.0) / (FREEDOM + distance))
+        weight = min(1.0, (FREEDOM + 3.0) / (FREEDOM + distance))
+        weights[i] = weight if weight > _GROSS else NO_WEIGHT
     return weights
 
 

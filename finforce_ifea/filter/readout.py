@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from finforce_ifea.filter.measurement import NO_WEIGHT
 from finforce_ifea.filter.state import CAMERA_X, CAMERA_Z, DEPTH, HEIGHT, SHARED, TRACTION
 from finforce_ifea.tracking.contact_search import LOADED_DEPTH, TOUCH_DEPTH
 
@@ -14,7 +15,7 @@ _MISDIRECTED = 0.03
 # Below this depth the force goes linearly to zero [m].
 _LEAST_DEPTH = 3e-5
 # Weight at which a key point still agrees.
-_AGREES = 0.25
+AGREES = 0.25
 
 
 @njit(**_OPTIONS)
@@ -85,11 +86,10 @@ def judge_points(state, points, seen, mean, V, left, weight, expected_height):
     for k in range(len(points)):
         points[k].weight = 0.0
     for i in range(len(seen)):
-        points[seen[i]].weight = weight[i]
+        points[seen[i]].weight = weight[i] if weight[i] > NO_WEIGHT else 0.0
         squares += weight[i] * (left[i, 0] ** 2 + left[i, 1] ** 2)
     state.residual = np.sqrt(squares / (2.0 * weight.sum()))
-    state.used = state.known = len(seen)
-    state.agreed = (weight > _AGREES).sum()
+    state.known, state.used, state.agreed = len(seen), (weight > NO_WEIGHT).sum(), (weight > AGREES).sum()
     misfit, offsets = 0.0, 2 * len(points)
     for i in range(SHARED, SHARED + offsets):
         misfit += mean[i] ** 2 / V[i]

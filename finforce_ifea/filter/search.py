@@ -17,7 +17,7 @@ from finforce_ifea.contact_mechanics.friction import Traction, constant_traction
 from finforce_ifea.contact_mechanics.pressed_jaw import PressedState, RigidContact, limit_step
 from finforce_ifea.filter.filter import Posterior, reduce_covariance, update
 from finforce_ifea.filter.friction_path import LARGEST_RATIO, TractionHypotheses
-from finforce_ifea.filter.jump import BUMPED, LIFTED, MISPLACED, NUDGED, OFFSET, JumpWatch, detect_jump
+from finforce_ifea.filter.jump import BUMPED, LIFTED, MISPLACED, NO_JUMP, NUDGED, OFFSET, JumpWatch, detect_jump
 from finforce_ifea.filter.measurement import Measurement, find_seen, observe
 from finforce_ifea.filter.process import (
     BUMPED_SHIFT,
@@ -37,7 +37,7 @@ from finforce_ifea.filter.process import (
     find_growth,
     predict,
 )
-from finforce_ifea.filter.readout import judge_points, read_out
+from finforce_ifea.filter.readout import AGREES, judge_points, read_out
 from finforce_ifea.filter.state import CONTACT, DEPTH, HEIGHT, SHAPE, TRACTION, state_size
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tracking.contact_search import LOADED_DEPTH, ContactSearch, find_x_model
@@ -73,6 +73,9 @@ _UNDECIDED = 0.2
 # Least force at which the inclination of the faces is asked for [N].
 _LEAST_FORCE = 0.1
 _LEAST_VARIANCE = 1e-14
+# Share of the key points that has to agree, and the largest bump of a camera that is believed [sigma].
+_MAJORITY = 0.5
+_LARGEST_BUMP = 5.0
 # Variances (4,) of the camera's motion where nobody touches it, and where it was bumped.
 _STILL = np.array([CAMERA_SHIFT, CAMERA_SHIFT, CAMERA_TURN_STDDEV, 0.0]) ** 2
 _BUMPED = np.array([BUMPED_SHIFT, BUMPED_SHIFT, BUMPED_TURN, 0.0]) ** 2
@@ -239,7 +242,7 @@ class FilterSearch(ContactSearch):
         x[0], x[1] = self.track.x, min(max(x[1], expectation["lowest"]), expectation["highest"])
         q = self.q + self._modes @ (find_x_model(contact, x)[0] - self.state["x_model"])
         settled, iteration, share, last = False, 0, 1.0, np.zeros(3)
-        at, weight, moved = None, None, np.zeros(3)
+        at, weight, moved, jump, P = None, None, np.zeros(3), NO_JUMP, self.P.copy()
         while iteration < iterations and not settled:
             iteration += 1
             q, made = self._linearize(contact, probe, q, x, ratio)
@@ -247,8 +250,10 @@ class FilterSearch(ContactSearch):
                 continue
             at = made
             measured = observe(points, seen, at.positions, at.motions, at.x, ratio)
-            weight = self._detect_jump(measured, ratios) if weight is None else weight
-            posterior = update(measured, weight, ratios, self.x, self.log_weights, self.P)
+            if weight is None:
+                possible = self._find_possible_jumps()
+                weight, jump = detect_jump(measured, ratios, self.x, self.log_weights, P, _JUMPS, possible)
+            posterior = update(measured, weight, ratios, self.x, self.log_weights, P)
             weight, aim = posterior.weight, posterior.mean[CONTACT] - x
             aim[0] = self.track.expect(posterior.mean[DEPTH], max(posterior.own[0, 0], _LEAST_VARIANCE)) - x[0]
             last, share = _bound_step(aim, last, share, expectation)
@@ -257,14 +262,15 @@ class FilterSearch(ContactSearch):
             moved = find_x_model(contact, x)[0] - at.x
             q = q + limit_step(contact.model, at.pressed.modes[:, :3] @ moved)
             settled = at.pressed.size < _SETTLED_CORRECTION and _is_settled(moved, aim - last, share, expectation)
-        if at is None:
+        if at is None or not _is_believed(posterior, self._V):
             return False
         self.q, self._modes, self.positions = q, at.pressed.modes[:, :3], at.positions
-        self._conclude(measured, posterior, is_settled=settled)
+        self._take_jump(jump)
+        self.x, self.P, self.log_weights = posterior.x, reduce_covariance(P, posterior.A), posterior.log_weights
+        if settled:
+            self._watch(measured, posterior)
         self._read_out(contact, at, x, posterior, (ratios, ratio))
-        judge_points(
-            self.state, points, seen, posterior.mean, self._V, posterior.left, weight, expectation["mean"][1]
-        )
+        judge_points(self.state, points, seen, posterior.mean, self._V, posterior.left, weight, expectation["mean"][1])
         self.state["iterations"], self.state["converged"] = iteration, settled
         self.state["ambiguity"] = 0.0 if settled else np.linalg.norm(at.pressed.force_modes[:, :3] @ moved)
         return True
@@ -281,29 +287,28 @@ class FilterSearch(ContactSearch):
         motions = contact.model.project(probe, q, pressed.modes)
         return q, _Linearized(x_model, pressed, contact.model.positions(probe, q), motions)
 
-    def _detect_jump(self, measured: Measurement, ratios: NDArray) -> NDArray:
-        """Widen the prediction where something has jumped; return weights of the key points (m,)."""
+    def _find_possible_jumps(self) -> tuple[bool, bool, bool]:
+        """Return which of `_JUMPS` are possible now."""
         loaded = bool(self.state["depth"] > LOADED_DEPTH)
-        possible = True, loaded and not self._misplaced, loaded and self.settings.may_be_held
-        weight, found = detect_jump(measured, ratios, self.x, self.log_weights, self.P, _JUMPS, possible)
-        if found >= 0:
-            self._forget_innovations()
-            self._bumped |= _JUMPS[found] is BUMPED
-            self._misplaced |= _JUMPS[found] is MISPLACED
-        return weight
+        return True, loaded and not self._misplaced, loaded and self.settings.may_be_held
 
-    def _conclude(self, measured: Measurement, posterior: Posterior, *, is_settled: bool) -> None:
-        """Take over what an image leaves."""
-        self.x, self.P = posterior.x, reduce_covariance(self.P, posterior.A)
+    def _take_jump(self, index: int) -> None:
+        """Remember which of `_JUMPS` was seen, or `NO_JUMP`."""
+        if index != NO_JUMP:
+            self._forget_innovations()
+            self._bumped |= _JUMPS[index] is BUMPED
+            self._misplaced |= _JUMPS[index] is MISPLACED
+
+    def _watch(self, measured: Measurement, posterior: Posterior) -> None:
+        """Look for jumps that show over several images only."""
         for watch, is_possible in zip(self._watches, (True, not self._misplaced), strict=True):
-            change = watch.update(measured, posterior) if is_settled and is_possible else None
+            change = watch.update(measured, posterior) if is_possible else None
             if change is not None:
                 self.x, self.P = self.x + change[0], self.P + change[1]
                 self._bumped |= watch is self._watches[0]
                 self._misplaced |= watch is self._watches[1]
                 self._forget_innovations()
-                break
-        self.log_weights = posterior.log_weights
+                return
 
     def _smooth_depth(self, posterior: Posterior) -> NDArray:
         """Smooth the depth; return by how much that lessens the covariance of the first four entries (4, 4)."""
@@ -335,7 +340,8 @@ class FilterSearch(ContactSearch):
         x_model, s["depth"] = find_x_model(contact, x)
         s["x"], s["x_model"], s["x_asked"], s["speed"] = x, x_model, x, self.track.speed
         s["pressure_point"], s["pressure_location"] = pressed.pressure_point, pressed.pressure_location
-        s["extrapolation"], s["sound"], s["mistaken"] = pressed.extrapolation, pressed.smallest_det > 0.0, self._misplaced
+        s["extrapolation"], s["sound"] = pressed.extrapolation, pressed.smallest_det > 0.0
+        s["mistaken"] = self._misplaced
         force, modes, (ratios, ratio) = pressed.force, np.ascontiguousarray(pressed.force_modes), traction
         shift, spread = self._smooth + x_model[0] - x[0], self.hypotheses.spread_cells(self.weights)
         read_out(s, force, modes, self.x, self.log_weights, self.P, shift, smoothing, at.x, ratios, ratio, spread)
@@ -396,3 +402,9 @@ def _is_settled(moved, missing, share, expectation):
         if abs(moved[i]) >= tolerance[i] or (share > _UNDECIDED and abs(missing[i]) >= tolerance[i]):
             return False
     return True
+
+
+def _is_believed(posterior: Posterior, V: NDArray) -> bool:
+    """Whether most key points agree, and the camera has moved no farther than a bump, or V (n,), allows."""
+    moved = np.abs(posterior.mean[BUMPED.entries]) / np.maximum(BUMPED.stddev, np.sqrt(V[BUMPED.entries]))
+    return bool((posterior.weight > AGREES).mean() > _MAJORITY and (moved < _LARGEST_BUMP).all())

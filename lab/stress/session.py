@@ -176,8 +176,6 @@ def judge(solution: Solution, step: SessionStep) -> Trial:
 # The truth comes from the estimator's own mechanics: no more than this share of a force is left to it.
 FORCE_ERROR = 0.01
 COURSE_STEPS = 16
-# The cylinders and objects have no friction, which the estimator is told.
-SMOOTH = {"friction": 0.0, "friction_stddev": 0.03}
 OWN_MECHANICS = ("solid", "frame", "plane")
 # Heights [m] of the bench finger's first and last candidate.
 _BENCH_REACH = (0.008, 0.073)
@@ -195,7 +193,7 @@ class Bench:
         calibration = Calibration(
             young_modulus=modulus * jaw.material.young_modulus, force_error=FORCE_ERROR, clamped_z=0.0
         )
-        chosen = EstimatorSettings(solver=plan.solver, mesh=plan.mesh, **(SMOOTH | settings))
+        chosen = EstimatorSettings(solver=plan.solver, mesh=plan.mesh, **settings)
         self.estimator = ForceEstimator(jaw, settings=chosen, calibration=calibration)
         self.estimator.warm_up()
         self.jaw = self.estimator.jaw

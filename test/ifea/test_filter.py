@@ -18,7 +18,7 @@ from finforce_ifea.estimator import ForceEstimator
 from finforce_ifea.filter.filter import expect_innovations, innovate, reduce_covariance, update
 from finforce_ifea.filter.friction_path import NODES, TractionHypotheses
 from finforce_ifea.filter.jump import BUMPED, LIFTED, MISPLACED, weigh_jump
-from finforce_ifea.filter.measurement import FREEDOM, Measurement, weigh
+from finforce_ifea.filter.measurement import FREEDOM, NO_WEIGHT, Measurement, weigh
 from finforce_ifea.filter.process import CAMERA_TIME, FREE_DEPTH, Expectation, expect_state, find_decay, predict
 from finforce_ifea.filter.slip_path import SlipPath
 from finforce_ifea.filter.state import DEPTH, SHARED, TRACTION, offset_entries, relative_entries, state_size
@@ -121,7 +121,12 @@ class TestWeights:
         noise, square = np.tile((0.2e-3) ** 2 * np.eye(2), (2, 1, 1)), np.zeros(2)
         weights = weigh(np.array([[0.2e-3, 0.0], [10e-3, 0.0]]), noise, square)
         assert weights[0] == 1.0
-        assert weights[1] == pytest.approx((FREEDOM + 3.0) / (FREEDOM + 2500.0))
+        assert weights[1] == NO_WEIGHT
+
+    def test_between_them_it_is_that_of_students_t(self):
+        noise, square = np.tile((0.2e-3) ** 2 * np.eye(2), (1, 1, 1)), np.zeros(1)
+        weights = weigh(np.array([[1e-3, 0.0]]), noise, square)
+        assert weights[0] == pytest.approx((FREEDOM + 3.0) / (FREEDOM + 25.0))
 
 
 def press(contact, x, ratio, q):
@@ -281,3 +286,39 @@ class TestBumpedCamera:
         assert trusted[after].mean() > 0.9
         within = np.abs(force - truth)[after & trusted][:, [0, 2]] < 3.0 * stddev[after & trusted][:, [0, 2]]
         assert within.mean() > 0.9
+
+    def test_a_new_tare_forgets_the_bump(self):
+        estimator = ForceEstimator(BENCH, settings=EstimatorSettings(tracker="filter").resolve_held(both=False))
+        random, contact, image = np.random.default_rng(2), contact_with(circle(12.5e-3), 0.040), 0
+
+        def see(shift, count):
+            nonlocal image
+            for _ in range(count):
+                points = BENCH.keypoints + shift + NOISE * random.standard_normal(BENCH.keypoints.shape)
+                solution = estimator.update(Observation(stamp=image * PERIOD, points=points), contact)
+                image += 1
+            return solution
+
+        see(np.zeros(3), 60)
+        bump = np.array([2e-3, 0.0, 1e-3])
+        see(bump, 60)
+        estimator.tare()
+        last = see(bump, 10)
+        assert np.linalg.norm(last.force) < 3.0 * last.magnitude_stddev + 1e-3
+        assert last.magnitude_stddev < 0.1
+
+
+class TestGarbage:
+    @pytest.mark.parametrize("kind", ["scattered", "far away"])
+    def test_it_gives_no_force_and_is_forgotten_at_once(self, kind):
+        estimator = ForceEstimator(BENCH, settings=EstimatorSettings(tracker="filter").resolve_held(both=False))
+        random, contact = np.random.default_rng(4), contact_with(circle(12.5e-3), 0.040)
+        trusted = []
+        for image in range(80):
+            points = BENCH.keypoints + NOISE * random.standard_normal(BENCH.keypoints.shape)
+            if 60 <= image < 70:
+                scatter = 5e-3 * random.standard_normal(points.shape)
+                points += scatter if kind == "scattered" else np.array([0.0, 0.0, 20e-3])
+            trusted.append(estimator.update(Observation(stamp=image * PERIOD, points=points), contact).trusted)
+        assert not any(trusted[60:70])
+        assert all(trusted[72:])
