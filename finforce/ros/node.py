@@ -65,6 +65,7 @@ from finforce.ros.topics import (  # noqa: F401 - for those with topics
     Outlet,
     Pipeline,
     Stage,
+    describe_rivals,
     is_wanted,
     listen,
     send_cloud,
@@ -223,13 +224,13 @@ def warn_first_start() -> None:
 
 
 def publish_diagnostics(stage: Stage, name: str, period: float, report: Callable[[list[Outcome]], Report]) -> None:
-    """Publish a report on /diagnostics every `period` seconds; mismatches of the stage are its alarms."""
+    """Publish a report on /diagnostics every `period` seconds; faults of the stage's topics are its alarms."""
     node, publisher = stage.node, stage.publisher(DiagnosticArray, "/diagnostics", RESULT)
     space = node.get_namespace().lstrip("/")
     space += "/" if space else ""
 
     def make() -> Report | None:
-        return report([Outcome(level=Level.ERROR, reason="qos", text=fault) for fault in stage.mismatches()])
+        return report([Outcome(level=Level.ERROR, reason=fault, text=fault) for fault in stage.mismatches()])
 
     guarded = stage.guard(make)
 

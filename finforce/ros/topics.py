@@ -148,6 +148,7 @@ class Port:
         callback: takes messages, guarded.
         subscribe: makes the subscription to what comes from outside.
         can_wait: whether the process goes on without it where it takes too long.
+        is_contested: says whether several nodes outside publish the topic, whose messages are then dropped.
         outside: the subscription to what comes from outside; None while there is none.
     """
 
@@ -156,6 +157,7 @@ class Port:
     callback: Callable
     subscribe: Callable[[], Subscription]
     can_wait: bool = False
+    is_contested: Callable[[], bool] = lambda: False
     outside: Subscription | None = field(default=None, init=False)
     _times: deque[float] = field(default_factory=lambda: deque(maxlen=WATCHED), init=False)
 
@@ -182,6 +184,7 @@ class Port:
         """
         if self.outside is None:
             return
+        is_contested = self.is_contested()
         with (handle := self.outside.handle):
             for _ in range(_MOST_WAITING):
                 try:
@@ -190,7 +193,8 @@ class Port:
                     continue
                 if taken is None:
                     return
-                yield taken[0]
+                if not is_contested:
+                    yield taken[0]
 
 
 @dataclass(eq=False)
@@ -236,6 +240,7 @@ class Stage:
     def __init__(self, node: Node, pipeline: Pipeline | None = None) -> None:
         self.node, self.pipeline, self.fault = node, pipeline or Pipeline(is_shared=False), ""
         self._suspects: dict[str, tuple[bool, QoSProfile]] = {}
+        self._contested: set[str] = set()
 
     def guard(self, callback: Callable) -> Callable:
         """Return a callback whose failure stops this node alone, where its process has others; then it does nothing."""
@@ -282,8 +287,36 @@ class Stage:
         made = self.node.create_publisher(kind, topic, qos, event_callbacks=events, qos_overriding_options=_OVERRIDABLE)
         return self.pipeline.outlet(self.node.resolve_topic_name(topic), made, qos)
 
+    def _is_contested(self, topic: str) -> bool:
+        """Say, also in log and diagnostics, whether several nodes publish a topic."""
+        rivals = describe_rivals(self.node, topic)
+        if rivals:
+            self._contested.add(topic)
+            self.node.get_logger().error(f"{rivals}; its messages are dropped", throttle_duration_sec=5.0)
+        return bool(rivals)
+
+    @staticmethod
+    def _take_unless(is_contested: Callable[[], bool], callback: Callable) -> Callable:
+        """Return a callback for messages from outside, which are dropped while these are contested."""
+        if inspect.iscoroutinefunction(callback):
+
+            async def wait(message: Any) -> None:
+                if not is_contested():
+                    await callback(message)
+
+            return wait
+        return lambda message: None if is_contested() else callback(message)
+
     def subscription(
-        self, kind: type, topic: str, callback: Callable, qos: QoSProfile, *, can_wait: bool = False, **options: Any
+        self,
+        kind: type,
+        topic: str,
+        callback: Callable,
+        qos: QoSProfile,
+        *,
+        can_wait: bool = False,
+        is_exclusive: bool = True,
+        **options: Any,
     ) -> Port:
         """Create a watched subscription.
 
@@ -293,19 +326,22 @@ class Stage:
             callback: takes them.
             qos: that is asked for.
             can_wait: a process of several nodes may go on without this one where it takes long.
+            is_exclusive: messages are dropped while several nodes publish the topic: they may contradict each other.
             options: of the subscription, as its callback group.
         """
         events = SubscriptionEventCallbacks(incompatible_qos=lambda _: self._suspect(topic, False, qos))
         guarded = self.guard_taker(topic, callback)
 
+        is_contested = partial(self._is_contested, topic) if is_exclusive else lambda: False
+
         def subscribe() -> Subscription:
+            taker = self._take_unless(is_contested, guarded)
             return self.node.create_subscription(
-                kind, topic, guarded, qos, event_callbacks=events, **{"qos_overriding_options": _OVERRIDABLE, **options}
+                kind, topic, taker, qos, event_callbacks=events, **{"qos_overriding_options": _OVERRIDABLE, **options}
             )
 
-        return self.pipeline.add(
-            Port(self.pipeline, self.node.resolve_topic_name(topic), guarded, subscribe, can_wait=can_wait)
-        )
+        name = self.node.resolve_topic_name(topic)
+        return self.pipeline.add(Port(self.pipeline, name, guarded, subscribe, can_wait, is_contested))
 
     def large_subscription(self, kind: type, topic: str, callback: Callable, **options: Any) -> None:
         """Subscribe to messages of a megabyte from outside, whose lost pieces come again, unless nobody keeps them.
@@ -330,7 +366,7 @@ class Stage:
 
         def connect() -> None:
             events = SubscriptionEventCallbacks(incompatible_qos=take_as_it_comes)
-            taker = self.guard_taker(topic, callback)
+            taker = self._take_unless(partial(self._is_contested, topic), self.guard_taker(topic, callback))
             made.append(
                 self.node.create_subscription(
                     kind, topic, taker, STEADY, event_callbacks=events, qos_overriding_options=_OVERRIDABLE, **options
@@ -344,8 +380,9 @@ class Stage:
         self.node.get_logger().error("; ".join(self.mismatches()))
 
     def mismatches(self) -> list[str]:
-        """Return one sentence per mismatch that still stands."""
+        """Return one sentence per mismatch, and per topic with several publishers, that still stands."""
         found = [self._mismatches_of(topic, *end) for topic, end in self._suspects.items()]
+        found.append([rivals for topic in sorted(self._contested) if (rivals := describe_rivals(self.node, topic))])
         return [sentence for sentences in found for sentence in sentences]
 
     def _mismatches_of(self, topic: str, writes: bool, qos: QoSProfile) -> list[str]:
@@ -357,6 +394,23 @@ class Stage:
             if compatibility == QoSCompatibility.ERROR:
                 sentences.append(f"quality of service of {topic} does not match {end.node_name}: {why}")
         return sentences
+
+
+_PARTICIPANT = 12  # bytes of an endpoint's id that name its process
+
+
+def describe_rivals(node: Node, topic: str) -> str:
+    """Return a sentence with the nodes that publish a topic where they are several, also of one name; else nothing.
+
+    Several publishers of one node are one.
+    """
+    topic = node.resolve_topic_name(topic)
+    if node.count_publishers(topic) < 2:
+        return ""
+    ends = node.get_publishers_info_by_topic(topic)
+    nodes = {(f"{end.node_namespace.rstrip('/')}/{end.node_name}", *end.endpoint_gid[:_PARTICIPANT]) for end in ends}
+    names = sorted(name for name, *_ in nodes)
+    return f"{topic} is published by {' and '.join(names)}; expected one: stop the others" if len(names) > 1 else ""
 
 
 def is_wanted(publisher: Outlet, skips: Skips) -> bool:

@@ -17,6 +17,7 @@ from keypoint_node_fakes import (
     header,
     start_detector,
 )
+from rclpy import create_node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import CompressedImage
 
@@ -117,3 +118,29 @@ def test_quality_of_service_of_images_can_be_overridden(probe):
     bench = CameraBench(probe, **{name: "best_effort"})
     ends = bench.node.get_subscriptions_info_by_topic(COLOR)
     assert [end.qos_profile.reliability.name for end in ends] == ["BEST_EFFORT"]
+
+
+@pytest.mark.parametrize("stream", ["color", "depth", "info"])
+def test_a_camera_topic_that_two_nodes_publish_is_refused_with_their_names(probe, stream):
+    bench = CameraBench(probe)
+    bench.shoot()
+    bench.wait_for_clouds()
+    own = {"color": bench.color_out, "depth": bench.depth_out, "info": bench.info_out}[stream]
+    second = create_node("second_camera", context=probe.context)
+    rival = second.create_publisher(own.msg_type, own.topic_name, detector_node.ros.RESULT)
+    probe.wait_for(lambda: bench.node.count_publishers(own.topic_name) == 2)
+    before = len(bench.clouds())
+    for _ in range(3):
+        bench.send_info()
+        bench.shoot()
+    names = f"{own.topic_name} is published by /probe and /second_camera; expected one"
+    assert bench.diagnosis(level=Level.ERROR, word=names)
+    assert stream != "color" or len(bench.clouds()) == before
+    second.destroy_publisher(rival)
+    probe.wait_for(lambda: bench.node.count_publishers(own.topic_name) == 1)
+    probe.got["/diagnostics"].clear()
+    bench.send_info()
+    bench.shoot()
+    bench.wait_for_clouds(before + 1)
+    assert "is published by" not in bench.diagnosis().message
+    second.destroy_node()
