@@ -83,8 +83,8 @@ provide_transport()  # read when the first context is made, whoever makes it
 def declare_record(node: Node, record: type[RecordT], prefix: str = "") -> RecordT:
     """Declare a ROS parameter for every field of a frozen dataclass that is a `setting`, and return the record.
 
-    Field metadata: `description`, `unit`, `min`, `max`, `choices`, `topic` (names one, or several), `settable` (not
-    read-only); NaN may be a default.
+    Field metadata: `description`, `unit`, `min`, `max`, `choices`, `topic` (names one, or several: the record has
+    their full names), `settable` (not read-only); NaN may be a default.
 
     Args:
         node: the node that gets the parameters.
@@ -100,8 +100,8 @@ def declare_record(node: Node, record: type[RecordT], prefix: str = "") -> Recor
         value = _read_value(node, name, entry, prefix)
         check_value(entry, value, name=name)
         if entry.metadata.get("topic"):
-            for topic in (value,) if isinstance(value, str) else value:
-                _check_topic(node, name, topic)
+            found = [_full_topic(node, name, topic) for topic in ((value,) if isinstance(value, str) else value)]
+            value = found[0] if isinstance(value, str) else tuple(found)
         values[entry.name] = value
     return record(**values)
 
@@ -125,11 +125,13 @@ def _read_value(node: Node, name: str, entry: Field, prefix: str) -> Any:
     return () if value is None else value
 
 
-def _check_topic(node: Node, name: str, topic: str) -> None:
-    """Refuse a parameter whose value is no name of a topic."""
+def _full_topic(node: Node, name: str, topic: str) -> str:
+    """Return a topic with the namespace of a node; refuse a parameter whose value is no name of a topic."""
     try:
         validate_topic_name(topic)
-        validate_full_topic_name(expand_topic_name(topic, node.get_name(), node.get_namespace()))
+        full = expand_topic_name(topic, node.get_name(), node.get_namespace())
+        validate_full_topic_name(full)
+        return full
     except (NameValidationException, ValueError) as error:
         # rclpy draws the place under the name, and tells where it was found out
         why = str(error).splitlines()[0].partition(": ")[2].partition(", at /")[0].rstrip(":")

@@ -136,20 +136,15 @@ def see_camera(process: Process, options: RobotOptions) -> Process:
     """Return a process with the topics of the camera by its name; the twin films under them, in the camera's frame."""
     if not options.camera_name:
         return process
-    base = f"/{_camera_namespace(options)}/{options.camera_name}"
+    base = f"camera/{options.camera_name}"
     if process.executable == "twin_camera":
-        topics = {f"/camera/camera/{stream}": f"{base}/{stream}" for stream in (COLOR, DEPTH, INFO)}
+        topics = {f"camera/camera/{stream}": f"{base}/{stream}" for stream in (COLOR, DEPTH, INFO)}
         frame = {"camera_frame": _camera_frame(options)}
         return replace(process, parameters={**process.parameters, **frame}, remappings=topics)
     topics = {"depth_topic": f"{base}/{DEPTH}", "info_topic": f"{base}/{INFO}"}
     if process.executable == "keypoint_detector":
         topics["color_topics"] = [f"{base}/{stream}" for stream in (COLOR, OLD_COLOR)]
     return replace(process, parameters={**process.parameters, **topics})
-
-
-def _camera_namespace(options: RobotOptions) -> str:
-    """Return the namespace of the camera's topics, in that of the robot."""
-    return "/".join(filter(None, (options.namespace.strip("/"), "camera")))
 
 
 def _camera_frame(options: RobotOptions) -> str:
@@ -170,7 +165,7 @@ def camera_includes(options: RobotOptions, share: Path) -> list[Include]:
     if not options.camera_name:
         raise ValueError("camera_name:=none: camera:=true needs a name, as wrist_camera")
     arguments = {
-        "camera_namespace": _camera_namespace(options),
+        "camera_namespace": "/".join(filter(None, (options.namespace.strip("/"), "camera"))),
         "camera_name": options.camera_name,
         "config_file": options.camera_config or str(share / "config" / "d405.yaml"),
         **given({"tf_prefix": options.frame_prefix}),

@@ -15,7 +15,14 @@ from finforce.systems.live import (
     camera_pose,
     robot_processes,
 )
-from finforce.systems.processes import BenchOptions, Include, RobotOptions
+from finforce.systems.processes import (
+    BenchOptions,
+    Include,
+    Process,
+    ReplayOptions,
+    RobotOptions,
+    replay_processes,
+)
 from finforce_contact.mesh.object_mesh import load_object_mesh
 from finforce_contact.parameters import ContactParameters
 from finforce_driver.settings import DriverParameters
@@ -80,9 +87,9 @@ def test_detector_and_contacts_read_the_camera_that_is_started():
     parts = robot(camera_name="hand")
     assert parts["realsense2_camera"].arguments["camera_name"] == "hand"
     detector, contacts = (parts[name].parameters for name in ("keypoint_detector", "contact_estimator"))
-    assert detector["color_topics"] == ["/camera/hand/color/image_raw", "/camera/hand/color/image_rect_raw"]
-    assert detector["info_topic"] == "/camera/hand/color/camera_info"
-    depth = "/camera/hand/aligned_depth_to_color/image_raw"
+    assert detector["color_topics"] == ["camera/hand/color/image_raw", "camera/hand/color/image_rect_raw"]
+    assert detector["info_topic"] == "camera/hand/color/camera_info"
+    depth = "camera/hand/aligned_depth_to_color/image_raw"
     assert detector["depth_topic"] == contacts["depth_topic"] == depth
 
 
@@ -90,7 +97,7 @@ def test_poses_of_another_program_come_from_its_topic_beside_those_of_the_camera
     asked = {"object_mesh": "c.stl", "pose_source": "detections"}
     contacts = robot(camera_name="hand", pose_topic="/pose_estimation/output", **asked)["contact_estimator"]
     assert contacts.remappings["object_detections"] == contacts.remappings["object_pose"] == "/pose_estimation/output"
-    assert contacts.parameters["info_topic"] == "/camera/hand/color/camera_info"
+    assert contacts.parameters["info_topic"] == "camera/hand/color/camera_info"
     assert contacts.parameters["pose_source"] == "detections"
     assert "object_pose" not in robot(**asked)["contact_estimator"].remappings
 
@@ -116,15 +123,26 @@ def test_two_robots_in_one_domain_share_neither_topics_nor_frames():
     assert all(part.words[2:4] == ["-r", "__ns:=/r1"] for part in ours)
     nodes = [part for part in ours if part.executable != "twin_camera"]
     assert {part.parameters["frame_prefix"] for part in nodes} == {"r1/"}
-    color = "/r1/camera/wrist_camera/color/image_raw"
+    color = "camera/wrist_camera/color/image_raw"  # relative: in the namespace of each
     assert parts["keypoint_detector"].parameters["color_topics"][0] == color
     twin = parts["twin_camera"]
-    assert twin.remappings["/camera/camera/color/image_raw"] == color
+    assert twin.remappings["camera/camera/color/image_raw"] == color
     assert twin.parameters["camera_frame"] == "r1/wrist_camera_color_optical_frame"
     assert parts["robot_state_publisher"].parameters["frame_prefix"] == "r1/"
     assert {"r1/gripper_base", twin.parameters["camera_frame"]} < set(parts["static_transform_publisher"].arguments)
     camera = robot(namespace="r1", frame_prefix="r1/")["realsense2_camera"].arguments
     assert (camera["camera_namespace"], camera["tf_prefix"]) == ("r1/camera", "r1/")
+
+
+@pytest.mark.parametrize("processes", [bench_processes, robot_processes, replay_processes])
+def test_no_system_names_a_camera_topic_outside_of_its_namespace(processes):
+    record = {bench_processes: BenchOptions, robot_processes: RobotOptions, replay_processes: ReplayOptions}[processes]
+    parts = processes(record(composed=False, images=True, object_mesh="can.stl", namespace="r2"), ROOT)
+    words = [word for part in parts if isinstance(part, Process) for word in part.command()]
+    assert not [word for word in words if ":=" in word and '"/camera' in word or ":=/camera" in word]
+    for kind in (DetectorParameters, ContactParameters):
+        topics = [entry.default for entry in fields(kind) if entry.metadata.get("topic")]
+        assert topics and "'/" not in repr(topics)
 
 
 def test_the_camera_gets_the_transport_of_our_nodes_unless_somebody_chose_one(monkeypatch):
@@ -226,7 +244,7 @@ def test_the_object_of_the_twin_is_a_cylinder_of_25_mm_along_y_in_metres():
 
 def test_the_twin_films_under_the_cameras_name():
     twin = robot(sim=True)["twin_camera"]
-    assert twin.remappings["/camera/camera/color/image_raw"] == "/camera/wrist_camera/color/image_raw"
+    assert twin.remappings["camera/camera/color/image_raw"] == "camera/wrist_camera/color/image_raw"
     assert twin.parameters["camera_frame"] == "wrist_camera_color_optical_frame"
 
 

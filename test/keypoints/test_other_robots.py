@@ -144,3 +144,24 @@ def test_a_camera_topic_that_two_nodes_publish_is_refused_with_their_names(probe
     bench.wait_for_clouds(before + 1)
     assert "is published by" not in bench.diagnosis().message
     second.destroy_node()
+
+
+def test_a_detector_hears_the_camera_of_its_own_namespace_and_one_that_was_named(probe):
+    def start(name, **parameters):
+        node = KeypointDetectorNode(
+            lambda jaws, *_, **__: FakeDetector(tuple(jaws)),
+            context=probe.context,
+            namespace=name,
+            parameter_overrides=[Parameter(key, value=value) for key, value in parameters.items()],
+        )
+        probe.spinner.add_node(node)
+        return node
+
+    def camera_topics(node):
+        return {port.topic_name for port in node.subscriptions if "camera" in port.topic_name}
+
+    mine = camera_topics(start("r2"))
+    assert len(mine) == 4 and all(topic.startswith("/r2/camera/camera/") for topic in mine)
+    node = start("r3", depth_topic="/camera/depth", color_topics=["hand/color"], info_topic="/camera/info")
+    assert camera_topics(node) == {"/camera/depth", "/camera/info"}
+    assert node.feed.source == "/r3/hand/color"
