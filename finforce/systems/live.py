@@ -8,9 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from finforce.files import FileError, read_yaml
 from finforce.gripper_frames import ROBOT_CAMERA
 from finforce.ros.transport import CHOICES, PROFILES, TRANSPORT
+from finforce.systems.parameter_file import parameters_of
 from finforce.systems.processes import (
     BenchOptions,
     GripperOptions,
@@ -245,21 +245,6 @@ def camera_pose(options: SolverOptions) -> Sequence[float]:
         ValueError: the option, or what the parameter file says, is not seven numbers.
     """
     asked = read_numbers("T_gripper_camera", options.T_gripper_camera, 7)
-    told = _parameters_of(options.parameter_file, "keypoint_detector").get("T_gripper_camera")
+    node = "/".join(("", *filter(None, (options.namespace.strip("/"), "keypoint_detector"))))
+    told = parameters_of(options.parameter_file, node).get("T_gripper_camera")
     return asked or told or pose_numbers(ROBOT_CAMERA)
-
-
-def _parameters_of(file: str, node: str) -> Mapping[str, Any]:
-    """Return the parameters that a file gives to a node.
-
-    Raises:
-        ValueError: the file cannot be read, or is none of parameters.
-    """
-    found: dict[str, Any] = {}
-    try:
-        sections = read_yaml(file) or {}
-        for name in ("/**", f"/**/{node}", node, f"/{node}"):
-            found |= (sections.get(name) or {}).get("ros__parameters") or {}
-    except (FileError, AttributeError, TypeError, ValueError) as error:
-        raise ValueError(f"{file}: {error}; expected ROS parameters: node, ros__parameters, names") from error
-    return found

@@ -12,7 +12,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from finforce.gripper_frames import SIDES
 from finforce.settings import setting
+from finforce.systems.parameter_file import check_sections
 
 # small matrices: more threads per process cost time and make it vary
 SINGLE_THREAD = {
@@ -21,6 +23,7 @@ SINGLE_THREAD = {
 POSE_TOPICS = ("object_pose", "object_detections")  # where a contact estimator listens for poses of other programs
 PIPELINE = "pipeline"
 STAGES = ("keypoint_detector", "contact_estimator", "ifea_solver")  # in the order in which an image passes them
+NODES = (*STAGES[:2], *(f"{side}_ifea_solver" for side in SIDES), "gripper_driver", "twin_camera", "recording_player")
 DEPTHS = {"aligned": "aligned", "auto": "auto", "off": "none"}  # options of a system: the detector's parameter `depth`
 
 
@@ -103,7 +106,13 @@ class Include:
 
 
 def finish(parts: Sequence[Process | Include], options: SolverOptions) -> list[Process | Include]:
-    """Return parts of a system in its namespace, with its prefix of frames, and composed where that is asked for."""
+    """Return parts of a system in its namespace, with its prefix of frames, and composed where that is asked for.
+
+    Raises:
+        ValueError: the parameter file has a section for none of the nodes.
+    """
+    if options.parameter_file:
+        check_sections(options.parameter_file, options.namespace, NODES)
     parts = [_place(part, options) if isinstance(part, Process) else part for part in parts]
     return compose(parts) if options.composed else parts
 

@@ -5,10 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rclpy
 import yaml
 
 from finforce.gripper_frames import ROBOT_CAMERA
-from finforce.ros.transport import CHOICES, PROFILES, TRANSPORT
+from finforce.ros.transport import CHOICES, PROFILES, TRANSPORT, free_domain
 from finforce.systems.live import (
     SIM_OBJECT,
     bench_processes,
@@ -275,3 +276,57 @@ def test_only_the_frames_can_be_done_without():
         "static_transform_publisher",
     }
     assert all(part.advice for part in parts.values() if part.package != "finforce")
+
+
+@pytest.mark.parametrize(
+    ("key", "namespace", "advice"),
+    [
+        (
+            "keypoint_detector",
+            "r2",
+            "'keypoint_detector' is no node of this system in the namespace /r2.*write /\\*\\*/key",
+        ),
+        ("/r1/keypoint_detector", "r2", r"write /\*\*/keypoint_detector"),
+        ("keypoint_detctor", "", "without a namespace.*did you mean keypoint_detector"),
+        ("ifea_solver", "", "did you mean left_ifea_solver"),
+        ("/*/keypoint_detector", "", r"write /\*\*/keypoint_detector"),
+    ],
+)
+def test_a_section_of_a_parameter_file_that_no_node_would_read_is_refused(tmp_path, key, namespace, advice):
+    file = parameter_file(tmp_path, key)
+    for processes, record in ((bench_processes, BenchOptions), (robot_processes, RobotOptions)):
+        with pytest.raises(ValueError, match=advice):
+            processes(record(parameter_file=file, namespace=namespace), ROOT)
+
+
+def parameter_file(folder, key):
+    file = folder / "lab.yaml"
+    file.write_text(f"{key}: {{ros__parameters: {{T_gripper_camera: [0.0, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0]}}}}")
+    return str(file)
+
+
+KEYS = (
+    "/**",
+    "/**/keypoint_detector",
+    "r2/keypoint_detector",
+    "/r2/keypoint_detector",
+    "/*/keypoint_detector",
+    "/r2/*",
+)
+
+
+@pytest.mark.parametrize("key", [*KEYS, "r2: {keypoint_detector"])
+def test_the_tool_reads_a_parameter_file_as_the_node_does(tmp_path, key):
+    file = parameter_file(tmp_path, key)
+    if "{" in key:
+        Path(file).write_text(Path(file).read_text() + "}")
+    options = RobotOptions(parameter_file=file, namespace="r2")
+    assert camera_pose(options)[2] == 0.5
+    assert robot_processes(options, ROOT)
+    context = rclpy.Context()
+    rclpy.init(context=context, args=[], domain_id=free_domain())
+    words = ["--ros-args", "--params-file", file]
+    node = rclpy.create_node("keypoint_detector", context=context, namespace="r2", cli_args=words)
+    assert "T_gripper_camera" in node._parameter_overrides
+    node.destroy_node()
+    rclpy.shutdown(context=context)

@@ -10,8 +10,8 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from std_msgs.msg import Header
 
-from finforce.gripper_frames import ROBOT_CAMERA, jaw_in_camera
 from finforce.camera_topics import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC, OLD_COLOR_TOPIC
+from finforce.gripper_frames import ROBOT_CAMERA, jaw_in_camera
 from finforce.ros import node as ros
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints.images import ImageWatch, check_image
