@@ -16,7 +16,7 @@ from sensor_msgs.msg import CameraInfo
 
 from finforce.camera_topics import COMPRESSED_DEPTH
 from finforce.errors import FinforceError, ObservationError
-from finforce.health import IDLE, STILL, UNHEARD, Health, Idling, Outcome, Report, Skips, StampGate
+from finforce.health import IDLE, STILL, UNHEARD, Health, Idling, Level, Outcome, Report, Skips, StampGate
 from finforce.messages import CameraStream, Stamped
 from finforce.ros import node as ros
 from finforce.transforms import pose_numbers
@@ -153,7 +153,7 @@ class KeypointDetectorNode(ros.ImageNode):
         ros.warn_first_start()
         self.detector = build(jaws, parameters, settings, dots, self.skips.allows(STILL))
         ros.follow_settings(self, settings, self._adjust, "detector")
-        ros.follow_settings(self, parameters, lambda changed: self.gate.limit(changed.max_age))
+        ros.follow_settings(self, parameters, self._limit)
         self.feed = RgbdFeed(parameters)
         self.frames, self._settings = ros.Frames(self), settings
         self._build = partial(build, jaws, dots=dots, rests=self.skips.allows(STILL))
@@ -216,6 +216,8 @@ class KeypointDetectorNode(ros.ImageNode):
         """Take a depth image."""
         with self.rejections():
             self._answer(self.feed.take_depth(message))
+        if delay := self.feed.delay_of_depth:
+            self.get_logger().warning(delay, throttle_duration_sec=10.0)
 
     def _answer(self, images: Sequence[Stamped]) -> None:
         """Find the key points of all jaws in images that are whole."""
@@ -262,6 +264,11 @@ class KeypointDetectorNode(ros.ImageNode):
             self.detector = self._build(self.parameters, settings=self._settings)
             self.detector.warm_up()
 
+    def _limit(self, parameters: DetectorParameters) -> None:
+        """Go on with a maximum age that was changed."""
+        self.gate.limit(parameters.max_age)
+        self.feed.max_age = parameters.max_age
+
     def _adjust(self, settings: DetectorSettings) -> None:
         """Go on with settings that were changed."""
         self._settings = settings
@@ -290,6 +297,8 @@ class KeypointDetectorNode(ros.ImageNode):
     def _report(self, side: str, alarms: list[Outcome]) -> Report:
         """Return how one jaw is seen."""
         known = describe(self.feed, self.detector.name, self.found.get(side)) | self.skips.describe()
+        if delay := self.feed.delay_of_depth:
+            alarms = [*alarms, Outcome(level=Level.WARN, reason="late depth", text=delay)]
         report = self.health[side].report(alarms, known)
         if monotonic() - self.rested > self.parameters.max_age:
             return report
