@@ -230,8 +230,8 @@ class RgbdFeed:
     A colour image takes the depth image nearest to it, at most half a period of the camera away, unless the parameters
     say how far. One whose depth has been lost, as a later one's shows, is taken alone where depth may be missing; where
     it must not, the image is passed over. When no depth comes at all, or always too late, the first image that waited
-    in vain is taken alone, and so are those after it, until depth comes in time again. Of several colour topics the first that brings an image
-    is listened to, until it is silent.
+    in vain is taken alone, and so are those after it, until depth comes in time again. Of several colour topics the
+    first that brings an image is listened to, until it is silent.
 
     Attributes:
         stream: of the camera, in whose frame all messages must be.

@@ -32,7 +32,7 @@ class ForceGrasp:
     Args:
         goal: force, speed, least opening, time limit.
         settings: limits and expectations.
-        jaws: closed opening and stroke.
+        jaws: closed opening, stroke, range of forces.
         resolution: opening per step of the gripper [m]; None: that of its position byte.
         ratios: of the camera's force to the motor's in the first grasps of this gripper, which adds its own.
 
@@ -49,14 +49,14 @@ class ForceGrasp:
         resolution: float | None = None,
         ratios: list[float] | None = None,
     ) -> None:
-        jaws, self._ratios = jaws or GripperSettings(), [] if ratios is None else ratios
+        self._jaws, self._ratios = jaws or GripperSettings(), [] if ratios is None else ratios
         self._below, self._low_images = False, 0
         self.goal, self.settings = goal, settings or GraspSettings()
         self.set_force = self.settings.check_force(goal.force)
         self._feed = ForceFeed(self.settings.stale_after)
         self._load = LoadWatch(self.settings, min(_ONSET_FORCE, 0.5 * goal.force))
         self._position = JawPosition(opening=math.nan, resting=False)
-        self._plan = GraspPlan(goal, self.settings, self._load, self._feed, jaws, resolution or jaws.resolution)
+        self._plan = GraspPlan(goal, self.settings, self._load, self._feed, self._jaws, resolution)
         self._pending: deque[ForceSample | TouchSample] = deque()
         self.phase, self._reason = GraspPhase.APPROACH, "waits for the first force"
         self._began = self._held_at = self._reserve = self._saturated = math.nan
@@ -311,7 +311,8 @@ class ForceGrasp:
     @property
     def _motor_force(self) -> float:
         """The motor's limit [N]: no hindrance to the set force, which both jaws give, and friction takes from."""
-        return max(self.settings.motor_force, _FACTOR * self.set_force)
+        least, largest = self._jaws.forces
+        return min(max(self.settings.motor_force, _FACTOR * self.set_force, least), largest)
 
     def status(self, state: GripperState, now: float) -> GraspStatus:
         """Return the grasp as it is, after an `update` with the same state and time."""

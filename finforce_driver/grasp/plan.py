@@ -61,7 +61,7 @@ class GraspPlan:
         load: force, stiffness, contact.
         feed: latency and period.
         jaws: closed opening and stroke.
-        step: of the gripper [m].
+        step: of the gripper [m]; None: that of its position byte.
     """
 
     def __init__(
@@ -71,9 +71,9 @@ class GraspPlan:
         load: LoadWatch,
         feed: ForceFeed,
         jaws: GripperSettings,
-        step: float,
+        step: float | None = None,
     ) -> None:
-        self.step, self._closed, self.widest = step, jaws.closed_opening, jaws.largest_opening
+        self.step, self._closed, self.widest = step or jaws.resolution, jaws.closed_opening, jaws.largest_opening
         self.target, self.speed, self.stepping = math.nan, 0.0, False
         self._goal, self._settings, self._load, self._feed = goal, settings, load, feed
         self._settling = settings.reaction + SETTLING

@@ -9,9 +9,11 @@ from grasp_fakes import STEP, Bench, Camera, Fingers, Jaws, build_spring, spring
 
 from finforce.errors import ObservationError
 from finforce.ros.messages import force_stddev
+from finforce_driver.grasp.controller import ForceGrasp
+from finforce_driver.grasp.plan import FRICTION
 from finforce_driver.gripper import Gripper
 from finforce_driver.settings import GraspGoal, GraspSettings, GripperSettings
-from finforce_driver.state import GraspPhase
+from finforce_driver.state import GraspPhase, GripperState, Phase
 from lab.experiments.grasp_world import GraspCase, NoisySensor, Plant, World
 
 
@@ -183,3 +185,12 @@ def test_a_wall_is_let_go_with_the_setting_named(variant):
     assert "largest_stiffness" in course.error or "the motor presses" in course.error
     world.gripper.wait(lambda state: state.opening > 0.026, 10.0)
     assert world.force < 1.0
+
+
+@pytest.mark.parametrize("force_per_current", [5.0, 30.0, 49.0, 51.0, 80.0, 500.0])
+def test_the_limit_of_the_motor_is_one_that_the_gripper_has_whatever_its_force_per_current(force_per_current):
+    settings = GripperSettings(force_per_current=force_per_current)
+    grasp = ForceGrasp(GraspGoal(force=2.0), jaws=settings)
+    limit = grasp.status(GripperState(phase=Phase.READY, opening=0.03), 0.0).hard_bound + 2.0 - FRICTION
+    assert settings.current_of(limit) > 0
+    assert limit == pytest.approx(min(max(7.5, 0.15 * force_per_current), 1.3 * force_per_current))
