@@ -232,6 +232,13 @@ class GraspSettings(_Bounded):
         10.0,
         alias="touch_timeout",
     )
+    motor_friction: float = setting(
+        0.4,
+        "Grip force at rest that friction of the gear may hide from the motor current, or add to it",
+        "N",
+        0.0,
+        10.0,
+    )
     motor_force: float = setting(
         7.5,
         "Motor limit as grip force, at least 1.5 times the set force, within what the currents of the gripper give",

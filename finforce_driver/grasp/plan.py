@@ -32,7 +32,7 @@ _CONTRADICTED = 0.5  # share of the speed while the contact estimator says that 
 _WITNESS_TIME = 0.15  # [s] from a force to the stop that the motor's current brings about
 FRICTION = 1.0  # [N] by which the motor's current, also at its limit, may tell too little
 _BEYOND_NOISE = 4.0  # deviations of one force, beyond which a step's change of it is no chance
-_DEVIATIONS = 2.0  # stated deviations of the force within which it is reckoned with
+DEVIATIONS = 2.0  # stated deviations of the force within which it is reckoned with
 _HYSTERESIS = 0.3  # [steps] of force beyond the tolerance before jaws at rest open again
 SETTLING = 0.03  # [s] in addition to the reaction: the jaws come to rest, and the driver may step them one by one
 _NEAR = 2.0  # steps between target and reported opening at rest: the byte is truncated, and flickers by one
@@ -178,7 +178,7 @@ class GraspPlan:
         if not load.loaded:
             return max(0.0, self.stiffness * unseen - set_force)
         stiffness = max(2.0 * load.model.stiffness, self.stiffness)
-        margin = load.model.force_stddev + _DEVIATIONS * load.stddev
+        margin = load.model.force_stddev + DEVIATIONS * load.stddev
         return max(0.0, load.model.force + margin + stiffness * unseen - set_force)
 
     def _allowed(self, set_force: float, slack: float = 0.0) -> float:
