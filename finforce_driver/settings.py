@@ -234,7 +234,7 @@ class GraspSettings(_Bounded):
     )
     motor_friction: float = setting(
         0.4,
-        "Grip force at rest that friction of the gear may hide from the motor current, or add to it",
+        "Grip force at rest that the motor current may show too much or too little by friction",
         "N",
         0.0,
         10.0,
