@@ -158,7 +158,7 @@ class KeypointDetectorNode(ros.ImageNode):
         self.frames, self._settings = ros.Frames(self), settings
         self._build = partial(build, jaws, dots=dots, rests=self.skips.allows(STILL))
         self._mounting = not ros.is_given(self, "T_gripper_camera") and self.frames.listen()
-        self._asked = float("inf")
+        self._asked, self._tared, self._mount_trouble = float("inf"), False, ""
         self.gate = StampGate(parameters.max_age)
         source, age = self.feed.source, parameters.max_age
         self.health = {side: Health(source=source, stale_after=age) for side in parameters.sides}
@@ -187,11 +187,17 @@ class KeypointDetectorNode(ros.ImageNode):
             images(parameters.depth_topic, self._on_depth, end=COMPRESSED_DEPTH)
         for topic in parameters.color_topics:
             images(topic, self._on_color)
+        for side in parameters.sides if self._mounting else ():  # a solver that tells a force has made its tare
+            self.stage.subscription(ros.WrenchStamped, f"{side}/wrench", self._on_wrench, ros.SENSOR)
 
     def _on_info(self, message: CameraInfo) -> None:
         """Keep the camera's intrinsics."""
         with self.rejections():
             self.feed.stream.take_info(message)
+
+    def _on_wrench(self, _: ros.WrenchStamped) -> None:
+        """Keep that solvers rely on the camera's pose."""
+        self._tared = True
 
     def _on_color(self, topic: str, message: Any) -> None:
         """Take a colour image of the camera's topic."""
@@ -244,7 +250,9 @@ class KeypointDetectorNode(ros.ImageNode):
         self.idling.note(whole.stamp, is_still)
 
     def _mount(self) -> None:
-        """Take the camera's pose from /tf; after a while without it, the shipped mount's.
+        """Take the camera's pose from /tf; after a while without it, the shipped mount's, until it comes.
+
+        One that comes after the solvers' tare is not taken: their offsets are those of the other pose.
 
         Raises:
             ObservationError: /tf has not got it yet.
@@ -254,15 +262,28 @@ class KeypointDetectorNode(ros.ImageNode):
         self._asked = min(self._asked, monotonic())
         if T_gripper_camera is None and monotonic() - self._asked < TF_WAIT:
             raise ObservationError(f"waiting for the camera's pose on /tf, {arrow}, or set T_gripper_camera")
-        self._mounting = False
         if T_gripper_camera is None:
-            self.get_logger().warning(f"/tf has no transform {arrow}: using the default T_gripper_camera")
+            self._complain(f"/tf has no transform {arrow}: using the default T_gripper_camera")
             return
+        self._mounting = False
+        if self._mount_trouble and self._tared:
+            self._complain(
+                f"/tf has a transform {arrow} only since the tare, which was made with the default T_gripper_camera: "
+                "that stays; restart the nodes"
+            )
+            return
+        self._mount_trouble = ""
         self.get_logger().info(f"camera pose taken from /tf, {arrow}")
         if not np.allclose(T_gripper_camera, self.parameters.camera_pose, atol=1e-6):
             self.parameters = replace(self.parameters, T_gripper_camera=pose_numbers(T_gripper_camera))
             self.detector = self._build(self.parameters, settings=self._settings)
             self.detector.warm_up()
+
+    def _complain(self, trouble: str) -> None:
+        """Say once in the log, and from now on in the diagnostics, what is wrong with the camera's pose."""
+        if trouble != self._mount_trouble:
+            self.get_logger().warning(trouble)
+        self._mount_trouble = trouble
 
     def _limit(self, parameters: DetectorParameters) -> None:
         """Go on with a maximum age that was changed."""
@@ -297,8 +318,8 @@ class KeypointDetectorNode(ros.ImageNode):
     def _report(self, side: str, alarms: list[Outcome]) -> Report:
         """Return how one jaw is seen."""
         known = describe(self.feed, self.detector.name, self.found.get(side)) | self.skips.describe()
-        if delay := self.feed.delay_of_depth:
-            alarms = [*alarms, Outcome(level=Level.WARN, reason="late depth", text=delay)]
+        troubles = filter(None, (self.feed.delay_of_depth, self._mount_trouble))
+        alarms = [*alarms, *(Outcome(level=Level.WARN, reason=text, text=text) for text in troubles)]
         report = self.health[side].report(alarms, known)
         if monotonic() - self.rested > self.parameters.max_age:
             return report

@@ -65,6 +65,31 @@ def test_while_tf_may_still_tell_the_cameras_pose_nothing_is_answered(probe, tf,
     assert bench.node.parameters.T_gripper_camera == TOPICS.T_gripper_camera
 
 
+@pytest.mark.parametrize("is_tared", [False, True])
+def test_a_pose_on_tf_that_comes_late_is_taken_before_the_tare_and_not_after_it(probe, tf, monkeypatch, is_tared):
+    monkeypatch.setattr(detector_node, "TF_WAIT", 0.0)
+    bench = CameraBench(probe)
+    default = bench.node.parameters.T_gripper_camera
+    bench.shoot()
+    bench.wait_for_clouds()
+    assert bench.diagnosis(level=Level.WARN, word="using the default T_gripper_camera")
+    if is_tared:
+        solver = probe.speak("left/wrench", detector_node.ros.WrenchStamped)
+        probe.connected(solver)
+        solver.publish(detector_node.ros.WrenchStamped())
+        probe.wait_for(lambda: bench.node._tared)
+    tf["gripper_base", FRAME] = CAMERA
+    probe.got["/diagnostics"].clear()
+    bench.shoot()
+    bench.wait_for_clouds(2)
+    if is_tared:
+        assert bench.diagnosis(level=Level.WARN, word="only since the tare")
+        assert bench.node.parameters.T_gripper_camera == default
+    else:
+        np.testing.assert_allclose(bench.node.parameters.camera_pose, CAMERA, atol=1e-9)
+        bench.diagnosis(level=Level.OK)
+
+
 @pytest.mark.parametrize("transport", ["compressed", "auto"])
 def test_compressed_images_are_taken_where_nobody_sends_raw_ones(probe, transport):
     node = start_detector(probe, image_transport=transport)
