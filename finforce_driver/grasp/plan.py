@@ -80,7 +80,8 @@ class GraspPlan:
         self._arrives = self._powered_from = math.inf
         self._least = max(self.snap(goal.least_opening), jaws.closed_opening)
         self._rest = (math.nan, math.nan)  # target [m] and force [N] of the last image at rest
-        self._step_force = 0.0  # [N] that a step of the jaws was seen to change, where that was beyond expectation
+        self._change = 0.0  # [N] of the force with the last step
+        self._step_force = 0.0  # [N] the same where it was beyond expectation, or the step was taken back
 
     @property
     def stiffness(self) -> float:
@@ -115,7 +116,11 @@ class GraspPlan:
         if 0.5 < steps < 1.5:
             change = abs(load.force - before[1])
             expected = load.model.likely_stiffness * self.step + _BEYOND_NOISE * load.model.noise
-            self._step_force = change if change > expected else 0.0
+            if self.target > before[0]:  # a step that was taken back is not to be taken again
+                self._step_force = max(change, self._change)
+            else:
+                self._step_force = change if change > expected else 0.0
+            self._change = change
 
     def limit(self, target: float) -> float:
         """Return a target [m] within the least opening and what the gripper can open."""
@@ -200,7 +205,8 @@ class GraspPlan:
 
     def _steps_back(self, excess: float) -> int:
         """Return by how many steps jaws at rest are to open for an excess of force [N]."""
-        if excess < _HYSTERESIS * self.force_per_step + self._load.model.force_stddev:
+        half = 0.5 * max(self.force_per_step, self._change)  # of two steps the nearer one is kept
+        if excess < max(_HYSTERESIS * self.force_per_step, half - _TOLERANCE) + self._load.model.force_stddev:
             return 0
         return max(1, round(excess / (self.stiffness * self.step)))
 

@@ -194,3 +194,24 @@ def test_the_limit_of_the_motor_is_one_that_the_gripper_has_whatever_its_force_p
     limit = grasp.status(GripperState(phase=Phase.READY, opening=0.03), 0.0).hard_bound + 2.0 - FRICTION
     assert settings.current_of(limit) > 0
     assert limit == pytest.approx(min(max(7.5, 0.15 * force_per_current), 1.3 * force_per_current))
+
+
+def hold_rigid(force, noise, seed, largest):
+    """A grasp of an object of 10 N/mm, of which a step of the jaws changes the force by 1.9 N."""
+    plant = Plant(force_at=build_spring(10_000.0))
+    case = GraspCase(plant=plant, force=force, speed=0.004, latency=0.06, seed=seed)
+    return World(case, NoisySensor(noise, seed), GraspSettings(largest_stiffness=largest)).run()
+
+
+@pytest.mark.parametrize("seed", [2, 4])
+@pytest.mark.parametrize("largest", [1400.0, 12_000.0])
+def test_of_two_steps_about_the_set_force_the_nearer_one_is_kept(seed, largest):
+    course = hold_rigid(3.0, 0.2, 4 if largest > 1400.0 else seed, largest)
+    # it was 1.5 to 3.7 N, again and again
+    forces = course.forces[-6000:]  # 6 s
+    assert course.error == "" and min(forces) > 3.3 and max(forces) < 3.7
+
+
+def test_a_rigid_object_that_the_jaws_let_go_by_a_step_has_not_slipped():
+    course = hold_rigid(5.0, 0.05, 2, 12_000.0)
+    assert course.forces[-1] > 3.3 and "slip" not in course.error
