@@ -23,6 +23,9 @@ SINGLE_THREAD = {
 POSE_TOPICS = ("object_pose", "object_detections")  # where a contact estimator listens for poses of other programs
 PIPELINE = "pipeline"
 STAGES = ("keypoint_detector", "contact_estimator", "ifea_solver")  # in the order in which an image passes them
+RESPAWNED = (*STAGES, PIPELINE, "robot_state_publisher", "static_transform_publisher")  # none of them holds anything
+RESPAWN_DELAY = 2.0  # [s]
+UNUSABLE = 2  # exit status of a node whose settings cannot be used
 NODES = (*STAGES[:2], *(f"{side}_ifea_solver" for side in SIDES), "gripper_driver", "twin_camera", "recording_player")
 DEPTHS = {"aligned": "aligned", "auto": "auto", "off": "none"}  # options of a system: the detector's parameter `depth`
 
@@ -67,6 +70,11 @@ class Process:
     def label(self) -> str:
         """What the process is called."""
         return self.name or self.executable
+
+    @property
+    def respawns(self) -> bool:
+        """Whether it is started again when it dies; a driver is not, whose gripper goes on holding."""
+        return self.executable in RESPAWNED
 
     @property
     def words(self) -> list[str]:

@@ -215,7 +215,7 @@ class LoadWatch:
         self._empty = self._empty + 1 if force < 0.5 * self.onset < 0.25 * self._peak else 0
         if self._empty >= _EMPTY:
             raise GraspError(
-                f"the force of {self._peak:.2f} N has gone: the object slipped out or broke; open, look, and grasp again"
+                f"the force of {self._peak:.2f} N has gone: the object slipped out or broke; open, look, grasp again"
             )
 
 

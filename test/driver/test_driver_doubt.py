@@ -207,8 +207,7 @@ def hold_rigid(force, noise, seed, largest):
 @pytest.mark.parametrize("largest", [1400.0, 12_000.0])
 def test_of_two_steps_about_the_set_force_the_nearer_one_is_kept(seed, largest):
     course = hold_rigid(3.0, 0.2, 4 if largest > 1400.0 else seed, largest)
-    # it was 1.5 to 3.7 N, again and again
-    forces = course.forces[-6000:]  # 6 s
+    forces = course.forces[-6000:]  # 6 s; it was 1.5 to 3.7 N, again and again
     assert course.error == "" and min(forces) > 3.3 and max(forces) < 3.7
 
 
