@@ -163,7 +163,7 @@ class KeypointDetectorNode(ros.ImageNode):
         source, age = self.feed.source, parameters.max_age
         self.health = {side: Health(source=source, stale_after=age) for side in parameters.sides}
         self.found: Mapping[str, JawKeypoints] = {}
-        self.rested, self.idling = float("-inf"), Idling()
+        self.idling = Idling()
         self.stage = ros.Stage(self, pipeline)
         self.out = _DetectorOutputs(self.stage, parameters, self.feed.stream, self.frames, names, self.detector)
         self.detector.warm_up()  # before images come: those that came meanwhile would be lost
@@ -182,7 +182,8 @@ class KeypointDetectorNode(ros.ImageNode):
         """Create the subscriptions."""
         parameters = self.parameters
         self.stage.subscription(CameraInfo, parameters.info_topic, self._on_info, ros.SENSOR)
-        images = partial(ros.subscribe_to_images, self.stage, transport=parameters.image_transport)
+        wanted = {"transport": parameters.image_transport, "is_wanted": self._is_wanted}
+        images = partial(ros.ImageInput, self.stage, **wanted)
         if parameters.depth != NO_DEPTH:
             images(parameters.depth_topic, self._on_depth, end=COMPRESSED_DEPTH)
         for topic in parameters.color_topics:
@@ -195,6 +196,10 @@ class KeypointDetectorNode(ros.ImageNode):
         with self.rejections():
             self.feed.stream.take_info(message)
 
+    def _is_wanted(self) -> bool:
+        """Say whether key points are to be found."""
+        return self.out.are_heard or not self.skips.allows(UNHEARD)
+
     def _on_wrench(self, _: ros.WrenchStamped) -> None:
         """Keep that solvers rely on the camera's pose."""
         self._tared = True
@@ -205,8 +210,7 @@ class KeypointDetectorNode(ros.ImageNode):
             return
         for health in self.health.values():
             health.arrive(source=topic)
-        if self.skips.allows(UNHEARD) and not self.out.are_heard:
-            self.rested = monotonic()
+        if not self._is_wanted():
             self.skips.count(UNHEARD)
             return
         with self.rejections():
@@ -321,6 +325,4 @@ class KeypointDetectorNode(ros.ImageNode):
         troubles = filter(None, (self.feed.delay_of_depth, self._mount_trouble))
         alarms = [*alarms, *(Outcome(level=Level.WARN, reason=text, text=text) for text in troubles)]
         report = self.health[side].report(alarms, known)
-        if monotonic() - self.rested > self.parameters.max_age:
-            return report
-        return report_of_rest(alarms, report.values)
+        return report if self._is_wanted() else report_of_rest(alarms, report.values)

@@ -62,6 +62,7 @@ from finforce.ros.topics import (  # noqa: F401 - for those with topics
     RESULT,
     SENSOR,
     STEADY_CLOCK,
+    ImageInput,
     Outlet,
     Pipeline,
     Stage,
@@ -69,7 +70,6 @@ from finforce.ros.topics import (  # noqa: F401 - for those with topics
     is_wanted,
     listen,
     send_cloud,
-    subscribe_to_images,
 )
 from finforce.ros.tracing import write_trace
 from finforce.ros.transport import CHOICES, PROFILES, TRANSPORT, provide_transport  # noqa: F401 - for tests

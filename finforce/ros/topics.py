@@ -343,7 +343,7 @@ class Stage:
         name = self.node.resolve_topic_name(topic)
         return self.pipeline.add(Port(self.pipeline, name, guarded, subscribe, can_wait, is_contested))
 
-    def large_subscription(self, kind: type, topic: str, callback: Callable, **options: Any) -> None:
+    def large_subscription(self, kind: type, topic: str, callback: Callable, **options: Any) -> Callable[[], None]:
         """Subscribe to messages of a megabyte from outside, whose lost pieces come again, unless nobody keeps them.
 
         Best effort alone loses most of such messages where Fast DDS has its default of 512 kB of shared memory. From a
@@ -354,26 +354,32 @@ class Stage:
             topic: of the messages.
             callback: takes them.
             options: of the subscription, as its callback group.
+
+        Returns:
+            What ends it.
         """
         made: list[Subscription] = []
+        taker = self._take_unless(partial(self._is_contested, topic), self.guard_taker(topic, callback))
+
+        def subscribe(qos: QoSProfile, **events: Any) -> None:
+            made.append(self.node.create_subscription(kind, topic, taker, qos, **events, **options))
 
         def take_as_it_comes(_: Any) -> None:
             if made:
                 self.node.get_logger().warning(f"{topic} is published best effort: large messages may be lost")
-                self.node.destroy_subscription(made.pop())
-                # the overrides now hold what was asked for at first
-                self.subscription(kind, topic, callback, SENSOR, qos_overriding_options=None, **options)
+                close()
+                subscribe(SENSOR)  # without overrides, which now hold what was asked for at first
 
         def connect() -> None:
             events = SubscriptionEventCallbacks(incompatible_qos=take_as_it_comes)
-            taker = self._take_unless(partial(self._is_contested, topic), self.guard_taker(topic, callback))
-            made.append(
-                self.node.create_subscription(
-                    kind, topic, taker, STEADY, event_callbacks=events, qos_overriding_options=_OVERRIDABLE, **options
-                )
-            )
+            subscribe(STEADY, event_callbacks=events, qos_overriding_options=_OVERRIDABLE)
+
+        def close() -> None:
+            while made:
+                self.node.destroy_subscription(made.pop())
 
         self.pipeline.when_open(connect)
+        return close
 
     def _suspect(self, topic: str, writes: bool, qos: QoSProfile) -> None:
         self._suspects[self.node.resolve_topic_name(topic)] = (writes, qos)
@@ -426,49 +432,53 @@ def send_cloud(publisher: Outlet, header: Header, columns: Mapping[str, NDArray]
     publisher.publish(CloudColumns(header, columns))
 
 
-_LOOKED_FOR = 0.5  # [s] between looks at who publishes
+_LOOKED_FOR = 0.2  # [s] between looks at who publishes, and at whether images are wanted
 
 
-def subscribe_to_images(
-    stage: Stage,
-    topic: str,
-    take: Callable[[str, Any], Any],
-    transport: str,
-    end: str = COMPRESSED_COLOR,
-    **options: Any,
-) -> None:
-    """Subscribe to the images of a topic.
+class ImageInput:
+    """A subscription to the images of a topic, raw or compressed, while they are wanted.
 
     Args:
         stage: of the node.
         topic: of raw images; one that ends as compressed images do is subscribed to whatever the transport.
         take: takes the name of the topic and a message.
-        transport: raw, compressed, or auto: raw, and compressed where nobody publishes raw ones.
+        transport: raw, compressed, or auto: raw, and compressed while nobody publishes raw ones.
         end: of the topic of compressed images.
+        is_wanted: says whether anything is to be done with images.
         options: of the subscription, as its callback group.
     """
-    node = stage.node
-    packed = topic if topic.endswith(ENDS) else node.resolve_topic_name(topic) + end
 
-    def subscribe(kind: type, name: str) -> None:
-        stage.large_subscription(kind, name, partial(take, name), **options)
+    def __init__(
+        self,
+        stage: Stage,
+        topic: str,
+        take: Callable[[str, Any], Any],
+        transport: str,
+        end: str = COMPRESSED_COLOR,
+        is_wanted: Callable[[], bool] = lambda: True,
+        **options: Any,
+    ) -> None:
+        self._stage, self._take, self._is_wanted, self._options = stage, take, is_wanted, options
+        packed = topic if topic.endswith(ENDS) else stage.node.resolve_topic_name(topic) + end
+        only = packed if topic.endswith(ENDS) or transport == COMPRESSED else topic if transport == RAW else ""
+        self._choices = (only,) if only else (topic, packed)
+        self._topic, self._close = "", lambda: None
+        self._follow()
+        stage.node.create_timer(_LOOKED_FOR, self._follow, clock=STEADY_CLOCK)
 
-    if topic.endswith(ENDS) or transport == COMPRESSED:
-        subscribe(CompressedImage, packed)
-        return
-    subscribe(Image, topic)
-    if transport == RAW:
-        return
-
-    def look() -> None:
-        if node.count_publishers(topic):
-            timer.cancel()
-        elif node.count_publishers(packed):
-            timer.cancel()
-            node.get_logger().info(f"no publisher on {topic}: using {packed}")
-            subscribe(CompressedImage, packed)
-
-    timer = node.create_timer(_LOOKED_FOR, look, clock=STEADY_CLOCK)
+    def _follow(self) -> None:
+        """Subscribe to what is published, raw images first; to nothing while nothing is wanted."""
+        there = (name for name in self._choices if self._stage.node.count_publishers(name))
+        topic = next(there, self._topic or self._choices[0]) if self._is_wanted() else ""
+        if topic == self._topic:
+            return
+        self._close()
+        if self._topic and topic:
+            self._stage.node.get_logger().info(f"no publisher on {self._topic}: using {topic}")
+        self._topic, self._close = topic, lambda: None
+        if topic:
+            kind = CompressedImage if topic.endswith(ENDS) else Image
+            self._close = self._stage.large_subscription(kind, topic, partial(self._take, topic), **self._options)
 
 
 Heard = Mapping[str, list[bytes]]

@@ -19,7 +19,7 @@ from keypoint_node_fakes import (
 )
 from rclpy import create_node
 from rclpy.parameter import Parameter
-from sensor_msgs.msg import CompressedImage
+from sensor_msgs.msg import CompressedImage, Image
 
 from finforce.health import Level
 from finforce.messages import stamp_of
@@ -173,6 +173,7 @@ def test_a_camera_topic_that_two_nodes_publish_is_refused_with_their_names(probe
 
 def test_a_detector_hears_the_camera_of_its_own_namespace_and_one_that_was_named(probe):
     def start(name, **parameters):
+        parameters["skip_off"] = ["all"]  # nobody listens
         node = KeypointDetectorNode(
             lambda jaws, *_, **__: FakeDetector(tuple(jaws)),
             context=probe.context,
@@ -190,3 +191,14 @@ def test_a_detector_hears_the_camera_of_its_own_namespace_and_one_that_was_named
     node = start("r3", depth_topic="/camera/depth", color_topics=["hand/color"], info_topic="/camera/info")
     assert camera_topics(node) == {"/camera/depth", "/camera/info"}
     assert node.feed.source == "/r3/hand/color"
+
+
+def test_compressed_images_are_returned_to_when_raw_ones_are_gone(probe):
+    node = start_detector(probe, depth="none")
+    probe.hear("left/keypoints", detector_node.ros.PointCloud2)
+    probe.speak(f"{COLOR}/compressed", CompressedImage)
+    raw = probe.speak(COLOR, Image)
+    kinds = lambda: {sub.msg_type for sub in node.subscriptions if sub.topic_name.startswith(COLOR)}  # noqa: E731
+    probe.wait_for(lambda: kinds() == {Image})
+    probe.destroy_publisher(raw)
+    probe.wait_for(lambda: kinds() == {CompressedImage})
