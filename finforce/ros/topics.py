@@ -6,6 +6,7 @@ import inspect
 import traceback
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
+from copy import copy
 from dataclasses import dataclass, field
 from functools import partial
 from importlib import import_module
@@ -283,6 +284,7 @@ class Stage:
 
     def publisher(self, kind: type, topic: str, qos: QoSProfile) -> Outlet:
         """Create a watched publisher."""
+        qos = copy(qos)  # overrides are written into it
         events = PublisherEventCallbacks(incompatible_qos=lambda _: self._suspect(topic, True, qos))
         made = self.node.create_publisher(kind, topic, qos, event_callbacks=events, qos_overriding_options=_OVERRIDABLE)
         return self.pipeline.outlet(self.node.resolve_topic_name(topic), made, qos)
@@ -329,6 +331,7 @@ class Stage:
             is_exclusive: messages are dropped while several nodes publish the topic: they may contradict each other.
             options: of the subscription, as its callback group.
         """
+        qos = copy(qos)
         events = SubscriptionEventCallbacks(incompatible_qos=lambda _: self._suspect(topic, False, qos))
         guarded = self.guard_taker(topic, callback)
 
@@ -362,7 +365,7 @@ class Stage:
         taker = self._take_unless(partial(self._is_contested, topic), self.guard_taker(topic, callback))
 
         def subscribe(qos: QoSProfile, **events: Any) -> None:
-            made.append(self.node.create_subscription(kind, topic, taker, qos, **events, **options))
+            made.append(self.node.create_subscription(kind, topic, taker, copy(qos), **events, **options))
 
         def take_as_it_comes(_: Any) -> None:
             if made:

@@ -143,6 +143,8 @@ def test_quality_of_service_of_images_can_be_overridden(probe):
     bench = CameraBench(probe, **{name: "best_effort"})
     ends = bench.node.get_subscriptions_info_by_topic(COLOR)
     assert [end.qos_profile.reliability.name for end in ends] == ["BEST_EFFORT"]
+    ends = bench.node.get_subscriptions_info_by_topic(TOPICS.color_topics[1])
+    assert [end.qos_profile.reliability.name for end in ends] == ["RELIABLE"]  # of the others nothing was asked
 
 
 @pytest.mark.parametrize("stream", ["color", "depth", "info"])
