@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -272,10 +273,22 @@ def viewer(options: SolverOptions, share: Path, config: str = "finforce.rviz") -
             executable="rviz2",
             name="rviz",
             parameters={"use_sim_time": options.use_sim_time},
-            arguments=("-d", str(share / "rviz" / config)),
+            arguments=("-d", str(_own_view(share / "rviz" / config, options))),
             advice="or leave rviz:=true out",
         )
     ]
+
+
+def _own_view(file: Path, options: SolverOptions) -> Path:
+    """Return RViz's configuration; with the topics of a namespace and frames of a prefix, a file of its own."""
+    space, prefix = options.namespace.strip("/"), options.frame_prefix
+    if not (space or prefix):
+        return file
+    text = re.sub(r"(Value: /)(?=\w)", rf"\g<1>{space}/" if space else r"\1", file.read_text(encoding="utf-8"))
+    text = re.sub(r"(Fixed Frame: )(?=\w)", rf"\g<1>{prefix}", text).replace('TF Prefix: ""', f'TF Prefix: "{prefix}"')
+    own = Path(tempfile.mkdtemp(prefix="finforce_rviz_")) / file.name
+    own.write_text(text, encoding="utf-8")
+    return own
 
 
 def emulated_port() -> str:
