@@ -132,7 +132,8 @@ def test_rviz_shows_the_topics_of_a_namespace_and_the_frames_of_a_prefix():
 
 
 def test_every_diagnosis_has_one_heading_in_the_aggregator(graph):
-    tree = yaml.safe_load((ROOT / "config" / "diagnostics" / "aggregator.yaml").read_text(encoding="utf-8"))["/**"]["ros__parameters"]
+    file = ROOT / "config" / "diagnostics" / "aggregator.yaml"
+    tree = yaml.safe_load(file.read_text(encoding="utf-8"))["/**"]["ros__parameters"]
     words = [group["contains"] for group in tree["finforce"]["analyzers"].values()]
     graph.wait_for(lambda: len({s.name for a in graph.got["/diagnostics"] for s in a.status}) >= 5)
     names = {status.name for array in graph.got["/diagnostics"] for status in array.status} | {"finforce: gripper"}
