@@ -42,6 +42,7 @@ setup(
         (f"share/{NAME}/config/ros2_control", glob("config/ros2_control/*")),
         (f"share/{NAME}/config/moveit", glob("config/moveit/*")),
         (f"share/{NAME}/config/grippers", glob("config/grippers/*")),
+        (f"share/{NAME}/config/diagnostics", glob("config/diagnostics/*")),
         (f"share/{NAME}/examples", glob("examples/*.py")),
         (f"share/{NAME}/rviz", glob("rviz/*")),
         (f"share/{NAME}/urdf", glob("urdf/*")),

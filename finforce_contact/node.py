@@ -133,7 +133,7 @@ class ContactEstimatorNode(ros.ImageNode):
             camera, group = self.session.camera, MutuallyExclusiveCallbackGroup()
             info, transport = partial(self._on_image, camera.take_camera, ""), self.parameters.image_transport
             self.stage.subscription(ros.CameraInfo, self.parameters.info_topic, info, ros.SENSOR, callback_group=group)
-            images = partial(ros.subscribe_to_images, self.stage, transport=transport, callback_group=group)
+            images = partial(ros.ImageInput, self.stage, transport=transport, callback_group=group)
             images("object_mask", partial(self._on_image, camera.take_mask))
             images(self.parameters.depth_topic, partial(self._on_image, camera.take_depth), end=COMPRESSED_DEPTH)
         elif source == "topic":

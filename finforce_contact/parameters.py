@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from finforce.camera_topics import AUTO, DEPTH_TOPIC, INFO_TOPIC, TRANSPORTS
+from finforce.camera_topics import AUTO, DEPTH_TOPIC, INFO_TOPIC, TRANSPORTS, relative
 from finforce.errors import PoseError
 from finforce.settings import Bounded, TimeParameters, setting
 from finforce_ifea.errors import ContactError
@@ -94,8 +94,8 @@ class ContactParameters(TimeParameters):
     pose_tolerance: float = setting(
         0.017, "Maximum stamp difference between a jaw pose and its object pose", "s", 0.0, 1.0
     )
-    depth_topic: str = setting(DEPTH_TOPIC, "Topic of depth images for the tracker", topic=True)
-    info_topic: str = setting(INFO_TOPIC, "Topic of the intrinsics of the depth images", topic=True)
+    depth_topic: str = setting(relative(DEPTH_TOPIC), "Topic of depth images for the tracker", topic=True)
+    info_topic: str = setting(relative(INFO_TOPIC), "Topic of the intrinsics of the depth images", topic=True)
     image_transport: str = setting(AUTO, "Transport of images, as for the detector", choices=TRANSPORTS)
     depth_scale: float = setting(0.001, "Unit of 16-bit depth images", "m", 1e-6, 0.01)
     reconstruct_method: str = setting(

@@ -220,13 +220,19 @@ def outcome_of_state(state: GripperState) -> Outcome:
     if level == Level.OK and (state.outcome in FAILURES or extraordinary):
         level = Level.WARN
     word = "estopped" if state.estopped else state.phase.value
-    return Outcome(level=level, reason=word, text=state.message or word)
+    return Outcome(level=level, reason=word, text=(state.message or word) + name_limp(state))
+
+
+def name_limp(state: GripperState) -> str:
+    """Return that a gripper is limp although it is ready, as after a fault; else nothing."""
+    is_limp = state.phase is Phase.READY and not state.activated and not state.estopped
+    return ", limp until the next move" if is_limp else ""
 
 
 def news_of_state(state: GripperState) -> str:
     """Return the text to log of a gripper when it changes; moves do not change it."""
     outcome = outcome_of_state(state)
-    return "the gripper is ready" if outcome.level == Level.OK else outcome.text
+    return f"the gripper is ready{name_limp(state)}" if outcome.level == Level.OK else outcome.text
 
 
 def outcome_of_grasp(status: GraspStatus) -> Outcome:

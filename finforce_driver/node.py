@@ -225,9 +225,10 @@ class GripperDriverNode(Node):
 
     def _subscribe(self) -> None:
         """Create the subscriptions; a node that has them is ready."""
-        self.stage.subscription(JointState, "~/command", self._on_command, ros.RESULT)
-        self.stage.subscription(JointState, "~/grasp_goal", self._on_goal, ros.RESULT)
-        self.stage.subscription(WrenchStamped, "grasp_wrench", self._on_wrench, ros.SENSOR)
+        shared = {"is_exclusive": False}  # several programs may command; of rival forces the grasp is told
+        self.stage.subscription(JointState, "~/command", self._on_command, ros.RESULT, **shared)
+        self.stage.subscription(JointState, "~/grasp_goal", self._on_goal, ros.RESULT, **shared)
+        self.stage.subscription(WrenchStamped, "grasp_wrench", self._on_wrench, ros.SENSOR, **shared)
         for side in JAWS:
             self.stage.subscription(PointCloud2, f"{side}/contact", partial(self._on_contact, side), ros.SENSOR)
             stddev = f"{side}/wrench_stddev"
@@ -305,12 +306,8 @@ class GripperDriverNode(Node):
     def _on_wrench(self, message: WrenchStamped) -> None:
         """Hand the force of an image to the grasp."""
         with self._rejections("force", told=self.session.reject):
-            topic = self.resolve_topic_name("grasp_wrench")
-            if self.count_publishers(topic) > 1:  # they may contradict each other
-                ends = self.get_publishers_info_by_topic(topic)
-                names = sorted({f"{end.node_namespace.rstrip('/')}/{end.node_name}" for end in ends})
-                if len(names) > 1:
-                    raise TargetError(f"{topic} is published by {' and '.join(names)}; expected one: stop the others")
+            if rivals := ros.describe_rivals(self, "grasp_wrench"):
+                raise TargetError(rivals)
             force, stamp = ros.grasp_force(message, self.parameters.base_frame), self._enter("force", message)
             sample = ForceSample(stamp=stamp, arrived=self.gripper.clock.now(), force=force)
             self.session.take_force(sample)

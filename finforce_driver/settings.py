@@ -149,13 +149,18 @@ class GripperSettings(_Bounded):
         """Return the grip force [N] of a current [A]; both positive when driving closed."""
         return self.force_per_current * current
 
+    @property
+    def forces(self) -> tuple[float, float]:
+        """The least and the largest grip force of a command [N]."""
+        return self.force_of(LEAST_CURRENT), self.force_of(self.largest_current)
+
     def current_of(self, force: float) -> int:
         """Return the current limit [mA] of a grip force [N].
 
         Raises:
             TargetError: it is no number, or outside the range of the current limit.
         """
-        low, high = self.force_of(LEAST_CURRENT), self.force_of(self.largest_current)
+        low, high = self.forces
         if not low - ROUNDING <= force <= high + ROUNDING:
             raise TargetError(
                 f"force: got {force:g} N, expected {low:.3g} to {high:.3g} N, the range of the current limit; "
@@ -227,8 +232,19 @@ class GraspSettings(_Bounded):
         10.0,
         alias="touch_timeout",
     )
+    motor_friction: float = setting(
+        0.4,
+        "Grip force at rest that the motor current may show too much or too little by friction",
+        "N",
+        0.0,
+        10.0,
+    )
     motor_force: float = setting(
-        7.5, "Motor limit as grip force by the vendor's curve, at least 1.5 times the set force", "N", 7.0, 62.0
+        7.5,
+        "Motor limit as grip force, at least 1.5 times the set force, within what the currents of the gripper give",
+        "N",
+        7.0,
+        62.0,
     )
 
     def check_force(self, force: float) -> float:

@@ -15,7 +15,7 @@ from typing import Any
 from finforce_driver.errors import DriverError, GripperStateError, GripperTimeoutError
 from finforce_driver.grasp.session import GraspSession
 from finforce_driver.gripper import Gripper
-from finforce_driver.messages import fill_outcome
+from finforce_driver.messages import fill_outcome, name_limp
 from finforce_driver.settings import DriverParameters
 from finforce_driver.state import ABSENT, GripperState, MoveOutcome, MoveRequest, Phase
 
@@ -111,7 +111,7 @@ class GripperTasks:
         state = self._await(
             lambda state: state.phase is not Phase.FAULT and not state.estopped, CLEARING_TIMEOUT, self._commands
         )
-        return f"no error is latched; the gripper is {state.phase.value}"
+        return f"no error is latched; the gripper is {state.phase.value}{name_limp(state)}"
 
     def grasp(self) -> str:
         """Close until the set force is reached by vision; return while it is held."""

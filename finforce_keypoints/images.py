@@ -6,6 +6,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from statistics import median
 from time import monotonic
 from typing import Any, Protocol
 
@@ -33,7 +34,9 @@ _TILES = 4  # rows and columns of parts, each of which can stand still
 _NEAR_BLACK, _NEAR_WHITE = 8, 247  # of 255: what is beyond may stay the same without a fault
 SILENCE = 1.0  # s without an image, after which another colour topic may be the camera's
 _WAITING = 2.5  # periods of the camera that a colour image waits for its depth, longer where depth has come later
-LONGEST_WAIT = 500_000_000  # [ns] the same, at most
+_LONGEST_WAIT = 0.5  # [s] the same, at most
+_WAITING_SHARE = {AUTO: 0.5, ALIGNED: 1.0}  # of the maximum age, at most: an image without depth is to be answered, too
+_DELAYS = 15  # depth images over which their delay is learnt
 _MOST_WAITING = 32  # colour images in memory
 _FIRST_TOLERANCE = 8_000_000  # [ns] while the camera's period is not known
 _KNOWN, _PERIODS = 2, 15  # periods from which on it is, and over which it is learnt
@@ -226,14 +229,15 @@ class RgbdFeed:
 
     A colour image takes the depth image nearest to it, at most half a period of the camera away, unless the parameters
     say how far. One whose depth has been lost, as a later one's shows, is taken alone where depth may be missing; where
-    it must not, the image is passed over. When no depth comes at all, the first image that waited in vain is taken
-    alone, and so are those after it, until depth comes again. Of several colour topics the first that brings an image
-    is listened to, until it is silent.
+    it must not, the image is passed over. When no depth comes at all, or always too late, the first image that waited
+    in vain is taken alone, and so are those after it, until depth comes in time again. Of several colour topics the
+    first that brings an image is listened to, until it is silent.
 
     Attributes:
         stream: of the camera, in whose frame all messages must be.
         passed: colour images that were overtaken while they waited.
         alone: colour images that were taken without depth.
+        max_age: greatest age of an image that is answered [s], which bounds the wait.
         topic: the colour topic that is listened to, None before the first image.
 
     Args:
@@ -245,6 +249,7 @@ class RgbdFeed:
         self._parameters, self._clock = parameters, clock
         self.stream = CameraStream(parameters.camera_frame, parameters.depth_scale)
         self.passed = self.alone = 0
+        self.max_age = parameters.max_age
         self.topic: str | None = None
         self._heard = clock()
         self.reset()
@@ -282,7 +287,7 @@ class RgbdFeed:
         self._tolerance = _FIRST_TOLERANCE if math.isnan(given) else round(given / SECOND)
         self._images = Synchronizer({_COLOR: None, _DEPTH: _MOST_WAITING}, self._tolerance)
         self._stamps: deque[int] = deque(maxlen=_PERIODS + 1)
-        self._late = 0
+        self._delays: deque[int] = deque(maxlen=_DELAYS)
         self._alone = self._parameters.depth == NO_DEPTH
 
     def listens(self, topic: str) -> bool:
@@ -334,8 +339,8 @@ class RgbdFeed:
         stamp = stamp_of(message)
         depth = self.stream.read_depth(message)
         is_empty = self._parameters.depth == AUTO and not np.isfinite(depth).any()
-        self._alone = False
-        self._late = max(self._late, max(self._stamps, default=stamp) - stamp)
+        self._delays.append(max(0, max(self._stamps, default=stamp) - stamp))
+        self._alone &= self._is_late
         self._images.add(_DEPTH, stamp, None if is_empty else depth)
         return self._match()
 
@@ -352,8 +357,28 @@ class RgbdFeed:
         """Say whether the first colour image that waits has waited long enough, given the newest [ns]."""
         if len(self._images.entries(_COLOR)) > _MOST_WAITING:
             return True
-        own = _WAITING * median_period(self._stamps) if len(self._stamps) > _KNOWN else LONGEST_WAIT
-        return newest - first > min(own + self._late, LONGEST_WAIT)
+        own = _WAITING * median_period(self._stamps) if len(self._stamps) > _KNOWN else self._longest_wait
+        return newest - first > min(own + max(self._delays, default=0), self._longest_wait)
+
+    @property
+    def _longest_wait(self) -> float:
+        """Time that an image may wait for its depth [ns]."""
+        return min(_WAITING_SHARE.get(self._parameters.depth, 1.0) * self.max_age, _LONGEST_WAIT) / SECOND
+
+    @property
+    def _is_late(self) -> bool:
+        """Whether most of the last depth images came later than their colour images may wait."""
+        return bool(self._delays) and median(self._delays) > self._longest_wait
+
+    @property
+    def delay_of_depth(self) -> str:
+        """What depth that comes too late means for the images; empty while it comes in time."""
+        if not self._is_late:
+            return ""
+        late, wait = (f"{1e3 * SECOND * time:.0f} ms" for time in (median(self._delays), self._longest_wait))
+        used = "images are answered without depth" if self._parameters.depth == AUTO else "images are not answered"
+        cause = f"which waits {wait} as max_age is {self.max_age:g} s"
+        return f"depth images come {late} after their colour image, {cause}: {used}"
 
     def _match(self) -> list[Stamped]:
         """Return the newest colour image that has its depth, after the one before whose depth must have been lost."""
@@ -373,6 +398,8 @@ class RgbdFeed:
 
     def _missing_depth(self, stamp: int) -> SyncError:
         """Return the error of a colour image [ns] that has waited long enough."""
+        if self._is_late:
+            return SyncError(self.delay_of_depth)
         nearest = self._images.nearest(_DEPTH, stamp)
         if nearest is None:
             return SyncError(

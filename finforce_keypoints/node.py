@@ -16,7 +16,7 @@ from sensor_msgs.msg import CameraInfo
 
 from finforce.camera_topics import COMPRESSED_DEPTH
 from finforce.errors import FinforceError, ObservationError
-from finforce.health import IDLE, STILL, UNHEARD, Health, Idling, Outcome, Report, Skips, StampGate
+from finforce.health import IDLE, STILL, UNHEARD, Health, Idling, Level, Outcome, Report, Skips, StampGate
 from finforce.messages import CameraStream, Stamped
 from finforce.ros import node as ros
 from finforce.transforms import pose_numbers
@@ -153,17 +153,17 @@ class KeypointDetectorNode(ros.ImageNode):
         ros.warn_first_start()
         self.detector = build(jaws, parameters, settings, dots, self.skips.allows(STILL))
         ros.follow_settings(self, settings, self._adjust, "detector")
-        ros.follow_settings(self, parameters, lambda changed: self.gate.limit(changed.max_age))
+        ros.follow_settings(self, parameters, self._limit)
         self.feed = RgbdFeed(parameters)
         self.frames, self._settings = ros.Frames(self), settings
         self._build = partial(build, jaws, dots=dots, rests=self.skips.allows(STILL))
         self._mounting = not ros.is_given(self, "T_gripper_camera") and self.frames.listen()
-        self._asked = float("inf")
+        self._asked, self._tared, self._mount_trouble = float("inf"), False, ""
         self.gate = StampGate(parameters.max_age)
         source, age = self.feed.source, parameters.max_age
         self.health = {side: Health(source=source, stale_after=age) for side in parameters.sides}
         self.found: Mapping[str, JawKeypoints] = {}
-        self.rested, self.idling = float("-inf"), Idling()
+        self.idling = Idling()
         self.stage = ros.Stage(self, pipeline)
         self.out = _DetectorOutputs(self.stage, parameters, self.feed.stream, self.frames, names, self.detector)
         self.detector.warm_up()  # before images come: those that came meanwhile would be lost
@@ -182,16 +182,27 @@ class KeypointDetectorNode(ros.ImageNode):
         """Create the subscriptions."""
         parameters = self.parameters
         self.stage.subscription(CameraInfo, parameters.info_topic, self._on_info, ros.SENSOR)
-        images = partial(ros.subscribe_to_images, self.stage, transport=parameters.image_transport)
+        wanted = {"transport": parameters.image_transport, "is_wanted": self._is_wanted}
+        images = partial(ros.ImageInput, self.stage, **wanted)
         if parameters.depth != NO_DEPTH:
             images(parameters.depth_topic, self._on_depth, end=COMPRESSED_DEPTH)
         for topic in parameters.color_topics:
             images(topic, self._on_color)
+        for side in parameters.sides if self._mounting else ():  # a solver that tells a force has made its tare
+            self.stage.subscription(ros.WrenchStamped, f"{side}/wrench", self._on_wrench, ros.SENSOR)
 
     def _on_info(self, message: CameraInfo) -> None:
         """Keep the camera's intrinsics."""
         with self.rejections():
             self.feed.stream.take_info(message)
+
+    def _is_wanted(self) -> bool:
+        """Say whether key points are to be found."""
+        return self.out.are_heard or not self.skips.allows(UNHEARD)
+
+    def _on_wrench(self, _: ros.WrenchStamped) -> None:
+        """Keep that solvers rely on the camera's pose."""
+        self._tared = True
 
     def _on_color(self, topic: str, message: Any) -> None:
         """Take a colour image of the camera's topic."""
@@ -199,8 +210,7 @@ class KeypointDetectorNode(ros.ImageNode):
             return
         for health in self.health.values():
             health.arrive(source=topic)
-        if self.skips.allows(UNHEARD) and not self.out.are_heard:
-            self.rested = monotonic()
+        if not self._is_wanted():
             self.skips.count(UNHEARD)
             return
         with self.rejections():
@@ -216,6 +226,8 @@ class KeypointDetectorNode(ros.ImageNode):
         """Take a depth image."""
         with self.rejections():
             self._answer(self.feed.take_depth(message))
+        if delay := self.feed.delay_of_depth:
+            self.get_logger().warning(delay, throttle_duration_sec=10.0)
 
     def _answer(self, images: Sequence[Stamped]) -> None:
         """Find the key points of all jaws in images that are whole."""
@@ -242,7 +254,9 @@ class KeypointDetectorNode(ros.ImageNode):
         self.idling.note(whole.stamp, is_still)
 
     def _mount(self) -> None:
-        """Take the camera's pose from /tf; after a while without it, the shipped mount's.
+        """Take the camera's pose from /tf; after a while without it, the shipped mount's, until it comes.
+
+        One that comes after the solvers' tare is not taken: their offsets are those of the other pose.
 
         Raises:
             ObservationError: /tf has not got it yet.
@@ -252,15 +266,33 @@ class KeypointDetectorNode(ros.ImageNode):
         self._asked = min(self._asked, monotonic())
         if T_gripper_camera is None and monotonic() - self._asked < TF_WAIT:
             raise ObservationError(f"waiting for the camera's pose on /tf, {arrow}, or set T_gripper_camera")
-        self._mounting = False
         if T_gripper_camera is None:
-            self.get_logger().warning(f"/tf has no transform {arrow}: using the default T_gripper_camera")
+            self._complain(f"/tf has no transform {arrow}: using the default T_gripper_camera")
             return
+        self._mounting = False
+        if self._mount_trouble and self._tared:
+            self._complain(
+                f"/tf has a transform {arrow} only since the tare, which was made with the default T_gripper_camera: "
+                "that stays; restart the nodes"
+            )
+            return
+        self._mount_trouble = ""
         self.get_logger().info(f"camera pose taken from /tf, {arrow}")
         if not np.allclose(T_gripper_camera, self.parameters.camera_pose, atol=1e-6):
             self.parameters = replace(self.parameters, T_gripper_camera=pose_numbers(T_gripper_camera))
             self.detector = self._build(self.parameters, settings=self._settings)
             self.detector.warm_up()
+
+    def _complain(self, trouble: str) -> None:
+        """Say once in the log, and from now on in the diagnostics, what is wrong with the camera's pose."""
+        if trouble != self._mount_trouble:
+            self.get_logger().warning(trouble)
+        self._mount_trouble = trouble
+
+    def _limit(self, parameters: DetectorParameters) -> None:
+        """Go on with a maximum age that was changed."""
+        self.gate.limit(parameters.max_age)
+        self.feed.max_age = parameters.max_age
 
     def _adjust(self, settings: DetectorSettings) -> None:
         """Go on with settings that were changed."""
@@ -290,7 +322,7 @@ class KeypointDetectorNode(ros.ImageNode):
     def _report(self, side: str, alarms: list[Outcome]) -> Report:
         """Return how one jaw is seen."""
         known = describe(self.feed, self.detector.name, self.found.get(side)) | self.skips.describe()
+        troubles = filter(None, (self.feed.delay_of_depth, self._mount_trouble))
+        alarms = [*alarms, *(Outcome(level=Level.WARN, reason=text, text=text) for text in troubles)]
         report = self.health[side].report(alarms, known)
-        if monotonic() - self.rested > self.parameters.max_age:
-            return report
-        return report_of_rest(alarms, report.values)
+        return report if self._is_wanted() else report_of_rest(alarms, report.values)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce.camera_topics import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC, OLD_COLOR_TOPIC, TRANSPORTS
+from finforce.camera_topics import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC, OLD_COLOR_TOPIC, TRANSPORTS, relative
 from finforce.gripper_frames import ROBOT_CAMERA
 from finforce.settings import GripperParameters, check_bounds, setting
 from finforce.transforms import pose_from_quaternion, pose_numbers
@@ -60,17 +60,17 @@ class DetectorParameters(GripperParameters):
         choices=TRANSPORTS,
     )
     color_topics: tuple[str, ...] = setting(
-        (COLOR_TOPIC, OLD_COLOR_TOPIC),
+        (relative(COLOR_TOPIC), relative(OLD_COLOR_TOPIC)),
         "Colour image topics; the first one with an image is used until it is silent; .../compressed: jpeg, png",
         topic=True,
     )
-    depth_topic: str = setting(DEPTH_TOPIC, "Topic of depth images aligned to the colour images", topic=True)
+    depth_topic: str = setting(relative(DEPTH_TOPIC), "Topic of depth images aligned to the colour images", topic=True)
     depth: str = setting(
         AUTO,
         "Use of depth: auto (if available), aligned (required for every colour image), none",
         choices=DEPTHS,
     )
-    info_topic: str = setting(INFO_TOPIC, "Topic of the colour camera's intrinsics", topic=True)
+    info_topic: str = setting(relative(INFO_TOPIC), "Topic of the colour camera's intrinsics", topic=True)
     detection_method: str = setting(
         "network",
         "Pixel detector: network (on rectified side planes), frame (a DeepLabCut network on the whole image), dots "

@@ -15,7 +15,7 @@ from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from std_msgs.msg import Header, String
 
 from finforce.camera import CameraIntrinsics
-from finforce.camera_topics import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
+from finforce.camera_topics import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC, relative
 from finforce.ros import node as ros
 from finforce.settings import setting
 from finforce.transforms import pose_numbers
@@ -141,7 +141,7 @@ class TwinCameraNode(Node):
         """Yield publishers and messages of what a script's image has in addition to what is seen."""
         if frame.phase != self._phase:
             self._phase = frame.phase
-            yield self._output(String, "/bench/phase"), String(data=frame.phase)
+            yield self._output(String, "bench/phase"), String(data=frame.phase)
         yield from self._true(frame.jaws, frame.T_camera_object)
 
     def _true(self, wrenches: Any, T_camera_object: Any) -> Iterable[Output]:
@@ -161,9 +161,9 @@ class TwinCameraNode(Node):
         if self.parameters.detects:
             yield from self._detected(frame)
         header, depth = Header(frame_id=self.parameters.camera_frame), encode_depth(frame.depth, self.scene.depth_step)
-        yield self._output(CameraInfo, INFO_TOPIC), camera_info(header, self.scene.camera)
-        yield self._output(Image, DEPTH_TOPIC), ros.image_message(header, depth, "16UC1")
-        yield self._output(Image, COLOR_TOPIC), ros.image_message(header, frame.color)
+        yield self._output(CameraInfo, relative(INFO_TOPIC)), camera_info(header, self.scene.camera)
+        yield self._output(Image, relative(DEPTH_TOPIC)), ros.image_message(header, depth, "16UC1")
+        yield self._output(Image, relative(COLOR_TOPIC)), ros.image_message(header, frame.color)
 
     def _detected(self, frame: Shot) -> Iterable[Output]:
         """Yield publishers and messages of what a detector without errors finds."""

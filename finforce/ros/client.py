@@ -30,7 +30,7 @@ class GripperClient:
     """Calls a gripper driver that runs elsewhere, from a script without a node of its own.
 
     Args:
-        driver: name of the driver's node.
+        driver: name of the driver's node, in the namespace of whose robot forces and joint states are.
         context: of rclpy; None: the default one, which is initialised where it is not, and shut down at the end.
     """
 
@@ -45,8 +45,10 @@ class GripperClient:
         self._grasp = ""
         node = self._node
         self._goals = node.create_publisher(JointState, f"{driver}/grasp_goal", ros.RESULT)
-        node.create_subscription(WrenchStamped, "grasp_wrench", self._take_force, ros.SENSOR)
-        node.create_subscription(JointState, "joint_states", self._take_joints, ros.RESULT)
+        space = driver[: driver.rfind("/") + 1]
+        self._topic = node.resolve_topic_name(f"{space}grasp_wrench")
+        node.create_subscription(WrenchStamped, self._topic, self._take_force, ros.SENSOR)
+        node.create_subscription(JointState, f"{space}joint_states", self._take_joints, ros.RESULT)
         node.create_subscription(DiagnosticStatus, f"{driver}/grasp_state", self._take_grasp, ros.LATCHED)
         self._executor = SingleThreadedExecutor(context=context)
         self._executor.add_node(node)
@@ -71,14 +73,19 @@ class GripperClient:
 
     @property
     def force(self) -> float | None:
-        """The grasp force [N]; None while none comes that is trusted. A warning says if nobody publishes any."""
-        force, topic = _fresh(self._force), self._node.resolve_topic_name("grasp_wrench")
-        if force is None and monotonic() - self._began > FOUND and not self._node.count_publishers(topic):
-            text = (
-                f"nobody publishes {topic}: no solver runs in this domain; start one with finforce launch or pipeline"
+        """The grasp force [N]; None while none comes that is trusted. A warning says if nobody publishes any, or two.
+
+        The two may be nodes of different robots.
+        """
+        force, trouble = _fresh(self._force), ros.describe_rivals(self._node, self._topic)
+        if force is None and monotonic() - self._began > FOUND and not self._node.count_publishers(self._topic):
+            trouble = (
+                f"nobody publishes {self._topic}, where the {self._driver} is: start a solver there with finforce "
+                "launch or pipeline"
             )
-            self._node.get_logger().warning(text, throttle_duration_sec=5.0)
-        return force
+        if trouble:
+            self._node.get_logger().warning(trouble, throttle_duration_sec=5.0)
+        return None if trouble else force
 
     @property
     def opening(self) -> float | None:

@@ -62,13 +62,14 @@ from finforce.ros.topics import (  # noqa: F401 - for those with topics
     RESULT,
     SENSOR,
     STEADY_CLOCK,
+    ImageInput,
     Outlet,
     Pipeline,
     Stage,
+    describe_rivals,
     is_wanted,
     listen,
     send_cloud,
-    subscribe_to_images,
 )
 from finforce.ros.tracing import write_trace
 from finforce.ros.transport import CHOICES, PROFILES, TRANSPORT, provide_transport  # noqa: F401 - for tests
@@ -82,8 +83,8 @@ provide_transport()  # read when the first context is made, whoever makes it
 def declare_record(node: Node, record: type[RecordT], prefix: str = "") -> RecordT:
     """Declare a ROS parameter for every field of a frozen dataclass that is a `setting`, and return the record.
 
-    Field metadata: `description`, `unit`, `min`, `max`, `choices`, `topic` (names one, or several), `settable` (not
-    read-only); NaN may be a default.
+    Field metadata: `description`, `unit`, `min`, `max`, `choices`, `topic` (names one, or several: the record has
+    their full names), `settable` (not read-only); NaN may be a default.
 
     Args:
         node: the node that gets the parameters.
@@ -99,8 +100,8 @@ def declare_record(node: Node, record: type[RecordT], prefix: str = "") -> Recor
         value = _read_value(node, name, entry, prefix)
         check_value(entry, value, name=name)
         if entry.metadata.get("topic"):
-            for topic in (value,) if isinstance(value, str) else value:
-                _check_topic(node, name, topic)
+            found = [_full_topic(node, name, topic) for topic in ((value,) if isinstance(value, str) else value)]
+            value = found[0] if isinstance(value, str) else tuple(found)
         values[entry.name] = value
     return record(**values)
 
@@ -124,11 +125,13 @@ def _read_value(node: Node, name: str, entry: Field, prefix: str) -> Any:
     return () if value is None else value
 
 
-def _check_topic(node: Node, name: str, topic: str) -> None:
-    """Refuse a parameter whose value is no name of a topic."""
+def _full_topic(node: Node, name: str, topic: str) -> str:
+    """Return a topic with the namespace of a node; refuse a parameter whose value is no name of a topic."""
     try:
         validate_topic_name(topic)
-        validate_full_topic_name(expand_topic_name(topic, node.get_name(), node.get_namespace()))
+        full = expand_topic_name(topic, node.get_name(), node.get_namespace())
+        validate_full_topic_name(full)
+        return full
     except (NameValidationException, ValueError) as error:
         # rclpy draws the place under the name, and tells where it was found out
         why = str(error).splitlines()[0].partition(": ")[2].partition(", at /")[0].rstrip(":")
@@ -223,13 +226,13 @@ def warn_first_start() -> None:
 
 
 def publish_diagnostics(stage: Stage, name: str, period: float, report: Callable[[list[Outcome]], Report]) -> None:
-    """Publish a report on /diagnostics every `period` seconds; mismatches of the stage are its alarms."""
+    """Publish a report on /diagnostics every `period` seconds; faults of the stage's topics are its alarms."""
     node, publisher = stage.node, stage.publisher(DiagnosticArray, "/diagnostics", RESULT)
     space = node.get_namespace().lstrip("/")
     space += "/" if space else ""
 
     def make() -> Report | None:
-        return report([Outcome(level=Level.ERROR, reason="qos", text=fault) for fault in stage.mismatches()])
+        return report([Outcome(level=Level.ERROR, reason=fault, text=fault) for fault in stage.mismatches()])
 
     guarded = stage.guard(make)
 

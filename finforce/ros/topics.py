@@ -6,6 +6,7 @@ import inspect
 import traceback
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
+from copy import copy
 from dataclasses import dataclass, field
 from functools import partial
 from importlib import import_module
@@ -148,6 +149,7 @@ class Port:
         callback: takes messages, guarded.
         subscribe: makes the subscription to what comes from outside.
         can_wait: whether the process goes on without it where it takes too long.
+        is_contested: says whether several nodes outside publish the topic, whose messages are then dropped.
         outside: the subscription to what comes from outside; None while there is none.
     """
 
@@ -156,6 +158,7 @@ class Port:
     callback: Callable
     subscribe: Callable[[], Subscription]
     can_wait: bool = False
+    is_contested: Callable[[], bool] = lambda: False
     outside: Subscription | None = field(default=None, init=False)
     _times: deque[float] = field(default_factory=lambda: deque(maxlen=WATCHED), init=False)
 
@@ -182,6 +185,7 @@ class Port:
         """
         if self.outside is None:
             return
+        is_contested = self.is_contested()
         with (handle := self.outside.handle):
             for _ in range(_MOST_WAITING):
                 try:
@@ -190,7 +194,8 @@ class Port:
                     continue
                 if taken is None:
                     return
-                yield taken[0]
+                if not is_contested:
+                    yield taken[0]
 
 
 @dataclass(eq=False)
@@ -236,6 +241,7 @@ class Stage:
     def __init__(self, node: Node, pipeline: Pipeline | None = None) -> None:
         self.node, self.pipeline, self.fault = node, pipeline or Pipeline(is_shared=False), ""
         self._suspects: dict[str, tuple[bool, QoSProfile]] = {}
+        self._contested: set[str] = set()
 
     def guard(self, callback: Callable) -> Callable:
         """Return a callback whose failure stops this node alone, where its process has others; then it does nothing."""
@@ -278,12 +284,41 @@ class Stage:
 
     def publisher(self, kind: type, topic: str, qos: QoSProfile) -> Outlet:
         """Create a watched publisher."""
+        qos = copy(qos)  # overrides are written into it
         events = PublisherEventCallbacks(incompatible_qos=lambda _: self._suspect(topic, True, qos))
         made = self.node.create_publisher(kind, topic, qos, event_callbacks=events, qos_overriding_options=_OVERRIDABLE)
         return self.pipeline.outlet(self.node.resolve_topic_name(topic), made, qos)
 
+    def _is_contested(self, topic: str) -> bool:
+        """Say, also in log and diagnostics, whether several nodes publish a topic."""
+        rivals = describe_rivals(self.node, topic)
+        if rivals:
+            self._contested.add(topic)
+            self.node.get_logger().error(f"{rivals}; its messages are dropped", throttle_duration_sec=5.0)
+        return bool(rivals)
+
+    @staticmethod
+    def _take_unless(is_contested: Callable[[], bool], callback: Callable) -> Callable:
+        """Return a callback for messages from outside, which are dropped while these are contested."""
+        if inspect.iscoroutinefunction(callback):
+
+            async def wait(message: Any) -> None:
+                if not is_contested():
+                    await callback(message)
+
+            return wait
+        return lambda message: None if is_contested() else callback(message)
+
     def subscription(
-        self, kind: type, topic: str, callback: Callable, qos: QoSProfile, *, can_wait: bool = False, **options: Any
+        self,
+        kind: type,
+        topic: str,
+        callback: Callable,
+        qos: QoSProfile,
+        *,
+        can_wait: bool = False,
+        is_exclusive: bool = True,
+        **options: Any,
     ) -> Port:
         """Create a watched subscription.
 
@@ -293,21 +328,25 @@ class Stage:
             callback: takes them.
             qos: that is asked for.
             can_wait: a process of several nodes may go on without this one where it takes long.
+            is_exclusive: messages are dropped while several nodes publish the topic: they may contradict each other.
             options: of the subscription, as its callback group.
         """
+        qos = copy(qos)
         events = SubscriptionEventCallbacks(incompatible_qos=lambda _: self._suspect(topic, False, qos))
         guarded = self.guard_taker(topic, callback)
 
+        is_contested = partial(self._is_contested, topic) if is_exclusive else lambda: False
+
         def subscribe() -> Subscription:
+            taker = self._take_unless(is_contested, guarded)
             return self.node.create_subscription(
-                kind, topic, guarded, qos, event_callbacks=events, **{"qos_overriding_options": _OVERRIDABLE, **options}
+                kind, topic, taker, qos, event_callbacks=events, **{"qos_overriding_options": _OVERRIDABLE, **options}
             )
 
-        return self.pipeline.add(
-            Port(self.pipeline, self.node.resolve_topic_name(topic), guarded, subscribe, can_wait=can_wait)
-        )
+        name = self.node.resolve_topic_name(topic)
+        return self.pipeline.add(Port(self.pipeline, name, guarded, subscribe, can_wait, is_contested))
 
-    def large_subscription(self, kind: type, topic: str, callback: Callable, **options: Any) -> None:
+    def large_subscription(self, kind: type, topic: str, callback: Callable, **options: Any) -> Callable[[], None]:
         """Subscribe to messages of a megabyte from outside, whose lost pieces come again, unless nobody keeps them.
 
         Best effort alone loses most of such messages where Fast DDS has its default of 512 kB of shared memory. From a
@@ -318,34 +357,41 @@ class Stage:
             topic: of the messages.
             callback: takes them.
             options: of the subscription, as its callback group.
+
+        Returns:
+            What ends it.
         """
         made: list[Subscription] = []
+        taker = self._take_unless(partial(self._is_contested, topic), self.guard_taker(topic, callback))
+
+        def subscribe(qos: QoSProfile, **events: Any) -> None:
+            made.append(self.node.create_subscription(kind, topic, taker, copy(qos), **events, **options))
 
         def take_as_it_comes(_: Any) -> None:
             if made:
                 self.node.get_logger().warning(f"{topic} is published best effort: large messages may be lost")
-                self.node.destroy_subscription(made.pop())
-                # the overrides now hold what was asked for at first
-                self.subscription(kind, topic, callback, SENSOR, qos_overriding_options=None, **options)
+                close()
+                subscribe(SENSOR)  # without overrides, which now hold what was asked for at first
 
         def connect() -> None:
             events = SubscriptionEventCallbacks(incompatible_qos=take_as_it_comes)
-            taker = self.guard_taker(topic, callback)
-            made.append(
-                self.node.create_subscription(
-                    kind, topic, taker, STEADY, event_callbacks=events, qos_overriding_options=_OVERRIDABLE, **options
-                )
-            )
+            subscribe(STEADY, event_callbacks=events, qos_overriding_options=_OVERRIDABLE)
+
+        def close() -> None:
+            while made:
+                self.node.destroy_subscription(made.pop())
 
         self.pipeline.when_open(connect)
+        return close
 
     def _suspect(self, topic: str, writes: bool, qos: QoSProfile) -> None:
         self._suspects[self.node.resolve_topic_name(topic)] = (writes, qos)
         self.node.get_logger().error("; ".join(self.mismatches()))
 
     def mismatches(self) -> list[str]:
-        """Return one sentence per mismatch that still stands."""
+        """Return one sentence per mismatch, and per topic with several publishers, that still stands."""
         found = [self._mismatches_of(topic, *end) for topic, end in self._suspects.items()]
+        found.append([rivals for topic in sorted(self._contested) if (rivals := describe_rivals(self.node, topic))])
         return [sentence for sentences in found for sentence in sentences]
 
     def _mismatches_of(self, topic: str, writes: bool, qos: QoSProfile) -> list[str]:
@@ -357,6 +403,23 @@ class Stage:
             if compatibility == QoSCompatibility.ERROR:
                 sentences.append(f"quality of service of {topic} does not match {end.node_name}: {why}")
         return sentences
+
+
+_PARTICIPANT = 12  # bytes of an endpoint's id that name its process
+
+
+def describe_rivals(node: Node, topic: str) -> str:
+    """Return a sentence with the nodes that publish a topic where they are several, also of one name; else nothing.
+
+    Several publishers of one node are one.
+    """
+    topic = node.resolve_topic_name(topic)
+    if node.count_publishers(topic) < 2:
+        return ""
+    ends = node.get_publishers_info_by_topic(topic)
+    nodes = {(f"{end.node_namespace.rstrip('/')}/{end.node_name}", *end.endpoint_gid[:_PARTICIPANT]) for end in ends}
+    names = sorted(name for name, *_ in nodes)
+    return f"{topic} is published by {' and '.join(names)}; expected one: stop the others" if len(names) > 1 else ""
 
 
 def is_wanted(publisher: Outlet, skips: Skips) -> bool:
@@ -372,49 +435,53 @@ def send_cloud(publisher: Outlet, header: Header, columns: Mapping[str, NDArray]
     publisher.publish(CloudColumns(header, columns))
 
 
-_LOOKED_FOR = 0.5  # [s] between looks at who publishes
+_LOOKED_FOR = 0.2  # [s] between looks at who publishes, and at whether images are wanted
 
 
-def subscribe_to_images(
-    stage: Stage,
-    topic: str,
-    take: Callable[[str, Any], Any],
-    transport: str,
-    end: str = COMPRESSED_COLOR,
-    **options: Any,
-) -> None:
-    """Subscribe to the images of a topic.
+class ImageInput:
+    """A subscription to the images of a topic, raw or compressed, while they are wanted.
 
     Args:
         stage: of the node.
         topic: of raw images; one that ends as compressed images do is subscribed to whatever the transport.
         take: takes the name of the topic and a message.
-        transport: raw, compressed, or auto: raw, and compressed where nobody publishes raw ones.
+        transport: raw, compressed, or auto: raw, and compressed while nobody publishes raw ones.
         end: of the topic of compressed images.
+        is_wanted: says whether anything is to be done with images.
         options: of the subscription, as its callback group.
     """
-    node = stage.node
-    packed = topic if topic.endswith(ENDS) else node.resolve_topic_name(topic) + end
 
-    def subscribe(kind: type, name: str) -> None:
-        stage.large_subscription(kind, name, partial(take, name), **options)
+    def __init__(
+        self,
+        stage: Stage,
+        topic: str,
+        take: Callable[[str, Any], Any],
+        transport: str,
+        end: str = COMPRESSED_COLOR,
+        is_wanted: Callable[[], bool] = lambda: True,
+        **options: Any,
+    ) -> None:
+        self._stage, self._take, self._is_wanted, self._options = stage, take, is_wanted, options
+        packed = topic if topic.endswith(ENDS) else stage.node.resolve_topic_name(topic) + end
+        only = packed if topic.endswith(ENDS) or transport == COMPRESSED else topic if transport == RAW else ""
+        self._choices = (only,) if only else (topic, packed)
+        self._topic, self._close = "", lambda: None
+        self._follow()
+        stage.node.create_timer(_LOOKED_FOR, self._follow, clock=STEADY_CLOCK)
 
-    if topic.endswith(ENDS) or transport == COMPRESSED:
-        subscribe(CompressedImage, packed)
-        return
-    subscribe(Image, topic)
-    if transport == RAW:
-        return
-
-    def look() -> None:
-        if node.count_publishers(topic):
-            timer.cancel()
-        elif node.count_publishers(packed):
-            timer.cancel()
-            node.get_logger().info(f"no publisher on {topic}: using {packed}")
-            subscribe(CompressedImage, packed)
-
-    timer = node.create_timer(_LOOKED_FOR, look, clock=STEADY_CLOCK)
+    def _follow(self) -> None:
+        """Subscribe to what is published, raw images first; to nothing while nothing is wanted."""
+        there = (name for name in self._choices if self._stage.node.count_publishers(name))
+        topic = next(there, self._topic or self._choices[0]) if self._is_wanted() else ""
+        if topic == self._topic:
+            return
+        self._close()
+        if self._topic and topic:
+            self._stage.node.get_logger().info(f"no publisher on {self._topic}: using {topic}")
+        self._topic, self._close = topic, lambda: None
+        if topic:
+            kind = CompressedImage if topic.endswith(ENDS) else Image
+            self._close = self._stage.large_subscription(kind, topic, partial(self._take, topic), **self._options)
 
 
 Heard = Mapping[str, list[bytes]]

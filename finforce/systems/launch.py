@@ -6,12 +6,13 @@ import os
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import Field, fields
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
 from finforce.errors import MissingDependencyError, suggest
 from finforce.settings import check_bounds, describe
-from finforce.systems.processes import SINGLE_THREAD, Include, Process
+from finforce.systems.processes import RESPAWN_DELAY, SINGLE_THREAD, UNUSABLE, Include, Process
 
 OptionsT = TypeVar("OptionsT")
 
@@ -150,7 +151,6 @@ def missing(package: str, advice: str) -> str:
 
 def _node_action(process: Process) -> Any:
     """Return the launch_ros action of a process."""
-    from launch.actions import Shutdown
     from launch_ros.actions import Node
     from launch_ros.parameter_descriptions import ParameterValue
 
@@ -170,8 +170,18 @@ def _node_action(process: Process) -> Any:
         remappings=list(process.remappings.items()),
         arguments=list(process.arguments),
         additional_env=SINGLE_THREAD,
-        on_exit=Shutdown(reason=f"{process.name or process.executable} has ended") if process.ends_all else None,
+        respawn=process.respawns,
+        respawn_delay=RESPAWN_DELAY,
+        on_exit=partial(_on_exit, process),
     )
+
+
+def _on_exit(process: Process, event: Any, _: Any) -> Any:
+    """Return the action that ends all after a process that does so, or whose settings cannot be used; else nothing."""
+    from launch.actions import Shutdown
+
+    is_end = process.ends_all or event.returncode == UNUSABLE
+    return Shutdown(reason=f"{process.label} ended with status {event.returncode}") if is_end else None
 
 
 def _include_action(part: Include, folder: Path) -> Any:

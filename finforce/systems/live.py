@@ -8,9 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from finforce.files import FileError, read_yaml
 from finforce.gripper_frames import ROBOT_CAMERA
 from finforce.ros.transport import CHOICES, PROFILES, TRANSPORT
+from finforce.systems.parameter_file import parameters_of
 from finforce.systems.processes import (
     BenchOptions,
     GripperOptions,
@@ -136,20 +136,15 @@ def see_camera(process: Process, options: RobotOptions) -> Process:
     """Return a process with the topics of the camera by its name; the twin films under them, in the camera's frame."""
     if not options.camera_name:
         return process
-    base = f"/{_camera_namespace(options)}/{options.camera_name}"
+    base = f"camera/{options.camera_name}"
     if process.executable == "twin_camera":
-        topics = {f"/camera/camera/{stream}": f"{base}/{stream}" for stream in (COLOR, DEPTH, INFO)}
+        topics = {f"camera/camera/{stream}": f"{base}/{stream}" for stream in (COLOR, DEPTH, INFO)}
         frame = {"camera_frame": _camera_frame(options)}
         return replace(process, parameters={**process.parameters, **frame}, remappings=topics)
     topics = {"depth_topic": f"{base}/{DEPTH}", "info_topic": f"{base}/{INFO}"}
     if process.executable == "keypoint_detector":
         topics["color_topics"] = [f"{base}/{stream}" for stream in (COLOR, OLD_COLOR)]
     return replace(process, parameters={**process.parameters, **topics})
-
-
-def _camera_namespace(options: RobotOptions) -> str:
-    """Return the namespace of the camera's topics, in that of the robot."""
-    return "/".join(filter(None, (options.namespace.strip("/"), "camera")))
 
 
 def _camera_frame(options: RobotOptions) -> str:
@@ -170,7 +165,7 @@ def camera_includes(options: RobotOptions, share: Path) -> list[Include]:
     if not options.camera_name:
         raise ValueError("camera_name:=none: camera:=true needs a name, as wrist_camera")
     arguments = {
-        "camera_namespace": _camera_namespace(options),
+        "camera_namespace": "/".join(filter(None, (options.namespace.strip("/"), "camera"))),
         "camera_name": options.camera_name,
         "config_file": options.camera_config or str(share / "config" / "d405.yaml"),
         **given({"tf_prefix": options.frame_prefix}),
@@ -250,21 +245,6 @@ def camera_pose(options: SolverOptions) -> Sequence[float]:
         ValueError: the option, or what the parameter file says, is not seven numbers.
     """
     asked = read_numbers("T_gripper_camera", options.T_gripper_camera, 7)
-    told = _parameters_of(options.parameter_file, "keypoint_detector").get("T_gripper_camera")
+    node = "/".join(("", *filter(None, (options.namespace.strip("/"), "keypoint_detector"))))
+    told = parameters_of(options.parameter_file, node).get("T_gripper_camera")
     return asked or told or pose_numbers(ROBOT_CAMERA)
-
-
-def _parameters_of(file: str, node: str) -> Mapping[str, Any]:
-    """Return the parameters that a file gives to a node.
-
-    Raises:
-        ValueError: the file cannot be read, or is none of parameters.
-    """
-    found: dict[str, Any] = {}
-    try:
-        sections = read_yaml(file) or {}
-        for name in ("/**", f"/**/{node}", node, f"/{node}"):
-            found |= (sections.get(name) or {}).get("ros__parameters") or {}
-    except (FileError, AttributeError, TypeError, ValueError) as error:
-        raise ValueError(f"{file}: {error}; expected ROS parameters: node, ros__parameters, names") from error
-    return found

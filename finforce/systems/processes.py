@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -12,7 +13,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from finforce.gripper_frames import SIDES
 from finforce.settings import setting
+from finforce.systems.parameter_file import check_sections
 
 # small matrices: more threads per process cost time and make it vary
 SINGLE_THREAD = {
@@ -21,6 +24,10 @@ SINGLE_THREAD = {
 POSE_TOPICS = ("object_pose", "object_detections")  # where a contact estimator listens for poses of other programs
 PIPELINE = "pipeline"
 STAGES = ("keypoint_detector", "contact_estimator", "ifea_solver")  # in the order in which an image passes them
+RESPAWNED = (*STAGES, PIPELINE, "robot_state_publisher", "static_transform_publisher")  # none of them holds anything
+RESPAWN_DELAY = 2.0  # [s]
+UNUSABLE = 2  # exit status of a node whose settings cannot be used
+NODES = (*STAGES[:2], *(f"{side}_ifea_solver" for side in SIDES), "gripper_driver", "twin_camera", "recording_player")
 DEPTHS = {"aligned": "aligned", "auto": "auto", "off": "none"}  # options of a system: the detector's parameter `depth`
 
 
@@ -66,6 +73,11 @@ class Process:
         return self.name or self.executable
 
     @property
+    def respawns(self) -> bool:
+        """Whether it is started again when it dies; a driver is not, whose gripper goes on holding."""
+        return self.executable in RESPAWNED
+
+    @property
     def words(self) -> list[str]:
         """The node's ROS arguments."""
         words = ["-r", f"__node:={self.name}"] if self.name else []
@@ -103,7 +115,13 @@ class Include:
 
 
 def finish(parts: Sequence[Process | Include], options: SolverOptions) -> list[Process | Include]:
-    """Return parts of a system in its namespace, with its prefix of frames, and composed where that is asked for."""
+    """Return parts of a system in its namespace, with its prefix of frames, and composed where that is asked for.
+
+    Raises:
+        ValueError: the parameter file has a section for none of the nodes.
+    """
+    if options.parameter_file:
+        check_sections(options.parameter_file, options.namespace, NODES)
     parts = [_place(part, options) if isinstance(part, Process) else part for part in parts]
     return compose(parts) if options.composed else parts
 
@@ -255,10 +273,22 @@ def viewer(options: SolverOptions, share: Path, config: str = "finforce.rviz") -
             executable="rviz2",
             name="rviz",
             parameters={"use_sim_time": options.use_sim_time},
-            arguments=("-d", str(share / "rviz" / config)),
+            arguments=("-d", str(_own_view(share / "rviz" / config, options))),
             advice="or leave rviz:=true out",
         )
     ]
+
+
+def _own_view(file: Path, options: SolverOptions) -> Path:
+    """Return RViz's configuration; with the topics of a namespace and frames of a prefix, a file of its own."""
+    space, prefix = options.namespace.strip("/"), options.frame_prefix
+    if not (space or prefix):
+        return file
+    text = re.sub(r"(Value: /)(?=\w)", rf"\g<1>{space}/" if space else r"\1", file.read_text(encoding="utf-8"))
+    text = re.sub(r"(Fixed Frame: )(?=\w)", rf"\g<1>{prefix}", text).replace('TF Prefix: ""', f'TF Prefix: "{prefix}"')
+    own = Path(tempfile.mkdtemp(prefix="finforce_rviz_")) / file.name
+    own.write_text(text, encoding="utf-8")
+    return own
 
 
 def emulated_port() -> str:

@@ -7,7 +7,8 @@ from typing import Any
 
 from finforce.files import read_yaml
 from finforce.optional import import_library
-from finforce.systems.processes import Process, StackOptions, emulated_port, given
+from finforce.systems.parameter_file import check_sections
+from finforce.systems.processes import NODES, Process, StackOptions, emulated_port, given
 
 STATES = "gripper_driver/joint_states"  # of the driver, where joint_states are those of the whole robot
 CONTROLLERS = ("joint_state_broadcaster", "finray_gripper_controller")
@@ -66,7 +67,11 @@ def moveit_processes(options: StackOptions, share: Path) -> list[Process]:
 
 
 def gripper_processes(options: StackOptions, share: Path, remappings: dict[str, str]) -> list[Process]:
-    """Return the driver with remapped topics, and with `sim` the emulated gripper."""
+    """Return the driver with remapped topics, and with `sim` the emulated gripper.
+
+    Raises:
+        ValueError: the parameter file has a section for none of the nodes.
+    """
     port, interface = options.gripper_port, options.gripper_interface
     processes = []
     if options.sim:
@@ -74,11 +79,13 @@ def gripper_processes(options: StackOptions, share: Path, remappings: dict[str, 
         interface = "slcan"
         processes.append(Process(executable="emulated_gripper", name="emulated_gripper", arguments=("--link", port)))
     if options.gripper:
+        file = options.parameter_file or str(share / "config" / "robot.yaml")
+        check_sections(file, "", NODES)
         driver = Process(
             executable="gripper_driver",
             name="gripper_driver",
             parameters=given({"port": port, "interface": interface}),
-            parameter_file=options.parameter_file or str(share / "config" / "robot.yaml"),
+            parameter_file=file,
             remappings=remappings,
         )
         processes.append(driver)

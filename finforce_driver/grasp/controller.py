@@ -10,7 +10,7 @@ from statistics import median
 
 from finforce_driver.errors import BackOffError, GraspError, UnseenForceError
 from finforce_driver.grasp.load_watch import NOISE, ForceFeed, ForceSample, JawPosition, LoadWatch, TouchSample
-from finforce_driver.grasp.plan import FRICTION, MOTOR_MARGIN, GraspPlan
+from finforce_driver.grasp.plan import DEVIATIONS, FRICTION, MOTOR_MARGIN, GraspPlan
 from finforce_driver.settings import GraspGoal, GraspSettings, GripperSettings
 from finforce_driver.state import USABLE, GraspPhase, GraspStatus, GripperState, MoveRequest
 
@@ -22,7 +22,10 @@ _SATURATED_AFTER = 1.0  # [s] at the least opening
 _RESERVE_STEPS = 3  # that holding may close in any case
 _WITHIN, _FARTHEST = 0.2, 1.0  # share of the set force, and [N], below it that still hold it; a step may be more
 _FIRST_GRASPS = 9  # that teach how the motor's force goes with the camera's
-_FACTOR, _REST_FRICTION = 1.5, 0.4  # times the camera's force, and [N], that the motor's may be at rest
+_FACTOR = 1.5  # times the camera's force, that the motor's may be at rest
+_FRICTION_DOUBT = "does the gear have more friction than motor_friction"
+_LIKELY_ERROR = 0.1  # of a force, of camera and motor alike
+_DOUBTED = 15  # images at rest in which the camera says more than the motor gives, after which a hold has ended
 _WITNESSED = 0.05  # [s] that the motor's force has to be too large; the current of a motor that starts is, too
 
 
@@ -32,7 +35,7 @@ class ForceGrasp:
     Args:
         goal: force, speed, least opening, time limit.
         settings: limits and expectations.
-        jaws: closed opening and stroke.
+        jaws: closed opening, stroke, range of forces.
         resolution: opening per step of the gripper [m]; None: that of its position byte.
         ratios: of the camera's force to the motor's in the first grasps of this gripper, which adds its own.
 
@@ -49,14 +52,15 @@ class ForceGrasp:
         resolution: float | None = None,
         ratios: list[float] | None = None,
     ) -> None:
-        jaws, self._ratios = jaws or GripperSettings(), [] if ratios is None else ratios
-        self._below, self._low_images = False, 0
+        self._jaws, self._ratios = jaws or GripperSettings(), [] if ratios is None else ratios
+        self._short, self._low_images, self._high_images = False, 0, 0
+        self._excess = 0.0  # of the camera's force above the motor's [N], more than friction explains
         self.goal, self.settings = goal, settings or GraspSettings()
         self.set_force = self.settings.check_force(goal.force)
         self._feed = ForceFeed(self.settings.stale_after)
         self._load = LoadWatch(self.settings, min(_ONSET_FORCE, 0.5 * goal.force))
         self._position = JawPosition(opening=math.nan, resting=False)
-        self._plan = GraspPlan(goal, self.settings, self._load, self._feed, jaws, resolution or jaws.resolution)
+        self._plan = GraspPlan(goal, self.settings, self._load, self._feed, self._jaws, resolution)
         self._pending: deque[ForceSample | TouchSample] = deque()
         self.phase, self._reason = GraspPhase.APPROACH, "waits for the first force"
         self._began = self._held_at = self._reserve = self._saturated = math.nan
@@ -221,8 +225,8 @@ class ForceGrasp:
         plan, pressing = self._plan, 0.0 if math.isnan(self._load.force) else self._load.pressing
         got = f"{pressing:.2f} N of {self.set_force:g} N"
         if self.phase is not GraspPhase.HOLDING and now - self._began > self.goal.time_limit:
-            below = f": {self._reason}" if self._below else ""
-            raise GraspError(f"{got} within the time limit of {self.goal.time_limit:g} s{below}")
+            cause = f": {self._reason}" if self._short else ""
+            raise GraspError(f"{got} within the time limit of {self.goal.time_limit:g} s{cause}")
         if now - self._saturated > _SATURATED_AFTER:
             raise GraspError(f"{got} with the jaws at their least opening, {1e3 * plan.target:.1f} mm")
         if plan.is_late(now, state.opening):
@@ -270,18 +274,24 @@ class ForceGrasp:
     def _is_near_set_force(self) -> bool:
         """Return whether the force that is held is near to the set one, and say it, or why it is held below."""
         plan, load, short = self._plan, self._load, self.set_force - self._load.pressing
-        self._below = short > min(_FARTHEST, max(_WITHIN * self.set_force, plan.force_per_step))
+        if self._excess:
+            self._short, self._reason = True, f"not known to be held: {self._describe_excess()}"
+            return False
+        self._short = short > min(_FARTHEST, max(_WITHIN * self.set_force, plan.force_per_step))
         cause = f"one step of the gripper is {plan.force_per_step:.2f} N"
         if load.stddev > plan.force_per_step:
             cause = f"its stated deviation is {load.stddev:.2f} N"
-        self._reason = f"held below the set force by {short:.2f} N: {cause}" if self._below else "holds the set force"
-        return not self._below
+        self._reason = f"held below the set force by {short:.2f} N: {cause}" if self._short else "holds the set force"
+        return not self._short
 
     def _compare_motor(self, state: GripperState) -> None:
-        """Refuse a camera that sees, at rest, much less than the motor gives, by what that was in the first grasps.
+        """Doubt a camera whose force at rest is not that of the motor, by what that was in the first grasps.
+
+        A camera that says more ends nothing before the force was held, but is no success.
 
         Raises:
-            UnseenForceError: that is so in several images.
+            UnseenForceError: it says much less in several images.
+            GraspError: it says more for a while, of a force that was held.
         """
         load, plan = self._load, self._plan
         if not (
@@ -289,13 +299,26 @@ class ForceGrasp:
         ):
             return
         known = state.force * (median(self._ratios) if len(self._ratios) >= _SETTLED else 1.0)
-        low = known > _FACTOR * load.pressing + _REST_FRICTION
-        self._low_images = self._low_images + 1 if low else 0
+        friction, excess = self.settings.motor_friction, load.pressing - known
+        largest = max(friction, _LIKELY_ERROR * load.pressing, DEVIATIONS * load.stddev)
+        self._low_images = self._low_images + 1 if known > _FACTOR * load.pressing + friction else 0
+        self._high_images = self._high_images + 1 if excess > largest else 0
+        self._excess = excess if self._high_images >= _SETTLED else 0.0
         if self._low_images >= _SETTLED:
             raise UnseenForceError(
                 f"the motor holds {known:.1f} N by its current, the camera says {load.pressing:.2f} N: is the "
-                "camera's calibration off by a factor? The jaws back off"
+                f"camera's calibration off by a factor, or {_FRICTION_DOUBT}? The jaws back off"
             )
+        if self._high_images >= _DOUBTED and self.phase is GraspPhase.HOLDING:
+            raise GraspError(self._describe_excess())
+
+    def _describe_excess(self) -> str:
+        """Say that the camera's force is above the motor's."""
+        pressing = self._load.pressing
+        return (
+            f"the camera says {pressing:.2f} N, the motor holds {pressing - self._excess:.1f} N by its current: does "
+            f"the camera read too much, or {_FRICTION_DOUBT}?"
+        )
 
     def _pause(self, state: GripperState, now: float) -> MoveRequest | None:
         """Return a move that keeps the jaws where they are until the next image says what to think of this one."""
@@ -311,7 +334,8 @@ class ForceGrasp:
     @property
     def _motor_force(self) -> float:
         """The motor's limit [N]: no hindrance to the set force, which both jaws give, and friction takes from."""
-        return max(self.settings.motor_force, _FACTOR * self.set_force)
+        least, largest = self._jaws.forces
+        return min(max(self.settings.motor_force, _FACTOR * self.set_force, least), largest)
 
     def status(self, state: GripperState, now: float) -> GraspStatus:
         """Return the grasp as it is, after an `update` with the same state and time."""
@@ -331,7 +355,7 @@ class ForceGrasp:
             peak=load.peak,
             resolution=self._plan.force_per_step,
             target=self._plan.target,
-            stddev=load.stddev,
+            stddev=max(load.stddev, self._excess),
             failure=self._failure,
             rejected=dict(feed.rejected),
         )

@@ -82,7 +82,7 @@ class LoadWatch:
         self.model = ForceModel(stiffness=settings.largest_stiffness, noise=NOISE)
         self.loaded = self.suspect = self.resting = False
         self.force = self.opening = math.nan
-        self.peak = self.stddev = 0.0
+        self.peak = self._peak = self.stddev = 0.0  # the second one since the jaws last opened
         self._idle: deque[float] = deque([0.0], maxlen=15)
         self._above = self._jumps = self._empty = self._same = 0
         self._last = self._last_opening = math.nan
@@ -126,6 +126,8 @@ class LoadWatch:
             raise GraspError(
                 f"the force is {sample.force:.2f} N, above the limit of {self._settings.force_limit:g} N: the jaws hold"
             )
+        if jaws.opening > self.opening:
+            self._peak = 0.0
         self.force, self.opening, self.resting = sample.force, jaws.opening, jaws.resting
         self.stddev = sample.stddev
         if not self.loaded:
@@ -134,7 +136,7 @@ class LoadWatch:
         if not passing:
             self.model.update(jaws.opening, sample.force, sample.stamp, travel_stddev)
         self._check_presence(sample.force)
-        self.peak = max(self.peak, sample.force)
+        self.peak, self._peak = max(self.peak, sample.force), max(self._peak, sample.force)
 
     def _watch_onset(self, sample: ForceSample, jaws: JawPosition, travel_stddev: float, touching: bool) -> None:
         """Begin the model with the first of the images that show a load."""
@@ -180,7 +182,9 @@ class LoadWatch:
     def _surprise(self, force: float, opening: float) -> float:
         """Return by how much a force differs from what may be expected [N], signed."""
         if self.loaded:
-            return self.model.surprise(opening, force)
+            surprise = self.model.surprise(opening, force)
+            # jaws that open may let go of something stiffer than was learnt
+            return surprise if surprise > 0.0 or opening <= self.opening else 0.0
         # where contact began between the two images is not known: any force up to the greatest stiffness may be
         reach = self._settings.largest_stiffness * max(0.0, self.opening - opening)
         return max(0.0, force - self.force - reach)
@@ -208,10 +212,10 @@ class LoadWatch:
         Raises:
             GraspError: several images in a row show none, after there was one.
         """
-        self._empty = self._empty + 1 if force < 0.5 * self.onset < 0.25 * self.peak else 0
+        self._empty = self._empty + 1 if force < 0.5 * self.onset < 0.25 * self._peak else 0
         if self._empty >= _EMPTY:
             raise GraspError(
-                f"the force of {self.peak:.2f} N has gone: the object slipped out or broke; open, look, and grasp again"
+                f"the force of {self._peak:.2f} N has gone: the object slipped out or broke; open, look, grasp again"
             )
 
 

@@ -32,7 +32,7 @@ _CONTRADICTED = 0.5  # share of the speed while the contact estimator says that 
 _WITNESS_TIME = 0.15  # [s] from a force to the stop that the motor's current brings about
 FRICTION = 1.0  # [N] by which the motor's current, also at its limit, may tell too little
 _BEYOND_NOISE = 4.0  # deviations of one force, beyond which a step's change of it is no chance
-_DEVIATIONS = 2.0  # stated deviations of the force within which it is reckoned with
+DEVIATIONS = 2.0  # stated deviations of the force within which it is reckoned with
 _HYSTERESIS = 0.3  # [steps] of force beyond the tolerance before jaws at rest open again
 SETTLING = 0.03  # [s] in addition to the reaction: the jaws come to rest, and the driver may step them one by one
 _NEAR = 2.0  # steps between target and reported opening at rest: the byte is truncated, and flickers by one
@@ -61,7 +61,7 @@ class GraspPlan:
         load: force, stiffness, contact.
         feed: latency and period.
         jaws: closed opening and stroke.
-        step: of the gripper [m].
+        step: of the gripper [m]; None: that of its position byte.
     """
 
     def __init__(
@@ -71,16 +71,17 @@ class GraspPlan:
         load: LoadWatch,
         feed: ForceFeed,
         jaws: GripperSettings,
-        step: float,
+        step: float | None = None,
     ) -> None:
-        self.step, self._closed, self.widest = step, jaws.closed_opening, jaws.largest_opening
+        self.step, self._closed, self.widest = step or jaws.resolution, jaws.closed_opening, jaws.largest_opening
         self.target, self.speed, self.stepping = math.nan, 0.0, False
         self._goal, self._settings, self._load, self._feed = goal, settings, load, feed
         self._settling = settings.reaction + SETTLING
         self._arrives = self._powered_from = math.inf
         self._least = max(self.snap(goal.least_opening), jaws.closed_opening)
         self._rest = (math.nan, math.nan)  # target [m] and force [N] of the last image at rest
-        self._step_force = 0.0  # [N] that a step of the jaws was seen to change, where that was beyond expectation
+        self._change = 0.0  # [N] of the force with the last step
+        self._step_force = 0.0  # [N] the same where it was beyond expectation, or the step was taken back
 
     @property
     def stiffness(self) -> float:
@@ -115,7 +116,11 @@ class GraspPlan:
         if 0.5 < steps < 1.5:
             change = abs(load.force - before[1])
             expected = load.model.likely_stiffness * self.step + _BEYOND_NOISE * load.model.noise
-            self._step_force = change if change > expected else 0.0
+            if self.target > before[0]:  # a step that was taken back is not to be taken again
+                self._step_force = max(change, self._change)
+            else:
+                self._step_force = change if change > expected else 0.0
+            self._change = change
 
     def limit(self, target: float) -> float:
         """Return a target [m] within the least opening and what the gripper can open."""
@@ -178,7 +183,7 @@ class GraspPlan:
         if not load.loaded:
             return max(0.0, self.stiffness * unseen - set_force)
         stiffness = max(2.0 * load.model.stiffness, self.stiffness)
-        margin = load.model.force_stddev + _DEVIATIONS * load.stddev
+        margin = load.model.force_stddev + DEVIATIONS * load.stddev
         return max(0.0, load.model.force + margin + stiffness * unseen - set_force)
 
     def _allowed(self, set_force: float, slack: float = 0.0) -> float:
@@ -200,7 +205,8 @@ class GraspPlan:
 
     def _steps_back(self, excess: float) -> int:
         """Return by how many steps jaws at rest are to open for an excess of force [N]."""
-        if excess < _HYSTERESIS * self.force_per_step + self._load.model.force_stddev:
+        half = 0.5 * max(self.force_per_step, self._change)  # of two steps the nearer one is kept
+        if excess < max(_HYSTERESIS * self.force_per_step, half - _TOLERANCE) + self._load.model.force_stddev:
             return 0
         return max(1, round(excess / (self.stiffness * self.step)))
 

@@ -52,6 +52,7 @@ class GraspSession:
         self._touch_told = -math.inf
         self._stddevs: dict[str, tuple[float, float]] = {}
         self._ratios: list[float] = []
+        self._goals = 0  # that were set
         self._changed = Condition()
 
     @property
@@ -68,6 +69,7 @@ class GraspSession:
         self._settings.check_force(goal.force)
         _check_opening(goal, self._gripper)
         with self._changed:
+            self._goals += goal != self.goal
             self.goal = goal
             if self._grasp is not None:
                 self._grasp.change_force(goal.force)
@@ -117,8 +119,11 @@ class GraspSession:
                 self.begin()
                 if self.runs:
                     begun()
-            if not self._changed.wait_for(self._is_settled, self.goal.time_limit + MARGIN):
-                self.stop("the gripper did not answer in time")
+            before = self._goals
+            if not self._changed.wait_for(self._is_settled, longest := self.goal.time_limit + MARGIN):
+                changes = self._goals - before
+                cause = f"its goal was changed {changes} times meanwhile" if changes else "the gripper was silent"
+                self.stop(f"the force was not held within {longest:g} s: {cause}")
             if self.status.phase is GraspPhase.STOPPED:
                 raise GraspError(f"the grasp was ended: {self.status.reason}")
             return self.status

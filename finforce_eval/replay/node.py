@@ -21,7 +21,7 @@ from rclpy.signals import uninstall_signal_handlers
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 
-from finforce.camera_topics import COLOR_TOPIC
+from finforce.camera_topics import COLOR_TOPIC, relative
 from finforce.gripper_frames import SIDES
 from finforce.ros import node as ros
 from finforce.settings import setting
@@ -33,7 +33,7 @@ HEARD = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 
 
 class PlayerNode(Node):
-    """Publishes recorded messages, each when its time has come, and spins in between."""
+    """Publishes recorded messages in its own namespace, each when its time has come, and spins in between."""
 
     def __init__(self, name: str = "recording_player", **options: Any) -> None:
         super().__init__(name, **options)
@@ -52,7 +52,7 @@ class PlayerNode(Node):
             except ImportError:
                 self.get_logger().warning(f"{topic} is not played: {msgtype} is not installed")
                 continue
-            self._outputs[topic] = self.create_publisher(kind, topic, ros.RESULT)
+            self._outputs[topic] = self.create_publisher(kind, relative(topic), ros.RESULT)
         # what belongs to one image leaves at once
         portions = groupby(messages, key=attrgetter("time"))
         self._coming = ReadAhead((time, list(due)) for time, due in portions)
@@ -69,10 +69,11 @@ class PlayerNode(Node):
 
     def _count_others(self, topic: str) -> int:
         """Return how many listen to a topic other than this node."""
-        own = sum(subscription.topic_name == topic for subscription in self.subscriptions)
+        name = self.resolve_topic_name(relative(topic))
+        own = sum(subscription.topic_name == name for subscription in self.subscriptions)
         if topic in self._outputs:
             return self._outputs[topic].get_subscription_count() - own
-        return self.count_subscribers(topic) - own
+        return self.count_subscribers(name) - own
 
     def wait_for(self, condition: Callable[[], bool], patience: float) -> bool:
         """Spin until a condition holds, for at most `patience` [s]; return whether it does."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
+import sys
 import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -14,7 +15,7 @@ from typing import IO, Any
 import psutil
 
 from finforce.errors import FinforceError
-from finforce.systems.processes import SINGLE_THREAD, Process
+from finforce.systems.processes import RESPAWN_DELAY, SINGLE_THREAD, UNUSABLE, Process
 
 # how long each signal is given before the next, harder one [s]
 PATIENCE = ((signal.SIGINT, 5.0), (signal.SIGTERM, 3.0), (signal.SIGKILL, 3.0))
@@ -38,21 +39,22 @@ class ProcessGroup:
         self._environment = {**os.environ, **SINGLE_THREAD, **environment}
         self._children: list[subprocess.Popen] = []
         self._logs: list[IO[bytes]] = []
+        self._dead: dict[int, float] = {}  # places of processes, and when [s] they were seen to have ended
 
     def __enter__(self) -> ProcessGroup:
         try:
             for process in self._processes:
-                self._start(process)
+                self._children.append(self._start(process))
         except BaseException:
             self.__exit__()
             raise
         return self
 
-    def _start(self, process: Process) -> None:
+    def _start(self, process: Process) -> subprocess.Popen:
         log = tempfile.TemporaryFile()  # noqa: SIM115 - closed when the group ends
         self._logs.append(log)
         try:
-            child = subprocess.Popen(
+            return subprocess.Popen(
                 process.command(),
                 env=self._environment,
                 stdin=subprocess.DEVNULL,
@@ -62,7 +64,6 @@ class ProcessGroup:
             )
         except OSError as error:
             raise ProcessError(f"{process.label} cannot be started: {error}") from error
-        self._children.append(child)
 
     @property
     def pids(self) -> dict[str, int]:
@@ -81,15 +82,27 @@ class ProcessGroup:
                 raise ProcessError(f"{process.label} ended with status {child.returncode}{words}")
 
     def has_finished(self) -> bool:
-        """Return whether the process has ended well that ends all.
+        """Start again what has died and may be; return whether the process that ends all has ended well, or all have.
 
         Raises:
-            ProcessError: one has ended with an error.
+            ProcessError: the settings of one cannot be used, or the process that ends all has failed.
         """
-        statuses = [child.poll() for child in self._children]
-        if any(statuses):
-            self.check()
-        return any(part.ends_all and status == 0 for part, status in zip(self._processes, statuses, strict=True))
+        for index, (process, child) in enumerate(zip(self._processes, self._children, strict=True)):
+            status = child.poll()
+            if status is None:
+                continue
+            if status == UNUSABLE or (status and process.ends_all):
+                raise ProcessError(f"{process.label} ended with status {status}")
+            if process.ends_all:
+                return True
+            if index not in self._dead:
+                self._dead[index] = monotonic()
+                then = "it is started again" if process.respawns else "the others go on"
+                print(f"{process.label} ended with status {status}: {then}", file=sys.stderr)
+            elif process.respawns and monotonic() > self._dead[index] + RESPAWN_DELAY:
+                del self._dead[index]
+                self._children[index] = self._start(process)
+        return len(self._dead) == len(self._children) and not any(process.respawns for process in self._processes)
 
     def __exit__(self, *_: Any) -> None:
         for number, patience in PATIENCE:

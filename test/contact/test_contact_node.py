@@ -5,6 +5,7 @@ from time import time_ns
 
 import numpy as np
 import pytest
+import rclpy
 from contact_node_fakes import (
     CAMERA,
     MESH,
@@ -300,3 +301,17 @@ def test_the_camera_frame_is_a_parameter(probe):
     bench = ContactBench(probe, camera_frame="wrist")
     bench.jaw_out.publish(pose(time_ns(), T_CAMERA_JAW))
     bench.diagnosis(level=Level.ERROR, word=f"'{CAMERA}'; expected 'wrist'")
+
+
+def test_object_poses_of_two_nodes_are_refused_with_their_names(probe):
+    bench = ContactBench(probe)
+    first = bench.image(cylinder_before_jaw())
+    bench.wait_for_contacts()
+    tracker = rclpy.create_node("tracker", context=probe.context)
+    tracker.create_publisher(PoseStamped, "object_pose", 1)
+    probe.wait_for(lambda: bench.node.count_publishers("object_pose") == 2)
+    for _ in range(3):
+        bench.image(cylinder_before_jaw())
+    assert bench.diagnosis(Level.ERROR, "/object_pose is published by /probe and /tracker; expected one")
+    assert bench.node.session.pose.stamp == pytest.approx(1e-9 * first, abs=1e-3)
+    tracker.destroy_node()

@@ -124,8 +124,17 @@ def test_images_start_the_detector_with_the_configuration(recorded_launch):
 def test_the_end_of_the_player_ends_the_launch(recorded_launch):
     nodes = start(ROOT / "launch" / "replay.launch.py", bag="somewhere", jaws="both")
     assert set(nodes) == {"left_ifea_solver", "right_ifea_solver", "recording_player"}
-    assert nodes["recording_player"]["on_exit"] is not None
-    assert nodes["left_ifea_solver"]["on_exit"] is None
+    well, bad, killed = (SimpleNamespace(returncode=status) for status in (0, 2, -9))
+    assert all(nodes["recording_player"]["on_exit"](ended, None) for ended in (well, bad, killed))
+    solver = nodes["left_ifea_solver"]
+    assert [bool(solver["on_exit"](ended, None)) for ended in (well, bad, killed)] == [False, True, False]
+    assert solver["respawn"] and not nodes["recording_player"]["respawn"]
+
+
+def test_whatever_holds_something_is_not_started_again(recorded_launch):
+    nodes = start(ROBOT, sim="true")
+    respawned = {name for name, node in nodes.items() if node["respawn"]}
+    assert not {"gripper_driver", "twin_camera"} & respawned and {"keypoint_detector", "right_ifea_solver"} < respawned
 
 
 RECORDS = {"bench": BenchOptions, "replay": ReplayOptions, "robot": RobotOptions}

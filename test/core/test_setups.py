@@ -5,17 +5,25 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rclpy
 import yaml
 
 from finforce.gripper_frames import ROBOT_CAMERA
-from finforce.ros.transport import CHOICES, PROFILES, TRANSPORT
+from finforce.ros.transport import CHOICES, PROFILES, TRANSPORT, free_domain
 from finforce.systems.live import (
     SIM_OBJECT,
     bench_processes,
     camera_pose,
     robot_processes,
 )
-from finforce.systems.processes import BenchOptions, Include, RobotOptions
+from finforce.systems.processes import (
+    BenchOptions,
+    Include,
+    Process,
+    ReplayOptions,
+    RobotOptions,
+    replay_processes,
+)
 from finforce_contact.mesh.object_mesh import load_object_mesh
 from finforce_contact.parameters import ContactParameters
 from finforce_driver.settings import DriverParameters
@@ -80,9 +88,9 @@ def test_detector_and_contacts_read_the_camera_that_is_started():
     parts = robot(camera_name="hand")
     assert parts["realsense2_camera"].arguments["camera_name"] == "hand"
     detector, contacts = (parts[name].parameters for name in ("keypoint_detector", "contact_estimator"))
-    assert detector["color_topics"] == ["/camera/hand/color/image_raw", "/camera/hand/color/image_rect_raw"]
-    assert detector["info_topic"] == "/camera/hand/color/camera_info"
-    depth = "/camera/hand/aligned_depth_to_color/image_raw"
+    assert detector["color_topics"] == ["camera/hand/color/image_raw", "camera/hand/color/image_rect_raw"]
+    assert detector["info_topic"] == "camera/hand/color/camera_info"
+    depth = "camera/hand/aligned_depth_to_color/image_raw"
     assert detector["depth_topic"] == contacts["depth_topic"] == depth
 
 
@@ -90,7 +98,7 @@ def test_poses_of_another_program_come_from_its_topic_beside_those_of_the_camera
     asked = {"object_mesh": "c.stl", "pose_source": "detections"}
     contacts = robot(camera_name="hand", pose_topic="/pose_estimation/output", **asked)["contact_estimator"]
     assert contacts.remappings["object_detections"] == contacts.remappings["object_pose"] == "/pose_estimation/output"
-    assert contacts.parameters["info_topic"] == "/camera/hand/color/camera_info"
+    assert contacts.parameters["info_topic"] == "camera/hand/color/camera_info"
     assert contacts.parameters["pose_source"] == "detections"
     assert "object_pose" not in robot(**asked)["contact_estimator"].remappings
 
@@ -116,15 +124,26 @@ def test_two_robots_in_one_domain_share_neither_topics_nor_frames():
     assert all(part.words[2:4] == ["-r", "__ns:=/r1"] for part in ours)
     nodes = [part for part in ours if part.executable != "twin_camera"]
     assert {part.parameters["frame_prefix"] for part in nodes} == {"r1/"}
-    color = "/r1/camera/wrist_camera/color/image_raw"
+    color = "camera/wrist_camera/color/image_raw"  # relative: in the namespace of each
     assert parts["keypoint_detector"].parameters["color_topics"][0] == color
     twin = parts["twin_camera"]
-    assert twin.remappings["/camera/camera/color/image_raw"] == color
+    assert twin.remappings["camera/camera/color/image_raw"] == color
     assert twin.parameters["camera_frame"] == "r1/wrist_camera_color_optical_frame"
     assert parts["robot_state_publisher"].parameters["frame_prefix"] == "r1/"
     assert {"r1/gripper_base", twin.parameters["camera_frame"]} < set(parts["static_transform_publisher"].arguments)
     camera = robot(namespace="r1", frame_prefix="r1/")["realsense2_camera"].arguments
     assert (camera["camera_namespace"], camera["tf_prefix"]) == ("r1/camera", "r1/")
+
+
+@pytest.mark.parametrize("processes", [bench_processes, robot_processes, replay_processes])
+def test_no_system_names_a_camera_topic_outside_of_its_namespace(processes):
+    record = {bench_processes: BenchOptions, robot_processes: RobotOptions, replay_processes: ReplayOptions}[processes]
+    parts = processes(record(composed=False, images=True, object_mesh="can.stl", namespace="r2"), ROOT)
+    words = [word for part in parts if isinstance(part, Process) for word in part.command()]
+    assert not [word for word in words if ":=" in word and '"/camera' in word or ":=/camera" in word]
+    for kind in (DetectorParameters, ContactParameters):
+        topics = [entry.default for entry in fields(kind) if entry.metadata.get("topic")]
+        assert topics and "'/" not in repr(topics)
 
 
 def test_the_camera_gets_the_transport_of_our_nodes_unless_somebody_chose_one(monkeypatch):
@@ -226,7 +245,7 @@ def test_the_object_of_the_twin_is_a_cylinder_of_25_mm_along_y_in_metres():
 
 def test_the_twin_films_under_the_cameras_name():
     twin = robot(sim=True)["twin_camera"]
-    assert twin.remappings["/camera/camera/color/image_raw"] == "/camera/wrist_camera/color/image_raw"
+    assert twin.remappings["camera/camera/color/image_raw"] == "camera/wrist_camera/color/image_raw"
     assert twin.parameters["camera_frame"] == "wrist_camera_color_optical_frame"
 
 
@@ -257,3 +276,57 @@ def test_only_the_frames_can_be_done_without():
         "static_transform_publisher",
     }
     assert all(part.advice for part in parts.values() if part.package != "finforce")
+
+
+@pytest.mark.parametrize(
+    ("key", "namespace", "advice"),
+    [
+        (
+            "keypoint_detector",
+            "r2",
+            "'keypoint_detector' is no node of this system in the namespace /r2.*write /\\*\\*/key",
+        ),
+        ("/r1/keypoint_detector", "r2", r"write /\*\*/keypoint_detector"),
+        ("keypoint_detctor", "", "without a namespace.*did you mean keypoint_detector"),
+        ("ifea_solver", "", "did you mean left_ifea_solver"),
+        ("/*/keypoint_detector", "", r"write /\*\*/keypoint_detector"),
+    ],
+)
+def test_a_section_of_a_parameter_file_that_no_node_would_read_is_refused(tmp_path, key, namespace, advice):
+    file = parameter_file(tmp_path, key)
+    for processes, record in ((bench_processes, BenchOptions), (robot_processes, RobotOptions)):
+        with pytest.raises(ValueError, match=advice):
+            processes(record(parameter_file=file, namespace=namespace), ROOT)
+
+
+def parameter_file(folder, key):
+    file = folder / "lab.yaml"
+    file.write_text(f"{key}: {{ros__parameters: {{T_gripper_camera: [0.0, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0]}}}}")
+    return str(file)
+
+
+KEYS = (
+    "/**",
+    "/**/keypoint_detector",
+    "r2/keypoint_detector",
+    "/r2/keypoint_detector",
+    "/*/keypoint_detector",
+    "/r2/*",
+)
+
+
+@pytest.mark.parametrize("key", [*KEYS, "r2: {keypoint_detector"])
+def test_the_tool_reads_a_parameter_file_as_the_node_does(tmp_path, key):
+    file = parameter_file(tmp_path, key)
+    if "{" in key:
+        Path(file).write_text(Path(file).read_text() + "}")
+    options = RobotOptions(parameter_file=file, namespace="r2")
+    assert camera_pose(options)[2] == 0.5
+    assert robot_processes(options, ROOT)
+    context = rclpy.Context()
+    rclpy.init(context=context, args=[], domain_id=free_domain())
+    words = ["--ros-args", "--params-file", file]
+    node = rclpy.create_node("keypoint_detector", context=context, namespace="r2", cli_args=words)
+    assert "T_gripper_camera" in node._parameter_overrides
+    node.destroy_node()
+    rclpy.shutdown(context=context)

@@ -11,7 +11,7 @@ from finforce_keypoints.detector import KeypointDetector
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "interfaces.md"
 WORDS = {
-    "keypoint_detector": (),
+    "keypoint_detector": ("-p", "skip_off:=[all]"),  # else it hears no images while nobody listens
     "contact_estimator": ("-p", "jaws:=both"),
     "ifea_solver": ("-p", "peer:=right"),
     "gripper_driver": ("-p", "port:=/dev/null"),

@@ -19,12 +19,16 @@ from rclpy.qos import (
 )
 from std_msgs.msg import String
 
+from finforce.systems.live import robot_processes
+from finforce.systems.processes import RobotOptions
+
 ROOT = Path(__file__).resolve().parents[2]
 TYPES = {
     "MarkerArray": "visualization_msgs/msg/MarkerArray",
     "PointCloud2": "sensor_msgs/msg/PointCloud2",
     "Image": "sensor_msgs/msg/Image",
     "RobotModel": "std_msgs/msg/String",
+    "Wrench": "geometry_msgs/msg/WrenchStamped",
 }
 SHOWN_IN_3D = ("visualization_msgs/msg/MarkerArray", "sensor_msgs/msg/PointCloud2")
 FOREIGN = {  # published by a recording or by robot_state_publisher, not by our nodes
@@ -111,3 +115,27 @@ def test_every_panel_of_the_layout_stands_somewhere():
         return {tree} if isinstance(tree, str) else leaves(tree["first"]) | leaves(tree["second"])
 
     assert leaves(layout["layout"]) == set(layout["configById"])
+
+
+def test_rviz_shows_the_topics_of_a_namespace_and_the_frames_of_a_prefix():
+    parts = robot_processes(RobotOptions(rviz=True, namespace="r1", frame_prefix="r1/"), ROOT)
+    (rviz,) = [part for part in parts if getattr(part, "executable", "") == "rviz2"]
+    manager = yaml.safe_load(Path(rviz.arguments[1]).read_text(encoding="utf-8"))["Visualization Manager"]
+    told = [display.get("Topic") or display.get("Description Topic") for display in manager["Displays"]]
+    topics = {topic["Value"] for topic in told if topic}
+    assert "/r1/grasp_wrench" in topics and all(topic.startswith("/r1/") for topic in topics)
+    assert manager["Global Options"]["Fixed Frame"] == "r1/gripper_base"
+    (model,) = [display for display in manager["Displays"] if "TF Prefix" in display]
+    assert model["TF Prefix"] == "r1/"
+    plain = robot_processes(RobotOptions(rviz=True), ROOT)
+    assert plain[-1].arguments[1] == str(ROOT / "rviz" / "robot.rviz")
+
+
+def test_every_diagnosis_has_one_heading_in_the_aggregator(graph):
+    file = ROOT / "config" / "diagnostics" / "aggregator.yaml"
+    tree = yaml.safe_load(file.read_text(encoding="utf-8"))["/**"]["ros__parameters"]
+    words = [group["contains"] for group in tree["finforce"]["analyzers"].values()]
+    graph.wait_for(lambda: len({s.name for a in graph.got["/diagnostics"] for s in a.status}) >= 5)
+    names = {status.name for array in graph.got["/diagnostics"] for status in array.status} | {"finforce: gripper"}
+    for name in names:
+        assert sum(any(word in name for word in group) for group in words) == 1, name

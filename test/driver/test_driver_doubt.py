@@ -9,9 +9,11 @@ from grasp_fakes import STEP, Bench, Camera, Fingers, Jaws, build_spring, spring
 
 from finforce.errors import ObservationError
 from finforce.ros.messages import force_stddev
+from finforce_driver.grasp.controller import ForceGrasp
+from finforce_driver.grasp.plan import FRICTION
 from finforce_driver.gripper import Gripper
 from finforce_driver.settings import GraspGoal, GraspSettings, GripperSettings
-from finforce_driver.state import GraspPhase
+from finforce_driver.state import GraspPhase, GripperState, Phase
 from lab.experiments.grasp_world import GraspCase, NoisySensor, Plant, World
 
 
@@ -183,3 +185,32 @@ def test_a_wall_is_let_go_with_the_setting_named(variant):
     assert "largest_stiffness" in course.error or "the motor presses" in course.error
     world.gripper.wait(lambda state: state.opening > 0.026, 10.0)
     assert world.force < 1.0
+
+
+@pytest.mark.parametrize("force_per_current", [5.0, 30.0, 49.0, 51.0, 80.0, 500.0])
+def test_the_limit_of_the_motor_is_one_that_the_gripper_has_whatever_its_force_per_current(force_per_current):
+    settings = GripperSettings(force_per_current=force_per_current)
+    grasp = ForceGrasp(GraspGoal(force=2.0), jaws=settings)
+    limit = grasp.status(GripperState(phase=Phase.READY, opening=0.03), 0.0).hard_bound + 2.0 - FRICTION
+    assert settings.current_of(limit) > 0
+    assert limit == pytest.approx(min(max(7.5, 0.15 * force_per_current), 1.3 * force_per_current))
+
+
+def hold_rigid(force, noise, seed, largest):
+    """A grasp of an object of 10 N/mm, of which a step of the jaws changes the force by 1.9 N."""
+    plant = Plant(force_at=build_spring(10_000.0))
+    case = GraspCase(plant=plant, force=force, speed=0.004, latency=0.06, seed=seed)
+    return World(case, NoisySensor(noise, seed), GraspSettings(largest_stiffness=largest)).run()
+
+
+@pytest.mark.parametrize("seed", [2, 4])
+@pytest.mark.parametrize("largest", [1400.0, 12_000.0])
+def test_of_two_steps_about_the_set_force_the_nearer_one_is_kept(seed, largest):
+    course = hold_rigid(3.0, 0.2, 4 if largest > 1400.0 else seed, largest)
+    forces = course.forces[-6000:]  # 6 s; it was 1.5 to 3.7 N, again and again
+    assert course.error == "" and min(forces) > 3.3 and max(forces) < 3.7
+
+
+def test_a_rigid_object_that_the_jaws_let_go_by_a_step_has_not_slipped():
+    course = hold_rigid(5.0, 0.05, 2, 12_000.0)
+    assert course.forces[-1] > 3.3 and "slip" not in course.error

@@ -1,6 +1,7 @@
 """Claims about what a driver's services, commands and goals do: refusals, waiting, and what ends a grasp."""
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -10,7 +11,13 @@ from emulator_fakes import Rig
 from finforce_driver.errors import DriverError, GraspError, GripperStateError, TargetError
 from finforce_driver.grasp.load_watch import ForceSample
 from finforce_driver.grasp.session import GraspSession
-from finforce_driver.messages import fill_gripper_command, move_from_gripper_command, move_from_joint_state
+from finforce_driver.messages import (
+    fill_gripper_command,
+    move_from_gripper_command,
+    move_from_joint_state,
+    news_of_state,
+    outcome_of_state,
+)
 from finforce_driver.settings import DriverParameters, GraspGoal, GraspSettings
 from finforce_driver.state import GraspPhase, MoveOutcome, Phase
 from finforce_driver.tasks import GripperTasks, MoveAction
@@ -333,3 +340,24 @@ def test_a_goal_of_the_action_that_cannot_be_is_rejected_with_the_reason(positio
     rejection = action(rig.gripper).rejection(goal)
     assert words in rejection and bool(words) == bool(rejection)
     assert rig.state.outcome is MoveOutcome.NONE
+
+
+def test_a_gripper_that_is_ready_and_limp_is_said_to_be_limp():
+    gripper, _, tasks = build(FakeGripper(replace(READY, activated=False)))
+    assert tasks.clear_errors() == "no error is latched; the gripper is ready, limp until the next move"
+    assert "limp" in outcome_of_state(gripper.state).text and "limp" in news_of_state(gripper.state)
+    assert "limp" not in outcome_of_state(READY).text + news_of_state(READY)
+
+
+def test_a_grasp_whose_goal_is_changed_again_and_again_says_so(monkeypatch):
+    monkeypatch.setattr("finforce_driver.grasp.session.MARGIN", 0.3)
+    _, session, tasks = build()
+    session.set_goal(replace(session.goal, time_limit=0.1))
+    monkeypatch.setattr(session, "update", lambda state: None)  # it goes on
+    session.status = None
+    with Caller(tasks.grasp) as caller:
+        caller.wait_for(lambda: session.runs)
+        for force in (1.0, 2.0, 2.0, 1.0):
+            session.set_goal(replace(session.goal, force=force))
+        with pytest.raises(GraspError, match="not held within 0.4 s: its goal was changed 2 times"):
+            caller.result()

@@ -8,8 +8,8 @@ from grasp_fakes import STEP, build_spring
 
 from finforce_driver.errors import UnseenForceError
 from finforce_driver.grasp.controller import ForceGrasp
-from finforce_driver.settings import GraspGoal
-from finforce_driver.state import GripperState, Phase
+from finforce_driver.settings import GraspGoal, GraspSettings
+from finforce_driver.state import GraspPhase, GripperState, Phase
 from lab.experiments.grasp_world import GraspCase, NoisySensor, Plant, World
 
 
@@ -98,3 +98,60 @@ def test_a_grasp_that_is_seen_is_held(variant, stiffness, force, speed):
     ).run()
     assert course.error == ""
     assert max(course.forces) < force + 0.25
+
+
+class HighSensor(NoisySensor):
+    """A camera that sees a multiple of the force, an offset [N] more, and more from second to second [N/s]."""
+
+    def __init__(self, factor=1.0, offset=0.0, drift=0.0):
+        super().__init__(0.05, 1)
+        self.factor, self.offset, self.drift, self.began = factor, offset, drift, None
+
+    def measure(self, stamp, force, opening):
+        self.began = stamp if self.began is None else self.began
+        seen = self.factor * super().measure(stamp, force, opening)
+        return seen + self.offset + self.drift * (stamp - self.began)
+
+
+def low_while_held(sensor, stiffness, force):
+    """By how much the true force is below the set one at most while it is said to be held [N], and the course."""
+    plant, low = Plant(force_at=build_spring(stiffness)), [0.0]
+    world = World(GraspCase(plant=plant, force=force, speed=0.004, latency=0.06, seed=1), sensor)
+    is_over = world._is_over
+
+    def look(status):
+        if status.phase is GraspPhase.HOLDING:
+            low.append(force - world.force)
+        return is_over(status)
+
+    world._is_over = look
+    course = world.run()
+    return max(low), course
+
+
+@pytest.mark.parametrize("high", [{"factor": 1.3}, {"offset": 1.0}, {"drift": 0.1}], ids=["130 %", "+1 N", "+0.1 N/s"])
+@pytest.mark.parametrize(("stiffness", "force"), [(400.0, 2.0), (1300.0, 5.0), (800.0, 7.0)])
+def test_a_camera_that_reads_too_much_is_no_success(high, stiffness, force):
+    low, course = low_while_held(HighSensor(**high), stiffness, force)
+    assert low < 1.0
+    assert "the motor holds" in course.error and "does the camera read too much" in course.error
+    assert max(status.stddev for _, status in course.statuses) > 0.3
+
+
+@pytest.mark.parametrize(("factor", "stiffness", "force"), [(0.95, 400.0, 1.0), (1.0, 1300.0, 5.0), (1.05, 800.0, 7.0)])
+def test_a_camera_within_its_error_is_believed(factor, stiffness, force):
+    low, course = low_while_held(HighSensor(factor), stiffness, force)
+    assert course.error == "" and low < 0.1 * force + 0.1
+
+
+def test_a_gear_with_more_friction_is_known_by_a_setting():
+    settings = GraspSettings(motor_friction=1.0)
+    for limits, excess in ((GraspSettings(), 0.8), (settings, 0.0)):
+        grasp = ForceGrasp(GraspGoal(force=3.0), limits, resolution=STEP)
+        grasp._load.loaded = grasp._load.resting = True
+        grasp._load.model.begin(0.02, 3.0, 0.0)
+        grasp._load.opening = grasp._plan.target = 0.02
+        grasp._plan._arrives = 0.0
+        for _ in range(3):
+            grasp._compare_motor(GripperState(phase=Phase.READY, stamp=1.0, opening=0.02, force=2.2))
+        assert grasp._excess == pytest.approx(excess)

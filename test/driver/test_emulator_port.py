@@ -151,3 +151,17 @@ def test_program_says_its_path_and_ends_cleanly(link, end):
         process.send_signal(end)
         assert process.wait(PATIENCE) == 0
     assert not os.path.lexists(link)
+
+
+def test_a_signal_while_the_program_is_loaded_ends_it_without_a_word():
+    code = """
+import os, runpy, signal, sys
+class Hook:
+    def find_spec(self, name, *_):
+        if name == "finforce_sim.emulator.adapter":
+            os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Hook())
+runpy.run_module("finforce_sim.emulator", run_name="__main__")
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (0, "")

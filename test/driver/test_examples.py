@@ -11,10 +11,12 @@ from time import monotonic, sleep
 
 import pytest
 import rclpy
+from driver_node_fakes import wrench
 from emulator_fakes import Bench, Fingers
-from geometry_msgs.msg import TwistStamped
+from geometry_msgs.msg import TwistStamped, WrenchStamped
 from node_fakes import ros_domain
 from process_fakes import running
+from sensor_msgs.msg import JointState
 
 from finforce import GripperClient
 from finforce.errors import ServiceError
@@ -178,9 +180,46 @@ def beside_error(bench, call):
     raise found[0]
 
 
+def test_a_client_of_a_driver_in_a_namespace_hears_that_robot_alone(probe):
+    spoken = {name: probe.speak(f"{name}grasp_wrench", WrenchStamped) for name in ("/", "/r2/", "/r3/")}
+    jaws = probe.speak("/r2/joint_states", JointState)
+    joints = JointState(name=["left_jaw_joint", "right_jaw_joint"], position=[0.01, 0.01])
+    forces = dict(zip(spoken, (7.0, 2.0, 5.0), strict=True))
+
+    def told():
+        for name, out in spoken.items():
+            out.publish(wrench(forces[name]))
+        jaws.publish(joints)
+        return client.force is not None
+
+    for driver, force in (("/r2/gripper_driver", 2.0), ("r3/gripper_driver", 5.0), ("/gripper_driver", 7.0)):
+        with GripperClient(driver, context=probe.context) as client:
+            probe.wait_for(told)
+            assert client.force == force
+            if driver.startswith("/r2"):
+                probe.wait_for(lambda: told() and client.opening is not None)
+                assert client.opening == pytest.approx(0.02)
+
+
+def test_a_client_tells_no_force_that_two_nodes_publish(probe, capfd):
+    other = rclpy.create_node("other", context=probe.context)
+    outs = [probe.speak("grasp_wrench", WrenchStamped), other.create_publisher(WrenchStamped, "grasp_wrench", 1)]
+    with GripperClient(context=probe.context) as client:
+
+        def both_are_known():
+            for out in outs:
+                out.publish(wrench(1.0))
+            return client._node.count_publishers("grasp_wrench") == 2
+
+        probe.wait_for(both_are_known)
+        assert client.force is None
+    other.destroy_node()
+    assert "/grasp_wrench is published by /other and /probe" in capfd.readouterr().err
+
+
 def test_a_client_that_nobody_tells_a_force_says_so(monkeypatch, capfd):
     monkeypatch.setattr("finforce.ros.client.FOUND", 0.0)
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     with watching(free_domain()) as client:
         assert client.force is None and client.opening is None
-    assert "nobody publishes /grasp_wrench: no solver runs in this domain" in capfd.readouterr().err
+    assert "nobody publishes /grasp_wrench, where the gripper_driver is: start a solver there" in capfd.readouterr().err

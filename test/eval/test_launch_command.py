@@ -9,6 +9,7 @@ from finforce.errors import MissingDependencyError
 from finforce.systems.processes import executables_of
 from finforce_eval.cli import demo, launch
 from finforce_eval.cli.main import main
+from finforce_eval.replay import processes
 
 
 @pytest.fixture(autouse=True)
@@ -67,6 +68,7 @@ class Script:
     code: str
     ends_all: bool = False
     label: str = "script"
+    respawns: bool = False
 
     def command(self):
         return [sys.executable, "-c", self.code]
@@ -84,9 +86,27 @@ def test_the_end_of_the_player_ends_all(monkeypatch):
     assert launch_scripts(monkeypatch, Script(WAIT), Script("", ends_all=True)) == 0
 
 
-def test_a_process_that_fails_ends_all_and_is_named(monkeypatch, capsys):
-    assert launch_scripts(monkeypatch, Script(WAIT), Script("raise SystemExit(3)", label="solver")) == 2
-    assert capsys.readouterr().err == "finforce: solver ended with status 3\n"
+def test_a_process_whose_settings_cannot_be_used_ends_all_and_is_named(monkeypatch, capsys):
+    assert launch_scripts(monkeypatch, Script(WAIT), Script("raise SystemExit(2)", label="solver")) == 2
+    assert capsys.readouterr().err == "finforce: solver ended with status 2\n"
+
+
+def test_a_node_that_dies_is_started_again_and_a_driver_is_not(monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr(processes, "RESPAWN_DELAY", 0.0)
+    code = "import pathlib; file = pathlib.Path({!r}); file.open('a').write('x'); raise SystemExit({})"
+    solver, driver = tmp_path / "solver", tmp_path / "driver"
+    wait = f"import pathlib, time\nwhile not pathlib.Path({str(solver)!r}).exists() or "
+    wait += f"pathlib.Path({str(solver)!r}).stat().st_size < 3: time.sleep(0.05)"
+    scripts = (
+        Script(code.format(str(driver), 1), label="gripper_driver"),
+        Script(code.format(str(solver), -9), label="solver", respawns=True),
+        Script(wait, ends_all=True),
+    )
+    assert launch_scripts(monkeypatch, *scripts) == 0
+    assert driver.read_text() == "x" and len(solver.read_text()) >= 3
+    said = capsys.readouterr().err
+    assert said.count("gripper_driver ended with status 1: the others go on") == 1
+    assert "solver ended with status" in said and "it is started again" in said
 
 
 def test_the_demo_ends_with_the_command_that_comes_next(monkeypatch):

@@ -4,6 +4,7 @@ from threading import Event, get_ident
 
 import pytest
 from eval_fakes import START, make_recording
+from node_fakes import ros_domain
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
@@ -11,7 +12,7 @@ from std_msgs.msg import String
 from finforce.camera_topics import COLOR_TOPIC
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.writer import write_recording
-from finforce_eval.replay.node import PlayerParameters, find_awaited
+from finforce_eval.replay.node import PlayerNode, PlayerParameters, find_awaited
 from finforce_eval.replay.playback import Playback, RawMessage, ReadAhead
 
 
@@ -124,3 +125,14 @@ TOPICS = ("/left/ground_truth_wrench", "/right/ground_truth_wrench", COLOR_TOPIC
 )
 def test_a_recording_waits_for_those_who_need_it_from_its_first_image(asked, awaited):
     assert find_awaited(TOPICS, PlayerParameters(**asked)) == awaited
+
+
+def test_a_recording_is_played_in_the_namespace_of_its_player(folder):
+    with ros_domain() as probe:
+        player = PlayerNode(context=probe.context, namespace="r2")
+        player.offer(Playback(folder))
+        names = {out.topic_name for out in player._outputs.values()}
+        assert "/r2/left/keypoints" in names and all(name.startswith("/r2/") for name in names)
+        probe.hear("/r2/left/keypoints", PointCloud2)
+        probe.wait_for(lambda: player.has_listeners({"/left/keypoints"}))
+        player.destroy_node()

@@ -10,6 +10,7 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from std_msgs.msg import Header
 
+from finforce.camera_topics import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC, OLD_COLOR_TOPIC
 from finforce.gripper_frames import ROBOT_CAMERA, jaw_in_camera
 from finforce.ros import node as ros
 from finforce_ifea.jaw.jaw import load_jaw
@@ -18,7 +19,7 @@ from finforce_keypoints.node import KeypointDetectorNode
 from finforce_keypoints.parameters import DetectorParameters
 
 FRAME = "camera_color_optical_frame"
-TOPICS = DetectorParameters()
+TOPICS = DetectorParameters(color_topics=(COLOR_TOPIC, OLD_COLOR_TOPIC), depth_topic=DEPTH_TOPIC, info_topic=INFO_TOPIC)
 COLOR, OLD_COLOR = TOPICS.color_topics
 WIDTH, HEIGHT = 64, 48
 MILLISECOND = 1_000_000

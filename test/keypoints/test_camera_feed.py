@@ -1,12 +1,12 @@
 """Claims about which of several colour topics is the camera's; no ROS runs."""
 
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
 import pytest
-from keypoint_node_fakes import COLOR, HEIGHT, OLD_COLOR, WIDTH, camera_info, image_of
+from keypoint_node_fakes import COLOR, HEIGHT, OLD_COLOR, TOPICS, WIDTH, camera_info, image_of
 
 from finforce.camera import ImageError
 from finforce.errors import ObservationError
@@ -27,7 +27,7 @@ class Camera:
     depth: str = "aligned"
 
     def __post_init__(self):
-        self.feed = RgbdFeed(DetectorParameters(depth=self.depth), lambda: self.now)
+        self.feed = RgbdFeed(replace(TOPICS, depth=self.depth), lambda: self.now)
         self.feed.stream.take_info(camera_info())
 
     def shoot(self, topic, picture=None):
@@ -122,17 +122,55 @@ def test_a_stated_tolerance_is_kept():
         pair_up(camera, [(kind, n, 9.0) for n in range(1, 9) for kind in ("color", "depth")])
 
 
-@pytest.mark.parametrize("depth", ["auto", "aligned"])
-def test_depth_that_comes_150_ms_late_is_waited_for(depth):
-    camera, whole = Camera(depth=depth), []
-    for n in range(1, 60):
-        for kind, number in (("color", n), ("depth", n - 5)):
+def pair_late(camera, late, jitter=lambda n: 0):
+    """Images (number, whether with depth, age in periods) that become whole when depth is so many periods late."""
+    whole = []
+    for n in range(1, 120):
+        for kind, number in (("color", n), ("depth", n - late - jitter(n))):
             if number > 0:
                 with suppress(SyncError):
-                    whole += pair_up(camera, [(kind, number, 0.0)])
-    answered = [number for number, has, _ in whole if has]
-    assert answered[-45:] == list(range(10, 55))
-    assert len(camera.feed._images.entries("color")) <= 6
+                    whole += [(found, has, n - found) for found, has, _ in pair_up(camera, [(kind, number, 0.0)])]
+    return whole
+
+
+@pytest.mark.parametrize(("depth", "late"), [("auto", 3), ("aligned", 5)])
+def test_late_depth_is_waited_for_while_its_images_are_fresh(depth, late):
+    camera = Camera(depth=depth)
+    answered = [number for number, has, _ in pair_late(camera, late) if has]
+    assert answered[-100:] == list(range(120 - late - 100, 120 - late))
+    assert len(camera.feed._images.entries("color")) <= late + 1 and not camera.feed.delay_of_depth
+
+
+@pytest.mark.parametrize("late", [5, 8, 17])
+@pytest.mark.parametrize("jitter", [lambda n: 0, lambda n: n % 2])
+def test_images_whose_depth_comes_too_late_are_taken_alone_while_they_are_fresh(late, jitter):
+    camera = Camera(depth="auto")
+    whole = pair_late(camera, late, jitter)
+    # half of max_age is left for what comes after
+    assert sum(age * PERIOD <= 0.1 for _, _, age in whole) >= 0.9 * 119
+    assert len({number for number, *_ in whole}) == len(whole)
+    assert f"{1e3 * late * PERIOD:.0f} ms" in camera.feed.delay_of_depth or jitter(1)
+    assert "without depth" in camera.feed.delay_of_depth
+
+
+def test_depth_that_comes_in_time_again_is_used_again():
+    camera = Camera(depth="auto")
+    whole = pair_late(camera, 8, lambda n: -7 if n > 60 else 0)
+    assert not any(has for number, has, _ in whole if number < 60)
+    assert all(has for number, has, _ in whole if number > 75) and not camera.feed.delay_of_depth
+
+
+def test_depth_that_is_too_late_for_any_answer_is_named_where_every_image_needs_it():
+    camera = Camera()
+    with pytest.raises(SyncError, match="depth images come 240 ms after .* max_age is 0.2 s"):
+        for n in range(1, 60):
+            try:
+                pair_up(camera, [("color", n, 0.0)])
+            except SyncError:
+                if n > 30:
+                    raise
+            if n > 8:
+                pair_up(camera, [("depth", n - 8, 0.0)])
 
 
 def test_images_whose_depth_was_lost_are_taken_alone_in_their_order():

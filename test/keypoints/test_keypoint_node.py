@@ -199,7 +199,7 @@ def test_an_annotated_image_is_made_only_for_those_who_listen(probe, monkeypatch
 
 
 def test_results_and_images_are_reliable_and_names_are_kept(probe):
-    node = start_detector(probe)
+    node = start_detector(probe, skip_off=["all"])
 
     def published(topic):
         return probe.get_publishers_info_by_topic(topic)[0].qos_profile
@@ -357,3 +357,16 @@ def test_a_jpeg_stream_without_depth_is_seen_as_it_was_sent(probe):
     (seen,) = node.detector.images
     assert seen.depth is None and np.abs(seen.color.astype(int) - picture).mean() < 3.0
     assert node.get_parameter("depth").value == "none"
+
+
+def test_depth_that_comes_too_late_is_said_and_the_images_are_answered(probe):
+    bench = CameraBench(probe, max_age=3.0)
+    first = time_ns()
+    for n in range(20):
+        stamp = first + n * 100 * MILLISECOND
+        bench.probe.spin(max(0.0, 1e-9 * (stamp - time_ns())))
+        bench.color(stamp)
+        if n >= 8:
+            bench.depth(stamp - 800 * MILLISECOND)
+    bench.wait_for_clouds(12)
+    bench.diagnosis(level=Level.WARN, word="depth images come 800 ms after their colour image, which waits 500 ms")

@@ -17,8 +17,9 @@ from keypoint_node_fakes import (
     header,
     start_detector,
 )
+from rclpy import create_node
 from rclpy.parameter import Parameter
-from sensor_msgs.msg import CompressedImage
+from sensor_msgs.msg import CompressedImage, Image
 
 from finforce.health import Level
 from finforce.messages import stamp_of
@@ -62,6 +63,31 @@ def test_while_tf_may_still_tell_the_cameras_pose_nothing_is_answered(probe, tf,
     bench.shoot()
     bench.wait_for_clouds()
     assert bench.node.parameters.T_gripper_camera == TOPICS.T_gripper_camera
+
+
+@pytest.mark.parametrize("is_tared", [False, True])
+def test_a_pose_on_tf_that_comes_late_is_taken_before_the_tare_and_not_after_it(probe, tf, monkeypatch, is_tared):
+    monkeypatch.setattr(detector_node, "TF_WAIT", 0.0)
+    bench = CameraBench(probe)
+    default = bench.node.parameters.T_gripper_camera
+    bench.shoot()
+    bench.wait_for_clouds()
+    assert bench.diagnosis(level=Level.WARN, word="using the default T_gripper_camera")
+    if is_tared:
+        solver = probe.speak("left/wrench", detector_node.ros.WrenchStamped)
+        probe.connected(solver)
+        solver.publish(detector_node.ros.WrenchStamped())
+        probe.wait_for(lambda: bench.node._tared)
+    tf["gripper_base", FRAME] = CAMERA
+    probe.got["/diagnostics"].clear()
+    bench.shoot()
+    bench.wait_for_clouds(2)
+    if is_tared:
+        assert bench.diagnosis(level=Level.WARN, word="only since the tare")
+        assert bench.node.parameters.T_gripper_camera == default
+    else:
+        np.testing.assert_allclose(bench.node.parameters.camera_pose, CAMERA, atol=1e-9)
+        bench.diagnosis(level=Level.OK)
 
 
 @pytest.mark.parametrize("transport", ["compressed", "auto"])
@@ -117,3 +143,64 @@ def test_quality_of_service_of_images_can_be_overridden(probe):
     bench = CameraBench(probe, **{name: "best_effort"})
     ends = bench.node.get_subscriptions_info_by_topic(COLOR)
     assert [end.qos_profile.reliability.name for end in ends] == ["BEST_EFFORT"]
+    ends = bench.node.get_subscriptions_info_by_topic(TOPICS.color_topics[1])
+    assert [end.qos_profile.reliability.name for end in ends] == ["RELIABLE"]  # of the others nothing was asked
+
+
+@pytest.mark.parametrize("stream", ["color", "depth", "info"])
+def test_a_camera_topic_that_two_nodes_publish_is_refused_with_their_names(probe, stream):
+    bench = CameraBench(probe)
+    bench.shoot()
+    bench.wait_for_clouds()
+    own = {"color": bench.color_out, "depth": bench.depth_out, "info": bench.info_out}[stream]
+    second = create_node("second_camera", context=probe.context)
+    rival = second.create_publisher(own.msg_type, own.topic_name, detector_node.ros.RESULT)
+    probe.wait_for(lambda: bench.node.count_publishers(own.topic_name) == 2)
+    before = len(bench.clouds())
+    for _ in range(3):
+        bench.send_info()
+        bench.shoot()
+    names = f"{own.topic_name} is published by /probe and /second_camera; expected one"
+    assert bench.diagnosis(level=Level.ERROR, word=names)
+    assert stream != "color" or len(bench.clouds()) == before
+    second.destroy_publisher(rival)
+    probe.wait_for(lambda: bench.node.count_publishers(own.topic_name) == 1)
+    probe.got["/diagnostics"].clear()
+    bench.send_info()
+    bench.shoot()
+    bench.wait_for_clouds(before + 1)
+    assert "is published by" not in bench.diagnosis().message
+    second.destroy_node()
+
+
+def test_a_detector_hears_the_camera_of_its_own_namespace_and_one_that_was_named(probe):
+    def start(name, **parameters):
+        parameters["skip_off"] = ["all"]  # nobody listens
+        node = KeypointDetectorNode(
+            lambda jaws, *_, **__: FakeDetector(tuple(jaws)),
+            context=probe.context,
+            namespace=name,
+            parameter_overrides=[Parameter(key, value=value) for key, value in parameters.items()],
+        )
+        probe.spinner.add_node(node)
+        return node
+
+    def camera_topics(node):
+        return {port.topic_name for port in node.subscriptions if "camera" in port.topic_name}
+
+    mine = camera_topics(start("r2"))
+    assert len(mine) == 4 and all(topic.startswith("/r2/camera/camera/") for topic in mine)
+    node = start("r3", depth_topic="/camera/depth", color_topics=["hand/color"], info_topic="/camera/info")
+    assert camera_topics(node) == {"/camera/depth", "/camera/info"}
+    assert node.feed.source == "/r3/hand/color"
+
+
+def test_compressed_images_are_returned_to_when_raw_ones_are_gone(probe):
+    node = start_detector(probe, depth="none")
+    probe.hear("left/keypoints", detector_node.ros.PointCloud2)
+    probe.speak(f"{COLOR}/compressed", CompressedImage)
+    raw = probe.speak(COLOR, Image)
+    kinds = lambda: {sub.msg_type for sub in node.subscriptions if sub.topic_name.startswith(COLOR)}  # noqa: E731
+    probe.wait_for(lambda: kinds() == {Image})
+    probe.destroy_publisher(raw)
+    probe.wait_for(lambda: kinds() == {CompressedImage})
