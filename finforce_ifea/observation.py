@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import isfinite
+from numbers import Integral
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +22,8 @@ _TOUCHING = 0.5
 _UNIT = 1e-3  # by which the length of a unit vector may be off
 # Images are at least so long apart [s]; what comes sooner is the same one, stamped again.
 _SHORTEST_PERIOD = 0.5e-3
+# Maximum capture time [s] since 1970: the year 5138. Milliseconds since 1970 are ten times as many.
+_LATEST = 1e11
 # An object is away that stands in front of the undeformed surface by more than this and what its place may err [m].
 AWAY, _SIGMAS = 10e-3, 3.0
 
@@ -199,8 +201,7 @@ def check_observation(observation: Observation, count: int, last_stamp: float | 
     gravity = observation.gravity
     if gravity is not None and not (np.shape(gravity) == (3,) and abs(np.linalg.norm(gravity) - 1.0) < _UNIT):
         raise ObservationError(f"gravity {np.asarray(gravity).tolist()}, expected a unit vector of three numbers")
-    if not isfinite(observation.stamp):
-        raise ObservationError(f"stamp {observation.stamp}, expected seconds")
+    check_stamp(observation.stamp)
     if last_stamp is not None and observation.stamp <= last_stamp:
         raise ObservationError(
             f"stamp {observation.stamp:.6f} s after {last_stamp:.6f} s, expected rising stamps; "
@@ -210,6 +211,19 @@ def check_observation(observation: Observation, count: int, last_stamp: float | 
         raise ObservationError(
             f"stamp {observation.stamp - last_stamp:.3g} s after the last, expected at least {_SHORTEST_PERIOD:g} s: "
             "one image came twice"
+        )
+
+
+def check_stamp(stamp: float) -> None:
+    """Refuse what cannot be a capture time in seconds: whole numbers, which count images or ticks, and far too many.
+
+    Raises:
+        ObservationError: the stamp is such a number, or not finite.
+    """
+    if isinstance(stamp, Integral) or not abs(stamp) < _LATEST:
+        raise ObservationError(
+            f"stamp {stamp}, expected seconds as a float: divide frame numbers by the frame rate, milliseconds by 1e3, "
+            "nanoseconds by 1e9"
         )
 
 
