@@ -7,11 +7,19 @@ from pathlib import Path
 
 import numpy as np
 
-from finforce_eval.calibration.weighing import find_holds, format_weighing, scale_calibration, weigh
+from finforce_eval.calibration.weighing import (
+    LEAST_HOLD,
+    SHORT_HOLD,
+    find_holds,
+    format_weighing,
+    list_holds,
+    scale_calibration,
+    weigh,
+)
 from finforce_eval.cli.parser import BAG_HELP, FORCE_HELP, CommandResult, add_run_options
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.forces import estimate_forces
-from finforce_eval.evaluation.setup import make_setup, read_keypoints
+from finforce_eval.evaluation.setup import make_setup, print_notes, read_keypoints
 from finforce_eval.tasks import progress_bar
 from finforce_ifea.jaw.calibration import save_calibration
 
@@ -36,7 +44,11 @@ def run(options: argparse.Namespace) -> CommandResult:
     stamps = recording.jaw(options.side).keypoints.stamps
     with progress_bar(len(stamps), "frame", recording.name) as bar:
         forces = estimate_forces(recording, setup, [options.side], strict=True, progress=bar.update)[options.side]
-    holds = find_holds((stamps - stamps[0]) * 1e-9, np.abs(forces.force[:, 0]))
+    pressed = (stamps - stamps[0]) * 1e-9, np.abs(forces.force[:, 0])
+    holds = find_holds(*pressed)
+    short = [hold for hold in find_holds(*pressed, SHORT_HOLD) if hold.end - hold.start < LEAST_HOLD]
+    if short:
+        print_notes(recording.name, [f"too short to count, under {LEAST_HOLD} s: {list_holds(short)}"])
     if not options.grams:
         for number, hold in enumerate(holds, 1):
             print(f"hold {number}: {hold.start:.1f} to {hold.end:.1f} s, estimated {hold.force:.3f} N")
