@@ -21,7 +21,6 @@ SINGLE_THREAD = {
 POSE_TOPICS = ("object_pose", "object_detections")  # where a contact estimator listens for poses of other programs
 PIPELINE = "pipeline"
 STAGES = ("keypoint_detector", "contact_estimator", "ifea_solver")  # in the order in which an image passes them
-DEPTHS = {"aligned": "aligned", "auto": "auto", "off": "none"}  # options of a system: the detector's parameter `depth`
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -194,7 +193,7 @@ def detector_processes(jaws: str, options: SolverOptions) -> list[Process]:
         "jaw_file": options.jaw_file,
         "detection_method": options.detection_method,
         "model": options.model,
-        "depth": DEPTHS.get(options.depth, ""),
+        "depth": "" if options.depth == "auto" else options.depth,  # the node's default, unless its file says otherwise
         "T_gripper_camera": read_numbers("T_gripper_camera", options.T_gripper_camera, 7),
     }
     return [node_process("keypoint_detector", asked, options)]
@@ -290,7 +289,9 @@ class SolverOptions:
     detection_method: str = setting("", "network, frame (DeepLabCut) or dots", alias="finder")
     model: str = setting("", "Folder of a network")
     depth: str = setting(
-        "", "Depth images: aligned (every image needs one), auto (where there is one), off", choices=("", *DEPTHS)
+        "auto",
+        "Depth images: aligned (every image needs one), auto (where there is one), none (colour alone)",
+        choices=("aligned", "auto", "none"),
     )
     T_gripper_camera: str = setting("", "Pose of the camera in the gripper frame: x y z [m] qx qy qz qw")
     solver: str = setting("", "Mechanics: reduced, solid, frame, linear or paper (Eq. 1)")
