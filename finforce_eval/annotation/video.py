@@ -45,7 +45,7 @@ def write_video(path: Path, recording: Recording, jaws: Mapping[str, ForceSeries
     images, camera = recording.images.all_colors(), recording.images.camera
     scale = -(-LEAST_HEIGHT // camera.height)
     overlays = [_Overlay(recording.jaw(side), forces, camera, scale) for side, forces in jaws.items()]
-    first = int(images.stamps[0])
+    first = int(images.stamps_ns[0])
     with av.open(str(path), "w") as file, progress_bar(len(images), "image", path.name) as bar:
         stream = file.add_stream("libx264", rate=30, options={"crf": _QUALITY})
         # the format has two pixels by two for each colour
@@ -72,7 +72,7 @@ class _Overlay:
         self._stated = np.linalg.norm(forces.column("force_stddev"), axis=1)
         self._points = forces.column("contact_point")
         self._rows = [
-            {stamp: row for row, stamp in enumerate(each.stamps.tolist())} if each is not None else {}
+            {stamp: row for row, stamp in enumerate(each.stamps_ns.tolist())} if each is not None else {}
             for each in (forces, track.detection, track.pose)
         ]
 

@@ -94,7 +94,7 @@ def choose_pictures(recording: Recording, count: int) -> list[NDArray]:
     images = choose_images(recording, NO_DEPTH) if recording.images is not None else []
     if not len(images):
         raise OptionError(f"{recording.name}: no images; expected pictures of jaws that are open and unloaded")
-    first = images.stamps[: min(count, len(images))]
+    first = images.stamps_ns[: min(count, len(images))]
     chosen = np.unique(np.linspace(0, len(first) - 1, PICTURES).round().astype(int))
     return [image.color for _, image in images.at(first[chosen])]
 

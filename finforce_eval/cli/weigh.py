@@ -44,7 +44,7 @@ def run(options: argparse.Namespace) -> CommandResult:
     stamps = recording.jaw(options.side).keypoints.stamps
     with progress_bar(len(stamps), "frame", recording.name) as bar:
         forces = estimate_forces(recording, setup, [options.side], strict=True, progress=bar.update)[options.side]
-    pressed = (stamps - stamps[0]) * 1e-9, np.abs(forces.force[:, 0])
+    pressed = stamps - stamps[0], np.abs(forces.force[:, 0])
     holds = find_holds(*pressed)
     short = [hold for hold in find_holds(*pressed, SHORT_HOLD) if hold.end - hold.start < LEAST_HOLD]
     if short:

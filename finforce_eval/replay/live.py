@@ -153,7 +153,7 @@ def live_result(
         estimator: a fresh one of the same jaw, for the undeformed surface.
     """
     track, nothing = recording.jaw(side).keypoints, np.full(3, np.nan)
-    rows = [log.rows[side].get(stamp, {}) for stamp in track.stamps.tolist()]
+    rows = [log.rows[side].get(stamp, {}) for stamp in track.stamps_ns.tolist()]
     force, stddev = (np.array([row.get(name, nothing) for row in rows]) for name in ("force", "force_stddev"))
     seen = np.isfinite(track.points).all(axis=2) & (track.likelihood >= likelihood_threshold)
     magnitude_stddev = stddev_along(force, stddev)
@@ -166,7 +166,7 @@ def live_result(
     return ForceSeries.build(
         recording.name,
         side,
-        track.stamps,
+        track.stamps_ns,
         force=force,
         magnitude_stddev=magnitude_stddev,
         force_stddev=stddev if np.isfinite(stddev).any() else None,
@@ -174,7 +174,7 @@ def live_result(
         status=np.where(np.isfinite(force).all(axis=1), "ok", "no wrench"),
         message="",
         step_ms=np.array([row.get("step_ms", np.nan) for row in rows]),
-        **recording.phases_at(track.stamps),
+        **recording.phases_at(track.stamps_ns),
         **contact,
         true_force=truth_columns(recording, side)["true_force"],
         **sight_columns(recording, side),
@@ -184,7 +184,7 @@ def live_result(
 def _contact_columns(recording: Recording, side: str, rows: list[dict[str, Any]], estimator: Any) -> dict[str, Any]:
     """Return the reported contact and the true one."""
     surface = InnerSurface(np.array(estimator.surface()), estimator.jaw.face)
-    lines = true_lines(recording, side, recording.jaw(side).keypoints.stamps, surface.face_x)
+    lines = true_lines(recording, side, recording.jaw(side).keypoints.stamps_ns, surface.face_x)
     truth = [
         surface.cut(row["surface"], point, direction) if "surface" in row else np.nan
         for row, point, direction in zip(rows, lines.points, lines.directions, strict=True)

@@ -81,7 +81,7 @@ def played(tmp_path_factory):
 
 def grasp_of(recording, error):
     """Grasp forces that are all wrong by as much, and come 50 ms after their images."""
-    stamps = recording.images.stamps.tolist()
+    stamps = recording.images.stamps_ns.tolist()
     truth = np.linalg.norm(recording.truth("left").force, axis=1)
     return dict(zip(stamps, truth + error, strict=True)), dict.fromkeys(stamps, 0.05)
 
@@ -130,7 +130,7 @@ def test_the_figures_that_matter_are_error_pixels_and_delay(played):
 
 def test_images_without_an_answer_are_counted_and_not_forgiven(played):
     grasp, lag = grasp_of(played, 0.03)
-    late = {stamp: value for stamp, value in grasp.items() if stamp > played.images.stamps[9]}
+    late = {stamp: value for stamp, value in grasp.items() if stamp > played.images.stamps_ns[9]}
     score = score_grasp(played, late, lag)
     assert (score.error.n, score.frames) == (30, 40)
 

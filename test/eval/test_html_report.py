@@ -227,7 +227,7 @@ def test_forces_of_an_annotated_recording_are_read_as_they_were_written(tmp_path
     from finforce_eval.recordings.recording import DEMO, read_recording
 
     whole = read_recording(DEMO)
-    begin = int(whole.jaws["left"].keypoints.stamps[0])
+    begin = int(whole.jaws["left"].keypoints.stamps_ns[0])
     bag = write_recording(cut(whole, begin, begin + 8 * 10**9), tmp_path / "short")
     out = tmp_path / "out"
     assert main(["annotate", str(bag), "--out", str(out), "--contact", "fixed:42", "--calibration", "bench"]) == 0

@@ -101,7 +101,7 @@ def test_what_cannot_be_played_ends_with_two_and_one_line(words, reason, capsys)
 
 def test_estimated_contacts_without_a_mesh_are_refused(tmp_path, capsys):
     recording = read_recording(SHIPPED)
-    start = recording.jaws["left"].keypoints.stamps[0]
+    start = recording.jaws["left"].keypoints.stamps_ns[0]
     short = write_recording(cut(recording, start, start + SECOND), tmp_path / "short")
     assert main(["replay", str(short), "--contact", "estimate"]) == 2 and "no object mesh" in capsys.readouterr().err
 
@@ -120,7 +120,7 @@ class FakeEstimator:
 
 def test_the_time_series_has_a_gap_where_no_wrench_came():
     recording = read_recording(SHIPPED)
-    stamps = recording.jaws["left"].keypoints.stamps
+    stamps = recording.jaws["left"].keypoints.stamps_ns
     log = ReplayLog(("left",))
     for stamp in stamps[::2].tolist():
         found = {"force": np.array([-2.0, 0, 0]), "torque": np.array([0.0, -0.08, 0])}
@@ -176,7 +176,7 @@ def test_every_image_comes_back_as_a_wrench_with_its_stamp_its_contact_estimated
     for side in ("left", "right"):
         case = scores["cases"][f"both/{side}"]
         # the first images are silent until the offsets of the key points are known
-        assert case["frames"] == len(result.recording.jaws[side].keypoints.stamps) > 100 and case["solved"] > 60
+        assert case["frames"] == len(result.recording.jaws[side].keypoints.stamps_ns) > 100 and case["solved"] > 60
         assert case["step_ms"]["p50"] > 0.0
     assert "grasp_wrench" in said
     (line,) = [line for line in said.splitlines() if "left contact" in line]
@@ -192,7 +192,7 @@ def test_one_contact_estimator_serves_both_jaws_which_answer_alike_and_complete_
     # the same object, the same noise; each solver gets its contact a little earlier or later than the other
     np.testing.assert_allclose(right.magnitude[held], left.magnitude[held], atol=0.1)
     weaker = np.minimum(left.magnitude, right.magnitude)
-    for stamp, magnitude in zip(left.stamps[held], weaker[held], strict=True):
+    for stamp, magnitude in zip(left.stamps_ns[held], weaker[held], strict=True):
         assert result.grasp[int(stamp)] == pytest.approx(magnitude, abs=1e-6)
     assert result.health["finforce: right contact"]["status"] == result.health["finforce: left contact"]["status"]
 

@@ -112,15 +112,15 @@ def test_a_wrong_modulus_is_mended_by_weights(tmp_path, capsys):
     wrong, mended = tmp_path / "wrong.yaml", tmp_path / "mended.yaml"
     save_calibration(base.changed(young_modulus=1.5 * base.young_modulus), wrong)
     whole = read_recording(RECORDING)
-    begin = int(whole.jaw("left").keypoints.stamps[0])
+    begin = int(whole.jaw("left").keypoints.stamps_ns[0])
     bag = write_recording(cut(whole, begin, begin + 19 * 10**9), tmp_path / "four_holds")
     options = ["weigh", str(bag), "--contact", "fixed:case", "--calibration", str(wrong)]
     assert main(options) == 0
     spans = [line.split()[2:5:2] for line in capsys.readouterr().out.splitlines() if line.startswith("hold ")]
     assert len(spans) == 4  # the first one, too, whose noise is the largest share of its force
     track, truth = (getattr(whole.jaw("left"), name) for name in ("keypoints", "truth"))
-    ends = track.stamps[0] * 1e-9 + np.array([float(end) for _, end in spans])
-    weights = [np.interp(end - 0.5, truth.stamps * 1e-9, np.abs(truth.force[:, 0])) for end in ends]
+    ends = track.stamps[0] + np.array([float(end) for _, end in spans])
+    weights = [np.interp(end - 0.5, truth.stamps, np.abs(truth.force[:, 0])) for end in ends]
     grams = [f"{1e3 * weight / GRAVITY:.0f}" for weight in weights]
     assert main([*options, "--grams", *grams, "-o", str(mended), "--json", str(tmp_path / "found.json")]) == 0
     found = json.loads((tmp_path / "found.json").read_text())
