@@ -67,6 +67,7 @@ UNITS = {
     "grasp_force": "N",  # of the gripper: the smaller of the jaws' forces
     "grasp_stddev": "N",
 }
+WAITING = "waiting"  # status of an image that the tare still needs
 _ABOUT = b"finforce"
 _LISTS = {name for name, unit in UNITS.items() if "each" in unit}
 

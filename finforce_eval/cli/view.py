@@ -152,7 +152,7 @@ class _RerunView:
             truth = recording.jaw(side).truth
             if truth is not None:
                 true = np.linalg.norm(truth.force, axis=1)
-                self._plot(f"forces/{side}_true", truth.stamps_ns, true, _COLOURS["truth"], f"{side}, measured [N]")
+                self._plot(f"forces/{side}_true", truth.stamps_ns, true, _COLOURS["truth"], f"{side}, true [N]")
         self._plot("forces/grasp", grasp.stamps_ns, grasp.column("grasp_force"), _COLOURS["grasp"], "grasp [N]")
 
     def _draw_force(self, forces: ForceSeries) -> None:

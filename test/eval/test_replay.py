@@ -133,6 +133,23 @@ def test_the_time_series_has_a_gap_where_no_wrench_came():
     assert result.scored.any() and not result.scored.all()
 
 
+def test_images_with_key_points_before_the_first_wrench_wait_for_the_tare():
+    recording = read_recording(SHIPPED)
+    track = recording.jaws["left"]
+    hidden = replace(track.keypoints, points=track.keypoints.points.copy())
+    hidden.points[3] = np.nan
+    recording = replace(recording, jaws={"left": replace(track, keypoints=hidden)})
+    log, stamps = ReplayLog(("left",)), hidden.stamps_ns.tolist()
+    for stamp in stamps[45::2]:
+        log.rows["left"][stamp] = {"force": np.array([-2.0, 0, 0]), "force_stddev": np.full(3, 0.1)}
+    status = live_result(recording, "left", log, likelihood_threshold=0.6, estimator=FakeEstimator()).column("status")
+    assert status[:5].tolist() == ["waiting"] * 3 + ["no wrench", "waiting"]
+    assert status[44:48].tolist() == ["waiting", "ok", "no wrench", "ok"]
+    log.rows["left"].clear()  # nothing ever came: that is no wait
+    silent = live_result(recording, "left", log, likelihood_threshold=0.6, estimator=FakeEstimator())
+    assert set(silent.column("status")) == {"no wrench"}
+
+
 def with_opposite_jaw(recording):
     """Give the right jaw the pose from which it sees the object as the left one does, turned by 180 degrees about z."""
     left, right, poses = recording.jaws["left"], recording.jaws["right"], recording.object_pose
