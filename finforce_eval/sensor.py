@@ -33,7 +33,7 @@ from finforce_keypoints.geometry.jaw_localizer import JawKeypoints
 from finforce_keypoints.images import RgbdImage
 from finforce_keypoints.rig import read_rig
 
-Camera = CameraIntrinsics | str | Path | Sequence[float]
+Camera = CameraIntrinsics | str | Path | ArrayLike
 # Shortest and longest image period [s]: 1000 Hz is beyond any RGB-D camera, and 0.2 Hz shows no grasp.
 _SHORTEST_PERIOD, _LONGEST_PERIOD = 1e-3, 5.0
 _USUAL_PERIOD = 1 / 30  # [s], by which the unit of other stamps is guessed
@@ -71,7 +71,8 @@ class ForceSensor:
 
     Args:
         jaw: name of a shipped jaw, jaw file, or a left jaw; None for that of the rig, else "bench".
-        camera: intrinsics, a file of them, or the numbers fx, fy, cx, cy [px] and perhaps k1, k2, p1, p2, k3.
+        camera: intrinsics, a file of them, a (3, 3) matrix [px], or the numbers fx, fy, cx, cy [px] and perhaps k1, k2,
+            p1, p2, k3.
         extrinsics: the camera in `gripper_base`: (4, 4), the seven numbers x, y, z [m], qx, qy, qz, qw, or "robot" or
             "bench" for those of the simulator.
         rig: file by `finforce camera`, which takes the place of these three.
@@ -145,7 +146,7 @@ class ForceSensor:
         """
         check_stamp(stamp)
         if not isinstance(self.camera, CameraIntrinsics):
-            self.camera = _intrinsics(self.camera, rgb.shape[:2])
+            self.camera = read_intrinsics(self.camera, rgb.shape[:2])
         if depth is not None:
             depth = decode_depth(depth, "16UC1" if np.asarray(depth).dtype.kind in "iu" else "32FC1")
         seen = self._detector.detect(RgbdImage(stamp=stamp, color=rgb, depth=depth, camera=self.camera))
@@ -247,8 +248,8 @@ def combine_solutions(stamp: float, found: Mapping[str, Solution | None]) -> Gri
     )
 
 
-def _intrinsics(camera: str | Path | Sequence[float], shape: tuple[int, int]) -> CameraIntrinsics:
-    """Return the camera of a file or of numbers for images of some height and width."""
+def read_intrinsics(camera: str | Path | ArrayLike, shape: tuple[int, int]) -> CameraIntrinsics:
+    """Return the camera of a file, a matrix or of numbers for images of some height and width."""
     if isinstance(camera, str | Path):
         return read_camera(camera, shape)
-    return build_camera(camera_numbers([float(number) for number in camera]), shape)
+    return build_camera(camera_numbers(np.asarray(camera, dtype=float).ravel().tolist()), shape)

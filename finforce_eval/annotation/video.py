@@ -39,7 +39,7 @@ def write_video(path: Path, recording: Recording, jaws: Mapping[str, ForceSeries
         RecordingError: the recording has no images, or they cannot be read.
         MissingDependencyError: PyAV is not installed.
     """
-    av = import_library("av", "writing videos", "'finforce[lerobot]'")
+    av = import_library("av", "writing videos", "'finforce[video]'")
     if recording.images is None or not len(recording.images):
         raise RecordingError(f"{recording.name}: no images to draw forces into; expected color images")
     images, camera = recording.images.all_colors(), recording.images.camera

@@ -120,7 +120,7 @@ def _open_video(path: Path, name: str) -> Iterator[tuple[Any, Any]]:
         RecordingError: it is no video, or damaged.
         MissingDependencyError: PyAV is not installed.
     """
-    av = import_library("av", "reading videos", "'finforce[lerobot]'")
+    av = import_library("av", "reading videos", "'finforce[video]'")
     try:
         check_plain(path)
         with av.open(str(path)) as container:

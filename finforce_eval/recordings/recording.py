@@ -253,6 +253,19 @@ def _pose_track(samples: Sequence[Any], topic: str, name: str) -> PoseTrack:
     )
 
 
+def stated_jaw(paths: Sequence[str | Path], default: str) -> str:
+    """Return the jaw that the `case.json` of recordings names, a default where none does.
+
+    Raises:
+        RecordingError: they name several, or a `case.json` cannot be read.
+    """
+    folders = [path if path.is_dir() else path.parent for path in map(Path, paths)]
+    named = {str(_read_case(folder / "case.json").get("jaw", default)) for folder in folders} or {default}
+    if len(named) > 1:
+        raise RecordingError(f"recordings of several jaws: {', '.join(sorted(named))}; give those of one at a time")
+    return named.pop()
+
+
 def _read_case(path: Path) -> dict[str, Any]:
     """Read `case.json`, empty when absent."""
     if not path.exists():

@@ -158,6 +158,9 @@ def test_the_client_tells_what_the_driver_says(bench):
         assert client.force == pytest.approx(1.0, abs=0.3)
         assert client.opening == pytest.approx(bench.gripper.jaws.opening, abs=4e-4)
         assert client.grasp_state.startswith("holding")
+        beside(bench, client.release)
+        beside(bench, lambda: client.move(0.030))
+        assert client.opening == pytest.approx(0.030, abs=1e-3)
         beside(bench, client.estop)
         with pytest.raises(ServiceError, match="gripper_driver/grasp: "):
             beside_error(bench, lambda: client.grasp(1.0))

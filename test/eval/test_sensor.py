@@ -6,7 +6,7 @@ import pytest
 import finforce as ff
 from finforce.gripper_frames import BENCH_CAMERA, ROBOT_CAMERA, read_extrinsics
 from finforce.transforms import pose_numbers
-from finforce_eval.sensor import combine_solutions
+from finforce_eval.sensor import combine_solutions, read_intrinsics
 from finforce_ifea.observation import blank_solution
 
 INTRINSICS = (430.0, 430.0, 320.0, 240.0)
@@ -92,6 +92,13 @@ def test_a_pause_of_the_camera_is_no_other_unit(sensor):
 def test_what_cannot_be_used_is_said(given, reason):
     with pytest.raises(ValueError, match=reason):
         ff.ForceSensor("bench", **{"camera": INTRINSICS, "extrinsics": "robot", **given})
+
+
+def test_intrinsics_are_taken_as_a_matrix():
+    matrix = np.array([[430.0, 0.0, 320.0], [0.0, 431.0, 240.0], [0.0, 0.0, 1.0]])
+    for form in (matrix, matrix.tolist(), matrix.ravel(), [430, 431, 320, 240]):
+        camera = read_intrinsics(form, (480, 640))
+        assert (camera.fx, camera.fy, camera.cx, camera.cy) == (430.0, 431.0, 320.0, 240.0)
 
 
 def test_a_camera_pose_is_read_in_every_form():

@@ -8,7 +8,7 @@ import pytest
 from eval_fakes import cut
 
 from finforce_eval.calibration.weighing import GRAVITY, Hold, calibrate_with_scale, find_holds, weigh
-from finforce_eval.cli.main import main
+from finforce_eval.cli.main import main, parse
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.writer import write_recording
@@ -148,6 +148,12 @@ def test_newtons_given_as_grams_are_refused_and_named():
         calibrate_with_scale(times, forces, newtons, jaw="bench")
     taken = calibrate_with_scale(times, forces, newtons, jaw="bench", force=True)
     assert taken.young_modulus == pytest.approx(1.5 * 26e6 * 1e-3 * GRAVITY, rel=0.01)
+
+
+def test_readings_may_be_separated_by_commas():
+    for words in (["160", "238"], ["160,238"], ["160,", "238"]):
+        options = parse(["weigh", str(RECORDING), "--grams", *words])
+        assert [reading for word in options.grams for reading in word] == [160.0, 238.0]
 
 
 def test_an_output_without_readings_is_refused(tmp_path, capsys):
