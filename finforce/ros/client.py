@@ -25,6 +25,7 @@ FOUND = 2.0  # [s] after which a publisher that there is has been found
 TOLD = 0.2  # [s] in which a goal reaches a driver before it is asked to grasp
 ARRIVED = 1e-3  # [m] from an opening at which it is reached
 LONGEST_MOVE = 15.0  # [s] that a move may take
+NO_ADAPTER = "there is no port"  # in the driver's answer
 LONGEST = 120.0  # [s] that a service may take
 
 
@@ -96,10 +97,20 @@ class GripperClient:
     def calibrate(self) -> str:
         """Find the end stops, over the whole stroke; return the driver's answer when that is done.
 
+        Waits for an adapter that is not there yet, as that of a simulated gripper while its images are rendered.
+
         Raises:
             ServiceError: it failed, with the driver's reason; so for all calls.
         """
-        return self._call("calibrate")
+        end = monotonic() + LONGEST
+        while True:
+            try:
+                return self._call("calibrate")
+            except ServiceError as error:
+                if NO_ADAPTER not in str(error) or monotonic() > end:
+                    raise
+                self._node.get_logger().info(f"waiting for the gripper: {error}", throttle_duration_sec=10.0)
+                sleep(1.0)
 
     def grasp(self, force: float, speed: float | None = None) -> str:
         """Close until a force [N] is held, at a speed of the opening [m/s]; return the driver's answer.

@@ -211,7 +211,8 @@ def main(pages):
         for page in pages:
             folder = Path(shared, page.stem)
             folder.mkdir()
-            for name in ("examples", "finforce_eval", "tools"):
+            for name in ("examples", "finforce_eval/data"):
+                (folder / name).parent.mkdir(exist_ok=True)
                 (folder / name).symlink_to(ROOT / name)
             for command in list_commands(page):
                 if missing := missing_for(command):

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from threading import Thread
 from time import monotonic, sleep
+from unittest.mock import MagicMock
 
 import pytest
 import rclpy
@@ -187,3 +188,20 @@ def test_a_client_that_nobody_tells_a_force_says_so(monkeypatch, capfd):
     with watching(free_domain()) as client:
         assert client.force is None and client.opening is None
     assert "nobody publishes /grasp_wrench: no solver runs in this domain" in capfd.readouterr().err
+
+
+def test_the_client_waits_for_an_adapter_that_is_not_there_yet_and_for_nothing_else(monkeypatch):
+    client, answers = object.__new__(GripperClient), ["calibrate: there is no port 'ssg48'", "done", "calibrate: hot"]
+    client._node = MagicMock()
+
+    def call(self, name):
+        answer = answers.pop(0)
+        if answer.startswith(name):
+            raise ServiceError(answer)
+        return answer
+
+    monkeypatch.setattr(GripperClient, "_call", call)
+    monkeypatch.setattr("finforce.ros.client.sleep", lambda seconds: None)
+    assert client.calibrate() == "done"
+    with pytest.raises(ServiceError, match="hot"):
+        client.calibrate()
