@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 from dataclasses import asdict
 from pathlib import Path
 
@@ -15,23 +14,10 @@ from finforce_eval.cli.parser import BAG_HELP, CommandResult, add_run_options
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.keypoint_source import parse_source
 from finforce_eval.evaluation.setup import make_setup
-from finforce_eval.evaluation.tables import evaluation_json, format_tables
+from finforce_eval.evaluation.tables import evaluation_json
 from finforce_eval.replay.replay import Playing, Replay, replay
 
 GRASP = "grasp.png"  # picture on top of the report
-
-
-def format_replay(result: Replay) -> str:
-    """Return the tables of the score, with the state of the nodes below."""
-    lines = [format_tables(result.evaluation), ""]
-    began = "images" if any(case.has("detector_ms") for case in result.evaluation.results.values()) else "key points"
-    lines.append(f"Step times are from {began} out to wrench in, over the middleware and back.")
-    largest = max(result.grasp.values(), default=math.nan)
-    lines.append(f"grasp_wrench: {len(result.grasp)} messages, largest {largest:.2f} N.")
-    for name, state in result.health.items():
-        own = " / ".join(state.get(f"callback to published {part} [ms]", "-") for part in ("p50", "p95"))
-        lines.append(f"{name}: {state['message']}; refused: {state.get('refused', '-')}; in the node {own} ms")
-    return "\n".join([*lines, ""])
 
 
 ENOUGH = 0.5  # of the images in the record phases that have to be answered for a score
@@ -77,8 +63,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--rate", type=float, default=1.0, help="playback speed; other than 1 uses /clock (1)")
     parser.add_argument("--domain", type=int, metavar="ID", help="ROS_DOMAIN_ID, for example to watch in RViz (random)")
     parser.add_argument("--report", metavar="DIR", help="write a page with figures to this folder")
-    text = "print the scores of each jaw, axis and phase, and the state of the nodes, too"
-    parser.add_argument("--tables", action="store_true", help=text)
 
 
 def run(options: argparse.Namespace) -> CommandResult:
@@ -96,8 +80,6 @@ def run(options: argparse.Namespace) -> CommandResult:
     keypoints, calibration = parse_source(options), options.calibration or ""
     recording = keypoints.read(options.bag)
     result = replay(recording, setup, calibration_file=calibration, playing=playing, keypoints=keypoints)
-    if options.tables:
-        print(format_replay(result))
     summary = format_summary(result)
     print("\n".join(summary))
     if options.report:

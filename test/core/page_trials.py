@@ -44,6 +44,7 @@ PATIENCE = 20.0  # [s] after which it is told to end
 QUICK = {  # options that a command is given here in addition
     "finforce twin record": "--set settle=0.1 --set record=0.3 --set closing_speed=0.06",
     "finforce bench": "--quick",
+    "finforce replay": "--rate 0.25",
 }
 # A recording of the page in the place of BAG: images of a grasp, or key points of presses on the bench.
 KEYPOINTS = ("annotate.md", "calibration.md")
