@@ -48,7 +48,7 @@ QUICK = {  # options that a command is given here in addition
 }
 # A recording of the page in the place of BAG: images of a grasp, or key points of presses on the bench.
 KEYPOINTS = ("annotate.md", "calibration.md")
-TRUTH_SHARE = 0.15  # by which the largest grasp force of the simulated finger may be off
+WORST = 0.4  # of the true force, by which one may be off without a calibration
 
 
 def list_commands(page):
@@ -76,7 +76,9 @@ def complete(command):
 
 @cache
 def images_of(folder):
-    """A short recording of a grasp with images, made once."""
+    """A short recording of a grasp with images, made once, or by a page before."""
+    if (made := folder / "getting_started" / "BAG").exists():
+        return made
     run("finforce twin record grasp_cylinder -o recorded", folder)
     return folder / "recorded"
 
@@ -186,7 +188,10 @@ def run(command, folder):
 
 
 def run_sensor(shared):
-    """Run the program with `ForceSensor` on the images of a grasp; 1 where its largest force is not the true one."""
+    """Run the program with `ForceSensor` on images of a grasp; 1 where the true force is beyond what it states.
+
+    The program has no calibration: the material of the jaw file is uncertain by 30 %, and its forces say so.
+    """
     import contextlib
     import io
 
@@ -199,10 +204,11 @@ def run_sensor(shared):
     (block,) = [block for block in PYTHON if "ForceSensor" in block.text and block.wanted == "images"]
     with contextlib.redirect_stdout(io.StringIO()) as said:
         exec(compile(block.text, block.page, "exec"), {"images": images})
-    found = [float(line.split()[1]) for line in said.getvalue().splitlines() if line.startswith("ok ")]
+    told = [line.split()[1:3] for line in said.getvalue().splitlines() if line.startswith("ok ")]
+    largest, stddev = max((float(force), float(deviation)) for force, deviation in told)
     true = min(np.linalg.norm(recording.truth(side).force, axis=1).max() for side in recording.jaws)
-    print(f"ForceSensor: {len(found)} of {len(images)} images, {max(found):.2f} N, true {true:.2f} N")
-    return int(not (len(found) > 20 and abs(max(found) / true - 1.0) < TRUTH_SHARE))
+    print(f"ForceSensor: {len(told)} of {len(images)} images, {largest:.2f} +- {stddev:.2f} N, true {true:.2f} N")
+    return int(not (len(told) > 20 and abs(largest - true) < 3.0 * stddev and abs(largest / true - 1.0) < WORST))
 
 
 def main(pages):
