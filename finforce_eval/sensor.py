@@ -34,9 +34,9 @@ from finforce_keypoints.images import RgbdImage
 from finforce_keypoints.rig import read_rig
 
 Camera = CameraIntrinsics | str | Path | ArrayLike
-# Shortest and longest image period [s]: 1000 Hz is beyond any RGB-D camera, and 0.2 Hz shows no grasp.
-_SHORTEST_PERIOD, _LONGEST_PERIOD = 1e-3, 5.0
-_USUAL_PERIOD = 1 / 30  # [s], by which the unit of other stamps is guessed
+_SHORTEST_PERIOD = 1e-3  # [s] between images: no RGB-D camera takes 1000 a second
+_LONGEST_PERIOD = 5.0  # [s] between images: rarer ones show no grasp
+_USUAL_PERIOD = 1 / 30  # [s] between images, by which the unit of other stamps is guessed
 _UNITS = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}  # [s]
 
 

@@ -30,20 +30,20 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add_run_options(parser)
     parser.add_argument("--side", default="left", choices=("left", "right"), help="jaw on the scale (left)")
     text = "reading of the scale [g] at the end of each hold, in order; without readings, the holds are listed"
-    parser.add_argument("--grams", nargs="+", type=read_grams, metavar="G", help=text)
+    parser.add_argument("--grams", nargs="+", type=grams, metavar="G", help=text)
     parser.add_argument("-o", "--output", metavar="FILE", help="calibration file to write; needs --grams")
     parser.add_argument("--force", action="store_true", help=FORCE_HELP)
 
 
-def read_grams(text: str) -> list[float]:
+def grams(text: str) -> list[float]:
     """Return the readings [g] of a word such as 160 or 160,238,320."""
     return [float(part) for part in text.split(",") if part]
 
 
 def run(options: argparse.Namespace) -> CommandResult:
     """Find the holds of a recording, and scale the stiffness by the readings of a scale."""
-    grams = [reading for word in options.grams or () for reading in word]
-    if options.output and not grams:
+    readings = [reading for word in options.grams or () for reading in word]
+    if options.output and not readings:
         raise OptionError("-o needs --grams: the readings of the scale, one for each hold")
     setup = make_setup(options).side(options.side)
     (recording,) = read_keypoints(options, (options.side,))
@@ -55,12 +55,12 @@ def run(options: argparse.Namespace) -> CommandResult:
     short = [hold for hold in find_holds(*pressed, SHORT_HOLD) if hold.end - hold.start < LEAST_HOLD]
     if short:
         print_notes(recording.name, [f"too short to count, under {LEAST_HOLD} s: {list_holds(short)}"])
-    if not grams:
+    if not readings:
         for number, hold in enumerate(holds, 1):
             print(f"hold {number}: {hold.start:.1f} to {hold.end:.1f} s, estimated {hold.force:.3f} N")
         print(f"{len(holds)} holds; give their readings with --grams")
         return CommandResult({"holds": [vars(hold) for hold in holds]})
-    weighing = weigh(holds, grams, recording.name)
+    weighing = weigh(holds, readings, recording.name)
     print(format_weighing(weighing))
     scaled = scale_calibration(
         weighing, setup.jaw, setup.calibration, solver=setup.settings.solver, force=options.force
