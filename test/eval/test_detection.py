@@ -36,7 +36,7 @@ def detect(recording, **options):
 
 def test_every_image_is_seen_once_in_order_and_its_key_points_take_their_place(recording):
     found, detector = detect(recording)
-    assert np.round(np.array(detector.stamps) * 1e9).astype(int).tolist() == recording.images.stamps.tolist()
+    assert np.round(np.array(detector.stamps) * 1e9).astype(int).tolist() == recording.images.stamps_ns.tolist()
     track = found.jaws["left"]
     np.testing.assert_array_equal(track.keypoints.stamps_ns, recording.images.stamps_ns)
     expected = track.sight.points[:, :2] + [3e-4, 0, 0]
