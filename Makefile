@@ -10,7 +10,7 @@ STRESS_JAWS ?= bench umi ssg48_fin_ray_1 xlerobot
 DESCRIBED := setup.py setup.cfg pyproject.toml $(SET_UP)
 ROS := $(if $(AMENT_PREFIX_PATH),ament,plain)
 
-.PHONY: demo test lint bench stress docs build dist clean
+.PHONY: demo test lint bench stress docs pages build dist clean
 
 demo: .venv/.$(ROS)-run
 	$(PYTHON) -m finforce_eval.cli.main demo --report report
@@ -36,6 +36,10 @@ stress: .venv/.$(ROS)-run
 
 docs: .venv/.$(ROS)-docs
 	NO_MKDOCS_2_WARNING=1 $(PYTHON) -m mkdocs build --strict
+
+# Every command and program of README and docs that needs nothing but this machine.
+pages: .venv/.$(ROS)-test
+	$(PYTHON) test/core/page_trials.py
 
 build: .venv/.$(ROS)-build
 	$(PYTHON) -m colcon build --event-handlers console_cohesion+

@@ -83,7 +83,8 @@ setup(
         ],
         "cad": ["cascadio", "ezdxf", "svgelements"],  # fingers from STEP, DXF and SVG files
         "can": ["python-can>=4.3"],  # other CAN adapters than SLCAN ones: SocketCAN and more
-        "lerobot": ["av"],  # videos of LeRobot datasets, by the library that they are made with
+        "video": ["av"],  # no other wheel decodes video exactly frame by frame
+        "lerobot": ["av"],  # whose datasets hold videos
         "zarr": ["numcodecs"],  # UMI's chunks; the library zarr itself takes a missing chunk for zeros, a force of none
         # many recordings on the workers of this machine or of a cluster, with its dashboard; TLS between the former
         "dask": ["dask[distributed,diagnostics]>=2025.1", "cryptography"],

@@ -17,6 +17,7 @@ from tempfile import mkdtemp
 
 from finforce.errors import FinforceError
 
+FIRST_START = "compiling, which takes a minute or two once; `finforce prepare` does it ahead of time"
 # Packages whose functions are compiled, and days after which what nobody has used is removed.
 _COMPILED = ("finforce", "finforce_contact", "finforce_ifea", "finforce_keypoints")
 _UNUSED = 30.0

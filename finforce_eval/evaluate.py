@@ -112,5 +112,5 @@ def evaluate_task(name: str, path: str, target: str, options: argparse.Namespace
 def note_left_out(recording: Recording, result: ForceSeries) -> str:
     """Return how many images of a jaw the live chain would have left out."""
     track = recording.jaw(result.side)
-    images = len(track.keypoints.stamps if track.detection is None else recording.images)
+    images = len(track.keypoints.stamps_ns if track.detection is None else recording.images)
     return f"{result.side} jaw: {images - len(result)} of {images} images left out, as the live chain leaves them out"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -25,14 +26,18 @@ from finforce_ifea.estimator import ForceEstimator
 from finforce_ifea.grasp_force import Wrench, combine_wrenches, single_jaw_grasp
 from finforce_ifea.jaw.calibration import Calibration
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
-from finforce_ifea.observation import Contact, Observation, Solution
+from finforce_ifea.observation import Contact, Observation, Solution, check_stamp
 from finforce_ifea.settings import EstimatorSettings
 from finforce_keypoints.build import build_detector
 from finforce_keypoints.geometry.jaw_localizer import JawKeypoints
 from finforce_keypoints.images import RgbdImage
 from finforce_keypoints.rig import read_rig
 
-Camera = CameraIntrinsics | str | Path | Sequence[float]
+Camera = CameraIntrinsics | str | Path | ArrayLike
+_SHORTEST_PERIOD = 1e-3  # [s] between images: no RGB-D camera takes 1000 a second
+_LONGEST_PERIOD = 5.0  # [s] between images: rarer ones show no grasp
+_USUAL_PERIOD = 1 / 30  # [s] between images, by which the unit of other stamps is guessed
+_UNITS = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}  # [s]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -66,7 +71,8 @@ class ForceSensor:
 
     Args:
         jaw: name of a shipped jaw, jaw file, or a left jaw; None for that of the rig, else "bench".
-        camera: intrinsics, a file of them, or the numbers fx, fy, cx, cy [px] and perhaps k1, k2, p1, p2, k3.
+        camera: intrinsics, a file of them, a (3, 3) matrix [px], or the numbers fx, fy, cx, cy [px] and perhaps k1, k2,
+            p1, p2, k3.
         extrinsics: the camera in `gripper_base`: (4, 4), the seven numbers x, y, z [m], qx, qy, qz, qw, or "robot" or
             "bench" for those of the simulator.
         rig: file by `finforce camera`, which takes the place of these three.
@@ -108,6 +114,7 @@ class ForceSensor:
         else:
             parameters = {"T_gripper_camera": pose_numbers(read_extrinsics(extrinsics))}
         self.camera = camera
+        self._stamps: deque[float] = deque(maxlen=3)
         jaws = {side: load_jaw(jaw or "bench", side) for side in sides}
         records = build_records({**parameters, **(detector or {})})
         self._detector = build_detector(jaws, *records, watched=not is_video)
@@ -129,18 +136,22 @@ class ForceSensor:
         Args:
             rgb: (h, w, 3) uint8.
             depth: (h, w) aligned to the colours, in metres, or whole numbers in millimetres; None without.
-            stamp: image capture time [s], rising.
+            stamp: image capture time [s], a rising float; frame numbers are divided by the frame rate.
             T_camera_object: (4, 4) pose of the object's mesh in this image, where it is known.
 
         Raises:
             ImageError: the image has another shape, shows nothing, or its stamp does not rise.
+            ObservationError: the stamps are not in seconds.
             PoseError: the pose makes no sense.
         """
+        check_stamp(stamp)
         if not isinstance(self.camera, CameraIntrinsics):
-            self.camera = _intrinsics(self.camera, rgb.shape[:2])
+            self.camera = read_intrinsics(self.camera, rgb.shape[:2])
         if depth is not None:
             depth = decode_depth(depth, "16UC1" if np.asarray(depth).dtype.kind in "iu" else "32FC1")
         seen = self._detector.detect(RgbdImage(stamp=stamp, color=rgb, depth=depth, camera=self.camera))
+        self._stamps.append(stamp)
+        check_periods(self._stamps)
         T = None if T_camera_object is None else check_pose(T_camera_object, "T_camera_object")
         found = {side: self._solve(loop, seen.get(side), stamp, T) for side, loop in self._loops.items()}
         return combine_solutions(stamp, {side: found[side] if side in seen else None for side in found})
@@ -155,6 +166,7 @@ class ForceSensor:
     def reset(self) -> None:
         """Forget everything that images have shown, the tare included; for a new recording or episode."""
         self._detector.reset()
+        self._stamps.clear()
         for loop in self._loops.values():
             loop.force.forget()
             loop.contact.reset()
@@ -174,6 +186,28 @@ class ForceSensor:
         if seen is None or T_camera_object is None:
             return loop.update(observation)
         return loop.update(observation, [(stamp, invert_pose(seen.T_camera_jaw) @ T_camera_object)])
+
+
+def check_periods(stamps: Sequence[float]) -> None:
+    """Refuse rising stamps of three images in a row that are not in seconds; a single gap is a pause.
+
+    Raises:
+        ObservationError: they are whole numbers, or closer or further apart than a camera's images.
+    """
+    if len(stamps) < 3:
+        return
+    periods = np.diff(np.asarray(stamps, dtype=float))
+    if all(float(stamp).is_integer() for stamp in stamps):
+        raise ObservationError(
+            f"stamps {', '.join(f'{stamp:g}' for stamp in stamps)}, expected seconds: if these are frame numbers, "
+            "divide them by the frame rate"
+        )
+    if periods.max() < _SHORTEST_PERIOD or periods.min() > _LONGEST_PERIOD:
+        unit = min(_UNITS, key=lambda name: abs(np.log(_UNITS[name] * periods.min() / _USUAL_PERIOD)))
+        likely = f"; the stamps look like {unit}" if periods.min() > _LONGEST_PERIOD else ""
+        raise ObservationError(
+            f"images {periods.min():.4g} s apart, expected {_SHORTEST_PERIOD:g} to {_LONGEST_PERIOD:g} s{likely}"
+        )
 
 
 def observe_jaw(seen: JawKeypoints | None, stamp: float, count: int) -> Observation:
@@ -214,8 +248,8 @@ def combine_solutions(stamp: float, found: Mapping[str, Solution | None]) -> Gri
     )
 
 
-def _intrinsics(camera: str | Path | Sequence[float], shape: tuple[int, int]) -> CameraIntrinsics:
-    """Return the camera of a file or of numbers for images of some height and width."""
+def read_intrinsics(camera: str | Path | ArrayLike, shape: tuple[int, int]) -> CameraIntrinsics:
+    """Return the camera of a file, a matrix or of numbers for images of some height and width."""
     if isinstance(camera, str | Path):
         return read_camera(camera, shape)
-    return build_camera(camera_numbers([float(number) for number in camera]), shape)
+    return build_camera(camera_numbers(np.asarray(camera, dtype=float).ravel().tolist()), shape)

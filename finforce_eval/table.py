@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 from numpy.typing import ArrayLike, NDArray
 
 from finforce.errors import one_line
+from finforce.messages import SECOND
 from finforce_eval.errors import RecordingError
 
 AXES = "xyz"
@@ -66,6 +67,7 @@ UNITS = {
     "grasp_force": "N",  # of the gripper: the smaller of the jaws' forces
     "grasp_stddev": "N",
 }
+WAITING = "waiting"  # status of an image that the tare still needs
 _ABOUT = b"finforce"
 _LISTS = {name for name, unit in UNITS.items() if "each" in unit}
 
@@ -150,14 +152,19 @@ class ForceSeries:
         return str(self.table["side"].iloc[0] if len(self) else self.table.attrs["side"])
 
     @property
-    def stamps(self) -> NDArray[np.int64]:
+    def stamps_ns(self) -> NDArray[np.int64]:
         """Image times (n,) [ns]."""
         return self.column("stamp")
 
     @property
+    def stamps(self) -> NDArray[np.float64]:
+        """Image times (n,) [s]."""
+        return SECOND * self.stamps_ns
+
+    @property
     def seconds(self) -> NDArray[np.float64]:
         """Time since the first image (n,) [s]."""
-        return (self.stamps - self.stamps[0]) * 1e-9
+        return (self.stamps_ns - self.stamps_ns[0]) * 1e-9
 
     @property
     def force(self) -> NDArray[np.float64]:

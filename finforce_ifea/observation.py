@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import isfinite
+from numbers import Integral
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +22,10 @@ _TOUCHING = 0.5
 _UNIT = 1e-3  # by which the length of a unit vector may be off
 # Images are at least so long apart [s]; what comes sooner is the same one, stamped again.
 _SHORTEST_PERIOD = 0.5e-3
+# Maximum coordinate of a key point [m]: fingers are 0.25 m long at most.
+_FARTHEST = 1.0
+# Maximum capture time [s] since 1970: the year 5138. Milliseconds since 1970 are ten times as many.
+_LATEST = 1e11
 # An object is away that stands in front of the undeformed surface by more than this and what its place may err [m].
 AWAY, _SIGMAS = 10e-3, 3.0
 
@@ -33,7 +37,7 @@ class Observation:
     Attributes:
         stamp: image capture time [s].
         points: (K, 3) [m], jaw frame; NaN where there is no depth.
-        likelihood: (K,) in [0, 1]; None: every point that is there is certain.
+        likelihood: (K,) in [0, 1]; None: 1 of every point that is there, 0 of those that are NaN.
         stddev: (K, 3) [m] of each point along the axes of the jaw frame, above zero where there is a point; None when
             the detector states none.
         shared: standard deviation [m] of a shift, beyond `stddev`, that all points of the image share because the jaw's
@@ -51,7 +55,8 @@ class Observation:
 
     def __post_init__(self) -> None:
         if self.likelihood is None:
-            object.__setattr__(self, "likelihood", np.ones(len(self.points)))
+            seen = np.isfinite(np.asarray(self.points, dtype=float)).all(axis=-1)
+            object.__setattr__(self, "likelihood", seen.astype(float))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -192,6 +197,12 @@ def check_observation(observation: Observation, count: int, last_stamp: float | 
                 f"key point {int(np.argwhere(np.isinf(points))[0, 0])} is infinite, expected metres or NaN"
             )
         raise ObservationError(f"likelihoods from {likelihood.min():g} to {likelihood.max():g}, expected 0 to 1")
+    far = (np.abs(points) > _FARTHEST).any(axis=1)  # one or two may be gross errors
+    if far.any() and 2 * np.count_nonzero(far) > np.count_nonzero(np.isfinite(points).all(axis=1)):
+        raise ObservationError(
+            f"key points up to {np.nanmax(np.abs(points)):.4g} m from the jaw's origin, expected metres in the jaw "
+            "frame: millimetres are divided by 1000"
+        )
     if observation.stddev is not None:
         check_stddev(np.asarray(observation.stddev), points)
     if not 0.0 <= observation.shared < np.inf:
@@ -199,8 +210,7 @@ def check_observation(observation: Observation, count: int, last_stamp: float | 
     gravity = observation.gravity
     if gravity is not None and not (np.shape(gravity) == (3,) and abs(np.linalg.norm(gravity) - 1.0) < _UNIT):
         raise ObservationError(f"gravity {np.asarray(gravity).tolist()}, expected a unit vector of three numbers")
-    if not isfinite(observation.stamp):
-        raise ObservationError(f"stamp {observation.stamp}, expected seconds")
+    check_stamp(observation.stamp)
     if last_stamp is not None and observation.stamp <= last_stamp:
         raise ObservationError(
             f"stamp {observation.stamp:.6f} s after {last_stamp:.6f} s, expected rising stamps; "
@@ -210,6 +220,19 @@ def check_observation(observation: Observation, count: int, last_stamp: float | 
         raise ObservationError(
             f"stamp {observation.stamp - last_stamp:.3g} s after the last, expected at least {_SHORTEST_PERIOD:g} s: "
             "one image came twice"
+        )
+
+
+def check_stamp(stamp: float) -> None:
+    """Refuse what cannot be a capture time in seconds: whole numbers, which count images or ticks, and far too many.
+
+    Raises:
+        ObservationError: the stamp is such a number, or not finite.
+    """
+    if isinstance(stamp, Integral) or not abs(stamp) < _LATEST:
+        raise ObservationError(
+            f"stamp {stamp}, expected seconds as a float: divide frame numbers by the frame rate, milliseconds by 1e3, "
+            "nanoseconds by 1e9"
         )
 
 

@@ -463,11 +463,11 @@ class _Refinement:
         count, most = int(visible[:-1].sum()), MOST_LEFT * typical
         if count < LEAST_SEEN or typical < LEAST_TYPICAL or contrast < self._least_contrast or residual > most:
             raise GeometryError(
-                f"no such jaws: outlines of '{self._jaws[first].name}' show with a contrast of {contrast:.2f} (least: "
-                f"{self._least_contrast:g}), {count} key points are seen (at least {LEAST_SEEN}) with a likelihood of "
-                f"{typical:.2f} (at least {LEAST_TYPICAL:g}), {residual:.1f} px off (at most {most:.1f}): another "
-                "finger, other intrinsics, a mirrored image, loaded jaws, or none in view? Jaws that look like their "
-                "background need a guess of T_gripper_camera"
+                f"the images do not show the finger '{self._jaws[first].name}': make the jaw file of another one with "
+                "finforce jaw PHOTO or STL; else check --lens, that the image is not mirrored and that open jaws are "
+                "in view, or give --extrinsics where jaws look like their background "
+                f"(contrast {contrast:.2f} of {self._least_contrast:g}, {count} of {LEAST_SEEN} key points, likelihood "
+                f"{typical:.2f} of {LEAST_TYPICAL:g}, {residual:.1f} px off of {most:.1f})"
             )
         names = np.array([*self._jaws[first].keypoint_names, REFERENCE])
         covered = frozenset(names[~visible].tolist())

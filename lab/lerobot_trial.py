@@ -105,7 +105,7 @@ def render() -> Session:
         recording = read_recording(find_scene(scene))
         images = [item.image for item in islice(recording.images.all_colors(), IMAGES)]
         depths = np.stack([np.nan_to_num(image.depth / FARTHEST, nan=0.0).clip(0.0, 1.0) for image in images])
-        stamps = recording.images.all_colors().stamps[:IMAGES]
+        stamps = recording.images.all_colors().stamps_ns[:IMAGES]
         opening = find_distances(recording, stamps, true=True)
         episodes.append(
             Episode(

@@ -23,6 +23,9 @@ FRESH = 0.5  # [s] for which a force or an opening is what there is
 DISCOVERY = 10.0  # [s] in which the driver is found
 FOUND = 2.0  # [s] after which a publisher that there is has been found
 TOLD = 0.2  # [s] in which a goal reaches a driver before it is asked to grasp
+ARRIVED = 1e-3  # [m] from an opening at which it is reached
+LONGEST_MOVE = 15.0  # [s] that a move may take
+NO_ADAPTER = "there is no port"  # in the driver's answer
 LONGEST = 120.0  # [s] that a service may take
 
 
@@ -44,6 +47,7 @@ class GripperClient:
         self._opening: tuple[float, float] = (-math.inf, math.nan)
         self._grasp = ""
         node = self._node
+        self._commands = node.create_publisher(JointState, f"{driver}/command", ros.RESULT)
         self._goals = node.create_publisher(JointState, f"{driver}/grasp_goal", ros.RESULT)
         space = driver[: driver.rfind("/") + 1]
         self._topic = node.resolve_topic_name(f"{space}grasp_wrench")
@@ -61,9 +65,9 @@ class GripperClient:
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
         """End the client; the gripper stays as it is."""
-        self.close()
+        self.disconnect()
 
-    def close(self) -> None:
+    def disconnect(self) -> None:
         """End the client; the gripper stays as it is."""
         self._executor.shutdown()
         self._thread.join(DISCOVERY)
@@ -100,21 +104,43 @@ class GripperClient:
     def calibrate(self) -> str:
         """Find the end stops, over the whole stroke; return the driver's answer when that is done.
 
+        Waits for an adapter that is not there yet, as that of a simulated gripper while its images are rendered.
+
         Raises:
             ServiceError: it failed, with the driver's reason; so for all calls.
         """
-        return self._call("calibrate")
+        end = monotonic() + LONGEST
+        while True:
+            try:
+                return self._call("calibrate")
+            except ServiceError as error:
+                if NO_ADAPTER not in str(error) or monotonic() > end:
+                    raise
+                self._node.get_logger().info(f"waiting for the gripper: {error}", throttle_duration_sec=10.0)
+                sleep(1.0)
 
     def grasp(self, force: float, speed: float | None = None) -> str:
         """Close until a force [N] is held, at a speed of the opening [m/s]; return the driver's answer.
 
         The driver goes on holding the force, until something else is asked for.
         """
-        missing = f"{self._driver}: no subscriber on its grasp_goal; is the driver running?"
-        _await(lambda: self._goals.get_subscription_count() > 0, DISCOVERY, missing)
-        self._goals.publish(JointState(effort=[float(force)], velocity=[] if speed is None else [float(speed)]))
+        self._tell(self._goals, "grasp_goal", JointState(effort=[float(force)], velocity=_known(speed)))
         sleep(TOLD)
         return self._call("grasp")
+
+    def move(self, opening: float, speed: float | None = None) -> None:
+        """Move the jaws to an opening [m] at a speed of the opening [m/s]; return when they are there.
+
+        Raises:
+            ServiceError: they are not there in time, because of an object, a rejected command or a fault.
+        """
+        self._tell(self._commands, "command", JointState(position=[float(opening)], velocity=_known(speed)))
+        missed = f"{self._driver}: the jaws did not get to {1e3 * opening:.1f} mm in {LONGEST_MOVE:g} s"
+        _await(lambda: (now := self.opening) is not None and abs(now - opening) < ARRIVED, LONGEST_MOVE, missed)
+
+    def close(self, speed: float | None = None) -> None:
+        """Close the jaws without an object between them; see `move`. `grasp` holds an object, `disconnect` ends."""
+        self.move(0.0, speed)
 
     def release(self) -> str:
         """Open; return the driver's answer when that is done."""
@@ -131,6 +157,12 @@ class GripperClient:
     def clear_errors(self) -> str:
         """Clear faults and emergency stops."""
         return self._call("clear_errors")
+
+    def _tell(self, publisher: Any, topic: str, message: JointState) -> None:
+        """Publish a message once the driver listens."""
+        missing = f"{self._driver}: no subscriber on its {topic}; is the driver running?"
+        _await(lambda: publisher.get_subscription_count() > 0, DISCOVERY, missing)
+        publisher.publish(message)
 
     def _call(self, name: str) -> str:
         service = f"{self._driver}/{name}"
@@ -170,6 +202,10 @@ def _await(condition: Callable[[], bool], longest: float, complaint: str) -> Non
         if monotonic() > end:
             raise ServiceError(complaint)
         sleep(0.005)
+
+
+def _known(value: float | None) -> list[float]:
+    return [] if value is None else [float(value)]
 
 
 def _fresh(last: tuple[float, float]) -> float | None:

@@ -33,7 +33,7 @@ from std_msgs.msg import Header, String  # noqa: F401 - for those who publish
 from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import MarkerArray  # noqa: F401 - for those who publish
 
-from finforce.caches import is_compiled
+from finforce.caches import FIRST_START, is_compiled
 from finforce.errors import FinforceError
 from finforce.health import Health, Level, Outcome, Report
 from finforce.messages import NANOSECONDS
@@ -220,9 +220,7 @@ class ImageNode(Node):
 def warn_first_start() -> None:
     """Log, once in a process, that a first start compiles, where nothing was compiled before."""
     if not is_compiled():
-        get_logger("finforce").info(
-            "compiling, which takes a minute or two once; `finforce prepare` does it ahead of time"
-        )
+        get_logger("finforce").info(FIRST_START)
 
 
 def publish_diagnostics(stage: Stage, name: str, period: float, report: Callable[[list[Outcome]], Report]) -> None:

@@ -17,7 +17,7 @@ from finforce.systems.processes import RESPAWN_DELAY, SINGLE_THREAD, UNUSABLE, I
 OptionsT = TypeVar("OptionsT")
 
 
-NONE = "none"  # on a command line, where an empty text cannot be given
+NONE = "none"  # on a command line, where an empty text cannot be given; not of an option that has it as a value
 SWITCH = ("true", "false", "True", "False")
 
 
@@ -97,18 +97,19 @@ def options_from_texts(record: type[OptionsT], texts: Mapping[str, str]) -> Opti
     Raises:
         ValueError: a text is no such value.
     """
-    options = record(**{entry.name: _value(entry.name, texts[entry.name], entry.default) for entry in fields(record)})
+    options = record(**{entry.name: _value(entry, texts[entry.name]) for entry in fields(record)})
     check_bounds(options, ValueError)
     return options
 
 
-def _value(name: str, text: str, default: Any) -> Any:
-    """Turn one text into the type of a default; "none" is an empty text, and no number."""
+def _value(entry: Field, text: str) -> Any:
+    """Turn one text into the type of a default; "none" is an empty text, and no number, unless it is a choice."""
+    name, default = entry.name, entry.default
     if isinstance(default, bool):
         if text not in SWITCH:
             raise ValueError(f"{name}:={text}: expected true or false")
         return text.lower() == "true"
-    if text == NONE and isinstance(default, str | float):
+    if text == NONE and NONE not in entry.metadata.get("choices", ()) and isinstance(default, str | float):
         return type(default)("" if isinstance(default, str) else "nan")
     try:
         return type(default)(text)

@@ -28,7 +28,6 @@ RESPAWNED = (*STAGES, PIPELINE, "robot_state_publisher", "static_transform_publi
 RESPAWN_DELAY = 2.0  # [s]
 UNUSABLE = 2  # exit status of a node whose settings cannot be used
 NODES = (*STAGES[:2], *(f"{side}_ifea_solver" for side in SIDES), "gripper_driver", "twin_camera", "recording_player")
-DEPTHS = {"aligned": "aligned", "auto": "auto", "off": "none"}  # options of a system: the detector's parameter `depth`
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -212,7 +211,7 @@ def detector_processes(jaws: str, options: SolverOptions) -> list[Process]:
         "jaw_file": options.jaw_file,
         "detection_method": options.detection_method,
         "model": options.model,
-        "depth": DEPTHS.get(options.depth, ""),
+        "depth": "" if options.depth == "auto" else options.depth,  # the node's default, unless its file says otherwise
         "T_gripper_camera": read_numbers("T_gripper_camera", options.T_gripper_camera, 7),
     }
     return [node_process("keypoint_detector", asked, options)]
@@ -320,7 +319,9 @@ class SolverOptions:
     detection_method: str = setting("", "network, frame (DeepLabCut) or dots", alias="finder")
     model: str = setting("", "Folder of a network")
     depth: str = setting(
-        "", "Depth images: aligned (every image needs one), auto (where there is one), off", choices=("", *DEPTHS)
+        "auto",
+        "Depth images: aligned (every image needs one), auto (where there is one), none (colour alone)",
+        choices=("aligned", "auto", "none"),
     )
     T_gripper_camera: str = setting("", "Pose of the camera in the gripper frame: x y z [m] qx qy qz qw")
     solver: str = setting("", "Mechanics: reduced, solid, frame, linear or paper (Eq. 1)")

@@ -139,7 +139,7 @@ def _describe(jaws: Mapping[str, ForceSeries], recording: Recording) -> dict[str
             "residual_mm": 1e3 * float(np.median(forces.column("residual")[forces.solved])) if known else None,
             "within_reach": share_reached(forces, recording.jaw(side).detection),
         }
-    stamps = np.concatenate([forces.stamps for forces in jaws.values()])
+    stamps = np.concatenate([forces.stamps_ns for forces in jaws.values()])
     return {"jaws": sides, "span_s": round(1e-9 * float(np.ptp(stamps)), 3) if len(stamps) else 0.0}
 
 

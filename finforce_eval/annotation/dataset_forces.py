@@ -131,7 +131,7 @@ def annotate_episode(
             raise
         nothing = {"force": np.full((len(images), 3), np.nan), "message": str(error).removeprefix(f"{name}: ")}
         nothing |= {"force_stddev": nothing["force"], "scored": True, "status": NOT_FOUND}
-        found = {side: ForceSeries.build(name, side, images.stamps, **nothing) for side in recording.jaws}
+        found = {side: ForceSeries.build(name, side, images.stamps_ns, **nothing) for side in recording.jaws}
     grasp = combine_jaws(found)
     values = grasp.column("grasp_force")
     both, why = int(np.isfinite(values).sum()), why_unanswered(found.values())

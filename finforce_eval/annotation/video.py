@@ -39,28 +39,47 @@ def write_video(path: Path, recording: Recording, jaws: Mapping[str, ForceSeries
         RecordingError: the recording has no images, or they cannot be read.
         MissingDependencyError: PyAV is not installed.
     """
-    av = import_library("av", "writing videos", "'finforce[lerobot]'")
+    av = import_library("av", "writing videos", "'finforce[video]'")
     if recording.images is None or not len(recording.images):
         raise RecordingError(f"{recording.name}: no images to draw forces into; expected color images")
     images, camera = recording.images.all_colors(), recording.images.camera
     scale = -(-LEAST_HEIGHT // camera.height)
-    overlays = [_Overlay(recording.jaw(side), forces, camera, scale) for side, forces in jaws.items()]
-    first = int(images.stamps[0])
+    draw = ForceOverlay(recording, jaws).draw
+    first = int(images.stamps_ns[0])
     with av.open(str(path), "w") as file, progress_bar(len(images), "image", path.name) as bar:
         stream = file.add_stream("libx264", rate=30, options={"crf": _QUALITY})
         # the format has two pixels by two for each colour
         stream.width, stream.height = 2 * (scale * camera.width // 2), 2 * (scale * camera.height // 2)
         stream.pix_fmt, stream.codec_context.time_base = "yuv420p", Fraction(1, 1000)
         for stamp, image in images:
-            picture = np.ascontiguousarray(image.color.repeat(scale, axis=0).repeat(scale, axis=1))
-            picture[: round(LINE * len(overlays) * stream.height)] //= 3  # words are white
-            for line, overlay in enumerate(overlays, start=1):
-                overlay.draw(picture, stamp, line)
+            picture = draw(stamp, image.color)
             frame = av.VideoFrame.from_ndarray(picture[: stream.height, : stream.width], format="rgb24")
             frame.pts, frame.time_base = round((stamp - first) / NANOSECONDS * 1000), Fraction(1, 1000)
             file.mux(stream.encode(frame))
             bar.update()
         file.mux(stream.encode())
+
+
+class ForceOverlay:
+    """Draws key points and forces of both jaws into the images of a recording.
+
+    Args:
+        recording: with images.
+        jaws: the forces, by side.
+    """
+
+    def __init__(self, recording: Recording, jaws: Mapping[str, ForceSeries]) -> None:
+        camera = recording.images.camera
+        self._scale = -(-LEAST_HEIGHT // camera.height)
+        self._jaws = [_Overlay(recording.jaw(side), forces, camera, self._scale) for side, forces in jaws.items()]
+
+    def draw(self, stamp: int, color: NDArray) -> NDArray:
+        """Return the picture (h, w, 3) of the image of a stamp [ns]; small images are enlarged."""
+        picture = np.ascontiguousarray(color.repeat(self._scale, axis=0).repeat(self._scale, axis=1))
+        picture[: round(LINE * len(self._jaws) * len(picture))] //= 3  # words are white
+        for line, jaw in enumerate(self._jaws, start=1):
+            jaw.draw(picture, stamp, line)
+        return picture
 
 
 class _Overlay:
@@ -72,7 +91,7 @@ class _Overlay:
         self._stated = np.linalg.norm(forces.column("force_stddev"), axis=1)
         self._points = forces.column("contact_point")
         self._rows = [
-            {stamp: row for row, stamp in enumerate(each.stamps.tolist())} if each is not None else {}
+            {stamp: row for row, stamp in enumerate(each.stamps_ns.tolist())} if each is not None else {}
             for each in (forces, track.detection, track.pose)
         ]
 

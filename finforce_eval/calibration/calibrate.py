@@ -42,14 +42,14 @@ def calibration_case(
     side = jaw.side
     track, truth = recording.jaw(side).keypoints, recording.truth(side)
     check_keypoint_count(recording, side, jaw)
-    forces = match_truth(truth, track.stamps)
+    forces = match_truth(truth, track.stamps_ns)
     known = np.isfinite(forces).all(axis=1)
-    observations = [track.observation(index) for index in range(len(track.stamps))]
+    observations = [track.observation(index) for index in range(len(track.stamps_ns))]
     return CalibrationCase(
         name=recording.name,
         observations=observations,
         contact=first_touch(contacts, recording, jaw, density),
-        stamps_true=track.stamps[known] * 1e-9,
+        stamps_true=track.stamps_ns[known] * 1e-9,
         forces_true=forces[known],
     )
 

@@ -20,11 +20,15 @@ from finforce_ifea.jaw.jaw import Jaw, load_jaw
 
 GRAVITY = 9.80665  # [m/s^2] by which kitchen scales turn weight into grams
 LEAST_HOLD = 1.5  # [s]
+SHORT_HOLD = 0.5  # [s] from which a steady force is mentioned that is too short to count
 LEAST_FORCE = 0.1  # [N]; below it a hold is not told from rest
 _WINDOW = 1.0  # [s] of the end of a hold, when the scale is read
 _DRIFT, _DRIFT_FLOOR = 0.04, 0.02  # of the force and [N] in one window: relaxation is slower, pressing is faster
+_NOISE_SIGMAS = 3.0  # standard errors of the drift by which noise may exceed that
 _SCALE_ERROR = 0.02  # [N]: two grams
 _RELATIVE_ERROR = 0.02  # of one reading, by the height at which it was pressed
+_WORST_MISFIT = 0.15  # [-] of a reading: estimates of one finger differ by less, readings of other holds by more
+_FEWEST_SHIFTED = 3  # readings by which a shift of all of them is told
 _FORCE_ERRORS = 0.005, 0.5  # [-] least and largest relative deviation of forces that a weighing can leave
 
 
@@ -62,12 +66,13 @@ class Weighing:
     misfit: float
 
 
-def find_holds(times: NDArray[np.float64], pressing: NDArray[np.float64]) -> list[Hold]:
+def find_holds(times: NDArray[np.float64], pressing: NDArray[np.float64], shortest: float = LEAST_HOLD) -> list[Hold]:
     """Return where a force was held steady for long enough to read a scale, in time.
 
     Args:
         times: (n,) [s], rising.
         pressing: (n,) [N], NaN where unknown.
+        shortest: duration of a hold [s].
     """
     known = np.isfinite(pressing)
     times, pressing = times[known], pressing[known]
@@ -78,17 +83,17 @@ def find_holds(times: NDArray[np.float64], pressing: NDArray[np.float64]) -> lis
         half = (low + high) // 2
         if half - low < 2 or high - half < 2:
             continue
-        level, drift = (
-            np.median(pressing[low:high]),
-            abs(np.median(pressing[half:high]) - np.median(pressing[low:half])),
-        )
-        steady[index] = level > LEAST_FORCE and drift < 0.5 * (_DRIFT * level + _DRIFT_FLOOR)
+        level, later, earlier = np.median(pressing[low:high]), pressing[half:high], pressing[low:half]
+        drift = abs(np.median(later) - np.median(earlier))
+        noise = (later[: half - low] - earlier[: high - half]).std() / np.sqrt(half - low)
+        largest = 0.5 * (_DRIFT * level + _DRIFT_FLOOR) + _NOISE_SIGMAS * noise
+        steady[index] = level > LEAST_FORCE and drift < largest
     edges = np.flatnonzero(np.diff(np.r_[False, steady, False].astype(int)))
     spans = [(start, end - 1) for start, end in zip(edges[::2], edges[1::2], strict=True)]
     return [
         Hold(start=float(times[a]), end=float(times[b]), force=_last(times[a : b + 1], pressing[a : b + 1]))
         for a, b in spans
-        if times[b] - times[a] >= LEAST_HOLD
+        if times[b] - times[a] >= shortest
     ]
 
 
@@ -119,7 +124,7 @@ def calibrate_with_scale(
         force: take a modulus, too, that the material of the jaw file has not got.
 
     Raises:
-        RecordingError: another number of presses than of readings, or readings that no scale shows.
+        RecordingError: another number of presses than of readings, readings of other presses, or that no scale shows.
         CalibrationError: the modulus found cannot be that of the finger.
     """
     jaw, forces = load_jaw(jaw), np.asarray(forces, dtype=float)
@@ -167,23 +172,52 @@ def weigh(holds: Sequence[Hold], grams: Sequence[float], name: str = "the record
         name: of the recording, for messages.
 
     Raises:
-        RecordingError: another number of holds than of readings, or readings that no scale shows.
+        RecordingError: another number of holds than of readings, readings of other holds, or that no scale shows.
     """
     weights = np.asarray(grams, dtype=float) * 1e-3 * GRAVITY
     if not len(weights) or not np.isfinite(weights).all() or (weights <= 0.0).any():
         raise RecordingError(f"{name}: readings {list(grams)}: expected grams above zero, one for each hold")
     if len(weights) != len(holds):
-        found = ", ".join(f"{hold.start:.1f}-{hold.end:.1f} s ({hold.force:.2f} N)" for hold in holds) or "none"
-        raise RecordingError(f"{name}: {len(weights)} readings for {len(holds)} holds; holds found: {found}")
+        raise RecordingError(
+            f"{name}: {len(weights)} readings for {len(holds)} holds; holds found: {list_holds(holds)}"
+        )
+    weighing = _fit_factor(tuple(holds), weights)
+    if weighing.misfit > _WORST_MISFIT:
+        raise RecordingError(
+            f"{name}: the readings do not fit the holds: {100 * weighing.misfit:.0f} % of a reading left over, "
+            f"expected at most {100 * _WORST_MISFIT:.0f} %{_suspect_shift(weighing)}; holds found: {list_holds(holds)}"
+        )
+    return weighing
+
+
+def list_holds(holds: Sequence[Hold]) -> str:
+    """Return holds with their times and forces on one line."""
+    return ", ".join(f"{hold.start:.1f}-{hold.end:.1f} s ({hold.force:.2f} N)" for hold in holds) or "none"
+
+
+def _fit_factor(holds: tuple[Hold, ...], weights: NDArray[np.float64]) -> Weighing:
+    """Return the least-squares factor of weights [N] over the forces of as many holds."""
     forces = np.array([hold.force for hold in holds])
     variance = _SCALE_ERROR**2 + (_RELATIVE_ERROR * weights) ** 2
     information = float((forces**2 / variance).sum())
     factor = float((forces * weights / variance).sum() / information)
     misfit = float(np.sqrt(np.mean((1.0 - factor * forces / weights) ** 2)))
     spread = max(1.0, float(np.sqrt(np.mean((weights - factor * forces) ** 2 / variance))))
-    return Weighing(
-        factor=factor, stddev=spread / np.sqrt(information), holds=tuple(holds), weights=weights, misfit=misfit
-    )
+    return Weighing(factor=factor, stddev=spread / np.sqrt(information), holds=holds, weights=weights, misfit=misfit)
+
+
+def _suspect_shift(weighing: Weighing) -> str:
+    """Return a hint where the readings fit the holds once they are shifted against them."""
+    holds, weights, shifted = weighing.holds, weighing.weights, {}
+    for shift in range(1, len(holds) - _FEWEST_SHIFTED + 1):
+        shifted[f"reading {1 + shift} fits hold 1: does reading 1 belong to a hold that was not found?"] = _fit_factor(
+            holds[:-shift], weights[shift:]
+        )
+        shifted[f"reading 1 fits hold {1 + shift}: is a hold without a reading?"] = _fit_factor(
+            holds[shift:], weights[:-shift]
+        )
+    best = min(shifted, key=lambda hint: shifted[hint].misfit, default=None)
+    return f"; {best}" if best and shifted[best].misfit < min(_WORST_MISFIT, 0.5 * weighing.misfit) else ""
 
 
 def format_weighing(weighing: Weighing) -> str:

@@ -45,7 +45,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
     parser.add_argument("bags", nargs=1, metavar="SOURCE", help=BAG_HELP)
     text = "intrinsics of the camera, as --intrinsics; of larger images the middle, scaled, is taken"
-    parser.add_argument("--calibration", dest="intrinsics", nargs="+", metavar="FILE", help=text)
+    parser.add_argument("--lens", dest="intrinsics", nargs="+", metavar="FILE", help=text)
     parser.add_argument("-o", "--output", default="rig.yaml", metavar="FILE", help="rig file (rig.yaml)")
     text = "numbers of the tags on the holders, which then tell where the jaws are under load"
     parser.add_argument("--tags", nargs="+", type=int, default=[], metavar="ID", help=text)
@@ -94,7 +94,7 @@ def choose_pictures(recording: Recording, count: int) -> list[NDArray]:
     images = choose_images(recording, NO_DEPTH) if recording.images is not None else []
     if not len(images):
         raise OptionError(f"{recording.name}: no images; expected pictures of jaws that are open and unloaded")
-    first = images.stamps[: min(count, len(images))]
+    first = images.stamps_ns[: min(count, len(images))]
     chosen = np.unique(np.linspace(0, len(first) - 1, PICTURES).round().astype(int))
     return [image.color for _, image in images.at(first[chosen])]
 

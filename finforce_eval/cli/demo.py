@@ -15,6 +15,7 @@ from finforce.systems.launch import find_share
 from finforce_eval.annotation.bag import new_folder
 from finforce_eval.cli.main import parse
 from finforce_eval.cli.parser import CONTACT_HELP, CommandResult
+from finforce_eval.cli.replay import ENOUGH
 from finforce_eval.cli.twin import record_footage
 from finforce_eval.errors import RecordingError, SilentReplayError
 from finforce_eval.evaluation.keypoint_source import IMAGES
@@ -26,7 +27,7 @@ CALIBRATION = "bench"
 # the synthetic scene of a run from images, and the calibration of its finger
 SCENE, SEED, SCENE_CALIBRATION = "grasp_cylinder", 4, "twin"
 SIZE = "640x480"
-SLOWER = 0.25  # than the speed at which no force came
+SLOWER = 0.25  # than the speed at which too few forces came
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -54,11 +55,12 @@ def run(options: argparse.Namespace) -> CommandResult:
     words += ["--rate", options.rate]
     replay = parse([*words, *(word for contact in contacts for word in ("--contact", contact))])
     print(f"Playing {bag.name} through the nodes at {options.rate} x real time ...", flush=True)
-    try:
+    outcome = None
+    with suppress(SilentReplayError):
         outcome = replay.run(replay)
-    except SilentReplayError as error:  # images are lost where others keep the processor busy
-        replay.rate *= SLOWER
-        print(f"{error}\nOnce more at {replay.rate:g} x real time ...", flush=True)
+    if outcome is None or outcome.results["grasp"]["n"] < ENOUGH * outcome.results["grasp_frames"]:
+        replay.rate *= SLOWER  # images are lost where others keep the processor busy
+        print(f"Too few images were answered. Once more at {replay.rate:g} x real time ...", flush=True)
         outcome = replay.run(replay)
     print(f"Next, the simulated robot: {next_command()}")
     return outcome

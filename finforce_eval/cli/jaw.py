@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 
 from finforce_eval.cli.parser import CommandResult, length_mm, picture_file
+from finforce_eval.errors import OptionError
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -52,6 +53,8 @@ def run(options: argparse.Namespace) -> CommandResult:
 
         return mechanics.measure_warping(jaw)
 
+    if options.file.suffix in (".yaml", ".yml"):
+        raise OptionError(f"{options.file}: is a jaw file already, for --jaw; expected a finger to make one of")
     started = time.monotonic()
     output = options.output or Path(f"{options.file.stem}.yaml")
     files, notes = make_jaw(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import signal
 import sys
 from collections.abc import Sequence
 from contextlib import redirect_stdout
@@ -83,7 +84,13 @@ def build_parser(command: str) -> Parser:
 
 def parse(words: Sequence[str]) -> argparse.Namespace:
     """Return the options of a command line, with `run`, the function that carries it out."""
-    return build_parser(build_commands().parse_args(words[:1]).command).parse_args(words[1:])
+    options = build_parser(build_commands().parse_args(words[:1]).command).parse_args(words[1:])
+    recordings = getattr(options, "bags", None) or [bag for bag in [getattr(options, "bag", None)] if bag]
+    if getattr(options, "jaw", "") is None and hasattr(options, "rig"):
+        from finforce_eval.recordings.recording import stated_jaw
+
+        options.jaw = stated_jaw(recordings, "bench")
+    return options
 
 
 def complete(words: Sequence[str]) -> None:
@@ -117,7 +124,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             complete(words)
         if quiet := not {"-q", "--quiet"}.isdisjoint(words):
             os.environ["TQDM_DISABLE"] = "1"
-        if words[:1] == ["--version"]:
+        if words[:1] in (["--version"], ["version"]):
             from finforce_eval.machine import version
 
             print(f"finforce {version()}")
@@ -129,7 +136,11 @@ def main(argv: Sequence[str] | None = None) -> int:
                 from finforce_eval.machine import write_figures
 
                 write_figures(options.json, outcome.results)
+            sys.stdout.flush()
             return outcome.status
+    except BrokenPipeError:  # whoever reads has seen enough, as `head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 128 + signal.SIGPIPE
     except (FinforceError, OSError) as error:
         print(f"finforce: {one_line(error)}".encode("utf-8", "backslashreplace").decode(), file=sys.stderr)
         return 2

@@ -21,6 +21,7 @@ SOURCES = ("images", "keypoints", "truth")
 JAWS_CHOICES = ("left", "right", "both")
 BAG_HELP = "rosbag2 folder, .mcap or .db3 file, the folder of a LeRobot dataset, UMI's or UMI-FT's .zarr or "
 BAG_HELP += ".zarr.zip, a video, or a folder of pictures"
+JAW_HELP = "jaw file, or name of an included jaw (that of the case.json, else bench)"
 CONTACT_HELP = (
     "contact: estimate, closest or paper, from the object's mesh and pose; fixed:Z_MM, the height of first touch above "
     "the clamped base [mm]; fixed:case, from the case.json next to each recording; NAME=Z_MM, for one "
@@ -67,7 +68,7 @@ class Parser(argparse.ArgumentParser):
 def add_run_options(parser: argparse.ArgumentParser, *, calibration: bool = True, settings: bool = True) -> None:
     """Add what names jaw, solver, contact and key points and, where they count, calibration and single settings."""
     finger = parser.add_argument_group("finger and mechanics")
-    finger.add_argument("--jaw", default="bench", metavar="FILE", help="jaw file, or name of an included jaw (bench)")
+    finger.add_argument("--jaw", metavar="FILE", help=JAW_HELP)
     if calibration:
         text = "calibration file, or name of an included one (material of the jaw file)"
         finger.add_argument("--calibration", metavar="FILE", help=text)
@@ -131,7 +132,7 @@ class _UseRig(argparse.Action):
 
 def add_rest_options(parser: argparse.ArgumentParser, images: int) -> None:
     """Add what names jaws at rest in the first images of a recording, so many unless told otherwise."""
-    parser.add_argument("--jaw", default="bench", metavar="FILE", help="jaw file, or name of an included jaw (bench)")
+    parser.add_argument("--jaw", metavar="FILE", help=JAW_HELP)
     parser.add_argument("--jaws", default="both", choices=JAWS_CHOICES, help="jaws in the images (both)")
     add_detector_options(parser)
     text = f"number of initial images with open, still, unloaded jaws ({images})"

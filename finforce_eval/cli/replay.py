@@ -3,44 +3,36 @@
 from __future__ import annotations
 
 import argparse
-import math
 from dataclasses import asdict
+from pathlib import Path
 
+import numpy as np
+
+from finforce.optional import import_cv2
+from finforce_eval.annotation.video import ForceOverlay
 from finforce_eval.cli.parser import BAG_HELP, CommandResult, add_run_options
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.keypoint_source import parse_source
 from finforce_eval.evaluation.setup import make_setup
-from finforce_eval.evaluation.tables import evaluation_json, format_tables
+from finforce_eval.evaluation.tables import evaluation_json
 from finforce_eval.replay.replay import Playing, Replay, replay
 
-
-def format_replay(result: Replay) -> str:
-    """Return the table of the score, with the state of the nodes and the figures that matter below."""
-    lines = [format_tables(result.evaluation), ""]
-    began = "images" if any(case.has("detector_ms") for case in result.evaluation.results.values()) else "key points"
-    lines.append(f"Step times are from {began} out to wrench in, over the middleware and back.")
-    largest = max(result.grasp.values(), default=math.nan)
-    lines.append(f"grasp_wrench: {len(result.grasp)} messages, largest {largest:.2f} N.")
-    for name, state in result.health.items():
-        own = " / ".join(state.get(f"callback to published {part} [ms]", "-") for part in ("p50", "p95"))
-        lines.append(f"{name}: {state['message']}; refused: {state.get('refused', '-')}; in the node {own} ms")
-    return "\n".join([*lines, "", *format_summary(result)])
+GRASP = "grasp.png"  # picture on top of the report
 
 
-# Of the images with a force: at rest every third is answered, with fewer some came too late.
-_FEW = 0.25
+ENOUGH = 0.5  # of the images in the record phases that have to be answered for a score
 
 
 def format_summary(result: Replay) -> list[str]:
     """Return the few figures that matter, one a line: error of the grasp force, pixel error, delay."""
     score, sight = result.grasp_score, result.evaluation.total.sight
     error, delay, lines = score.error, score.delay, []
+    answered = f"{error.n} of {score.frames} images in the record phases answered"
+    if error.n < ENOUGH * score.frames:
+        return [f"Grasp force: no score, {answered}; if the machine was busy, --rate 0.5 plays at half the speed"]
     if error.rmse_N is not None:
         errors = f"{error.rmse_N:.3f} N RMSE, {error.max_error_N:.3f} N largest error, of {score.largest:.2f} N at most"
-        answered = f"{error.n} of {score.frames} images in the record phases answered"
-        lines.append(f"Grasp force: {errors}; {answered}; at rest, two of three may be skipped")
-    if error.n < _FEW * score.frames:
-        lines.append("Few images were answered: where the machine was too busy, --rate 0.5 plays at half the speed")
+        lines.append(f"Grasp force: {errors}; {answered}")
     if sight["pixel_median_px"] is not None:
         median, p95 = sight["pixel_median_px"], sight["pixel_p95_px"]
         lines.append(f"Key points: {median:.2f} px off in the median, {p95:.2f} px at the 95th percentile")
@@ -49,6 +41,19 @@ def format_summary(result: Replay) -> list[str]:
     elif delay["missed"]:
         lines.append("Delay: the grasp force did not show within a second of its true onset")
     return lines
+
+
+def draw_grasp(result: Replay, path: Path) -> bool:
+    """Write the image with the largest force, key points and forces drawn into it; False without images."""
+    jaws = {series.side: series for series in result.evaluation.results.values()}
+    images = result.recording.images
+    if images is None or not result.grasp or any(track.detection is None for track in result.recording.jaws.values()):
+        return False
+    overlay = ForceOverlay(result.recording, jaws)
+    largest = max(result.grasp, key=lambda stamp: result.grasp[stamp])
+    for stamp, image in images.at(np.array([largest])):
+        return bool(import_cv2().imwrite(str(path), overlay.draw(stamp, image.color)[..., ::-1]))
+    return False
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -75,11 +80,21 @@ def run(options: argparse.Namespace) -> CommandResult:
     keypoints, calibration = parse_source(options), options.calibration or ""
     recording = keypoints.read(options.bag)
     result = replay(recording, setup, calibration_file=calibration, playing=playing, keypoints=keypoints)
-    print(format_replay(result))
+    summary = format_summary(result)
+    print("\n".join(summary))
     if options.report:
         from finforce_eval.figures.report import write_overview
 
-        print(f"Report: {write_overview(result.evaluation, options.report, about=setup.about)}")
+        Path(options.report).mkdir(parents=True, exist_ok=True)
+        picture = GRASP if draw_grasp(result, Path(options.report, GRASP)) else ""
+        page = write_overview(
+            result.evaluation,
+            options.report,
+            about=setup.about,
+            headline=summary[0] if summary else "",
+            picture=picture,
+        )
+        print(f"Report: {page}")
     score = result.grasp_score
-    grasp = {"grasp": asdict(score.error), "grasp_delay": score.delay}
+    grasp = {"grasp": asdict(score.error), "grasp_frames": score.frames, "grasp_delay": score.delay}
     return CommandResult(evaluation_json(result.evaluation, **grasp, **setup.about))

@@ -113,17 +113,17 @@ def _read_episodes(dataset: Dataset) -> list[ForceSeries]:
 def _make_series(name: str, side: str, samples: Mapping[str, list[Any]]) -> ForceSeries:
     """Return the series of one jaw."""
     found, stated, true = (_stack(samples.get(f"/{side}/{kind}", [])) for kind in (_FORCE, _STDDEV, _TRUTH))
-    stddev = match_truth(stated, found.stamps) if len(stated.stamps) else np.full_like(found.force, np.nan)
+    stddev = match_truth(stated, found.stamps_ns) if len(stated.stamps_ns) else np.full_like(found.force, np.nan)
     words = {stamp_of(each): each.status[0].values[0].value for each in samples.get(f"/{side}/{_STATUS}", [])}
-    status = [words.get(stamp, "") for stamp in found.stamps.tolist()]
+    status = [words.get(stamp, "") for stamp in found.stamps_ns.tolist()]
     return ForceSeries.build(
         name,
         side,
-        found.stamps,
+        found.stamps_ns,
         force=found.force,
         torque=found.torque,
         magnitude_stddev=stddev_along(found.force, stddev),
-        true_force=match_truth(true, found.stamps) if len(true.stamps) else None,
+        true_force=match_truth(true, found.stamps_ns) if len(true.stamps_ns) else None,
         status=np.array(status, dtype="U32"),
     )
 
@@ -135,4 +135,4 @@ def _stack(messages: list[Any]) -> WrenchTrack:
         np.array([[getattr(part, axis) for axis in AXES] for part in parts], dtype=np.float64).reshape(-1, 3)
         for parts in ([each.wrench.force for each in messages], [each.wrench.torque for each in messages])
     )
-    return WrenchTrack(stamps=np.array([stamp_of(each) for each in messages], np.int64), force=force, torque=torque)
+    return WrenchTrack(stamps_ns=np.array([stamp_of(each) for each in messages], np.int64), force=force, torque=torque)

@@ -262,6 +262,7 @@ def record_footage(
         "seed": seed,
         "finger": finger,
         "light": scenario.light,
+        "jaw": str(Path(scenario.jaw).resolve()) if Path(scenario.jaw).is_file() else scenario.jaw,
         "object": {"kind": scenario.object},
     }
     with progress_bar(len(footage), "image", scenario.name) as bar:

@@ -40,7 +40,7 @@ def run(options: argparse.Namespace) -> CommandResult:
     setup = make_setup(options)
     (recording,) = read_keypoints(options)
     view = _RerunView(recording.name, Path(options.save) if options.save else None)
-    frames = sum(len(track.keypoints.stamps) for track in recording.jaws.values())
+    frames = sum(len(track.keypoints.stamps_ns) for track in recording.jaws.values())
     with progress_bar(frames, "image", recording.name) as bar:
         jaws = estimate_forces(recording, setup, progress=bar.update, watch=view.show_shape)
     view.show_images(recording)
@@ -106,7 +106,7 @@ class _RerunView:
     def _show_pixels(self, side: str, track: JawTrack) -> None:
         """Send where the key points of a jaw were found in the pictures."""
         found = track.detection
-        for row, stamp in enumerate(found.stamps.tolist() if found is not None else ()):
+        for row, stamp in enumerate(found.stamps_ns.tolist() if found is not None else ()):
             seen = np.isfinite(found.pixels[row]).all(axis=1)
             colours = [USED if accepted else REFUSED for accepted in found.accepted[row][seen]]
             self._at(stamp)
@@ -134,7 +134,7 @@ class _RerunView:
         self._stream.log("jaws", axes.RDF if is_placed else axes.RIGHT_HAND_Z_DOWN, static=True)
         for side, track in recording.jaws.items():
             pose = track.pose
-            for row, stamp in enumerate(pose.stamps.tolist() if pose is not None else ()):
+            for row, stamp in enumerate(pose.stamps_ns.tolist() if pose is not None else ()):
                 self._at(stamp)
                 transform = self._rr.Transform3D(translation=pose.position[row], quaternion=pose.quaternion[row])
                 self._stream.log(f"jaws/{side}", transform)
@@ -145,18 +145,20 @@ class _RerunView:
             self._draw_force(forces)
             magnitude = forces.magnitude
             stated = np.linalg.norm(forces.column("force_stddev"), axis=1)
-            self._plot(f"forces/{side}", forces.stamps, magnitude, _COLOURS[side], f"{side} [N]")
-            self._plot(f"deviations/{side}", forces.stamps, stated, _COLOURS[side], f"{side}, standard deviation [N]")
+            self._plot(f"forces/{side}", forces.stamps_ns, magnitude, _COLOURS[side], f"{side} [N]")
+            self._plot(
+                f"deviations/{side}", forces.stamps_ns, stated, _COLOURS[side], f"{side}, standard deviation [N]"
+            )
             truth = recording.jaw(side).truth
             if truth is not None:
                 true = np.linalg.norm(truth.force, axis=1)
-                self._plot(f"forces/{side}_true", truth.stamps, true, _COLOURS["truth"], f"{side}, measured [N]")
-        self._plot("forces/grasp", grasp.stamps, grasp.column("grasp_force"), _COLOURS["grasp"], "grasp [N]")
+                self._plot(f"forces/{side}_true", truth.stamps_ns, true, _COLOURS["truth"], f"{side}, true [N]")
+        self._plot("forces/grasp", grasp.stamps_ns, grasp.column("grasp_force"), _COLOURS["grasp"], "grasp [N]")
 
     def _draw_force(self, forces: ForceSeries) -> None:
         """Send where the object presses on a jaw, and how hard; nothing where that is not known."""
         rr, side = self._rr, forces.side
-        rows = zip(forces.stamps.tolist(), forces.force, forces.column("contact_point"), strict=True)
+        rows = zip(forces.stamps_ns.tolist(), forces.force, forces.column("contact_point"), strict=True)
         for stamp, force, point in rows:
             known = np.isfinite(force).all() and np.isfinite(point).all() and force.any()
             self._at(stamp)

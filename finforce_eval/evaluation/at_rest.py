@@ -31,7 +31,7 @@ def first_images(recording: Recording, count: int) -> Recording:
         raise RecordingError(f"{recording.name}: no images; record colour and camera_info, and aligned depth")
     if len(images) < count:
         raise RecordingError(f"{recording.name}: {len(images)} images, expected at least {count} of jaws at rest")
-    return replace(recording, images=images.at(images.stamps[:count]))
+    return replace(recording, images=images.at(images.stamps_ns[:count]))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

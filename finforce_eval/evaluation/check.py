@@ -126,7 +126,7 @@ def _describe_camera(recording: Recording, depth: str) -> Iterator[Finding]:
     across = 2.0 * np.degrees(np.arctan(0.5 * camera.width / camera.fx))
     if camera.model == EQUIDISTANT:
         across = np.degrees(camera.width / camera.fx)
-    rate = (len(images) - 1) / max(1e-9 * float(images.stamps[-1] - images.stamps[0]), 1e-6)
+    rate = (len(images) - 1) / max(1e-9 * float(images.stamps_ns[-1] - images.stamps_ns[0]), 1e-6)
     kind = "with depth" if images.has_depth and depth != NO_DEPTH else "colour alone"
     yield Finding(
         OK, f"camera {camera.width}x{camera.height}, {camera.model}, {across:.0f} degrees, {rate:.0f} Hz, {kind}"

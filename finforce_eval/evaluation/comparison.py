@@ -57,7 +57,7 @@ class Change:
 
 def error_blocks(result: ForceSeries) -> list[list[float]]:
     """Return second, mean squared error [N^2] and number of its frames, of every second with counted frames."""
-    seconds = (result.stamps - result.stamps[:1]) // _SECOND
+    seconds = (result.stamps_ns - result.stamps_ns[:1]) // _SECOND
     squares = pd.Series(result.error[result.counted] ** 2).groupby(seconds[result.counted])
     return [list(row) for row in squares.agg(["mean", "size"]).itertuples()]
 

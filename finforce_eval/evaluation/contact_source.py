@@ -49,7 +49,7 @@ class RecordedContact(ContactLoop):
         Raises:
             RecordingError: the estimator refuses a pose.
         """
-        while self._next < len(self._track.stamps) and self._track.stamps[self._next] <= stamp + ROUNDING:
+        while self._next < len(self._track.stamps_ns) and self._track.stamps_ns[self._next] <= stamp + ROUNDING:
             self._take_recorded(self._next)
             self._next += 1
         if self._idling is None:
@@ -62,7 +62,7 @@ class RecordedContact(ContactLoop):
 
     def _take_recorded(self, index: int) -> None:
         """Give one pose to the estimator."""
-        stamp = int(self._track.stamps[index])
+        stamp = int(self._track.stamps_ns[index])
         camera = None if self._track.cameras is None else self._track.cameras[index]
         try:
             self.take_pose(stamp, self._track.poses[index], camera=camera)
@@ -148,7 +148,7 @@ def first_touch(choice: ContactChoice, recording: Recording, jaw: Jaw, mesh: str
         return Contact.fixed(jaw, choice.height(recording))
     estimator = build_estimator(choice, mode, recording, jaw, mesh)
     track = _before_load(track_object(recording, jaw.side), recording, jaw.side)
-    stamp = float(track.stamps[-1] * 1e-9)
+    stamp = float(track.stamps_ns[-1] * 1e-9)
     estimator.take_pose(stamp, mean_pose(track.poses))
     estimate = estimator.update(stamp)
     if estimate.contact is None or not len(estimate.contact.points):
@@ -166,13 +166,13 @@ def _before_load(track: ObjectTrack, recording: Recording, side: str) -> ObjectT
     """
     truth = recording.truth(side)
     loaded = np.flatnonzero(np.linalg.norm(truth.force, axis=1) > ONSET_FORCE)
-    begin = truth.stamps[loaded[0]] if loaded.size else track.stamps[-1] + 1
-    early = track.stamps < begin
+    begin = truth.stamps_ns[loaded[0]] if loaded.size else track.stamps_ns[-1] + 1
+    early = track.stamps_ns < begin
     if early.sum() < LEAST_POSES:
         raise RecordingError(
             f"{recording.name}: {early.sum()} object poses before the force rises; expected at least {LEAST_POSES}"
         )
-    return ObjectTrack(stamps=track.stamps[early], poses=track.poses[early])
+    return ObjectTrack(stamps_ns=track.stamps_ns[early], poses=track.poses[early])
 
 
 ESTIMATED = ("estimate", "closest", "paper")

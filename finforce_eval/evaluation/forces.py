@@ -47,7 +47,7 @@ def evaluate_jaws(recording: Recording, setup: EvaluationSetup) -> list[ForceSer
         FinforceError: the contact cannot be known, or the estimator refuses a frame.
     """
     sides = truth_sides(recording)
-    frames = sum(len(recording.jaw(side).keypoints.stamps) for side in sides)
+    frames = sum(len(recording.jaw(side).keypoints.stamps_ns) for side in sides)
     with progress_bar(frames, "frame", recording.name) as bar:
         found = estimate_forces(recording, setup, sides, strict=True, progress=bar.update)
     results = [each.renamed(f"{recording.name}/{side}") if len(sides) > 1 else each for side, each in found.items()]
@@ -196,7 +196,7 @@ def find_forces(
         RecordingError: a pose or an image is refused.
         ObservationError: the estimator refuses an image.
     """
-    stamps = recording.jaw(side).keypoints.stamps
+    stamps = recording.jaw(side).keypoints.stamps_ns
     run, rows = _JawRun(recording, side, jaw, ForceLoop(source, estimator), stills), []
     idling, passed = Idling(), np.zeros(len(stamps), dtype=bool)
     unseen = _is_unseen(recording, side)
@@ -251,7 +251,7 @@ class _JawRun:
         self._lines = None
         if recording.jaw(side).truth is not None:
             self._face = InnerSurface(np.array(loop.force.surface()), jaw.face)
-            self._lines = true_lines(recording, side, self._track.stamps, self._face.face_x)
+            self._lines = true_lines(recording, side, self._track.stamps_ns, self._face.face_x)
 
     def answer(self, index: int, strict: bool) -> dict[str, Any]:
         """Return what the loop makes of image `index`; one that is refused ends the run if `strict`; see `step`."""
@@ -305,12 +305,12 @@ class _JawRun:
 
 def truth_columns(recording: Recording, side: str) -> dict[str, Any]:
     """Return the measured wrenches at the stamps of the key points, none without any."""
-    truth, stamps = recording.jaw(side).truth, recording.jaw(side).keypoints.stamps
+    truth, stamps = recording.jaw(side).truth, recording.jaw(side).keypoints.stamps_ns
     if truth is None:
         return {}
     return {
         "true_force": match_truth(truth, stamps),
-        "true_torque": match_samples(truth.stamps, truth.torque, stamps),
+        "true_torque": match_samples(truth.stamps_ns, truth.torque, stamps),
     }
 
 
@@ -322,7 +322,7 @@ def sight_columns(recording: Recording, side: str) -> dict[str, Any]:
     columns: dict[str, Any] = {"detector_ms": track.detection.step_ms}
     if track.sight is not None:
         errors = compare_detection(track.detection, track.sight).set_index("stamp")
-        columns |= dict(errors.reindex(track.keypoints.stamps).items())
+        columns |= dict(errors.reindex(track.keypoints.stamps_ns).items())
     return columns
 
 
@@ -355,5 +355,5 @@ def share_reached(forces: ForceSeries, detection: DetectionTrack | None) -> floa
     """Return which share of the key points accepted in answered images the mechanics can reach; None if unknown."""
     if detection is None or not forces.solved.any():
         return None
-    accepted = detection.accepted[np.searchsorted(detection.stamps, forces.stamps[forces.solved])]
+    accepted = detection.accepted[np.searchsorted(detection.stamps_ns, forces.stamps_ns[forces.solved])]
     return float((forces.column("used")[forces.solved] & accepted).sum() / accepted.sum())

@@ -21,8 +21,8 @@ def with_distances(jaws: Mapping[str, ForceSeries], recording: Recording) -> dic
     """Return the series of both jaws with the distance between them, as it was seen and as it was."""
     return {
         side: series.with_columns(
-            jaw_distance=find_distances(recording, series.stamps),
-            true_jaw_distance=find_distances(recording, series.stamps, true=True),
+            jaw_distance=find_distances(recording, series.stamps_ns),
+            true_jaw_distance=find_distances(recording, series.stamps_ns, true=True),
         )
         for side, series in jaws.items()
     }
@@ -38,7 +38,7 @@ def combine_jaws(jaws: Mapping[str, ForceSeries]) -> ForceSeries:
         Net force and torque about the gripper's origin, their truth, and the grasp force with its standard deviation;
         NaN where a jaw has none.
     """
-    stamps = np.unique(np.concatenate([each.stamps for each in jaws.values()]))
+    stamps = np.unique(np.concatenate([each.stamps_ns for each in jaws.values()]))
     first = next(iter(jaws.values()))
     jaws = {
         side: ForceSeries(each.table.set_index("stamp").reindex(stamps).reset_index()) for side, each in jaws.items()
@@ -99,7 +99,7 @@ def find_distances(recording: Recording | None, stamps: NDArray, *, true: bool =
         if track is None:
             break
         poses = zip(track.position, track.quaternion, strict=True)
-        tracks[side] = dict(zip(track.stamps.tolist(), (pose_from_quaternion(*pose) for pose in poses), strict=True))
+        tracks[side] = dict(zip(track.stamps_ns.tolist(), (pose_from_quaternion(*pose) for pose in poses), strict=True))
     found: list[float | None] = []
     for stamp in stamps.tolist():
         for side, poses in tracks.items():

@@ -92,7 +92,7 @@ class KeypointSource:
         Raises:
             RecordingError: it has no such thing.
         """
-        has_keypoints = all(len(track.keypoints.stamps) for track in recording.jaws.values())
+        has_keypoints = all(len(track.keypoints.stamps_ns) for track in recording.jaws.values())
         source = self.source or (KEYPOINTS if has_keypoints or recording.images is None else IMAGES)
         has = {
             IMAGES: recording.images is not None,
@@ -207,7 +207,7 @@ def _true_track(track: JawTrack) -> JawTrack:
     """Return the track of a jaw with its true key points and poses; what the camera did not see is left out."""
     sight = track.sight
     points = np.where(sight.visible[:, :, None], sight.points, np.nan)
-    keypoints = KeypointTrack(stamps=sight.stamps, points=points, likelihood=sight.visible.astype(np.float64))
+    keypoints = KeypointTrack(stamps_ns=sight.stamps_ns, points=points, likelihood=sight.visible.astype(np.float64))
     return replace(track, keypoints=keypoints, pose=track.true_pose or track.pose)
 
 
@@ -400,7 +400,7 @@ def with_detections(
         passed: stamps [ns] of images that are left out.
     """
     images = recording.images
-    stamps = images.stamps[~np.isin(images.stamps, list(passed))]
+    stamps = images.stamps_ns[~np.isin(images.stamps_ns, list(passed))]
     # a jaw that was never found has as many key points as the other
     counts = [len(jaw.points) for jaws in found.values() for jaw in jaws.values()]
     counts += [track.sight.points.shape[1] for track in recording.jaws.values() if track.sight]
@@ -426,7 +426,7 @@ def _with_detection(
     # what is not valid has no coordinates for the solver, as when the cloud comes by topic in single precision
     passed = np.where(accepted[:, :, None], points, np.nan).astype(np.float32).astype(np.float64)
     keypoints = KeypointTrack(
-        stamps=stamps,
+        stamps_ns=stamps,
         points=passed,
         likelihood=np.nan_to_num(_rows(seen, "likelihood", (count,))),
         stddev=np.where(np.isfinite(passed), stddev, np.nan),
@@ -435,7 +435,7 @@ def _with_detection(
     unfound = np.full(count, "")
     reasons = [unfound if each is None else each.reasons for each in seen]
     detection = DetectionTrack(
-        stamps=stamps,
+        stamps_ns=stamps,
         pixels=_rows(seen, "pixels", (count, 2)),
         points=points,
         accepted=accepted,
@@ -459,7 +459,7 @@ def _pose_track(found: Mapping[int, JawKeypoints], images: NDArray[np.int64], fr
         return None
     poses = [found[stamp].T_camera_jaw for stamp in stamps]
     return PoseTrack(
-        stamps=np.array(stamps, dtype=np.int64),
+        stamps_ns=np.array(stamps, dtype=np.int64),
         position=np.array([pose[:3, 3] for pose in poses]),
         quaternion=np.array([quaternion_from_pose(pose) for pose in poses]),
         frame_id=frame_id,

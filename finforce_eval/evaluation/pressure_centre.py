@@ -93,12 +93,12 @@ def true_lines(recording: Recording, side: str, stamps: NDArray[np.int64], inner
         inner_face_x: plane of the undeformed inner surface [m].
     """
     truth = recording.truth(side)
-    force = match_samples(truth.stamps, truth.force, stamps)[:, [0, 2]]
+    force = match_samples(truth.stamps_ns, truth.force, stamps)[:, [0, 2]]
     square = (force**2).sum(axis=1, keepdims=True)
     square[square < _LEAST_FORCE**2] = np.nan
     directions = force / np.sqrt(square)
     if np.abs(np.nan_to_num(truth.torque)).max(initial=0.0) > 0.0:
-        turn = match_samples(truth.stamps, truth.torque, stamps)[:, 1:2]
+        turn = match_samples(truth.stamps_ns, truth.torque, stamps)[:, 1:2]
         # of z Fx - x Fz = Ty the point nearest to the origin
         return ForceLines(points=turn * np.stack([-force[:, 1], force[:, 0]], axis=1) / square, directions=directions)
     axis = _cylinder_axis(recording, stamps, inner_face_x)

@@ -196,9 +196,7 @@ def score_case(cases: Sequence[ForceSeries], span: float) -> CaseScore:
         place=distances([given_distance(case) for case in cases]),
         solved_place=distances([solved_distance(case) for case in cases]),
         onset=onset_stats(cases),
-        delay=delay_stats(
-            [force_delays(1e-9 * case.stamps, case.true_magnitude, case.magnitude, case.lag) for case in cases]
-        ),
+        delay=delay_stats([force_delays(case.stamps, case.true_magnitude, case.magnitude, case.lag) for case in cases]),
         sight=detection_stats([case.table for case in cases]),
         detector_ms=_times(detector.values()),
     )
@@ -342,7 +340,7 @@ def match_truth(truth: WrenchTrack, stamps: NDArray[np.int64]) -> NDArray[np.flo
         truth: measured wrenches.
         stamps: (n,) image times [ns].
     """
-    return match_samples(truth.stamps, truth.force, stamps)
+    return match_samples(truth.stamps_ns, truth.force, stamps)
 
 
 def match_samples(
@@ -505,7 +503,7 @@ def delay_stats(delays: Sequence[NDArray[np.float64]]) -> Numbers:
 
 def compare_detection(detection: DetectionTrack, sight: DetectionTruth) -> pd.DataFrame:
     """Return a detection against the truth, at the images that both know: columns of the table of forces."""
-    stamps, ours, theirs = np.intersect1d(detection.stamps, sight.stamps, return_indices=True)
+    stamps, ours, theirs = np.intersect1d(detection.stamps_ns, sight.stamps_ns, return_indices=True)
     visible, accepted = sight.visible[theirs], detection.accepted[ours]
     pixel_error = np.linalg.norm(detection.pixels[ours] - sight.pixels[theirs], axis=2)
     point_error = np.linalg.norm(detection.points[ours] - sight.points[theirs], axis=2)
@@ -593,7 +591,7 @@ def score_grasp(recording: Recording, grasp: Mapping[int, float], lag: Mapping[i
     """
     if any(track.truth is None for track in recording.jaws.values()):
         return GraspScore(error=Stats(n=0), frames=0, largest=float("nan"), delay=delay_stats([]))
-    stamps = next(iter(recording.jaws.values())).keypoints.stamps
+    stamps = next(iter(recording.jaws.values())).keypoints.stamps_ns
     forces = [np.linalg.norm(match_truth(recording.truth(side), stamps), axis=1) for side in recording.jaws]
     found, late = (pd.Series(values, dtype=float).reindex(stamps).to_numpy() for values in (grasp, lag))
     truth = np.min(forces, axis=0)

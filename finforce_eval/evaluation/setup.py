@@ -6,10 +6,12 @@ import argparse
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import cache
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+from finforce.caches import FIRST_START, is_compiled
 from finforce.errors import FinforceError
 from finforce_contact.loop import ContactSource
 from finforce_eval.errors import OptionError
@@ -86,6 +88,7 @@ def make_setup(options: argparse.Namespace) -> EvaluationSetup:
     """
     contacts = read_contacts(options)
     jaw = load_jaw(options.jaw)
+    announce_compilation()
     changes = getattr(options, "set", [])
     stills = getattr(options, "stills", False)
     settings = parse_settings(options.solver, options.mesh, changes)
@@ -113,6 +116,13 @@ def make_setup(options: argparse.Namespace) -> EvaluationSetup:
         as_live=as_live,
         stills=stills,
     )
+
+
+@cache
+def announce_compilation() -> None:
+    """Say, once in a process, that a first start compiles, where nothing was compiled before."""
+    if not is_compiled():
+        print(f"note: {FIRST_START}", file=sys.stderr, flush=True)
 
 
 def read_contacts(options: argparse.Namespace) -> ContactChoice:

@@ -142,17 +142,23 @@ def format_tables(evaluation: Evaluation) -> str:
 def summary_lines(evaluation: Evaluation) -> list[str]:
     """Return what the table's numbers mean, and the times."""
     total = evaluation.total
-    rmse = {name: score.all.rmse_N for name, score in evaluation.scores.items()}
-    worst = max(rmse, key=lambda name: rmse[name] or 0.0)
     times = ", ".join(f"{name} {_number(value)}" for name, value in total.step_ms.items())
     return [
-        f"Mean RMSE of {len(rmse)} case{'s' if rmse.keys() - {worst} else ''}: "
-        f"{_number(total.mean_rmse_N, 3)} N, worst {_number(rmse[worst], 3)} N ({worst}). "
-        f"RMSE and NRMSD: mean ± standard deviation over the cycles, {total.cycles['all']['n']} in all; "
-        f"NRMSD: over the force range {evaluation.span:.2f} N.",
+        f"{mean_rmse(evaluation)} RMSE and NRMSD: mean ± standard deviation over the cycles, "
+        f"{total.cycles['all']['n']} in all; NRMSD: over the force range {evaluation.span:.2f} N.",
         f"{total.frames} frames, {total.solved} solved, {total.skipped} skipped; in the record phases "
         f"{total.record_frames - total.record_skipped} of {total.record_frames} solved. Step: {times} ms.",
     ]
+
+
+def mean_rmse(evaluation: Evaluation) -> str:
+    """Return the figure that stands for an evaluation, as a sentence: mean RMSE of the cases, and the worst."""
+    rmse = {name: score.all.rmse_N for name, score in evaluation.scores.items()}
+    worst = max(rmse, key=lambda name: rmse[name] or 0.0)
+    return (
+        f"Mean RMSE of {len(rmse)} case{'s' if rmse.keys() - {worst} else ''}: "
+        f"{_number(evaluation.total.mean_rmse_N, 3)} N, worst {_number(rmse[worst], 3)} N ({worst})."
+    )
 
 
 def format_manipulation(scores: dict[str, Stats]) -> list[str]:

@@ -77,7 +77,7 @@ def borrow_tares(
     elif other.name in setup.tares:
         found = setup.tares[other.name]
     else:
-        first = other.images.stamps[: setup.settings.tare_frames + _SPARE]
+        first = other.images.stamps_ns[: setup.settings.tare_frames + _SPARE]
         seen = keypoints.apply(replace(other, images=other.images.at(first)))
         found = setup.tares[other.name] = _take_tares(seen, setup, 0.0)
     notes = []
@@ -100,7 +100,7 @@ def _take_tares(recording: Recording, setup: EvaluationSetup, start: float) -> d
 def _tared_estimator(recording: Recording, side: str, setup: EvaluationSetup, start: float) -> ForceEstimator:
     """Return the estimator of a jaw once it has seen the images from a time [s] on; see `_take_tares`."""
     track, count = recording.jaw(side).keypoints, setup.settings.tare_frames
-    rows = np.flatnonzero(track.stamps >= track.stamps[0] + start * NANOSECONDS)[: count + _SPARE]
+    rows = np.flatnonzero(track.stamps_ns >= track.stamps_ns[0] + start * NANOSECONDS)[: count + _SPARE]
     if len(rows) < count:
         raise RecordingError(f"{recording.name}: {len(rows)} images from {start:g} s on; a tare takes {count}")
     estimator = setup.side(side).estimator(len(recording.jaws) == 2)

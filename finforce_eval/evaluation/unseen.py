@@ -34,7 +34,7 @@ def explain_unseen(recording: Recording, source: KeypointSource, stamps: NDArray
     """
     parameters, settings, _ = build_records(source.node_parameters(recording))
     images, jaws = choose_images(recording, NO_DEPTH), load_jaws(parameters)
-    stamps = images.stamps if stamps is None else stamps
+    stamps = images.stamps_ns if stamps is None else stamps
     chosen = stamps[np.unique(np.linspace(0, len(stamps) - 1, PICTURES).round().astype(int))]
     mounts = find_mounts(parameters, jaws)
     changes = PictureChanges(
@@ -61,13 +61,13 @@ def describe_unseen(recording: Recording, source: KeypointSource, jaws: Mapping[
         return []
     for statuses in (UNSEEN, USELESS):
         runs = {
-            side: _longest_run(forces.stamps, np.isin(forces.column("status"), statuses))
+            side: _longest_run(forces.stamps_ns, np.isin(forces.column("status"), statuses))
             for side, forces in jaws.items()
         }
         side = max(runs, key=lambda side: np.ptp(runs[side]))
         if np.ptp(runs[side]) < LONG * NANOSECONDS:
             continue
-        stamps = recording.images.stamps
+        stamps = recording.images.stamps_ns
         why = explain_unseen(recording, source, stamps[(stamps >= runs[side][0]) & (stamps <= runs[side][1])])
         if why:
             begin, end = 1e-9 * (runs[side] - stamps[0])

@@ -57,7 +57,7 @@ def draw_unity(results: Sequence[ForceSeries]) -> Figure:
         axes.set_title(result.name, fontsize=10)
     for axes in panels[len(results) :]:
         axes.set_visible(False)
-    figure.supxlabel("measured force [N]", fontsize=10)
+    figure.supxlabel("true force [N]", fontsize=10)
     figure.supylabel("estimated force [N]", fontsize=10)
     if any((result.column("direction") != "").any() for result in results):
         patches = [Patch(color=colour, label=LABELS[key]) for key, colour in COLOURS.items()]

@@ -12,20 +12,24 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from finforce_eval.evaluation.scoring import Evaluation, rms
-from finforce_eval.evaluation.tables import score_table
+from finforce_eval.evaluation.tables import mean_rmse, score_table
 from finforce_eval.recordings.tracks import DIRECTIONS
-from finforce_eval.table import ForceSeries
+from finforce_eval.table import WAITING, ForceSeries
 
 TITLE, PAGE = "Force from key points", "report.html"
 
 
-def write_overview(evaluation: Evaluation, folder: str | Path, *, about: Mapping[str, str]) -> Path:
+def write_overview(
+    evaluation: Evaluation, folder: str | Path, *, about: Mapping[str, str], headline: str = "", picture: str = ""
+) -> Path:
     """Write the page of a report, with the picture of all cases together.
 
     Args:
         evaluation: scores and time series.
         folder: of the report; made when missing.
         about: what was run: solver, jaw, contact, ...
+        headline: its first sentence; the mean RMSE of the cases without.
+        picture: PNG file in the folder that stands on top; empty for none.
 
     Returns:
         The page.
@@ -38,7 +42,8 @@ def write_overview(evaluation: Evaluation, folder: str | Path, *, about: Mapping
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     draw_unity(list(evaluation.results.values())).savefig(folder / "unity.png")
-    return write_page(evaluation, folder / PAGE, about=about, title=TITLE, picture=folder / "unity.png")
+    pictures = [folder / name for name in (picture, "unity.png") if name]
+    return write_page(evaluation, folder / PAGE, about=about, title=TITLE, headline=headline, pictures=pictures)
 
 
 def write_page(
@@ -47,7 +52,8 @@ def write_page(
     *,
     about: Mapping[str, str],
     title: str,
-    picture: Path | None = None,
+    headline: str = "",
+    pictures: Sequence[Path] = (),
 ) -> Path:
     """Write one HTML page with the scores and plots that zoom; it needs no other file.
 
@@ -56,7 +62,8 @@ def write_page(
         path: of the page.
         about: what was run: solver, jaw, contact, ...
         title: heading of the page.
-        picture: PNG file of estimated against measured force.
+        headline: its first sentence; the mean RMSE of the cases without.
+        pictures: PNG files.
 
     Raises:
         OSError: it cannot be written.
@@ -64,13 +71,15 @@ def write_page(
     table, results = score_table(evaluation), list(evaluation.results.values())
     columns = ["case", *(" ".join(filter(None, names)) for names in table.columns)]
     rows = [[name, *row] for name, row in zip(table.index, table.to_numpy().tolist(), strict=True)]
-    return write_html(results, path, title=title, about=about, columns=columns, rows=rows, picture=picture)
+    headline = headline or f"{mean_rmse(evaluation)} {describe_answers(results)}"
+    return write_html(
+        results, path, title=title, headline=headline, about=about, columns=columns, rows=rows, pictures=pictures
+    )
 
 
 TEMPLATE = Path(__file__).parents[1] / "data" / "page" / "report.html"
 _PLACE = "@DATA@"
 _MOST_WORDS = 255
-WAITING = "waiting"  # status of an image that the tare still needs
 
 
 def write_html(
@@ -81,7 +90,8 @@ def write_html(
     about: Mapping[str, str],
     columns: Sequence[str] = (),
     rows: Sequence[Sequence[str]] = (),
-    picture: Path | None = None,
+    headline: str = "",
+    pictures: Sequence[Path] = (),
 ) -> Path:
     """Write the page.
 
@@ -92,7 +102,8 @@ def write_html(
         about: what was run, name by name.
         columns: of a table above the plots; the first holds names.
         rows: of the table: one for each series, in their order, and any after them; without one, images and answers.
-        picture: PNG file of estimated against measured force.
+        headline: its first sentence; errors, forces and answers of the series without.
+        pictures: PNG files.
 
     Returns:
         The page.
@@ -104,8 +115,8 @@ def write_html(
         columns, rows = _count_answers(series)
     content = {
         "title": title,
-        "headline": describe_series(series),
-        "picture": picture and "data:image/png;base64," + b64encode(picture.read_bytes()).decode(),
+        "headline": headline or describe_series(series),
+        "pictures": ["data:image/png;base64," + b64encode(picture.read_bytes()).decode() for picture in pictures],
         "about": dict(about),
         "columns": list(columns),
         "rows": [list(row) for row in rows],
@@ -119,15 +130,19 @@ def write_html(
 
 
 def describe_series(series: Sequence[ForceSeries]) -> str:
-    """Return in one sentence how far forces are off, or how large they are, and how many images have one."""
+    """Return in one sentence how far forces are off, where that is known, and what `describe_answers` says."""
+    errors = np.concatenate([np.zeros(0), *(each.error[each.counted] for each in series if each.has("true_force"))])
+    known = f"{rms(errors):.3f} N RMSE of the force over {errors.size} images, " if errors.size else ""
+    return known + describe_answers(series)
+
+
+def describe_answers(series: Sequence[ForceSeries]) -> str:
+    """Return in one sentence how large forces are, and how many images have one."""
     waited = sum(int((each.column("status") == WAITING).sum()) for each in series)
     solved = np.concatenate([np.zeros(0), *(each.magnitude[each.solved] for each in series)])
-    errors = np.concatenate([np.zeros(0), *(each.error[each.counted] for each in series if each.has("true_force"))])
-    count = sum(map(len, series))
-    head = f"{solved.max(initial=0.0):.2f} N at most"
-    if errors.size:
-        head = f"{rms(errors):.3f} N RMSE of the force over {errors.size} images, {head}"
-    return f"{head}; {count - waited - solved.size} of {count - waited} images after the tare without an answer"
+    after = sum(map(len, series)) - waited
+    largest = f"{solved.max(initial=0.0):.2f} N at most"
+    return f"{largest}; {after - solved.size} of {after} images after the tare without an answer"
 
 
 def _count_answers(series: Sequence[ForceSeries]) -> tuple[list[str], list[list[str]]]:

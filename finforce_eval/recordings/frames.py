@@ -21,7 +21,7 @@ from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.recordings.bags import list_pictures
 from finforce_eval.recordings.image_files import read_intrinsics
 from finforce_eval.recordings.images import ImageChoice, StampedImage
-from finforce_eval.recordings.tracks import JawTrack, KeypointTrack, Recording, WrenchTrack
+from finforce_eval.recordings.tracks import JawTrack, KeypointTrack, Recording, Timed, WrenchTrack
 from finforce_keypoints.images import RgbdImage, check_image
 
 STILL_RATE = 1.0  # Hz of pictures that say nothing of their times
@@ -29,7 +29,7 @@ LARGEST_PICTURE = 1 << 27  # bytes
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class FrameImages:
+class FrameImages(Timed):
     """Pictures that are decoded one by one when they are iterated over. See `ImageTrack`, whose part it takes.
 
     Attributes:
@@ -62,7 +62,7 @@ class FrameImages:
         return self.count if self.frames is None else len(self.frames)
 
     @property
-    def stamps(self) -> NDArray[np.int64]:
+    def stamps_ns(self) -> NDArray[np.int64]:
         """Stamps of the frames (n,) [ns]."""
         frames = np.arange(self.count) if self.frames is None else self.frames
         return np.rint(frames * (NANOSECONDS / self.fps)).astype(np.int64) if self.times is None else self.times[frames]
@@ -70,7 +70,7 @@ class FrameImages:
     def at(self, stamps: NDArray[np.int64]) -> FrameImages:
         """Return the frames at some stamps [ns]."""
         everything = np.arange(self.count) if self.frames is None else self.frames
-        return replace(self, frames=everything[np.isin(self.stamps, stamps)])
+        return replace(self, frames=everything[np.isin(self.stamps_ns, stamps)])
 
     def all_colors(self) -> FrameImages:
         """Return them all."""
@@ -97,7 +97,7 @@ class FrameImages:
             RecordingError: a frame is missing or damaged, or of another size than its camera.
         """
         frames = range(len(self)) if self.frames is None else self.frames.tolist()
-        wanted, count = dict(zip(frames, self.stamps.tolist(), strict=True)), 0
+        wanted, count = dict(zip(frames, self.stamps_ns.tolist(), strict=True)), 0
         for frame, color in enumerate(self.read()):
             if frame in wanted:
                 stamp, count = wanted[frame], count + 1
@@ -120,7 +120,7 @@ def _open_video(path: Path, name: str) -> Iterator[tuple[Any, Any]]:
         RecordingError: it is no video, or damaged.
         MissingDependencyError: PyAV is not installed.
     """
-    av = import_library("av", "reading videos", "'finforce[lerobot]'")
+    av = import_library("av", "reading videos", "'finforce[video]'")
     try:
         check_plain(path)
         with av.open(str(path)) as container:

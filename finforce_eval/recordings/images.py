@@ -36,7 +36,7 @@ from finforce.messages import (
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.bags import BagReader, check_types, open_bag
 from finforce_eval.recordings.image_files import read_intrinsics
-from finforce_eval.recordings.tracks import check_stamps
+from finforce_eval.recordings.tracks import Timed, check_stamps
 from finforce_keypoints.images import RgbdImage, check_image
 
 # the ends of topics by which the images are found first, whatever the camera is called; the first that is there counts
@@ -81,14 +81,14 @@ class StampedImage(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class ImageTrack:
+class ImageTrack(Timed):
     """Where the images of a recording lie; iterating reads them.
 
     Attributes:
         source: the bag.
         name: of the recording, for messages.
         topics: of colour and depth, "" without.
-        stamps: (n,) of the colour images [ns], strictly rising.
+        stamps_ns: (n,) of the colour images [ns], strictly rising.
         depth_stamps: (n,) of their depth images [ns], ALONE of an image without.
         camera: intrinsics.
         frame_id: of the camera.
@@ -100,7 +100,7 @@ class ImageTrack:
     source: Path
     name: str
     topics: tuple[str, str]
-    stamps: NDArray[np.int64]
+    stamps_ns: NDArray[np.int64]
     depth_stamps: NDArray[np.int64]
     camera: CameraIntrinsics
     frame_id: str
@@ -110,12 +110,12 @@ class ImageTrack:
     is_video = False
 
     def __len__(self) -> int:
-        return len(self.stamps)
+        return len(self.stamps_ns)
 
     def at(self, stamps: NDArray[np.int64]) -> ImageTrack:
         """Return the images at some stamps [ns]."""
-        chosen = np.isin(self.stamps, stamps)
-        return replace(self, stamps=self.stamps[chosen], depth_stamps=self.depth_stamps[chosen])
+        chosen = np.isin(self.stamps_ns, stamps)
+        return replace(self, stamps_ns=self.stamps_ns[chosen], depth_stamps=self.depth_stamps[chosen])
 
     @property
     def has_depth(self) -> bool:
@@ -124,15 +124,15 @@ class ImageTrack:
 
     def all_colors(self) -> ImageTrack:
         """Return all colour images, those alone that have no depth image."""
-        stamps = np.concatenate((self.stamps, self.unpaired))
+        stamps = np.concatenate((self.stamps_ns, self.unpaired))
         depths = np.concatenate((self.depth_stamps, np.full(len(self.unpaired), ALONE)))
         order = np.argsort(stamps)
-        return replace(self, stamps=stamps[order], depth_stamps=depths[order], unpaired=self.unpaired[:0])
+        return replace(self, stamps_ns=stamps[order], depth_stamps=depths[order], unpaired=self.unpaired[:0])
 
     def colors_alone(self) -> ImageTrack:
         """Return all colour images as if there was no depth."""
         track = self.all_colors()
-        return replace(track, topics=(self.topics[0], ""), depth_stamps=np.full(len(track.stamps), ALONE))
+        return replace(track, topics=(self.topics[0], ""), depth_stamps=np.full(len(track.stamps_ns), ALONE))
 
     def __iter__(self) -> Iterator[StampedImage]:
         """Read the images in the order of their stamps.
@@ -141,8 +141,8 @@ class ImageTrack:
             RecordingError: an image is damaged, of unknown encoding, or of another size than its camera.
         """
         color, depth = self.topics
-        wanted = {color: set(self.stamps.tolist()), depth: set(self.depth_stamps.tolist()) - {ALONE}}
-        pairs = zip(self.stamps.tolist(), self.depth_stamps.tolist(), strict=True)
+        wanted = {color: set(self.stamps_ns.tolist()), depth: set(self.depth_stamps.tolist()) - {ALONE}}
+        pairs = zip(self.stamps_ns.tolist(), self.depth_stamps.tolist(), strict=True)
         waiting: dict[tuple[str, int], Any] = {}
         pair = next(pairs, None)
         with open_bag(self.source, self.name) as bag:
@@ -219,7 +219,7 @@ def find_images(bag: BagReader, source: Path, choice: ImageChoice | None = None)
         source=source,
         name=bag.name,
         topics=(color, depth),
-        stamps=stamps[color][paired],
+        stamps_ns=stamps[color][paired],
         depth_stamps=depth_stamps[paired],
         camera=camera,
         frame_id=frame_id,

@@ -17,7 +17,7 @@ from finforce.messages import SECOND, find_nearest
 from finforce.transforms import invert_pose, pose_from_quaternion
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.recording import read_recording
-from finforce_eval.recordings.tracks import PoseTrack, Recording
+from finforce_eval.recordings.tracks import PoseTrack, Recording, Timed
 from finforce_ifea.observation import Observation
 from finforce_ifea.tracking.friction import Coefficient
 
@@ -26,16 +26,16 @@ PAIRED = 50_000_000
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class ObjectTrack:
+class ObjectTrack(Timed):
     """Poses of the object in the frame of one jaw.
 
     Attributes:
-        stamps: (n,) image time [ns], rising.
+        stamps_ns: (n,) image time [ns], rising.
         poses: T_jaw_object (n, 4, 4) [m].
         cameras: (n, 3) position of the camera in the jaw frame [m]; None when it is not known.
     """
 
-    stamps: NDArray[np.int64]
+    stamps_ns: NDArray[np.int64]
     poses: NDArray[np.float64]
     cameras: NDArray[np.float64] | None = None
 
@@ -119,19 +119,19 @@ def track_object(recording: Recording, side: str) -> ObjectTrack:
             f"{recording.name}: no object poses: /object_pose is absent or has no messages; give --contact fixed:Z_MM"
         )
     T_parent_object = _matrices(objects, "/object_pose", recording.name)
-    order = np.argsort(objects.stamps, kind="stable")
-    stamps, T_parent_object = objects.stamps[order], T_parent_object[order]
+    order = np.argsort(objects.stamps_ns, kind="stable")
+    stamps, T_parent_object = objects.stamps_ns[order], T_parent_object[order]
     if _is_in_jaw(objects, side):
-        return ObjectTrack(stamps=stamps, poses=T_parent_object)
+        return ObjectTrack(stamps_ns=stamps, poses=T_parent_object)
     jaw = _require_jaw_poses(recording, side, objects.frame_id)
     T_camera_jaw = _matrices(jaw, f"/{side}/jaw_pose", recording.name)
-    nearest = find_nearest(jaw.stamps, stamps)
-    paired = np.abs(jaw.stamps[nearest] - stamps) <= PAIRED
+    nearest = find_nearest(jaw.stamps_ns, stamps)
+    paired = np.abs(jaw.stamps_ns[nearest] - stamps) <= PAIRED
     if not paired.any():
         raise RecordingError(f"{recording.name}: no /{side}/jaw_pose within {PAIRED // 10**6} ms of any /object_pose")
     T_jaw_camera = np.stack([invert_pose(T) for T in T_camera_jaw])[nearest[paired]]
     return ObjectTrack(
-        stamps=stamps[paired],
+        stamps_ns=stamps[paired],
         poses=T_jaw_camera @ T_parent_object[paired],
         cameras=T_jaw_camera[:, :3, 3],
     )
@@ -162,9 +162,9 @@ def iter_frames(recording: Recording | str | Path, side: str = "left") -> Iterat
     recording = recording if isinstance(recording, Recording) else read_recording(recording)
     track, objects = recording.jaw(side).keypoints, track_object(recording, side)
     known = 0
-    for index, stamp in enumerate(track.stamps):
-        newest = int(np.searchsorted(objects.stamps, stamp, side="right"))
-        poses = [(SECOND * objects.stamps[pose], objects.poses[pose]) for pose in range(known, newest)]
+    for index, stamp in enumerate(track.stamps_ns):
+        newest = int(np.searchsorted(objects.stamps_ns, stamp, side="right"))
+        poses = [(SECOND * objects.stamps_ns[pose], objects.poses[pose]) for pose in range(known, newest)]
         known = newest
         yield RecordedImage(poses, track.observation(index))
 

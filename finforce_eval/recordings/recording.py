@@ -198,7 +198,7 @@ def _keypoint_track(samples: Sequence[Any], side: str, name: str) -> KeypointTra
         raise RecordingError(f"{name}: {topic} message {first} differs from the first in whether it states stddev_x")
     stddev = np.stack([c.stddev for c in clouds]) if stated[0] else None
     shared = np.array([c.shared for c in clouds]) if any(c.shared for c in clouds) else None
-    return KeypointTrack(stamps=stamps, points=points, likelihood=likelihood, stddev=stddev, shared=shared)
+    return KeypointTrack(stamps_ns=stamps, points=points, likelihood=likelihood, stddev=stddev, shared=shared)
 
 
 def _detection_truth(samples: Sequence[Any], side: str, name: str) -> DetectionTruth:
@@ -213,7 +213,7 @@ def _detection_truth(samples: Sequence[Any], side: str, name: str) -> DetectionT
     except (ObservationError, ValueError) as error:
         raise RecordingError(f"{name}: {topic}: {error}") from error
     points, pixels = np.stack([x, y, z], axis=-1), np.stack([u, v], axis=-1)
-    return DetectionTruth(stamps=stamps, points=points, pixels=pixels, visible=visible > 0)
+    return DetectionTruth(stamps_ns=stamps, points=points, pixels=pixels, visible=visible > 0)
 
 
 def _cloud(sample: Any, index: int, topic: str, name: str) -> Keypoints:
@@ -234,7 +234,7 @@ def _wrench_track(samples: Sequence[Any], side: str, name: str) -> WrenchTrack:
     torque = np.array([[w.torque.x, w.torque.y, w.torque.z] for w in wrenches])
     if not np.isfinite(force).all():
         raise RecordingError(f"{name}: {topic} holds forces that are not finite")
-    return WrenchTrack(stamps=stamps, force=force, torque=torque)
+    return WrenchTrack(stamps_ns=stamps, force=force, torque=torque)
 
 
 def _pose_track(samples: Sequence[Any], topic: str, name: str) -> PoseTrack:
@@ -246,11 +246,24 @@ def _pose_track(samples: Sequence[Any], topic: str, name: str) -> PoseTrack:
         raise RecordingError(f"{name}: {topic} {what}; expected one frame")
     poses = [sample.pose for sample in samples]
     return PoseTrack(
-        stamps=np.array([stamp_of(sample) for sample in samples], dtype=np.int64),
+        stamps_ns=np.array([stamp_of(sample) for sample in samples], dtype=np.int64),
         position=np.array([[p.position.x, p.position.y, p.position.z] for p in poses]),
         quaternion=np.array([[getattr(p.orientation, axis) for axis in "xyzw"] for p in poses]),
         frame_id=frames[0],
     )
+
+
+def stated_jaw(paths: Sequence[str | Path], default: str) -> str:
+    """Return the jaw that the `case.json` of recordings names, a default where none does.
+
+    Raises:
+        RecordingError: they name several, or a `case.json` cannot be read.
+    """
+    folders = [path if path.is_dir() else path.parent for path in map(Path, paths)]
+    named = {str(_read_case(folder / "case.json").get("jaw", default)) for folder in folders} or {default}
+    if len(named) > 1:
+        raise RecordingError(f"recordings of several jaws: {', '.join(sorted(named))}; give those of one at a time")
+    return named.pop()
 
 
 def _read_case(path: Path) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce.messages import NANOSECONDS
+from finforce.messages import NANOSECONDS, SECOND
 from finforce_eval.errors import RecordingError
 from finforce_ifea.observation import Observation
 
@@ -22,12 +22,23 @@ DIRECTIONS = ("load", "unload")
 STAGES = ("ramp", "settle", "record")
 
 
+class Timed:
+    """Gives the times of what a recording holds in seconds; whole nanoseconds tell what belongs to one image."""
+
+    stamps_ns: NDArray[np.int64]
+
+    @property
+    def stamps(self) -> NDArray[np.float64]:
+        """Times (n,) [s]."""
+        return SECOND * self.stamps_ns
+
+
 @dataclass(frozen=True, kw_only=True)
-class KeypointTrack:
+class KeypointTrack(Timed):
     """Key points of one jaw over time.
 
     Attributes:
-        stamps: (n,) image time [ns], strictly increasing.
+        stamps_ns: (n,) image time [ns], strictly increasing.
         points: (n, K, 3) [m], jaw frame; NaN = none.
         likelihood: (n, K) in [0, 1].
         stddev: (n, K, 3) one standard deviation [m], jaw frame, NaN = not known; None when nothing says.
@@ -35,7 +46,7 @@ class KeypointTrack:
         gravity: (n, 3) its direction, jaw frame; None when nothing says.
     """
 
-    stamps: NDArray[np.int64]
+    stamps_ns: NDArray[np.int64]
     points: NDArray[np.float64]
     likelihood: NDArray[np.float64]
     stddev: NDArray[np.float64] | None = None
@@ -45,7 +56,7 @@ class KeypointTrack:
     @classmethod
     def empty(cls, count: int = 0) -> KeypointTrack:
         """Return a track of no image, which stands where key points are still to be found."""
-        return cls(stamps=np.zeros(0, np.int64), points=np.zeros((0, count, 3)), likelihood=np.zeros((0, count)))
+        return cls(stamps_ns=np.zeros(0, np.int64), points=np.zeros((0, count, 3)), likelihood=np.zeros((0, count)))
 
     @property
     def count(self) -> int:
@@ -55,7 +66,7 @@ class KeypointTrack:
     def observation(self, index: int) -> Observation:
         """Return what an estimator is given of image `index`."""
         return Observation(
-            stamp=self.stamps[index] * 1e-9,
+            stamp=float(SECOND * self.stamps_ns[index]),
             points=self.points[index],
             likelihood=self.likelihood[index],
             stddev=None if self.stddev is None else self.stddev[index],
@@ -65,50 +76,50 @@ class KeypointTrack:
 
 
 @dataclass(frozen=True, kw_only=True)
-class WrenchTrack:
+class WrenchTrack(Timed):
     """Wrenches that an object applies to a jaw over time.
 
     Attributes:
-        stamps: (n,) [ns].
+        stamps_ns: (n,) [ns].
         force: (n, 3) [N], jaw frame.
         torque: (n, 3) [N m], about the origin of the jaw frame.
     """
 
-    stamps: NDArray[np.int64]
+    stamps_ns: NDArray[np.int64]
     force: NDArray[np.float64]
     torque: NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)
-class PoseTrack:
+class PoseTrack(Timed):
     """Poses over time.
 
     Attributes:
-        stamps: (n,) [ns].
+        stamps_ns: (n,) [ns].
         position: (n, 3) [m], in `frame_id`.
         quaternion: (n, 4), x y z w.
         frame_id: the frame in which the pose is given.
     """
 
-    stamps: NDArray[np.int64]
+    stamps_ns: NDArray[np.int64]
     position: NDArray[np.float64]
     quaternion: NDArray[np.float64]
     frame_id: str
 
 
 @dataclass(frozen=True, kw_only=True)
-class PhaseTrack:
+class PhaseTrack(Timed):
     """What the bench was doing, published on change.
 
     Attributes:
-        stamps: (m,) [ns], begin of each phase.
+        stamps_ns: (m,) [ns], begin of each phase.
         cycle: (m,) number of the loading cycle.
         direction: (m,) "load" or "unload".
         displacement_mm: (m,) commanded displacement [mm].
         stage: (m,) "ramp", "settle" or "record".
     """
 
-    stamps: NDArray[np.int64]
+    stamps_ns: NDArray[np.int64]
     cycle: NDArray[np.int64]
     direction: NDArray[np.str_]
     displacement_mm: NDArray[np.float64]
@@ -116,7 +127,7 @@ class PhaseTrack:
 
     def index_at(self, stamps: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return for each stamp [ns] the row of its phase, -1 before the first."""
-        return np.searchsorted(self.stamps, stamps, side="right") - 1
+        return np.searchsorted(self.stamps_ns, stamps, side="right") - 1
 
     def displacement_at(self, stamps: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the displacement (n,) [mm] at stamps [ns]: linear over a ramp, held in other phases, 0 before all."""
@@ -124,7 +135,7 @@ class PhaseTrack:
         begins = np.where(self.stage == "ramp", held[:-1], held[1:])
         # a ramp that nothing follows has no known end
         ends = np.r_[held[1:-1], begins[-1]] if self.stage[-1] == "ramp" else held[1:]
-        times = np.stack([self.stamps, np.r_[self.stamps[1:], self.stamps[-1]]], axis=1).ravel()
+        times = np.stack([self.stamps_ns, np.r_[self.stamps_ns[1:], self.stamps_ns[-1]]], axis=1).ravel()
         return np.interp(stamps, times, np.stack([begins, ends], axis=1).ravel(), left=0.0)
 
 
@@ -150,7 +161,7 @@ class JawTrack:
     @property
     def is_awaited(self) -> bool:
         """Whether key points and poses are still to come from images."""
-        return not len(self.keypoints.stamps)
+        return not len(self.keypoints.stamps_ns)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -252,7 +263,7 @@ def parse_phases(stamps: Sequence[int], texts: Sequence[str], name: str) -> Phas
     if (np.diff(order) < 0).any():
         raise RecordingError(f"{name}: the stamps of /bench/phase go back")
     return PhaseTrack(
-        stamps=order,
+        stamps_ns=order,
         cycle=np.asarray(cycle, dtype=np.int64),
         direction=np.asarray(direction),
         displacement_mm=np.asarray(displacement, dtype=np.float64),
@@ -273,28 +284,28 @@ def _parse_phase(text: str, name: str) -> tuple[int, str, float, str]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class DetectionTruth:
+class DetectionTruth(Timed):
     """Where the key points of one jaw truly were, and which of them the camera could see.
 
     Attributes:
-        stamps: (n,) image time [ns], strictly increasing.
+        stamps_ns: (n,) image time [ns], strictly increasing.
         points: (n, K, 3) [m], jaw frame.
         pixels: (n, K, 2) column and row in the raw image [px].
         visible: (n, K) neither occluded nor outside the image.
     """
 
-    stamps: NDArray[np.int64]
+    stamps_ns: NDArray[np.int64]
     points: NDArray[np.float64]
     pixels: NDArray[np.float64]
     visible: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, kw_only=True)
-class DetectionTrack:
+class DetectionTrack(Timed):
     """What the key point detector reported of one jaw in addition to the key points, image by image.
 
     Attributes:
-        stamps: (n,) image time [ns], strictly increasing.
+        stamps_ns: (n,) image time [ns], strictly increasing.
         pixels: (n, K, 2) column and row in the raw image [px], NaN = not found.
         points: (n, K, 3) [m], jaw frame, NaN = no depth.
         accepted: (n, K) handed on to the solver.
@@ -302,7 +313,7 @@ class DetectionTrack:
         step_ms: (n,) wall time from image to key points of all jaws [ms], NaN where it was not timed.
     """
 
-    stamps: NDArray[np.int64]
+    stamps_ns: NDArray[np.int64]
     pixels: NDArray[np.float64]
     points: NDArray[np.float64]
     accepted: NDArray[np.bool_]

@@ -133,7 +133,7 @@ def _read_wrenches(
             )
         force = force if side == "left" else force @ HALF_TURN[:3, :3]
         torque = np.full_like(force, np.nan)  # about another point than the jaw's origin
-        tracks[side] = WrenchTrack(stamps=_nanoseconds(stamps, times[0]), force=force, torque=torque)
+        tracks[side] = WrenchTrack(stamps_ns=_nanoseconds(stamps, times[0]), force=force, torque=torque)
     notes = []
     sizes = {side: np.linalg.norm(track.force, axis=1) for side, track in tracks.items()}
     firm = [tracks[side].force[size >= np.percentile(size, _FIRM), 0].mean() for side, size in sizes.items()]

@@ -184,7 +184,7 @@ def recording_entries(recording: Recording) -> Iterator[Entry]:
         if not track.is_awaited:
             yield from _keypoint_entries(track.keypoints, side)
         if track.truth is not None:
-            for stamp, force, torque in zip(track.truth.stamps, track.truth.force, track.truth.torque, strict=True):
+            for stamp, force, torque in zip(track.truth.stamps_ns, track.truth.force, track.truth.torque, strict=True):
                 wrench = wrench_message(stamp, f"{side}_jaw", force, torque)
                 yield Entry(int(stamp), f"/{side}/ground_truth_wrench", wrench)
         if track.pose is not None:
@@ -196,7 +196,7 @@ def recording_entries(recording: Recording) -> Iterator[Entry]:
 
 
 def _keypoint_entries(track: KeypointTrack, side: str) -> Iterator[Entry]:
-    for index, stamp in enumerate(track.stamps):
+    for index, stamp in enumerate(track.stamps_ns):
         columns = {axis: track.points[index, :, i] for i, axis in enumerate("xyz")}
         columns["likelihood"] = track.likelihood[index]
         if track.stddev is not None:
@@ -208,12 +208,12 @@ def _keypoint_entries(track: KeypointTrack, side: str) -> Iterator[Entry]:
 
 
 def _pose_entries(track: PoseTrack, topic: str) -> Iterator[Entry]:
-    for stamp, position, quaternion in zip(track.stamps, track.position, track.quaternion, strict=True):
+    for stamp, position, quaternion in zip(track.stamps_ns, track.position, track.quaternion, strict=True):
         yield Entry(int(stamp), topic, pose_message(stamp, track.frame_id, position, quaternion))
 
 
 def _phase_entries(track: PhaseTrack) -> Iterator[Entry]:
-    columns = (track.stamps, track.cycle, track.direction, track.displacement_mm, track.stage)
+    columns = (track.stamps_ns, track.cycle, track.direction, track.displacement_mm, track.stage)
     for stamp, cycle, direction, displacement, stage in zip(*columns, strict=True):
         text = f"{cycle}:{direction}:{displacement:g}:{stage}"
         yield Entry(int(stamp), "/bench/phase", make_message(STRING, data=text))

@@ -15,7 +15,7 @@ from finforce_eval.evaluation.forces import sight_columns, truth_columns
 from finforce_eval.evaluation.keypoint_source import with_detections
 from finforce_eval.evaluation.pressure_centre import InnerSurface, true_lines
 from finforce_eval.recordings.tracks import Recording
-from finforce_eval.table import ForceSeries, stddev_along
+from finforce_eval.table import WAITING, ForceSeries, stddev_along
 from finforce_ifea.messages import contact_from_cloud
 from finforce_ifea.observation import is_touch
 from finforce_keypoints.geometry.jaw_localizer import REASONS, JawKeypoints
@@ -143,7 +143,8 @@ def live_result(
     """Return the answers of one solver as the time series of an offline run.
 
     The solver's own contact location, its residual and the key points used do not travel; the first two stay open, and
-    the key points that passed the threshold stand for those used.
+    the key points that passed the threshold stand for those used. Images with key points before the first wrench are
+    those of the tare.
 
     Args:
         recording: that was played.
@@ -153,28 +154,28 @@ def live_result(
         estimator: a fresh one of the same jaw, for the undeformed surface.
     """
     track, nothing = recording.jaw(side).keypoints, np.full(3, np.nan)
-    rows = [log.rows[side].get(stamp, {}) for stamp in track.stamps.tolist()]
+    rows = [log.rows[side].get(stamp, {}) for stamp in track.stamps_ns.tolist()]
     force, stddev = (np.array([row.get(name, nothing) for row in rows]) for name in ("force", "force_stddev"))
     seen = np.isfinite(track.points).all(axis=2) & (track.likelihood >= likelihood_threshold)
     magnitude_stddev = stddev_along(force, stddev)
-    contact = {}
+    told, contact = np.isfinite(force).all(axis=1), {}
+    waiting = seen.any(axis=1) & ~np.logical_or.accumulate(told) & told.any()
     if any("contact_status" in row for row in rows):
-        told = np.isfinite(force).all(axis=1)
         newest = np.maximum.accumulate(np.where(told, np.arange(len(told)), 0))  # what was told last still holds
         touching = (told & is_touch(np.linalg.norm(force, axis=1), magnitude_stddev))[newest]
         contact = _contact_columns(recording, side, rows, estimator) | {"touching": touching}
     return ForceSeries.build(
         recording.name,
         side,
-        track.stamps,
+        track.stamps_ns,
         force=force,
         magnitude_stddev=magnitude_stddev,
         force_stddev=stddev if np.isfinite(stddev).any() else None,
         used=seen,
-        status=np.where(np.isfinite(force).all(axis=1), "ok", "no wrench"),
+        status=np.select([told, waiting], ["ok", WAITING], "no wrench"),
         message="",
         step_ms=np.array([row.get("step_ms", np.nan) for row in rows]),
-        **recording.phases_at(track.stamps),
+        **recording.phases_at(track.stamps_ns),
         **contact,
         true_force=truth_columns(recording, side)["true_force"],
         **sight_columns(recording, side),
@@ -184,7 +185,7 @@ def live_result(
 def _contact_columns(recording: Recording, side: str, rows: list[dict[str, Any]], estimator: Any) -> dict[str, Any]:
     """Return the reported contact and the true one."""
     surface = InnerSurface(np.array(estimator.surface()), estimator.jaw.face)
-    lines = true_lines(recording, side, recording.jaw(side).keypoints.stamps, surface.face_x)
+    lines = true_lines(recording, side, recording.jaw(side).keypoints.stamps_ns, surface.face_x)
     truth = [
         surface.cut(row["surface"], point, direction) if "surface" in row else np.nan
         for row, point, direction in zip(rows, lines.points, lines.directions, strict=True)

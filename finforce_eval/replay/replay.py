@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from finforce.camera_topics import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 from finforce.gripper_frames import SIDES
-from finforce.health import IDLE
+from finforce.health import IDLE, STILL
 from finforce.ros.tracing import FOLDER
 from finforce.systems.processes import Process, ReplayOptions, compose, replay_processes
 from finforce_eval.errors import RecordingError, SilentReplayError
@@ -195,7 +195,7 @@ def _for_scores(
     processes: Sequence[Process], recording: Recording, setup: EvaluationSetup, keypoints: KeypointSource
 ) -> list[Process]:
     """Return the processes: they answer every image, so that each is scored, as the options of the command say."""
-    more = {name: {"skip_off": [IDLE]} for name in ("keypoint_detector", "contact_estimator", "ifea_solver")}
+    more = {name: {"skip_off": [IDLE, STILL]} for name in ("keypoint_detector", "contact_estimator", "ifea_solver")}
     more["ifea_solver"] |= {"estimator.mesh": setup.settings.mesh}
     if (mode := _contact_mode(recording, setup.contacts)) != FIXED:
         density = {} if setup.settings.solver == "paper" else {"contact.mesh": setup.settings.mesh}

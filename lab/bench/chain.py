@@ -100,12 +100,12 @@ STEP = 1e-3  # [s] between two times at which the error now is taken
 class TrueGrasp:
     """The true grasp force, the smaller of the jaws', (n,) [N] at stamps (n,) [ns]."""
 
-    stamps: NDArray[np.int64]
+    stamps_ns: NDArray[np.int64]
     force: NDArray
 
     def at(self, stamps: NDArray) -> NDArray:
         """Return the force between the stamps, linearly; NaN outside."""
-        return np.interp(stamps, self.stamps, self.force, left=np.nan, right=np.nan)
+        return np.interp(stamps, self.stamps_ns, self.force, left=np.nan, right=np.nan)
 
 
 def measure(quick: bool) -> Figures:
@@ -179,9 +179,9 @@ def chain_processes(recording: Recording, *, images: bool, off: Sequence[str] = 
 
 def true_grasp(recording: Recording) -> TrueGrasp:
     """Return the true grasp force of a recording with the truth of both jaws."""
-    stamps = recording.truth(SIDES[0]).stamps
+    stamps = recording.truth(SIDES[0]).stamps_ns
     forces = [np.linalg.norm(match_truth(recording.truth(side), stamps), axis=1) for side in SIDES]
-    return TrueGrasp(stamps=stamps, force=np.min(forces, axis=0))
+    return TrueGrasp(stamps_ns=stamps, force=np.min(forces, axis=0))
 
 
 def describe_run(source: str, setup: str, rate: int, run: NodeRun, truth: TrueGrasp) -> dict[str, Any]:

@@ -164,7 +164,7 @@ def axis_sharpness(evaluation: Evaluation) -> dict[str, float | None]:
 def keep_poses(recording: Recording, seen: NDArray) -> Recording:
     """Return a recording with those poses of the object (n,) alone that are seen."""
     track = recording.object_pose
-    kept = {name: getattr(track, name)[seen] for name in ("stamps", "position", "quaternion")}
+    kept = {name: getattr(track, name)[seen] for name in ("stamps_ns", "position", "quaternion")}
     return replace(recording, object_pose=replace(track, **kept))
 
 

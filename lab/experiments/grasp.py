@@ -52,7 +52,7 @@ def join_jaws(evaluation: Evaluation, name: str) -> pd.DataFrame:
         less certain, and the `delay` [s] from the image to its force.
     """
     left, right = (evaluation.results[f"{name}/{side}"] for side in ("left", "right"))
-    stamps, mine, theirs = np.intersect1d(left.stamps, right.stamps, return_indices=True)
+    stamps, mine, theirs = np.intersect1d(left.stamps_ns, right.stamps_ns, return_indices=True)
     columns = {
         "truth": np.minimum(left.true_magnitude[mine], right.true_magnitude[theirs]),
         "found": np.minimum(left.magnitude[mine], right.magnitude[theirs]),
@@ -116,7 +116,7 @@ def run(options: RunOptions, case: Case, folder: Path) -> dict[str, Any]:
         grasp = join_jaws(evaluation, recording.name)
         loading = np.flatnonzero(find_phases(grasp)["load"])
         full = int(grasp.stamp.iloc[loading[-1] if loading.size else -1])
-        hidden = keep_poses(recording, recording.object_pose.stamps < full)
+        hidden = keep_poses(recording, recording.object_pose.stamps_ns < full)
         unseen = join_jaws(evaluate_all([hidden], setup), recording.name)
     drawn = grasp[["seconds", "truth", "found"]].iloc[::DRAWN_EVERY].round(4).to_dict("list")
     told = {"sharpness": axis_sharpness(evaluation), "hidden": score_grasp(unseen), "drawn": drawn}

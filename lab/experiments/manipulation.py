@@ -94,7 +94,7 @@ def tell_gravity(recording: Recording, gravity: Mapping[int, NDArray]) -> Record
     """Return a recording whose key points come with the direction of gravity, by stamps [ns], in each jaw's frame."""
     jaws = {}
     for side, jaw in recording.jaws.items():
-        directions = np.array([gravity[stamp] for stamp in jaw.keypoints.stamps.tolist()]) @ R_GRIPPER_JAW[side]
+        directions = np.array([gravity[stamp] for stamp in jaw.keypoints.stamps_ns.tolist()]) @ R_GRIPPER_JAW[side]
         jaws[side] = replace(jaw, keypoints=replace(jaw.keypoints, gravity=directions))
     return replace(recording, jaws=jaws)
 

@@ -368,8 +368,8 @@ def demo():
     track, seen = recording.jaw("left"), track_object(recording, "left")
     solver = ForceEstimator(load_jaw("bench"), calibration=load_calibration("bench"))
     estimator = ContactEstimator(solver.jaw, mesh=load_object_mesh(RECORDING.parent / recording.case["mesh"]))
-    stamps = track.keypoints.stamps[:200]
-    poses, estimates, solutions = iter(zip(seen.stamps, seen.poses, strict=True)), [], []
+    stamps = track.keypoints.stamps_ns[:200]
+    poses, estimates, solutions = iter(zip(seen.stamps_ns, seen.poses, strict=True)), [], []
     coming = next(poses)
     for index, stamp in enumerate(stamps):
         while coming[0] <= stamp:

@@ -6,6 +6,7 @@ import time
 import pytest
 
 from finforce import caches
+from finforce_eval.evaluation.setup import announce_compilation
 
 
 @pytest.fixture
@@ -65,11 +66,17 @@ def test_a_folder_that_cannot_be_written_stops_nobody(cache, monkeypatch):
     assert not cache.exists()
 
 
-def test_a_first_start_is_known_by_its_empty_cache(cache):
+def test_a_first_start_is_known_by_its_empty_cache_and_told_at_once(cache, capsys):
     assert not caches.is_compiled()
+    announce_compilation.cache_clear()
+    announce_compilation()
+    assert "compiling, which takes a minute or two once" in capsys.readouterr().err
     (folder,) = cache.iterdir()
     (folder / "kernels.1.nbc").touch()
     assert caches.is_compiled()
+    announce_compilation.cache_clear()
+    announce_compilation()
+    assert not capsys.readouterr().err
 
 
 @pytest.mark.parametrize("place", ["cache", "above"])

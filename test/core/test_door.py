@@ -9,7 +9,7 @@ import pytest
 
 import finforce
 
-README = Path(__file__).parents[2] / "README.md"
+PAGE = Path(__file__).parents[2] / "docs" / "getting_started.md"
 
 
 @pytest.mark.parametrize("name", finforce.__all__)
@@ -56,9 +56,9 @@ def test_a_shape_is_no_jaw_file(tmp_path):
         finforce.load_jaw(tmp_path / "finger.stl")
 
 
-def test_the_example_of_the_front_page_runs_and_says_what_it_prints(capsys):
-    code, printed = re.search(r"```python\n(.*?)```\n.*?```text\n(.*?)```", README.read_text("utf-8"), re.S).groups()
+def test_the_example_of_getting_started_runs_and_says_what_it_prints(capsys):
+    code, printed = re.search(r"```python\n(.*?)```\n.*?```text\n(.*?)```", PAGE.read_text("utf-8"), re.S).groups()
     assert len(code.splitlines()) <= 12
     assert code.count("import ") == 1
-    exec(compile(code, "README.md", "exec"), {})
+    exec(compile(code, PAGE.name, "exec"), {})
     assert capsys.readouterr().out.endswith(printed)

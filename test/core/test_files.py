@@ -141,7 +141,7 @@ def test_commands_say_what_is_wrong_in_one_line(tmp_path):
     from finforce_eval.recordings.writer import write_recording
 
     recording, orders, chosen = read_recording(DEMO), {}, cycle(COMMANDS.items())
-    begin = int(recording.jaw("left").keypoints.stamps[0])
+    begin = int(recording.jaw("left").keypoints.stamps_ns[0])
     bag = write_recording(cut(recording, begin, begin + 10**9), tmp_path / "bag")
     for name, bomb in BOMBS.items():
         file = tmp_path / name / "pytorch_config.yaml"

@@ -165,6 +165,15 @@ def test_none_is_an_empty_value(recorded_launch):
         act(ROBOT, dof="none")
 
 
+def test_none_is_itself_where_it_is_one_of_the_choices(recorded_launch):
+    for depth in ("none", "aligned"):
+        assert start(ROBOT, camera="false", depth=depth)["keypoint_detector"]["parameters"][1]["depth"] == depth
+    assert "depth" not in start(ROBOT, camera="false")["keypoint_detector"]["parameters"][1]
+    entries = [entry for record in RECORDS.values() for entry in fields(record)]
+    choices = [entry for entry in entries if launch_module.NONE in entry.metadata.get("choices", ())]
+    assert choices and all(entry.default for entry in choices)  # an empty default could not be typed
+
+
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
 def test_every_argument_is_described(recorded_launch, path):
     *arguments, _ = runpy.run_path(str(path))["generate_launch_description"]()

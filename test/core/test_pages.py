@@ -12,6 +12,7 @@ from typing import NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
+import page_trials
 import pytest
 import yaml
 
@@ -29,7 +30,8 @@ ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 LAUNCHED = {"bench": BenchOptions, "replay": ReplayOptions, "robot": RobotOptions}
 LAUNCHED |= dict.fromkeys(("ros2_control", "moveit"), StackOptions)
-OTHERS = {".", "cd", "colcon", "docker", "export", "git", "pip", "pytest", "rosdep", "source", "sudo"}
+OTHERS = {".", "cd", "colcon", "dask", "docker", "export", "git", "lerobot-train", "pip", "pytest", "rosdep", "source"}
+OTHERS |= {"sudo"}
 PROGRAMS = {"finforce", "make", "python", "ros2"} | OTHERS
 _FENCE = re.compile(r"^((?: *<!-- .*? -->\n)?)( *)```(\w*)\n(.*?)^ *```$", re.S | re.M)
 _INDENTED = re.compile(r"(?<=\n\n)(?: {4}\S.*\n)(?:(?: {4}.*)?\n)*", re.M)
@@ -54,7 +56,7 @@ def blocks_of(path):
     for comment, indent, language, inner in _FENCE.findall(text):
         mark, wanted = (_MARK.findall(comment) or [("", "")])[0]
         yield Block(name, language, mark, wanted, re.sub(rf"^{indent}", "", inner, flags=re.M))
-    for inner in _INDENTED.findall(_FENCE.sub("", text)):
+    for inner in _INDENTED.findall(_FENCE.sub("", re.sub(r"^(#.*\n)", r"\1\n", text, flags=re.M))):
         if not re.match(r" {4}[-*] ", inner):
             yield Block(name, "", "", "", re.sub(r"^ {4}", "", inner, flags=re.M))
 
@@ -64,7 +66,7 @@ HELPS = {name: build_parser(name).epilog for name in COMMANDS}
 BLOCKS += [
     Block(f"finforce {name} --help", "", "", "", text.replace("\n  ", "\n")) for name, text in HELPS.items() if text
 ]
-PYTHON = [block for block in BLOCKS if block.language == "python" and block.page != "README.md"]  # see test_door.py
+PYTHON = [block for block in BLOCKS if block.language == "python" and "ff.DEMO" not in block.text]  # see test_door.py
 
 
 def commands_of(block):
@@ -208,6 +210,16 @@ def test_a_file_on_a_page_is_well_formed(block):
         assert yaml.safe_load(block.text)
     else:
         ElementTree.fromstring(f'<robot xmlns:xacro="http://www.ros.org/wiki/xacro">{block.text}</robot>')
+
+
+def test_every_command_on_a_page_is_run_or_says_what_it_needs():
+    commands = [command for page in page_trials.PAGES for command in page_trials.list_commands(page)]
+    needs = [page_trials.missing_for(command) for command in commands]
+    assert needs.count("") > 40  # `make pages` runs these
+    patterns = [re.compile(pattern) for pattern in page_trials.NEEDS]
+    assert all(any(pattern.search(command) for command in commands) for pattern in patterns)  # no excuse is left over
+    ours = [command for command, need in zip(commands, needs, strict=True) if not need]
+    assert {command.split()[0] for command in ours} <= {"finforce", "python"}
 
 
 def test_every_example_that_a_page_includes_is_there():

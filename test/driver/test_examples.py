@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from threading import Thread
 from time import monotonic, sleep
+from unittest.mock import MagicMock
 
 import pytest
 import rclpy
@@ -160,6 +161,9 @@ def test_the_client_tells_what_the_driver_says(bench):
         assert client.force == pytest.approx(1.0, abs=0.3)
         assert client.opening == pytest.approx(bench.gripper.jaws.opening, abs=4e-4)
         assert client.grasp_state.startswith("holding")
+        beside(bench, client.release)
+        beside(bench, lambda: client.move(0.030))
+        assert client.opening == pytest.approx(0.030, abs=1e-3)
         beside(bench, client.estop)
         with pytest.raises(ServiceError, match="gripper_driver/grasp: "):
             beside_error(bench, lambda: client.grasp(1.0))
@@ -223,3 +227,20 @@ def test_a_client_that_nobody_tells_a_force_says_so(monkeypatch, capfd):
     with watching(free_domain()) as client:
         assert client.force is None and client.opening is None
     assert "nobody publishes /grasp_wrench, where the gripper_driver is: start a solver there" in capfd.readouterr().err
+
+
+def test_the_client_waits_for_an_adapter_that_is_not_there_yet_and_for_nothing_else(monkeypatch):
+    client, answers = object.__new__(GripperClient), ["calibrate: there is no port 'ssg48'", "done", "calibrate: hot"]
+    client._node = MagicMock()
+
+    def call(self, name):
+        answer = answers.pop(0)
+        if answer.startswith(name):
+            raise ServiceError(answer)
+        return answer
+
+    monkeypatch.setattr(GripperClient, "_call", call)
+    monkeypatch.setattr("finforce.ros.client.sleep", lambda seconds: None)
+    assert client.calibrate() == "done"
+    with pytest.raises(ServiceError, match="hot"):
+        client.calibrate()

@@ -45,11 +45,11 @@ def make_recording(name="case", *, frames=60, keypoints=4, phases=True, truth=Tr
     torque = np.cross([0.014, 0.0, 0.04], force)
     track = JawTrack(
         keypoints=KeypointTrack(
-            stamps=stamps,
+            stamps_ns=stamps,
             points=points.astype(np.float32).astype(np.float64),
             likelihood=random.uniform(0, 1, (frames, keypoints)).astype(np.float32).astype(np.float64),
         ),
-        truth=WrenchTrack(stamps=stamps, force=force, torque=torque) if truth else None,
+        truth=WrenchTrack(stamps_ns=stamps, force=force, torque=torque) if truth else None,
         pose=make_poses(stamps[::3]),
     )
     return Recording(
@@ -85,7 +85,7 @@ def make_poses(stamps):
     """Poses that do not move."""
     count = len(stamps)
     return PoseTrack(
-        stamps=stamps,
+        stamps_ns=stamps,
         position=np.tile([0.03, 0.02, 0.11], (count, 1)),
         quaternion=np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)),
         frame_id="camera_color_optical_frame",
@@ -220,16 +220,16 @@ def cut(recording, start, stop):
     """The part with start <= stamp < stop [ns], without images; a phase under way at start begins there."""
 
     def part(track):
-        rows = (track.stamps >= start) & (track.stamps < stop)
+        rows = (track.stamps_ns >= start) & (track.stamps_ns < stop)
         return replace(
             track, **{name: each[rows] for name, each in vars(track).items() if isinstance(each, np.ndarray)}
         )
 
     phases = recording.phases
     if phases is not None:
-        running = np.flatnonzero(phases.stamps <= start)[-1:]
-        begins = np.where(np.isin(np.arange(len(phases.stamps)), running), start, phases.stamps)
-        phases = part(replace(phases, stamps=begins))
+        running = np.flatnonzero(phases.stamps_ns <= start)[-1:]
+        begins = np.where(np.isin(np.arange(len(phases.stamps_ns)), running), start, phases.stamps_ns)
+        phases = part(replace(phases, stamps_ns=begins))
     jaws = {
         side: replace(track, **{name: part(each) for name, each in vars(track).items() if each is not None})
         for side, track in recording.jaws.items()
@@ -240,7 +240,7 @@ def cut(recording, start, stop):
 
 def with_both_jaws(recording, seconds):
     """The first seconds of a recording of the left jaw, with its mirror image as the right jaw."""
-    start = int(recording.jaw("left").keypoints.stamps[0])
+    start = int(recording.jaw("left").keypoints.stamps_ns[0])
     part = cut(recording, start, start + int(seconds * 1e9))
     left, truth = part.jaw("left"), part.truth("left")
     right = JawTrack(

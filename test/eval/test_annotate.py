@@ -35,7 +35,7 @@ def source(tmp_path_factory):
 
 def short_bag(folder, *, storage="mcap", begin=0):
     recording = read_recording(DEMO)
-    start = int(recording.jaw("left").keypoints.stamps[0]) + begin
+    start = int(recording.jaw("left").keypoints.stamps_ns[0]) + begin
     return write_recording(cut(recording, start, start + SECONDS * 10**9), folder, storage=storage)
 
 

@@ -89,7 +89,7 @@ def test_forces_are_in_their_frames_and_near_the_truth(version, annotated, scene
     left = np.array([row["force.left"] for row in rows])
     assert not grasp[~valid].any() and not left[~valid].any()
     assert not valid[:40].any() and valid[50:].all()
-    truth = true_grasp(recording).at(recording.images.colors_alone().stamps[:IMAGES])
+    truth = true_grasp(recording).at(recording.images.colors_alone().stamps_ns[:IMAGES])
     assert truth.max() > 1.0
     assert np.sqrt(np.mean((grasp - truth)[valid] ** 2)) < 0.15
     assert np.isfinite(left[valid]).all()

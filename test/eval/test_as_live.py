@@ -59,12 +59,12 @@ def test_images_that_the_solver_passes_over_have_no_row(probe):
         probe.wait_for(lambda n=number: len(probe.got["left/wrench"]) + passed_over(node) == n)
     live = [stamp_of(message) for message in probe.got["left/wrench"]]
     points = np.tile(KEYPOINTS, (len(stamps), 1, 1))
-    keypoints = KeypointTrack(stamps=stamps, points=points, likelihood=np.ones(points.shape[:2]))
+    keypoints = KeypointTrack(stamps_ns=stamps, points=points, likelihood=np.ones(points.shape[:2]))
     recording = make_recording(phases=False)
     recording = replace(recording, jaws={"left": replace(recording.jaw("left"), keypoints=keypoints, truth=None)})
     jaw, source = FakeJaw(keypoints=KEYPOINTS), GivenContact(CONTACT)
     found = find_forces(recording, jaw, source, IdleAt(first, idle), as_live=True)
-    assert found.stamps.tolist() == live
+    assert found.stamps_ns.tolist() == live
     assert len(live) < 14 and found.solved.all()
     assert len(find_forces(recording, jaw, source, IdleAt(first, idle))) == 18
 
@@ -85,7 +85,7 @@ class StillAt(FakeDetector):
 
 
 def test_images_that_the_detector_does_not_send_have_no_key_points(probe, recording):
-    stamps = recording.images.stamps
+    stamps = recording.images.stamps_ns
     bench = CameraBench(probe, max_age=10.0)
     shift = time_ns() // TENTH * TENTH - stamps[-1] // TENTH * TENTH  # whole periods
     for number, stamp in enumerate((stamps + shift).tolist()):
@@ -95,19 +95,24 @@ def test_images_that_the_detector_does_not_send_have_no_key_points(probe, record
     bench.wait_for_clouds(12 - 5)
     live = [stamp_of(cloud) - shift for cloud in bench.clouds()]
     found = detect_keypoints(recording, StillAt(recording), as_live=True).jaws["left"]
-    assert found.keypoints.stamps.tolist() == found.pose.stamps.tolist() == found.detection.stamps.tolist() == live
-    assert len(detect_keypoints(recording, StillAt(recording)).jaws["left"].keypoints.stamps) == 12
+    assert (
+        found.keypoints.stamps_ns.tolist()
+        == found.pose.stamps_ns.tolist()
+        == found.detection.stamps_ns.tolist()
+        == live
+    )
+    assert len(detect_keypoints(recording, StillAt(recording)).jaws["left"].keypoints.stamps_ns) == 12
 
 
 def test_of_an_object_out_of_reach_the_contact_of_a_tenth_of_a_second_is_kept(monkeypatch):
     monkeypatch.setattr(RecordedContact, "is_out_of_reach", True)
-    poses = ObjectTrack(stamps=START + PERIOD * np.arange(12), poses=np.tile(np.eye(4), (12, 1, 1)))
+    poses = ObjectTrack(stamps_ns=START + PERIOD * np.arange(12), poses=np.tile(np.eye(4), (12, 1, 1)))
     estimator = FakeContactEstimator()
     source = RecordedContact(estimator, poses, idling=Idling())
-    contacts = [source.contact_at(int(stamp)) for stamp in poses.stamps]
+    contacts = [source.contact_at(int(stamp)) for stamp in poses.stamps_ns]
     calls = [name for name, *_ in estimator.calls]
     assert calls.count("pose") == 12  # those of images that are passed over, too
-    assert calls.count("update") == len(set((poses.stamps // TENTH).tolist())) == len(set(map(id, contacts)))
+    assert calls.count("update") == len(set((poses.stamps_ns // TENTH).tolist())) == len(set(map(id, contacts)))
 
 
 def test_the_option_reaches_detector_contact_and_solver():

@@ -47,7 +47,7 @@ def test_case_holds_every_observation_and_the_truth_at_their_stamps(jaw):
     assert case.name == "pressed"
     assert len(case.observations) == 60
     np.testing.assert_array_equal(case.observations[7].points, track.keypoints.points[7])
-    np.testing.assert_allclose(case.stamps_true, track.keypoints.stamps * 1e-9)
+    np.testing.assert_allclose(case.stamps_true, track.keypoints.stamps)
     np.testing.assert_array_equal(case.forces_true, track.truth.force)
     assert case.contact.points[0, 2] == pytest.approx(0.040)
 
@@ -69,7 +69,7 @@ def test_first_touch_is_that_of_the_mean_pose_before_the_load(jaw, monkeypatch):
     poses = recording.object_pose
     T_camera_jaw = pose_from_quaternion(poses.position[0], poses.quaternion[0])
     # up to frame 12 the poses come at frames 0, 3, 6, 9; what comes later does not count
-    heights = np.where(np.arange(len(poses.stamps)) < 4, 0.0401, 0.060)
+    heights = np.where(np.arange(len(poses.stamps_ns)) < 4, 0.0401, 0.060)
     heights[:4] += np.array([3e-4, -3e-4, 1e-4, -1e-4])
     position = (T_camera_jaw @ np.stack([0 * heights, 0 * heights, heights, 1 + 0 * heights]))[:3].T
     seen = replace(recording, object_pose=replace(poses, position=position))
@@ -82,7 +82,7 @@ def test_first_touch_is_that_of_the_mean_pose_before_the_load(jaw, monkeypatch):
 
 def test_first_touch_needs_poses_before_the_load(jaw, monkeypatch):
     recording = pressed_by_a_mesh(monkeypatch, FakeContactEstimator())
-    late = replace(recording.object_pose, stamps=recording.object_pose.stamps + 6 * PERIOD)
+    late = replace(recording.object_pose, stamps_ns=recording.object_pose.stamps_ns + 6 * PERIOD)
     with pytest.raises(RecordingError, match="2 object poses before the force rises; expected at least 3"):
         calibration_case(replace(recording, object_pose=late), jaw, parse_contacts(["estimate"]))
 
@@ -100,7 +100,7 @@ def test_first_touch_that_is_not_found_is_refused_with_the_reason(jaw, monkeypat
 def test_frames_without_truth_are_observations_without_force(jaw):
     recording = bench_recording()
     track = recording.jaws["left"]
-    late = replace(track.truth, stamps=track.truth.stamps + 10 * PERIOD)
+    late = replace(track.truth, stamps_ns=track.truth.stamps_ns + 10 * PERIOD)
     case = calibration_case(
         replace(recording, jaws={"left": replace(track, truth=late)}),
         jaw,

@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from dataclasses import replace
@@ -275,6 +276,18 @@ def test_help_needs_no_heavy_import():
     assert done.returncode == 0, done.stderr
     for command in ("evaluate", "calibrate", "replay", "demo", "bench", "--version"):
         assert command in done.stdout
+
+
+def test_a_reader_that_has_seen_enough_is_no_error():
+    command = [sys.executable, "-m", "finforce_eval.cli.main", "twin", "list"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=ROOT) as process:
+        process.stdout.close()
+        assert process.stderr.read() == b"" and process.wait() == 128 + signal.SIGPIPE
+
+
+def test_a_jaw_file_is_no_finger_to_make_one_of(capsys):
+    assert main(["jaw", "mine.yaml"]) == 2
+    assert "mine.yaml: is a jaw file already, for --jaw" in capsys.readouterr().err
 
 
 def test_version_is_printed(capsys):

@@ -31,7 +31,7 @@ RECORDINGS, SECONDS = 4, 4
 def bags(tmp_path_factory):
     """Some seconds of a loading cycle each."""
     folder, whole = tmp_path_factory.mktemp("bags"), read_recording(DEMO)
-    begin = int(whole.jaws["left"].keypoints.stamps[0])
+    begin = int(whole.jaws["left"].keypoints.stamps_ns[0])
     parts = [(begin + n * 10**8, begin + n * 10**8 + SECONDS * 10**9) for n in range(RECORDINGS)]
     return [write_recording(cut(whole, *part), folder / f"part{n}") for n, part in enumerate(parts)]
 

@@ -17,7 +17,7 @@ def make_track(*frames):
     """One pose per frame, 40 mm above the clamp and a millimetre higher each."""
     poses = np.tile(np.eye(4), (len(frames), 1, 1))
     poses[:, 2, 3] = 0.04 + 1e-3 * np.arange(len(frames))
-    return ObjectTrack(stamps=START + PERIOD * np.array(frames), poses=poses)
+    return ObjectTrack(stamps_ns=START + PERIOD * np.array(frames), poses=poses)
 
 
 def run(track, *, lost=(), touching=lambda update: True):
@@ -84,11 +84,11 @@ def test_times_of_solver_and_contact_are_kept_apart():
 
 def test_late_poses_are_taken_in_their_place():
     recording = make_recording()
-    order = np.r_[1, 0, 2 : len(recording.object_pose.stamps)]
+    order = np.r_[1, 0, 2 : len(recording.object_pose.stamps_ns)]
     poses = recording.object_pose
     late = replace(
         poses,
-        stamps=poses.stamps[order],
+        stamps_ns=poses.stamps_ns[order],
         position=poses.position[order] + 1e-3 * order[:, None],
         quaternion=poses.quaternion,
     )
@@ -115,7 +115,7 @@ def test_pose_that_the_estimator_refuses_is_named():
 def test_a_pose_of_the_image_itself_is_used_with_it_whatever_the_date():
     recording = make_recording()
     shift = 1_790_000_000_123_456_789 - START
-    track = ObjectTrack(stamps=START + shift + PERIOD * np.arange(9), poses=np.tile(np.eye(4), (9, 1, 1)))
+    track = ObjectTrack(stamps_ns=START + shift + PERIOD * np.arange(9), poses=np.tile(np.eye(4), (9, 1, 1)))
     fake = FakeContactEstimator()
     loop = ForceLoop(RecordedContact(fake, track), FakeEstimator(np.zeros((9, 3))))
     for count in range(9):

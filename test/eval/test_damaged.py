@@ -38,10 +38,10 @@ def chunk_places(content):
 def is_part_of(read, whole):
     """Every image that was read is one of the whole recording, as it was."""
     mine, theirs = read.jaws["left"].keypoints, whole.jaws["left"].keypoints
-    rows = np.searchsorted(theirs.stamps, mine.stamps)
-    assert np.array_equal(theirs.stamps[rows], mine.stamps)
+    rows = np.searchsorted(theirs.stamps_ns, mine.stamps_ns)
+    assert np.array_equal(theirs.stamps_ns[rows], mine.stamps_ns)
     assert np.allclose(theirs.points[rows], mine.points, atol=1e-6, equal_nan=True)
-    return len(mine.stamps) / len(theirs.stamps)
+    return len(mine.stamps_ns) / len(theirs.stamps_ns)
 
 
 @pytest.mark.parametrize(("storage", "compression"), KINDS)
@@ -71,8 +71,8 @@ def test_a_bad_chunk_in_the_middle_costs_itself(tmp_path, compression):
     read = read_recording(path)
     share = is_part_of(read, whole)
     assert 1.0 - 2.5 / len(places) < share < 1.0
-    last = whole.jaws["left"].keypoints.stamps[-1]
-    assert read.jaws["left"].keypoints.stamps[-1] == last
+    last = whole.jaws["left"].keypoints.stamps_ns[-1]
+    assert read.jaws["left"].keypoints.stamps_ns[-1] == last
     assert any("read as far as it is good" in note for note in read.notes), read.notes
     with pytest.raises(DamagedError):
         read_recording(path, strict=True)
@@ -113,7 +113,7 @@ def test_damaged_recordings_are_annotated_and_evaluated_with_a_word(tmp_path, ca
     from finforce_eval.recordings.recording import DEMO
 
     whole = read_recording(DEMO)
-    begin = int(whole.jaw("left").keypoints.stamps[0])
+    begin = int(whole.jaw("left").keypoints.stamps_ns[0])
     short = write_recording(cut(whole, begin, begin + 8 * 10**9), tmp_path / "plain")
     path = pack_mcap(short, tmp_path / "cut.mcap", "zstd")
     begin, length = chunk_places(path.read_bytes())[-1]
@@ -137,7 +137,7 @@ def test_chunks_that_say_more_than_they_may_are_refused_and_names_the_way_out(tm
     with pytest.raises(OutOfBoundsError, match="FINFORCE_BUDGET=10"):
         read_recording(path)
     monkeypatch.setenv("FINFORCE_BUDGET", "1000")
-    assert len(read_recording(path).jaws["left"].keypoints.stamps) == 900
+    assert len(read_recording(path).jaws["left"].keypoints.stamps_ns) == 900
 
 
 def test_more_messages_than_a_file_can_hold_are_refused(tmp_path, monkeypatch):

@@ -36,9 +36,9 @@ def detect(recording, **options):
 
 def test_every_image_is_seen_once_in_order_and_its_key_points_take_their_place(recording):
     found, detector = detect(recording)
-    assert np.round(np.array(detector.stamps) * 1e9).astype(int).tolist() == recording.images.stamps.tolist()
+    assert np.round(np.array(detector.stamps) * 1e9).astype(int).tolist() == recording.images.stamps_ns.tolist()
     track = found.jaws["left"]
-    np.testing.assert_array_equal(track.keypoints.stamps, recording.images.stamps)
+    np.testing.assert_array_equal(track.keypoints.stamps_ns, recording.images.stamps_ns)
     expected = track.sight.points[:, :2] + [3e-4, 0, 0]
     np.testing.assert_allclose(track.keypoints.points[:, :2], expected, atol=1e-8)  # single precision, as by topic
     assert np.isnan(track.keypoints.points[:, 2:]).all()  # not valid: the solver gets no place
@@ -57,7 +57,7 @@ def test_an_image_without_the_jaw_has_no_key_points_and_no_pose(recording):
     track = found.jaws["left"]
     assert np.isnan(track.keypoints.points[[0, 4]]).all() and (track.keypoints.likelihood[[0, 4]] == 0).all()
     assert is_found(track).tolist() == [index not in (0, 4) for index in range(12)]
-    assert len(track.pose.stamps) == 10 and recording.images.stamps[4] not in track.pose.stamps
+    assert len(track.pose.stamps_ns) == 10 and recording.images.stamps_ns[4] not in track.pose.stamps_ns
 
 
 def test_what_a_detector_refuses_is_counted_and_the_rest_goes_on(recording):
@@ -279,6 +279,6 @@ def test_a_track_with_standard_deviations_comes_back_from_a_bag(recording, tmp_p
     found, _ = detect(recording)
     plain = replace(found, images=None, case={})
     track = read_recording(write_recording(plain, tmp_path / "bag")).jaws["left"].keypoints
-    for name in ("stamps", "points", "stddev"):
+    for name in ("stamps_ns", "points", "stddev"):
         expected = getattr(found.jaws["left"].keypoints, name)
         np.testing.assert_allclose(getattr(track, name), expected, rtol=1e-6)  # single precision

@@ -30,7 +30,7 @@ def without_times(content):
 @pytest.fixture(scope="module")
 def bags(tmp_path_factory):
     folder, whole = tmp_path_factory.mktemp("bags"), read_recording(DEMO)
-    begin = int(whole.jaws["left"].keypoints.stamps[0])
+    begin = int(whole.jaws["left"].keypoints.stamps_ns[0])
     made = []
     for number in range(2):
         part = cut(whole, begin, begin + (3 + number) * 10**9)

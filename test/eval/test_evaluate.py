@@ -34,7 +34,7 @@ def test_every_frame_is_given_once_in_order_with_its_stamp_and_contact():
     recording = make_recording()
     _, estimator = run(recording, truth_of(recording))
     track = recording.jaws["left"].keypoints
-    assert [round(seen.stamp * 1e9) for seen in estimator.observations] == track.stamps.tolist()
+    assert [round(seen.stamp * 1e9) for seen in estimator.observations] == track.stamps_ns.tolist()
     for seen, points, likelihood in zip(estimator.observations, track.points, track.likelihood, strict=True):
         np.testing.assert_array_equal(seen.points, points)
         np.testing.assert_array_equal(seen.likelihood, likelihood)
@@ -69,7 +69,7 @@ def test_every_frame_is_scored_without_phases():
 
 def test_frames_before_the_first_phase_are_not_scored():
     recording = make_recording()
-    late = replace(recording, phases=replace(recording.phases, stamps=recording.phases.stamps + 20 * PERIOD))
+    late = replace(recording, phases=replace(recording.phases, stamps_ns=recording.phases.stamps_ns + 20 * PERIOD))
     result, _ = run(late, truth_of(recording))
     assert not result.scored[:25].any()
     assert result.column("direction")[0] == ""
@@ -80,7 +80,7 @@ def test_without_a_frame_to_be_scored_the_phases_are_named():
     settling = replace(recording.phases, stage=np.full_like(recording.phases.stage, "settle"))
     with pytest.raises(RecordingError, match="none of the 60 frames is to be scored: /bench/phase names no 'record'"):
         run(replace(recording, phases=settling), truth_of(recording))
-    late = replace(recording.phases, stamps=recording.phases.stamps + 1000 * PERIOD)
+    late = replace(recording.phases, stamps_ns=recording.phases.stamps_ns + 1000 * PERIOD)
     with pytest.raises(RecordingError, match="its 'record' phases lie at none of their stamps"):
         run(replace(recording, phases=late), truth_of(recording))
 
@@ -99,7 +99,7 @@ def test_untrusted_steps_are_skipped_and_keep_their_status():
 def test_truth_sampled_at_other_stamps_is_matched():
     recording = make_recording(phases=False)
     track = recording.jaws["left"]
-    truth = replace(track.truth, stamps=track.truth.stamps + PERIOD // 2)
+    truth = replace(track.truth, stamps_ns=track.truth.stamps_ns + PERIOD // 2)
     shifted = replace(recording, jaws={"left": replace(track, truth=truth)})
     result, _ = run(shifted, truth.force)
     expected = 0.5 * (truth.force[:-1] + truth.force[1:])
@@ -124,9 +124,9 @@ def test_recording_of_another_jaw_is_refused():
     with pytest.raises(RecordingError, match="5 key points in /left/keypoints; the jaw 'fake' has 4"):
         run(make_recording(keypoints=5), [])
     recording = make_recording()
-    stamps = recording.jaw("left").keypoints.stamps
+    stamps = recording.jaw("left").keypoints.stamps_ns
     sight = DetectionTruth(
-        stamps=stamps,
+        stamps_ns=stamps,
         points=np.zeros((len(stamps), 5, 3)),
         pixels=np.zeros((len(stamps), 5, 2)),
         visible=np.ones((len(stamps), 5), bool),
@@ -144,7 +144,7 @@ def test_recording_of_which_nothing_is_solved_is_refused_with_the_reason():
 def test_truth_of_another_time_is_refused():
     recording = make_recording()
     track = recording.jaws["left"]
-    truth = replace(track.truth, stamps=track.truth.stamps + 10**12)
+    truth = replace(track.truth, stamps_ns=track.truth.stamps_ns + 10**12)
     with pytest.raises(RecordingError, match="no ground truth at the stamps of the key points"):
         run(replace(recording, jaws={"left": replace(track, truth=truth)}), truth.force)
 

@@ -64,8 +64,8 @@ def test_truth_comes_back_exactly(written):
     _, folder = written
     recording = read_recording(folder)
     track, frames = recording.jaws["left"], list(make_footage())
-    assert track.is_awaited and track.pose is None and track.keypoints.stamps.size == 0
-    np.testing.assert_array_equal(track.sight.stamps, [frame.stamp for frame in frames])
+    assert track.is_awaited and track.pose is None and track.keypoints.stamps_ns.size == 0
+    np.testing.assert_array_equal(track.sight.stamps_ns, [frame.stamp for frame in frames])
     truths = [frame.jaws["left"] for frame in frames]
     np.testing.assert_allclose(track.sight.points, [truth.points for truth in truths], atol=1e-8)  # single precision
     np.testing.assert_allclose(track.sight.pixels, [truth.pixels for truth in truths], atol=1e-4)
@@ -123,7 +123,7 @@ def test_images_without_camera_info_are_refused(tmp_path):
 def test_images_without_depth_are_read_as_colours_alone(tmp_path):
     images = read_recording(write_without(tmp_path / "bag", DEPTH_TOPIC)).images
     frames = list(make_footage())
-    assert not images.has_depth and images.stamps.tolist() == [frame.stamp for frame in frames]
+    assert not images.has_depth and images.stamps_ns.tolist() == [frame.stamp for frame in frames]
     for frame, (_, image) in zip(frames, images, strict=True):
         assert image.depth is None
         np.testing.assert_array_equal(image.color, frame.color)

@@ -64,11 +64,11 @@ def test_recordings_of_one_jaw_have_no_score():
 
 def test_the_torque_is_scored_where_the_jaws_places_are_known():
     left, right = jaws()
-    torque = np.tile([0.0, -0.12, 0.01], (len(left.stamps), 1))
+    torque = np.tile([0.0, -0.12, 0.01], (len(left.stamps_ns), 1))
     left, right = (jaw.with_columns(torque=torque, true_torque=torque) for jaw in (left, right))
     assert score_pair(left, right).torque_rmse_Nm is None
     recording = SimpleNamespace(jaw=lambda side: SimpleNamespace(pose=poses[side], true_pose=None))
-    poses = {side: track(left.stamps, x) for side, x in (("left", -0.03), ("right", 0.03))}
+    poses = {side: track(left.stamps_ns, x) for side, x in (("left", -0.03), ("right", 0.03))}
     assert score_pair(left, right, recording).torque_rmse_Nm == pytest.approx(0.0, abs=1e-12)
     left = left.with_columns(torque=torque + [0.0, 0.006, 0.0])
     assert score_pair(left, right, recording).torque_rmse_Nm == pytest.approx(0.006)
@@ -82,4 +82,4 @@ def track(stamps, x):
     pose = jaw_in_camera(ROBOT_CAMERA, "left" if x < 0 else "right", x)
     rows = len(stamps)
     position, quaternion = (np.tile(part, (rows, 1)) for part in (pose[:3, 3], quaternion_from_pose(pose)))
-    return PoseTrack(stamps=stamps, position=position, quaternion=quaternion, frame_id="camera")
+    return PoseTrack(stamps_ns=stamps, position=position, quaternion=quaternion, frame_id="camera")

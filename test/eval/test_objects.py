@@ -21,7 +21,7 @@ def track_of(T, stamps, frame=CAMERA):
     count = len(stamps)
     quaternion = Rotation.from_matrix(T[:3, :3]).as_quat()
     return PoseTrack(
-        stamps=np.asarray(stamps),
+        stamps_ns=np.asarray(stamps),
         position=np.tile(T[:3, 3], (count, 1)),
         quaternion=np.tile(quaternion, (count, 1)),
         frame_id=frame,
@@ -48,7 +48,7 @@ def seen(jaw_stamps, object_stamps, **frames):
 def test_object_is_found_in_the_jaw_frame_from_two_poses_in_the_camera_frame():
     stamps = START + PERIOD * np.arange(5)
     track = track_object(seen(stamps, stamps), "left")
-    np.testing.assert_array_equal(track.stamps, stamps)
+    np.testing.assert_array_equal(track.stamps_ns, stamps)
     np.testing.assert_allclose(track.poses, np.tile(T_JAW_OBJECT, (5, 1, 1)), atol=1e-12)
     np.testing.assert_allclose(track.cameras @ T_CAMERA_JAW[:3, :3].T + T_CAMERA_JAW[:3, 3], 0.0, atol=1e-12)
 
@@ -72,7 +72,7 @@ def test_nearest_pose_of_the_jaw_within_50_ms_counts():
     # the jaw has moved by 10 mm at its later pose, which came first
     moved = replace(jaw.pose, position=jaw.pose.position + [[0.01, 0.0, 0.0], [0.0, 0.0, 0.0]])
     track = track_object(replace(recording, jaws={"left": replace(jaw, pose=moved)}), "left")
-    assert ((track.stamps - START) // ms).tolist() == [49, 51, 149]
+    assert ((track.stamps_ns - START) // ms).tolist() == [49, 51, 149]
     shift = T_CAMERA_JAW[:3, :3].T @ [0.01, 0.0, 0.0]
     expected = T_JAW_OBJECT[:3, 3] - np.array([[0.0], [1.0], [1.0]]) * shift
     np.testing.assert_allclose(track.poses[:, :3, 3], expected, atol=1e-12)
@@ -102,7 +102,7 @@ def test_recording_without_object_poses_is_refused():
 )
 def test_pose_that_is_none_is_refused_with_its_message(topic, column, value, reason):
     recording = make_recording()
-    bad = make_poses(recording.object_pose.stamps)
+    bad = make_poses(recording.object_pose.stamps_ns)
     getattr(bad, column)[7] = value
     if topic == "/object_pose":
         recording = replace(recording, object_pose=bad)
@@ -115,11 +115,11 @@ def test_pose_that_is_none_is_refused_with_its_message(topic, column, value, rea
 def test_message_of_a_bad_pose_is_counted_as_recorded_even_when_it_came_late():
     recording = make_recording()
     poses = recording.object_pose
-    stamps = poses.stamps[::-1].copy()
+    stamps = poses.stamps_ns[::-1].copy()
     position = poses.position.copy()
     position[2] = np.nan
     with pytest.raises(RecordingError, match="message 2:"):
-        track_object(replace(recording, object_pose=replace(poses, stamps=stamps, position=position)), "left")
+        track_object(replace(recording, object_pose=replace(poses, stamps_ns=stamps, position=position)), "left")
 
 
 def test_mean_pose_is_the_middle_of_symmetric_noise():

@@ -44,7 +44,7 @@ def paint_dots(image: RgbdImage, stamp: int, jaws: Mapping[str, Jaw], tracks: Ma
     """
     color = image.color.astype(np.float32)
     for side, track in tracks.items():
-        row = int(np.searchsorted(track.sight.stamps, stamp))
+        row = int(np.searchsorted(track.sight.stamps_ns, stamp))
         pose = pose_from_quaternion(track.true_pose.position[row], track.true_pose.quaternion[row])
         points = track.sight.points[row][track.sight.visible[row]]
         for point in (*points, jaws[side].reference_point):
@@ -88,9 +88,9 @@ def scene():
     pixels = project(points @ POSE[:3, :3].T + POSE[:3, 3], LENS)
     visible = np.arange(len(points)) != HIDDEN
     stamps = np.array([7], dtype=np.int64)
-    sight = DetectionTruth(stamps=stamps, points=points[None], pixels=pixels[None], visible=visible[None])
+    sight = DetectionTruth(stamps_ns=stamps, points=points[None], pixels=pixels[None], visible=visible[None])
     poses = PoseTrack(
-        stamps=stamps, position=POSE[None, :3, 3], quaternion=quaternion_from_pose(POSE)[None], frame_id="camera"
+        stamps_ns=stamps, position=POSE[None, :3, 3], quaternion=quaternion_from_pose(POSE)[None], frame_id="camera"
     )
     track = JawTrack(keypoints=KeypointTrack.empty(), sight=sight, true_pose=poses)
     noise = np.random.default_rng(0).normal(110.0, 3.0, (480, 640, 3))

@@ -27,6 +27,10 @@ def test_one_jaw_at_a_known_height_needs_no_contact_estimator_and_the_driver_com
     assert "contact_height:=0.04" in parts[1] and 'port:="/dev/ttyACM0"' in parts[2]
 
 
+def test_depth_none_is_colour_alone():
+    assert 'depth:="none"' in parts_of("depth:=none", "contact_height:=0.04")[0]
+
+
 @pytest.mark.parametrize(
     ("word", "reason"),
     [

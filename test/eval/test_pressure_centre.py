@@ -73,7 +73,7 @@ def test_measured_torque_tells_the_line_of_action():
     arm = np.array([0.012, 0.003, 0.045])
     truth = replace(track.truth, force=force, torque=np.cross(arm, force))
     lines = true_lines(
-        replace(recording, jaws={"left": replace(track, truth=truth)}, case={}), "left", track.keypoints.stamps, FACE
+        replace(recording, jaws={"left": replace(track, truth=truth)}, case={}), "left", track.keypoints.stamps_ns, FACE
     )
     away = arm[[0, 2]] - lines.points
     # the line of the in-plane force through the point at which it acts, moment of the force along y included
@@ -100,7 +100,7 @@ def pressed_cylinder(**case):
 
 
 def lines_of(recording):
-    return true_lines(recording, "left", recording.jaws["left"].keypoints.stamps, FACE)
+    return true_lines(recording, "left", recording.jaws["left"].keypoints.stamps_ns, FACE)
 
 
 def test_force_of_a_frictionless_cylinder_passes_through_its_axis():

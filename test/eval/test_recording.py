@@ -8,8 +8,11 @@ import pytest
 from eval_fakes import PERIOD, START, make_recording
 
 from finforce_eval.errors import RecordingError
+from finforce_eval.recordings.frames import FrameImages
+from finforce_eval.recordings.images import ImageTrack
+from finforce_eval.recordings.objects import ObjectTrack, iter_frames
 from finforce_eval.recordings.recording import read_recording
-from finforce_eval.recordings.tracks import parse_phases
+from finforce_eval.recordings.tracks import DetectionTrack, DetectionTruth, Timed, parse_phases
 from finforce_eval.recordings.writer import (
     Entry,
     cloud_message,
@@ -19,6 +22,7 @@ from finforce_eval.recordings.writer import (
     write_entries,
     write_recording,
 )
+from finforce_eval.table import ForceSeries
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
 
@@ -63,13 +67,28 @@ def test_what_the_points_of_an_image_share_is_read_as_it_was_written(tmp_path):
     written = make_recording("held")
     jaws = dict(written.jaws)
     for side, jaw in jaws.items():
-        shared = np.linspace(1e-3, 3e-3, len(jaw.keypoints.stamps)).astype(np.float32)
+        shared = np.linspace(1e-3, 3e-3, len(jaw.keypoints.stamps_ns)).astype(np.float32)
         jaws[side] = replace(jaw, keypoints=replace(jaw.keypoints, shared=shared.astype(np.float64)))
     written = replace(written, jaws=jaws)
     read = read_recording(write_recording(written, tmp_path / "held"))
     assert_same(read, written)
     track = next(iter(read.jaws.values())).keypoints
     assert track.observation(2).shared == track.shared[2] > track.shared[0]
+
+
+def test_times_in_python_are_seconds_as_an_estimator_takes_them():
+    recording = make_recording()
+    track = recording.jaws["left"]
+    for part in (track.keypoints, track.truth, track.pose, recording.phases, recording.object_pose):
+        np.testing.assert_allclose(part.stamps, 1e-9 * part.stamps_ns, rtol=1e-15)
+    images = list(iter_frames(recording))
+    assert track.keypoints.stamps.tolist() == [image.observation.stamp for image in images]
+    assert all(type(image.observation.stamp) is float for image in images)
+    series = ForceSeries.build("one", "left", track.keypoints.stamps_ns)
+    assert series.stamps.tolist() == track.keypoints.stamps.tolist()
+    assert all(
+        issubclass(each, Timed) for each in (DetectionTrack, DetectionTruth, FrameImages, ImageTrack, ObjectTrack)
+    )
 
 
 def test_recording_of_the_right_jaw_is_read(tmp_path):
@@ -108,7 +127,7 @@ def test_unknown_types_are_skipped_with_a_note(tmp_path, entries):
                 writer.write(cloud, entry.stamp, types.serialize_cdr(entry.message, CLOUD))
     read = read_recording(tmp_path / "bag")
     assert read.notes == ("/odd skipped: unknown type own_msgs/msg/Odd",)
-    assert len(read.jaws["left"].keypoints.stamps) == 60
+    assert len(read.jaws["left"].keypoints.stamps_ns) == 60
 
 
 def test_garbage_is_refused(tmp_path):
@@ -274,7 +293,7 @@ def test_stated_deviations_go_with_the_key_points(tmp_path):
     np.testing.assert_array_equal(track.stddev[:, 2:, 1], np.float32([[2e-3, 3e-3]] * 2))
     observation = track.observation(1)
     np.testing.assert_array_equal(observation.stddev, track.stddev[1])
-    assert np.isnan(observation.points[1]).all() and observation.stamp == track.stamps[1] * 1e-9
+    assert np.isnan(observation.points[1]).all() and observation.stamp == track.stamps_ns[1] * 1e-9
 
 
 def test_recording_without_deviations_has_none(tmp_path, entries):

@@ -101,7 +101,7 @@ def test_what_cannot_be_played_ends_with_two_and_one_line(words, reason, capsys)
 
 def test_estimated_contacts_without_a_mesh_are_refused(tmp_path, capsys):
     recording = read_recording(SHIPPED)
-    start = recording.jaws["left"].keypoints.stamps[0]
+    start = recording.jaws["left"].keypoints.stamps_ns[0]
     short = write_recording(cut(recording, start, start + SECOND), tmp_path / "short")
     assert main(["replay", str(short), "--contact", "estimate"]) == 2 and "no object mesh" in capsys.readouterr().err
 
@@ -120,7 +120,7 @@ class FakeEstimator:
 
 def test_the_time_series_has_a_gap_where_no_wrench_came():
     recording = read_recording(SHIPPED)
-    stamps = recording.jaws["left"].keypoints.stamps
+    stamps = recording.jaws["left"].keypoints.stamps_ns
     log = ReplayLog(("left",))
     for stamp in stamps[::2].tolist():
         found = {"force": np.array([-2.0, 0, 0]), "torque": np.array([0.0, -0.08, 0])}
@@ -131,6 +131,23 @@ def test_the_time_series_has_a_gap_where_no_wrench_came():
     np.testing.assert_allclose(result.column("step_ms")[::2], 2.0)
     assert np.isnan(result.column("step_ms")[1::2]).all()
     assert result.scored.any() and not result.scored.all()
+
+
+def test_images_with_key_points_before_the_first_wrench_wait_for_the_tare():
+    recording = read_recording(SHIPPED)
+    track = recording.jaws["left"]
+    hidden = replace(track.keypoints, points=track.keypoints.points.copy())
+    hidden.points[3] = np.nan
+    recording = replace(recording, jaws={"left": replace(track, keypoints=hidden)})
+    log, stamps = ReplayLog(("left",)), hidden.stamps_ns.tolist()
+    for stamp in stamps[45::2]:
+        log.rows["left"][stamp] = {"force": np.array([-2.0, 0, 0]), "force_stddev": np.full(3, 0.1)}
+    status = live_result(recording, "left", log, likelihood_threshold=0.6, estimator=FakeEstimator()).column("status")
+    assert status[:5].tolist() == ["waiting"] * 3 + ["no wrench", "waiting"]
+    assert status[44:48].tolist() == ["waiting", "ok", "no wrench", "ok"]
+    log.rows["left"].clear()  # nothing ever came: that is no wait
+    silent = live_result(recording, "left", log, likelihood_threshold=0.6, estimator=FakeEstimator())
+    assert set(silent.column("status")) == {"no wrench"}
 
 
 def with_opposite_jaw(recording):
@@ -176,7 +193,7 @@ def test_every_image_comes_back_as_a_wrench_with_its_stamp_its_contact_estimated
     for side in ("left", "right"):
         case = scores["cases"][f"both/{side}"]
         # the first images are silent until the offsets of the key points are known
-        assert case["frames"] == len(result.recording.jaws[side].keypoints.stamps) > 100 and case["solved"] > 60
+        assert case["frames"] == len(result.recording.jaws[side].keypoints.stamps_ns) > 100 and case["solved"] > 60
         assert case["step_ms"]["p50"] > 0.0
     assert "grasp_wrench" in said
     (line,) = [line for line in said.splitlines() if "left contact" in line]
@@ -192,7 +209,7 @@ def test_one_contact_estimator_serves_both_jaws_which_answer_alike_and_complete_
     # the same object, the same noise; each solver gets its contact a little earlier or later than the other
     np.testing.assert_allclose(right.magnitude[held], left.magnitude[held], atol=0.1)
     weaker = np.minimum(left.magnitude, right.magnitude)
-    for stamp, magnitude in zip(left.stamps[held], weaker[held], strict=True):
+    for stamp, magnitude in zip(left.stamps_ns[held], weaker[held], strict=True):
         assert result.grasp[int(stamp)] == pytest.approx(magnitude, abs=1e-6)
     assert result.health["finforce: right contact"]["status"] == result.health["finforce: left contact"]["status"]
 

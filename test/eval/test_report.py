@@ -29,7 +29,7 @@ def evaluate(name, *, gain=1.1, phases=True, lost=()):
 def shown_in(page):
     """The bytes of the picture that the page shows."""
     data = json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', page.read_text())[1])
-    return b64decode(data["picture"].partition(",")[2])
+    return b64decode(data["pictures"][-1].partition(",")[2])
 
 
 def test_the_page_shows_the_picture_of_all_cases(tmp_path):

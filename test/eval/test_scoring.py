@@ -135,14 +135,14 @@ def test_range_is_that_of_all_recordings_of_the_call():
     assert score_series([case], []).span == 0.0
     recording = make_recording()
     force = np.array([[0.0, 0, 0], [-3, 0, 4], [np.nan, 0, 0]])
-    truth = WrenchTrack(stamps=np.arange(3), force=force, torque=force)
+    truth = WrenchTrack(stamps_ns=np.arange(3), force=force, torque=force)
     jaws = {"left": replace(recording.jaws["left"], truth=truth)}
     assert true_range(replace(recording, jaws=jaws)) == (0.0, 5.0)
 
 
 def truth_at(stamps, magnitudes):
     force = np.asarray(magnitudes, float)[:, None] * np.array([-1.0, 0.0, 0.0])
-    return WrenchTrack(stamps=np.asarray(stamps), force=force, torque=np.zeros_like(force))
+    return WrenchTrack(stamps_ns=np.asarray(stamps), force=force, torque=np.zeros_like(force))
 
 
 def test_truth_at_the_same_stamp_is_taken_as_it_is():

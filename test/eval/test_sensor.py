@@ -6,7 +6,7 @@ import pytest
 import finforce as ff
 from finforce.gripper_frames import BENCH_CAMERA, ROBOT_CAMERA, read_extrinsics
 from finforce.transforms import pose_numbers
-from finforce_eval.sensor import combine_solutions
+from finforce_eval.sensor import combine_solutions, read_intrinsics
 from finforce_ifea.observation import blank_solution
 
 INTRINSICS = (430.0, 430.0, 320.0, 240.0)
@@ -42,6 +42,41 @@ def test_arrays_go_through_the_detector_to_both_jaws():
         sensor.update(rgb, None, stamp=0.5)
 
 
+@pytest.fixture(scope="module")
+def sensor():
+    return ff.ForceSensor("bench", camera=INTRINSICS, extrinsics="robot", contact_height=0.04, sides=["left"])
+
+
+IMAGE = np.random.default_rng(1).integers(0, 255, (480, 640, 3), dtype=np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("unit", "named"),
+    [
+        (lambda i: i, "divide frame numbers by the frame rate"),
+        (lambda i: np.int64(i), "divide frame numbers by the frame rate"),
+        (lambda i: float(i), "frame numbers, divide them by the frame rate"),
+        (lambda i: i * 1e3 / 30, "look like milliseconds"),
+        (lambda i: i * 1e6 / 30 + 0.5, "look like microseconds"),
+        (lambda i: i * 1e9 / 30 + 0.5, "look like nanoseconds"),
+        (lambda i: 1.7e12 + i * 1e3 / 30, "milliseconds by 1e3"),
+        (lambda i: 1_700_000_000_000_000_000 + i * 33_333_333, "nanoseconds by 1e9"),
+        (lambda i: i / 30 / 60, "0.001 to 5 s"),
+    ],
+)
+def test_stamps_in_another_unit_than_seconds_are_refused_before_a_force_is_told(sensor, unit, named):
+    sensor.reset()
+    with pytest.raises(ValueError, match=named):
+        for i in range(4):
+            assert "ok" not in sensor.update(IMAGE + np.uint8(i), None, unit(i)).status
+
+
+def test_a_pause_of_the_camera_is_no_other_unit(sensor):
+    sensor.reset()
+    for stamp in (1000.0, 1000.033, 1011.5, 1011.533, 1030.0):
+        sensor.update(IMAGE + np.uint8(1e3 * stamp % 251), None, stamp)
+
+
 @pytest.mark.parametrize(
     ("given", "reason"),
     [
@@ -57,6 +92,13 @@ def test_arrays_go_through_the_detector_to_both_jaws():
 def test_what_cannot_be_used_is_said(given, reason):
     with pytest.raises(ValueError, match=reason):
         ff.ForceSensor("bench", **{"camera": INTRINSICS, "extrinsics": "robot", **given})
+
+
+def test_intrinsics_are_taken_as_a_matrix():
+    matrix = np.array([[430.0, 0.0, 320.0], [0.0, 431.0, 240.0], [0.0, 0.0, 1.0]])
+    for form in (matrix, matrix.tolist(), matrix.ravel(), [430, 431, 320, 240]):
+        camera = read_intrinsics(form, (480, 640))
+        assert (camera.fx, camera.fy, camera.cx, camera.cy) == (430.0, 431.0, 320.0, 240.0)
 
 
 def test_a_camera_pose_is_read_in_every_form():

@@ -41,6 +41,6 @@ def test_truth_has_the_measured_magnitude_along_minus_x(recording, measurement):
 
 
 def test_every_level_settles_and_is_recorded_as_long_as_the_others(recording, measurement):
-    stamps = recording.jaws["left"].keypoints.stamps
+    stamps = recording.jaws["left"].keypoints.stamps_ns
     rows = recording.phases.index_at(stamps)[recording.phases_at(stamps)["scored"]]
     assert recording.phases.displacement_mm[rows].tolist() == np.repeat(measurement["displacement_mm"], 30).tolist()

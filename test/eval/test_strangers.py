@@ -54,7 +54,7 @@ def test_a_jaw_that_is_never_seen_has_no_force_and_the_other_keeps_its_own(tmp_p
 
 def test_a_force_now_and_then_is_none(tmp_path):
     recording = make_recording(phases=False)
-    count = len(recording.jaw("left").keypoints.stamps)
+    count = len(recording.jaw("left").keypoints.stamps_ns)
     told = "a force in 5 of 60 images, on all jaws that were found, expected 6 at least"
     for answered, expected in ((5, told), (6, "")):
         forces = [[0.0, 0.0, 0.0]] * answered + [None] * (count - answered)
@@ -70,7 +70,7 @@ class TaringEstimator(FakeEstimator):
 @pytest.mark.parametrize(("estimator", "hinted"), [(TaringEstimator, True), (FakeEstimator, False)])
 def test_pictures_too_few_for_a_tare_are_told_to_be_taken_as_stills(estimator, hinted):
     recording = make_recording(phases=False)
-    forces = [None] * len(recording.jaw("left").keypoints.stamps)
+    forces = [None] * len(recording.jaw("left").keypoints.stamps_ns)
     series = find_forces(recording, FakeJaw(), GivenContact(None), estimator(forces), "left")
     assert ("--stills" in why_unanswered([series])) == hinted
 
@@ -140,7 +140,7 @@ def test_a_camera_without_camera_info_needs_its_intrinsics(tmp_path):
 
 def test_a_score_of_unloaded_frames_alone_is_none(tmp_path):
     recording = make_recording(phases=False)
-    forces = [[-1.0, 0.0, 0.0]] * len(recording.jaw("left").keypoints.stamps)
+    forces = [[-1.0, 0.0, 0.0]] * len(recording.jaw("left").keypoints.stamps_ns)
     series = evaluate_recording(recording, FakeJaw(), GivenContact(None), FakeEstimator(forces))
     loaded = np.linalg.norm(series.true_force, axis=1) > 0.02
     assert loaded.any() and not loaded.all()

@@ -35,7 +35,7 @@ class Sight:
 
 class Images:
     def __init__(self, stamps):
-        self.stamps = stamps
+        self.stamps_ns = stamps
 
     def at(self, stamps):
         return Images(stamps)
@@ -67,7 +67,7 @@ def record(jaw, bends, offset=MOUNT, name="one", seed=0):
     points[:, :, [0, 2]] += np.asarray(bends)[:, None, None] * find_modes()
     stamps = PERIOD * np.arange(count, dtype=np.int64)
     stddev = np.full(points.shape, NOISE)
-    keypoints = KeypointTrack(stamps=stamps, points=points, likelihood=np.ones(points.shape[:2]), stddev=stddev)
+    keypoints = KeypointTrack(stamps_ns=stamps, points=points, likelihood=np.ones(points.shape[:2]), stddev=stddev)
     return Recording(name=name, path=Path(name), jaws={"left": JawTrack(keypoints=keypoints)}, images=Images(stamps))
 
 

@@ -1,6 +1,7 @@
 """Claims about `finforce twin`, and about the table of a run from images."""
 
 import json
+from importlib import resources
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from eval_fakes import FakeEstimator, FakeJaw, evaluate_recording
 from rgbd_fakes import FakeDetector, FakeGripper, make_footage
 
 from finforce_contact.loop import GivenContact
-from finforce_eval.cli.main import main
+from finforce_eval.cli.main import main, parse
 from finforce_eval.cli.twin import write_footage
 from finforce_eval.evaluation.keypoint_source import detect_keypoints
 from finforce_eval.evaluation.scoring import score_results
@@ -87,6 +88,24 @@ def test_what_cannot_be_recorded_is_one_line_and_two(asked, tmp_path, capsys, wo
     assert status == 2 and not asked and not (tmp_path / "bag").exists()
     said = capsys.readouterr().err.strip().splitlines()
     assert len(said) == 1 and reason in said[0]
+
+
+def test_a_recording_names_its_jaw_and_the_printed_command_needs_no_other_option(asked, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    own = tmp_path / "own.yaml"
+    own.write_bytes((resources.files("finforce_ifea") / "jaw" / "jaws" / "bench.yaml").read_bytes())
+    for name, jaw in (("plain", "bench"), ("umi", "umi"), ("mine", "own.yaml")):
+        words = [] if name == "plain" else ["--jaw", jaw]
+        assert main(["twin", "record", "grasp_cylinder", "-o", name, *words]) == 0
+        printed = capsys.readouterr().out.splitlines()[-1].partition("finforce ")[2].split()
+        monkeypatch.chdir(tmp_path.parent)  # the recording is read from elsewhere, too
+        named = parse([str(tmp_path / word) if word == name else word for word in printed]).jaw
+        assert named == (str(own) if name == "mine" else jaw)
+        monkeypatch.chdir(tmp_path)
+    assert parse(["evaluate", "umi", "--jaw", "bench"]).jaw == parse(["evaluate", "nothing"]).jaw == "bench"
+    assert (
+        main(["evaluate", "plain", "umi"]) == 2 and "recordings of several jaws: bench, umi" in capsys.readouterr().err
+    )
 
 
 def test_a_folder_that_exists_is_left_alone(asked, tmp_path, capsys):

@@ -89,9 +89,9 @@ def test_an_episode_of_a_replay_buffer_has_its_pictures(zipped, tmp_path):
         path = tmp_path / "dataset.zarr.zip"
     recording = read_recording(path, ImageChoice(camera=CHOICE.camera, episode=1), ("left",))
     assert [int(image.color[0, 0, 0]) for _, image in recording.images] == [50, 60, 70, 80, 90, 100]
-    assert recording.images.stamps[1] == round(NANOSECONDS * 1001 / 60000)
+    assert recording.images.stamps_ns[1] == round(NANOSECONDS * 1001 / 60000)
     assert recording.name == "dataset/episode_000001" and set(recording.jaws) == {"left"}
-    late = recording.images.at(recording.images.stamps[4:])
+    late = recording.images.at(recording.images.stamps_ns[4:])
     assert [int(image.color[0, 0, 0]) for _, image in late] == [90, 100]
     with pytest.raises(RecordingError, match="no episode 2; expected 0 to 1"):
         read_recording(path, ImageChoice(camera=CHOICE.camera, episode=2))
@@ -101,9 +101,9 @@ def test_an_episode_of_a_replay_buffer_has_its_pictures(zipped, tmp_path):
 def test_wrenches_are_those_of_the_object_on_the_jaw_at_the_times_of_the_pictures(sign, tmp_path):
     recording = read_recording(write_episode(tmp_path / "ft.zarr", sign), CHOICE)
     share = 3.0 * (np.arange(12)[:, None] / 60.0 + 0.1)
-    assert recording.images.stamps[1] == pytest.approx(NANOSECONDS / 60, abs=300)  # ns; 1.7e9 s have steps of 240
+    assert recording.images.stamps_ns[1] == pytest.approx(NANOSECONDS / 60, abs=300)  # ns; 1.7e9 s have steps of 240
     for side in ("left", "right"):  # both jaws are pushed away, along x of their own frames
-        force = match_truth(recording.truth(side), recording.images.stamps)
+        force = match_truth(recording.truth(side), recording.images.stamps_ns)
         np.testing.assert_allclose(force, share * (PRESSING if side == "right" else [-3.0, -1.0, 0.5]), atol=1e-4)
     assert sum("other sign" in note for note in recording.notes) == (sign < 0.0)
     assert sum("here called right" in note for note in recording.notes) == 1

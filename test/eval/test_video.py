@@ -52,13 +52,13 @@ def test_pictures_of_a_folder_come_in_the_order_of_their_numbers(tmp_path):
     recording = read_recording(write_pictures(tmp_path / "stills"), CHOICE)
     assert [int(image.color.mean()) for _, image in recording.images] == [80, 120, 40]
     assert set(recording.jaws) == {"left", "right"} and recording.name == "stills"
-    assert (np.diff(recording.images.stamps) > 0).all()
+    assert (np.diff(recording.images.stamps_ns) > 0).all()
 
 
 def test_frames_of_a_video_have_its_times(tmp_path):
     recording = read_recording(write_video(tmp_path / "demo.mp4"), CHOICE, ("left",))
-    images = recording.images.at(recording.images.stamps[1:3])
-    np.testing.assert_array_equal(images.stamps, [50_000_000, 100_000_000])
+    images = recording.images.at(recording.images.stamps_ns[1:3])
+    np.testing.assert_array_equal(images.stamps_ns, [50_000_000, 100_000_000])
     np.testing.assert_allclose([image.color.mean() for _, image in images], LEVELS[1:3], atol=6)
     assert set(recording.jaws) == {"left"} and len(recording.images) == 5
 
@@ -66,8 +66,8 @@ def test_frames_of_a_video_have_its_times(tmp_path):
 def test_forces_are_drawn_where_they_act_at_the_times_of_the_images(tmp_path):
     av = pytest.importorskip("av")
     recording = read_recording(write_pictures(tmp_path / "stills"), CHOICE, ("left",))
-    stamps, ahead = recording.images.stamps, np.tile([0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0], (3, 1))
-    pose = PoseTrack(stamps=stamps, position=ahead[:, :3], quaternion=ahead[:, 3:], frame_id="camera")
+    stamps, ahead = recording.images.stamps_ns, np.tile([0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0], (3, 1))
+    pose = PoseTrack(stamps_ns=stamps, position=ahead[:, :3], quaternion=ahead[:, 3:], frame_id="camera")
     recording.jaws["left"] = replace(recording.jaws["left"], pose=pose)
     # 5 N, 25 mm: from (459, 244) to (374, 244) px, ten times those of the image
     force, point = np.full((3, 3), np.nan), np.full((3, 3), np.nan)
@@ -95,7 +95,7 @@ def test_of_accepted_points_those_in_answered_images_count_as_within_reach_or_no
         "reasons": accepted.astype(str),
         "step_ms": nothing[:, 0, 0],
     }
-    detection = DetectionTrack(stamps=stamps, accepted=accepted, **found)
+    detection = DetectionTrack(stamps_ns=stamps, accepted=accepted, **found)
     force, used = (
         np.array([[np.nan] * 3, [1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]),
         [[False] * 3, [True] * 3, [True, True, False]],
@@ -184,9 +184,9 @@ def test_why_key_points_were_of_no_use_for_long_is_said_with_the_time(monkeypatc
     monkeypatch.setattr(unseen, "explain_unseen", lambda recording, source, chosen: asked.append(chosen) or ["zoomed"])
 
     def describe(bad, status, detection="found"):
-        forces = SimpleNamespace(stamps=stamps, column=lambda name: np.where(bad, status, "ok"))
+        forces = SimpleNamespace(stamps_ns=stamps, column=lambda name: np.where(bad, status, "ok"))
         jaws = {"right": SimpleNamespace(detection=detection)}
-        recording = SimpleNamespace(jaws=jaws, images=SimpleNamespace(stamps=stamps))
+        recording = SimpleNamespace(jaws=jaws, images=SimpleNamespace(stamps_ns=stamps))
         return unseen.describe_unseen(recording, None, {"right": forces})
 
     long = (stamps >= 5e8) & (stamps <= 2e9) | (stamps == 3e9)

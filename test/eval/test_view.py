@@ -57,7 +57,7 @@ def column(batches, ending):
 def test_every_picture_is_there_at_its_time(scene):
     source, rows = scene.source, scene.rows
     times, pictures = column(rows["/camera"], "blob")
-    np.testing.assert_allclose(times, read_recording(source).images.all_colors().stamps, atol=1000)
+    np.testing.assert_allclose(times, read_recording(source).images.all_colors().stamps_ns, atol=1000)
     assert all(bytes(picture[0])[:2] == b"\xff\xd8" for picture in pictures)
     for side in ("left", "right"):
         assert len(column(rows[f"/camera/{side}"], "positions")[0]) == len(times)
@@ -68,7 +68,7 @@ def test_jaws_bend_and_forces_are_those_that_were_found(scene):
     for side in ("left", "right"):
         times, values = column(rows[f"/forces/{side}"], "scalars")
         expected = np.linalg.norm(forces[side].force, axis=1)
-        np.testing.assert_allclose(times, forces[side].stamps, atol=1000)
+        np.testing.assert_allclose(times, forces[side].stamps_ns, atol=1000)
         np.testing.assert_allclose([value[0] for value in values], expected)
         assert np.isnan(expected[:40]).all() and np.nanmax(expected) > 2.0
         _, meshes = column(rows[f"/jaws/{side}/surface"], "vertex_positions")

@@ -208,15 +208,6 @@ def test_refused_observations_leave_no_trace():
     assert_identical(solutions, solved())
 
 
-def test_points_in_millimetres_give_no_force():
-    recording, estimator = pressed(), make_estimator(solver="frame")
-    solutions = [
-        estimator.update(replace(observation, points=1e3 * observation.points), recording.contact)
-        for observation in recording.observations[:80]
-    ]
-    assert not any(solution.trusted for solution in solutions)
-
-
 # --- settings, jaws, calibrations
 
 
@@ -297,3 +288,24 @@ def test_a_direction_of_gravity_is_a_unit_vector(gravity):
     check_observation(one, 2, None)
     with pytest.raises(ObservationError, match="expected a unit vector"):
         check_observation(replace(one, gravity=gravity), 2, None)
+
+
+def test_key_points_in_millimetres_are_refused_with_their_unit_and_a_gross_error_is_not():
+    millimetres = Observation(stamp=1.0, points=1e3 * BENCH.keypoints)
+    with pytest.raises(ObservationError, match=r"key points up to \d+.* expected metres .* divided by 1000"):
+        check_observation(millimetres, len(BENCH.keypoints), None)
+    gross = BENCH.keypoints.copy()
+    gross[:3] = [0.0, 0.0, 2.5]
+    check_observation(Observation(stamp=1.0, points=gross), len(BENCH.keypoints), None)
+
+
+def test_points_without_likelihood_that_are_not_there_count_as_unseen():
+    points = BENCH.keypoints.copy()
+    points[2] = np.nan
+    assert Observation(stamp=1.0, points=points).likelihood.tolist() == [1.0, 1.0, 0.0] + [1.0] * (len(points) - 3)
+
+
+@pytest.mark.parametrize("stamp", [3, np.int64(3), 1.7e12, 1.7e18, np.nan])
+def test_stamps_that_are_no_seconds_are_refused(stamp):
+    with pytest.raises(ObservationError, match="expected seconds as a float: divide frame numbers"):
+        check_observation(Observation(stamp=stamp, points=BENCH.keypoints), len(BENCH.keypoints), None)

@@ -335,7 +335,7 @@ def test_a_picture_without_jaws_is_refused(monkeypatch):
     found = find_placement([paint(poses, jaws)], CAMERA, jaws, Dreamer(), ROBOT_CAMERA)
     assert found.contrast > 0.8 and not any(mount.covered for mount in found.mounts.values())
     blank = np.random.default_rng(0).integers(0, 255, (480, 640, 3), dtype=np.uint8)
-    with pytest.raises(GeometryError, match="no such jaws"):
+    with pytest.raises(GeometryError, match="do not show the finger .* finforce jaw PHOTO"):
         find_placement([blank], CAMERA, jaws, Dreamer(), ROBOT_CAMERA)
 
 

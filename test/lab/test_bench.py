@@ -62,7 +62,7 @@ def test_shipped_recording_is_small_and_one_cycle_that_begins_unloaded(recording
     assert set(recording.phases.cycle) == {0}
     track = recording.jaws["left"]
     assert track.keypoints.count == len(load_jaw("bench").keypoint_names)
-    seconds = (track.truth.stamps - track.truth.stamps[0]) * 1e-9
+    seconds = (track.truth.stamps_ns - track.truth.stamps_ns[0]) * 1e-9
     magnitude = np.linalg.norm(track.truth.force, axis=1)
     assert (magnitude[seconds < 2.5] == 0).all()
     assert magnitude.max() > 3.5

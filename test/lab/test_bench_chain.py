@@ -29,14 +29,14 @@ def stamp_of(index):
 def truth():
     """A force that grows by 1 N a second."""
     stamps = np.array([stamp_of(index) for index in range(COUNT)])
-    return TrueGrasp(stamps=stamps, force=(stamps - FIRST) / NANOSECONDS)
+    return TrueGrasp(stamps_ns=stamps, force=(stamps - FIRST) / NANOSECONDS)
 
 
 @pytest.fixture
 def run(truth):
     """Every image is answered 30 ms late and 0.2 N too high."""
     log = ReplayLog(("left", "right"))
-    for index, stamp in enumerate(truth.stamps.tolist()):
+    for index, stamp in enumerate(truth.stamps_ns.tolist()):
         for side in ("left", "right"):
             log.sent[side][stamp] = 0.0
         log.grasp[stamp], log.grasp_latency[stamp] = 0.1 * index + 0.2, 0.03
@@ -59,7 +59,7 @@ def test_what_was_dropped_is_counted_and_not_during_the_tare(run, truth):
 
 
 def test_error_now_is_that_of_the_newest_force_that_has_arrived(run, truth):
-    sent = truth.stamps
+    sent = truth.stamps_ns
     # a force of 0.2 N too much that is used from 30 to 130 ms after its image, while the truth grows by 1 N/s
     late = error_now(run.log, truth, sent)
     assert late.max() == pytest.approx(0.17, abs=2e-3) and late.min() == pytest.approx(0.07, abs=2e-3)
@@ -71,15 +71,15 @@ def test_an_image_that_is_dropped_makes_the_error_now_larger_and_not_that_of_the
         del run.log.grasp[stamp_of(index)], run.log.grasp_latency[stamp_of(index)]
     half = describe_run(IMAGES, TOGETHER, 10, run, truth)
     assert half["error/N"] == pytest.approx(full["error/N"])
-    assert error_now(run.log, truth, truth.stamps).min() == pytest.approx(-0.03, abs=2e-3)
+    assert error_now(run.log, truth, truth.stamps_ns).min() == pytest.approx(-0.03, abs=2e-3)
 
 
 def test_force_that_overtakes_an_older_one_is_the_newest():
-    truth = TrueGrasp(stamps=np.array([stamp_of(0), stamp_of(39)]), force=np.zeros(2))
+    truth = TrueGrasp(stamps_ns=np.array([stamp_of(0), stamp_of(39)]), force=np.zeros(2))
     log = ReplayLog(("left", "right"))
     log.grasp = {stamp_of(0): 1.0, stamp_of(25): 2.0}
     log.grasp_latency = {stamp_of(0): 3.5, stamp_of(25): 0.5}
-    errors = error_now(log, truth, truth.stamps)
+    errors = error_now(log, truth, truth.stamps_ns)
     # at 3.0 s the second one, at 3.5 s the first, which is older than what is known
     assert errors[0] == 2.0 and errors[-1] == 2.0
 
@@ -100,7 +100,7 @@ def test_a_force_shows_with_the_first_image_beyond_a_tenth_of_a_newton_and_its_l
     stamps = START + ((np.arange(90) + phase) * NANOSECONDS / rate).astype(np.int64)
     times = 1e-9 * (stamps - START)
     fine = np.linspace(0.0, 3.0, 30_001)
-    truth = TrueGrasp(stamps=START + (fine * 1e9).astype(np.int64), force=np.maximum(0.0, 10.0 * (fine - begin)))
+    truth = TrueGrasp(stamps_ns=START + (fine * 1e9).astype(np.int64), force=np.maximum(0.0, 10.0 * (fine - begin)))
     log = ReplayLog(("left", "right"))
     for index, stamp in enumerate(stamps.tolist()):
         log.sent["left"][stamp] = 0.0

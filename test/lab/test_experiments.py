@@ -205,7 +205,9 @@ def test_gravity_is_told_in_each_jaws_frame():
     assert directions[0] == pytest.approx([0.0, -1.0, 0.0])  # a level gripper that rolls
     assert directions[:, 0].min() == pytest.approx(-1.0, abs=1e-3) and np.abs(directions[:, 2]).max() < 1e-9
     one = make_recording("one")
-    told = tell_gravity(one, {stamp: np.array([0.6, 0.0, 0.8]) for stamp in one.jaw("left").keypoints.stamps.tolist()})
+    told = tell_gravity(
+        one, {stamp: np.array([0.6, 0.0, 0.8]) for stamp in one.jaw("left").keypoints.stamps_ns.tolist()}
+    )
     seen = told.jaw("left").keypoints.observation(0).gravity
     assert R_GRIPPER_JAW["left"] @ seen == pytest.approx([0.6, 0.0, 0.8])
     assert one.jaw("left").keypoints.observation(0).gravity is None
@@ -284,11 +286,11 @@ def test_a_recording_that_lacks_something_is_told_what(tmp_path, capsys):
 
 def test_an_object_that_is_hidden_has_no_poses_any_more():
     one = make_recording("one")
-    stamps = one.object_pose.stamps
+    stamps = one.object_pose.stamps_ns
     hidden = keep_poses(one, stamps < stamps[5])
-    assert len(hidden.object_pose.stamps) == 5
+    assert len(hidden.object_pose.stamps_ns) == 5
     assert len(hidden.object_pose.position) == 5
-    assert len(one.object_pose.stamps) > 5
+    assert len(one.object_pose.stamps_ns) > 5
 
 
 @pytest.mark.parametrize(
@@ -314,7 +316,7 @@ def test_what_cannot_be_run_is_one_line(words, expected, tmp_path, capsys):
 def test_places_run_on_a_recording_and_only_of_the_papers_cylinder(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("lab.experiments.paper_tables.OTHERS", {})  # what takes long, and is tested elsewhere
     whole = read_recording(DATA / "bench_cyl25_middle")
-    begin = int(whole.jaw("left").keypoints.stamps[0])
+    begin = int(whole.jaw("left").keypoints.stamps_ns[0])
     (tmp_path / "objects").symlink_to(DATA / "objects")
     pressed = cut(whole, begin, begin + 11 * 10**9)
 

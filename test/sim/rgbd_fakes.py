@@ -134,7 +134,7 @@ class FakeDetector:
     watch: ImageWatch = field(default_factory=ImageWatch)
 
     def detect(self, image) -> Mapping[str, FakeKeypoints]:
-        index = int(np.argmin(np.abs(self.recording.images.stamps * 1e-9 - image.stamp)))
+        index = int(np.argmin(np.abs(self.recording.images.stamps - image.stamp)))
         self.watch.check(image)
         self.stamps.append(image.stamp)
         if index in self.refused:
