@@ -102,14 +102,14 @@ def test_every_parameter_of_the_graph_is_one_of_the_node():
         assert set(process.parameters) <= known[process.executable]
 
 
-@pytest.mark.parametrize(("asked", "told"), [("", None), ("aligned", "aligned"), ("auto", "auto"), ("off", "none")])
-def test_colour_alone_is_asked_for_by_another_word_than_nothing(asked, told):
+@pytest.mark.parametrize(("asked", "told"), [("", ""), ("aligned", "aligned"), ("auto", ""), ("none", "none")])
+def test_depth_is_asked_of_the_detector_in_its_own_words_and_its_default_left_to_it(asked, told):
     (detector,) = [
         process
         for process in replay_processes(ReplayOptions(composed=False, images=True, depth=asked, bag="x"), ROOT)
         if process.executable == "keypoint_detector"
     ]
-    assert detector.parameters.get("depth") == told
+    assert detector.parameters.get("depth", "") == told
 
 
 def test_an_object_mesh_brings_one_contact_estimator_and_its_contacts_go_to_the_solvers():
