@@ -132,8 +132,8 @@ def give_finger(path, loops):
         return
     import cv2
 
-    picture = np.full((1300, 1000, 3), 20, np.uint8)  # ten pixels a millimetre
-    corner = np.array([500.0, 1150.0]) - [0.0, 0.0]
+    picture = np.full((1500, 1000, 3), 20, np.uint8)  # ten pixels a millimetre
+    corner = np.array([500.0, 1400.0])
     for loop, light in ((outline, 220), *((hole, 20) for hole in holes)):
         pixels = corner + (loop - outline.min(axis=0)) * [10.0, -10.0]
         cv2.fillPoly(picture, [np.round(pixels).astype(np.int32)], (light,) * 3, cv2.LINE_AA)
