@@ -88,7 +88,7 @@ class _Overlay:
     def __init__(self, track: JawTrack, forces: ForceSeries, camera: CameraIntrinsics, scale: int) -> None:
         self._track, self._forces, self._camera, self._scale = track, forces, camera, scale
         self._reasons = no_force_reasons(forces)
-        self._stated = np.linalg.norm(forces.column("force_stddev"), axis=1)
+        self._stated = forces.column("magnitude_stddev")
         self._points = forces.column("contact_point")
         self._rows = [
             {stamp: row for row, stamp in enumerate(each.stamps_ns.tolist())} if each is not None else {}

@@ -86,6 +86,27 @@ def test_forces_are_drawn_where_they_act_at_the_times_of_the_images(tmp_path):
     assert min(words) > 100
 
 
+def test_the_deviation_beside_a_force_is_that_of_its_magnitude(tmp_path, monkeypatch):
+    recording = read_recording(write_pictures(tmp_path / "stills"), CHOICE)
+    stamp, words = recording.images.stamps_ns[0], []
+    forces = ForceSeries.build(
+        "stills",
+        "left",
+        [stamp],
+        force=np.array([[-2.0, 0.0, 0.0]]),
+        force_stddev=np.array([[0.1, 0.2, 0.4]]),
+        magnitude_stddev=np.array([0.1]),
+        status=np.array(["ok"]),
+        contact_point=np.full((1, 3), np.nan),
+    )
+    cv2 = video.import_cv2()
+    fake = SimpleNamespace(**{name: getattr(cv2, name) for name in dir(cv2) if not name.startswith("_")})
+    fake.putText = lambda picture, text, *rest: words.append(text)
+    monkeypatch.setattr(video, "import_cv2", lambda: fake)
+    video.ForceOverlay(recording, {"left": forces}).draw(stamp, np.zeros((48, 64, 3), np.uint8))
+    assert words == ["left: 2.00 N +- 0.10"]
+
+
 def test_of_accepted_points_those_in_answered_images_count_as_within_reach_or_not():
     stamps, accepted = np.array([0, 10, 20, 30]), np.array([[1, 1, 1], [1, 1, 1], [1, 0, 1], [1, 1, 1]], bool)
     nothing = np.full((4, 3, 3), np.nan)
