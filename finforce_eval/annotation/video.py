@@ -42,17 +42,15 @@ def write_video(path: Path, recording: Recording, jaws: Mapping[str, ForceSeries
     av = import_library("av", "writing videos", "'finforce[video]'")
     if recording.images is None or not len(recording.images):
         raise RecordingError(f"{recording.name}: no images to draw forces into; expected color images")
-    images, camera = recording.images.all_colors(), recording.images.camera
-    scale = -(-LEAST_HEIGHT // camera.height)
-    draw = ForceOverlay(recording, jaws).draw
+    images, camera, overlay = recording.images.all_colors(), recording.images.camera, ForceOverlay(recording, jaws)
     first = int(images.stamps_ns[0])
     with av.open(str(path), "w") as file, progress_bar(len(images), "image", path.name) as bar:
         stream = file.add_stream("libx264", rate=30, options={"crf": _QUALITY})
         # the format has two pixels by two for each colour
-        stream.width, stream.height = 2 * (scale * camera.width // 2), 2 * (scale * camera.height // 2)
+        stream.width, stream.height = (2 * (overlay.scale * size // 2) for size in (camera.width, camera.height))
         stream.pix_fmt, stream.codec_context.time_base = "yuv420p", Fraction(1, 1000)
         for stamp, image in images:
-            picture = draw(stamp, image.color)
+            picture = overlay.draw(stamp, image.color)
             frame = av.VideoFrame.from_ndarray(picture[: stream.height, : stream.width], format="rgb24")
             frame.pts, frame.time_base = round((stamp - first) / NANOSECONDS * 1000), Fraction(1, 1000)
             file.mux(stream.encode(frame))
@@ -66,16 +64,19 @@ class ForceOverlay:
     Args:
         recording: with images.
         jaws: the forces, by side.
+
+    Attributes:
+        scale: by which images are enlarged.
     """
 
     def __init__(self, recording: Recording, jaws: Mapping[str, ForceSeries]) -> None:
         camera = recording.images.camera
-        self._scale = -(-LEAST_HEIGHT // camera.height)
-        self._jaws = [_Overlay(recording.jaw(side), forces, camera, self._scale) for side, forces in jaws.items()]
+        self.scale = -(-LEAST_HEIGHT // camera.height)
+        self._jaws = [_Overlay(recording.jaw(side), forces, camera, self.scale) for side, forces in jaws.items()]
 
     def draw(self, stamp: int, color: NDArray) -> NDArray:
         """Return the picture (h, w, 3) of the image of a stamp [ns]; small images are enlarged."""
-        picture = np.ascontiguousarray(color.repeat(self._scale, axis=0).repeat(self._scale, axis=1))
+        picture = np.ascontiguousarray(color.repeat(self.scale, axis=0).repeat(self.scale, axis=1))
         picture[: round(LINE * len(self._jaws) * len(picture))] //= 3  # words are white
         for line, jaw in enumerate(self._jaws, start=1):
             jaw.draw(picture, stamp, line)

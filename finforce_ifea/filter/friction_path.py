@@ -106,10 +106,15 @@ class TractionHypotheses:
         """Return the coefficient of friction for the weights of the hypotheses (N,)."""
         if not self.follows_path:
             return Coefficient(0.0, np.inf)
-        own = weights[: len(self.mu)] / max(weights[: len(self.mu)].sum(), 1e-300)
+        own = self._share(weights)
         mean = float(own @ self.mu)
         between = max(float(own @ self.mu**2) - mean**2, 0.0)
         return Coefficient(mean, float(np.sqrt(between + self._cell**2 / 12.0 + self.unweighed**2)))
+
+    def _share(self, weights: NDArray) -> NDArray:
+        """Return the probabilities of the coefficients (M,) where one of them holds, for all weights (N,)."""
+        own = weights[: len(self.mu)]
+        return own / max(own.sum(), 1e-300)
 
     def spread_cells(self, weights: NDArray) -> float:
         """Return the variance of kappa within the cells of the grid, for the weights of the hypotheses (N,)."""
@@ -155,7 +160,7 @@ class TractionHypotheses:
             track: of the depth.
             weights: of the hypotheses (N,).
         """
-        places, own = places[: len(self.mu)], weights[: len(self.mu)] / max(weights[: len(self.mu)].sum(), 1e-300)
+        places, own = places[: len(self.mu)], self._share(weights)
         if self._anchor is None:
             self._anchor = places.copy()
         motion = places - self._anchor

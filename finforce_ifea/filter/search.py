@@ -73,6 +73,8 @@ _UNDECIDED = 0.2
 # Least force at which the inclination of the faces is asked for [N].
 _LEAST_FORCE = 0.1
 _LEAST_VARIANCE = 1e-14
+# Jumps that one image may show.
+_JUMPS = (BUMPED, MISPLACED, LIFTED)
 # Share of the key points that has to agree, and the largest bump of a camera that is believed [sigma].
 _MAJORITY = 0.5
 _LARGEST_BUMP = 5.0
@@ -363,9 +365,6 @@ class FilterSearch(ContactSearch):
     def contact_covariance(self) -> NDArray:
         """Return the covariance of depth, shape and height (3, 3)."""
         return self.P[np.ix_(CONTACT, CONTACT)]
-
-
-_JUMPS = (BUMPED, MISPLACED, LIFTED)
 
 
 @njit(**_OPTIONS)

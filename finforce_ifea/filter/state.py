@@ -17,19 +17,8 @@ DEPTH, SHAPE, HEIGHT, TRACTION, CAMERA_X, CAMERA_Z, CAMERA_TURN, CAMERA_STRETCH,
 # Entries that no single key point owns.
 SHARED = 9
 CONTACT = np.array([DEPTH, SHAPE, HEIGHT])
-CAMERA = np.array([CAMERA_X, CAMERA_Z, CAMERA_TURN, CAMERA_STRETCH])
 
 
 def state_size(keypoints: int) -> int:
     """Return n for a number of key points."""
     return SHARED + 4 * keypoints
-
-
-def offset_entries(keypoints: int) -> slice:
-    """Return the entries of the offsets o, x and z of each key point in turn."""
-    return slice(SHARED, SHARED + 2 * keypoints)
-
-
-def relative_entries(keypoints: int) -> slice:
-    """Return the entries of the relative errors r, x and z of each key point in turn."""
-    return slice(SHARED + 2 * keypoints, SHARED + 4 * keypoints)

@@ -69,3 +69,12 @@ def test_another_origin_moves_the_position_alone():
     track.shift(2e-3)
     assert track.x == pytest.approx(before + 2e-3)
     assert (track.variance, track.speed) == (pytest.approx(variance), speed)
+
+
+def test_a_jump_is_where_it_is_seen_in_its_first_image():
+    jumpy = NOISE._replace(jump=(5e-3) ** 2, jump_probability=1e-3)
+    path = np.r_[np.zeros(60), np.full(3, 5e-3)]
+    lags = [[follow(path, seed, noise)[0][60] - 5e-3 for seed in range(10)] for noise in (jumpy, NOISE)]
+    told, smoothed = np.sqrt(np.mean(np.square(lags), axis=1))
+    assert told < 2.0 * SIGMA
+    assert smoothed > 5.0 * SIGMA

@@ -21,7 +21,7 @@ from finforce_ifea.filter.jump import BUMPED, LIFTED, MISPLACED, weigh_jump
 from finforce_ifea.filter.measurement import FREEDOM, NO_WEIGHT, Measurement, weigh
 from finforce_ifea.filter.process import CAMERA_TIME, FREE_DEPTH, Expectation, expect_state, find_decay, predict
 from finforce_ifea.filter.slip_path import SlipPath
-from finforce_ifea.filter.state import DEPTH, SHARED, TRACTION, offset_entries, relative_entries, state_size
+from finforce_ifea.filter.state import DEPTH, SHARED, TRACTION, state_size
 from finforce_ifea.jaw.calibration import Calibration, load_calibration
 from finforce_ifea.mechanics import build_chosen
 from finforce_ifea.observation import Observation
@@ -46,8 +46,8 @@ def draw(seed=0):
     full = np.zeros((6, SIZE))
     full[:, :SHARED] = H
     for row, entry in enumerate(rows):
-        full[row, offset_entries(COUNT).start + entry] = 1.0
-        full[row, relative_entries(COUNT).start + entry] = u[row]
+        full[row, SHARED + entry] = 1.0
+        full[row, SHARED + 2 * COUNT + entry] = u[row]
     root = random.standard_normal((SIZE, SIZE))
     R = np.stack([each @ each.T + 0.1 * np.eye(2) for each in random.standard_normal((3, 2, 2))])
     measured = Measurement(H, rows, u, random.standard_normal(6), R, np.zeros(3))
