@@ -12,9 +12,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from finforce.errors import ObservationError
+from finforce_ifea.contact_mechanics.friction import Coefficient
 from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics
 from finforce_ifea.errors import ContactError, NotEnoughDataError, UnobservableError
-from finforce_ifea.filter.tracker import FilterTracker
+from finforce_ifea.filter.tracker import ContactTracker
 from finforce_ifea.jaw.calibration import Calibration, load_calibration
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_ifea.mechanics import build_chosen
@@ -32,7 +33,6 @@ from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tare import Tare, TareKeeper
 from finforce_ifea.touch import find_touch_probability
 from finforce_ifea.tracking.contact_state import (
-    BUMPED,
     LARGEST_RESIDUAL,
     UNSEEN_ALONG,
     ContactState,
@@ -40,8 +40,6 @@ from finforce_ifea.tracking.contact_state import (
     compute_force,
     find_rejection_reason,
 )
-from finforce_ifea.tracking.contact_tracker import ContactTracker
-from finforce_ifea.tracking.friction import SMOOTH, Coefficient
 from finforce_ifea.tracking.given_contact import GivenContactTracker
 from finforce_ifea.tracking.influence import OffsetChange, ReachWatch, split_change
 from finforce_ifea.tracking.lateral_load import measure_torsion
@@ -97,15 +95,8 @@ class ForceEstimator:
         surface = self.mechanics.contact.surface
         # the least and the greatest y and z of contacts on the inner surface [m]
         self._surface_range = np.stack([surface.low - _TOLERANCE, surface.high + _TOLERANCE])
-        smooth = Coefficient(calibration.friction, calibration.friction_stddev) if calibration else SMOOTH
-        tracker = FilterTracker if self.settings.tracker == "filter" else ContactTracker
-        self._tracked = tracker(
-            self.mechanics,
-            self.jaw.keypoints,
-            self.settings,
-            torsion,
-            smooth,
-            contact_range=self.jaw.contact_range,
+        self._tracked = ContactTracker(
+            self.mechanics, self.jaw.keypoints, self.settings, torsion, contact_range=self.jaw.contact_range
         )
         self._given = GivenContactTracker(self.jaw, self.mechanics, self.settings, self._tracked.response)
         self._tracker: ContactTracker | GivenContactTracker = self._tracked
@@ -149,19 +140,9 @@ class ForceEstimator:
         self._tracked.expect_friction(friction)
 
     @property
-    def seen_friction(self) -> Coefficient:
-        """What the key points alone say of the object's coefficient of friction; infinite deviation: nothing."""
-        return self._tracked.roughness.seen
-
-    @property
     def friction(self) -> Coefficient:
         """The object's coefficient of friction as far as it is known."""
         return self._tracked.friction
-
-    @property
-    def mobilised(self) -> float:
-        """How far the object makes use of its friction, by the way that it has gone, from -1 to 1."""
-        return self._tracked.slips.mobilised
 
     @property
     def touch_probability(self) -> float:
@@ -364,9 +345,7 @@ class ForceEstimator:
         most = bound_residual(self.jaw.keypoints, self._taring.tare.noise) if is_far else np.inf
         reason = find_rejection_reason(state, largest_residual=most, settles=self.settings.solver != "paper")
         if reason:
-            if state["bumped"] > BUMPED and self._contact.touching is False:
-                self._taring.note(quiet=True, loaded=False)
-            if state["bumped"] <= BUMPED and state["magnitude"] <= state["bearable"]:
+            if state["magnitude"] <= state["bearable"]:
                 self._relax(state["force"])
             return self._fail("unobservable", reason, used, iterations)
         self._taring.note(quiet=bool(state["quiet"]), loaded=bool(state["loaded"]))

@@ -8,7 +8,7 @@ history of the recordings, ramps included.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from finforce_ifea.contact_mechanics.friction import Coefficient
 from finforce_ifea.contact_mechanics.indenter import DEPTH, ExpectedObject, expect_object
 from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics, limit_step
 from finforce_ifea.errors import CalibrationError, JawFileError, MeshError
@@ -27,7 +28,6 @@ from finforce_ifea.observation import Contact, Observation
 from finforce_ifea.relaxation import RelaxationTerm, apply_relaxation, invert_relaxation
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tare import OFFSET_STDDEV, compute_tare
-from finforce_ifea.tracking.friction import Coefficient
 
 BRANCH_PRIOR = np.array([0.1, np.log(1.0), 0.1, np.log(10.0)])
 BRANCH_STDDEV = np.array([0.3, 1.5, 0.3, 1.5])
@@ -123,9 +123,11 @@ def fit_calibration(
         return replace(
             rough, calibration=rough.calibration.changed(relaxation=(), force_error=error), uncertainty=known
         )
-    # magnitudes are compared; friction is looked for once they are known
-    smooth = replace(settings, smooth_share=1.0)
-    history = fit_force_history(jaw, cases, smooth, rough.calibration, progress)
+    known = [
+        settings if radius is None else replace(settings, radius=radius, radius_stddev=max(stddev, _LEAST_STDDEV))
+        for radius, stddev in zip(rough.radii, np.sqrt(np.diag(covariance))[len(_NAMES) :].tolist(), strict=True)
+    ]
+    history = fit_force_history(jaw, cases, known, rough.calibration, progress)
     return replace(
         rough,
         calibration=rough.calibration.changed(
@@ -139,7 +141,7 @@ def fit_calibration(
 
 
 class _Fit:
-    """Residuals of all parameters: the finger's, then the shape (log radius or tilt) of each recording's object."""
+    """Residuals of all parameters: the finger's, then radius [m] or tilt [rad] of each recording's object."""
 
     def __init__(
         self,
@@ -262,7 +264,7 @@ class _Fit:
             calibration=calibration,
             uncertainty=dict(zip(_NAMES, (scale * stddev[: len(_NAMES)]).tolist(), strict=True)),
             radii=tuple(
-                float(np.exp(shape)) if case.contact.outline is None else None
+                float(shape) if case.contact.outline is None else None
                 for case, shape in zip(self.cases, x[len(_NAMES) :], strict=True)
             ),
             force_rms=float(np.sqrt(np.mean(errors**2))),
@@ -346,6 +348,7 @@ class CalibrationCase:
         contact: height of first touch.
         stamps_true: (n,) [s].
         forces_true: (n, 3) [N], jaw frame.
+        friction: of the object; None where it is unknown.
     """
 
     name: str
@@ -353,6 +356,7 @@ class CalibrationCase:
     contact: Contact
     stamps_true: NDArray
     forces_true: NDArray
+    friction: Coefficient | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -456,6 +460,8 @@ def _robust_mean(samples: NDArray) -> tuple[NDArray, NDArray]:
 # Two branches, each a share [-] and a log time constant [s]: prior means, standard deviations and bounds.
 _LARGEST_SCALE = 3.0
 _LOADED_FORCE = 0.3
+# Least standard deviation of the radius of an object [m].
+_LEAST_STDDEV = 0.1e-3
 _RELATIVE_ERROR, _ABSOLUTE_ERROR = 0.02, 0.03
 # Errors of neighbouring frames are alike; this many count as one.
 _CORRELATED_FRAMES = 30
@@ -498,18 +504,25 @@ def branches_from_parameters(x: NDArray) -> tuple[RelaxationTerm, ...]:
 def fit_force_history(
     jaw: Jaw,
     cases: Sequence[CalibrationCase],
-    settings: EstimatorSettings,
+    settings: Sequence[EstimatorSettings],
     calibration: Calibration,
     progress: Callable[[float], None],
 ) -> HistoryFit:
     """Fit modulus and relaxation at a given geometry.
 
+    Args:
+        jaw: as drawn.
+        cases: recordings with true forces.
+        settings: of the estimator for each recording, which know its object.
+        calibration: of that geometry.
+        progress: called after each recording.
+
     Raises:
         CalibrationError: The estimator trusts hardly a loaded frame of the recordings.
     """
     histories = []
-    for case in cases:
-        histories.append(_track_force(jaw, case, settings, calibration))
+    for case, own in zip(cases, settings, strict=True):
+        histories.append(_track_force(jaw, case, own, calibration))
         progress(float("nan"))
     fit = least_squares(
         _residuals,
@@ -536,6 +549,7 @@ def _track_force(
 ) -> _ForceHistory:
     """Estimate the elastic force of every frame."""
     estimator = ForceEstimator(jaw, settings=settings, calibration=calibration.changed(relaxation=()))
+    estimator.expect_friction(case.friction)
     solutions = [estimator.update(observation, case.contact) for observation in case.observations]
     trusted = [solution for solution in solutions if solution.trusted]
     if sum(solution.status == "ok" for solution in trusted) < _CORRELATED_FRAMES:
@@ -553,42 +567,3 @@ def _residuals(x: NDArray, histories: Sequence[_ForceHistory]) -> NDArray:
     """Return the force residuals of all frames over their standard deviations, and those of the prior."""
     rows = [(_model(x, c) - c.true) / (_RELATIVE_ERROR * c.true + _ABSOLUTE_ERROR) for c in histories]
     return np.concatenate([np.concatenate(rows) / np.sqrt(_CORRELATED_FRAMES), (x[1:] - BRANCH_PRIOR) / BRANCH_STDDEV])
-
-
-# A coefficient that is known no better than this is none; more loops do not tell the errors of the mechanics apart.
-_VAGUE, _LEAST_STDDEV = 0.15, 0.03
-
-
-def identify_friction(
-    jaw: Jaw, calibration: Calibration, cases: Iterable[CalibrationCase], settings: EstimatorSettings
-) -> Coefficient | None:
-    """Return the coefficient that the key points of all recordings show together; None where they tell too little.
-
-    Recordings without an object's outline tell nothing, nor does the paper's solver.
-
-    Args:
-        jaw: as drawn.
-        calibration: that was found for it.
-        cases: the recordings.
-        settings: of the estimator that the calibration is for.
-
-    Raises:
-        ObservationError: Key points that are none.
-        ContactError: A contact that is not on the jaw.
-    """
-    known = [case for case in cases if case.contact.outline is not None]
-    if not known or settings.solver == "paper":
-        return None
-    estimator = ForceEstimator(jaw, calibration=calibration, settings=replace(settings, smooth_share=0.0))
-    information, vector = 0.0, 0.0
-    for case in known:
-        estimator.forget()
-        for observation in case.observations:
-            estimator.update(observation, case.contact)
-        seen = estimator.seen_friction
-        if np.isfinite(seen.stddev):
-            information += seen.stddev**-2
-            vector += seen.mean * seen.stddev**-2
-    if not information > _VAGUE**-2:
-        return None
-    return Coefficient(max(vector / information, 0.0), max(information**-0.5, _LEAST_STDDEV))

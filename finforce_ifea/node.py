@@ -356,8 +356,7 @@ class IfeaSolverNode(ros.ImageNode):
         limit = max(1.0, self.parameters.max_age)
         alarms = [*alarms, *peer_alarms(self.parameters.peer, self.pairing.silence, limit)]
         mean, stddev = self.estimator.friction
-        friction = f"{mean:.2f} ± {stddev:.2f}, cone used to {100.0 * abs(self.estimator.mobilised):.0f} %"
-        tared = {"tared": str(self.estimator.tared), "friction": friction}
+        tared = {"tared": str(self.estimator.tared), "friction": f"{mean:.2f} ± {stddev:.2f}"}
         tared["touch probability"] = f"{self.estimator.touch_probability:.2f}"
         health = self.health[self.parameters.jaw_name]
         return health.report(alarms, describe_solution(self.last) | tared | self.skips.describe())

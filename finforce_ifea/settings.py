@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from finforce.errors import ObservationError
 from finforce.settings import check_bounds, setting
 
-TRACKERS = ("contact", "filter")
 SOLVERS = ("default", "reduced", "solid", "frame", "plane", "linear", "paper")
 _SOLVER_MEANING = (
     "mechanics: reduced (default), stored equilibria of the model that the jaw file recommends; solid, plane or frame, "
@@ -21,11 +20,6 @@ class EstimatorSettings:
     """
 
     solver: str = setting("default", _SOLVER_MEANING, choices=SOLVERS)
-    tracker: str = setting(
-        "contact",
-        "tracking of the contact: contact, or filter, one Kalman filter whose state includes friction (experimental)",
-        choices=TRACKERS,
-    )
     mesh: str = setting("default", "mesh density of a drawing", choices=("coarse", "default", "fine"))
     likelihood_threshold: float = setting(0.6, "minimum likelihood of a used key point", "1", 0.0, 1.0)
     ignored_keypoints: str = setting("", "names of unused key points, comma-separated")
@@ -33,18 +27,8 @@ class EstimatorSettings:
     gate: float = setting(
         4.5, "residual at which a key point has a quarter of its weight", "sigma", 1.0, 100.0, parameter=False
     )
-    friction: float = setting(0.4, "expected coefficient of friction of a rough object", "1", 0.0, 2.0)
-    friction_stddev: float = setting(
-        0.2, "standard deviation of that coefficient (1 sigma)", "1", 1e-3, 2.0, parameter=False
-    )
-    smooth_share: float = setting(
-        0.65,
-        "prior probability that the object is no rougher than those of the calibration",
-        "1",
-        0.0,
-        1.0,
-        parameter=False,
-    )
+    friction: float = setting(0.45, "expected coefficient of friction of an object", "1", 0.0, 2.0)
+    friction_stddev: float = setting(0.25, "standard deviation of that coefficient (1 sigma)", "1", 1e-3, 2.0)
     held: str = setting(
         "auto",
         "whether only the jaws hold the object, so that friction balances the inclination of their faces; either: "
@@ -55,9 +39,7 @@ class EstimatorSettings:
     automatic_tare: bool = setting(True, "automatic tare at the start, while unloaded")
     height_stddev: float = setting(0.5e-3, "uncertainty of the stated height of first touch (1 sigma)", "m", 1e-6, 0.05)
     radius: float = setting(0.012, "expected radius of curvature of the object at the contact", "m", 0.002, 0.5)
-    radius_log_stddev: float = setting(
-        0.7, "uncertainty of the logarithm of that radius (1 sigma)", "1", 0.01, 3.0, parameter=False
-    )
+    radius_stddev: float = setting(0.008, "uncertainty of that radius (1 sigma)", "m", 1e-5, 0.5, parameter=False)
     iterations: int = setting(12, "maximum Newton iterations per image", "1", 1, 50, parameter=False)
     energy_weight: float = setting(1e-3, "energy weight epsilon of solver paper", "1", 0.0, 1e9)
     energy_form: str = setting(

@@ -46,7 +46,7 @@ class RigidCylinder:
 
     def press(self, points: NDArray, stiffness: NDArray, face_x: float, depth: float, height: float) -> PenaltyContact:
         """Return the contact with points (p, 3) [m] of the object sunk by depth [m] below x = face_x at height [m]."""
-        return RoundIndenter().press(points, stiffness, face_x, np.array([depth, np.log(self.radius), height]))
+        return RoundIndenter().press(points, stiffness, face_x, np.array([depth, self.radius, height]))
 
 
 class RigidOutline:

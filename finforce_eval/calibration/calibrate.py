@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from finforce_eval.evaluation.contact_source import ContactChoice, first_touch
 from finforce_eval.evaluation.forces import check_keypoint_count
 from finforce_eval.evaluation.scoring import match_truth
+from finforce_eval.recordings.objects import read_friction
 from finforce_eval.recordings.tracks import Recording
-from finforce_ifea.identification import CalibrationCase, CalibrationFit, fit_calibration, identify_friction
+from finforce_ifea.identification import CalibrationCase, CalibrationFit, fit_calibration
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_ifea.settings import EstimatorSettings
 
@@ -51,11 +51,12 @@ def calibration_case(
         contact=first_touch(contacts, recording, jaw, density),
         stamps_true=track.stamps_ns[known] * 1e-9,
         forces_true=forces[known],
+        friction=read_friction(recording),
     )
 
 
 def calibrate(cases: Sequence[CalibrationCase], jaw: Jaw, settings: EstimatorSettings) -> CalibrationFit:
-    """Fit the finger to the cases, showing the falling cost, and the friction of their objects.
+    """Fit the finger to the cases, showing the falling cost.
 
     Raises:
         FinforceError: the cases say nothing about the finger.
@@ -68,12 +69,7 @@ def calibrate(cases: Sequence[CalibrationCase], jaw: Jaw, settings: EstimatorSet
             bar.set_postfix(cost=f"{cost:.5g}", refresh=False)
             bar.update()
 
-        fit = fit_calibration(jaw, cases, settings, show)
-    rough = identify_friction(jaw, fit.calibration, cases, settings)
-    if rough is None:
-        return fit
-    known = fit.calibration.changed(friction=rough.mean, friction_stddev=rough.stddev)
-    return replace(fit, calibration=known, uncertainty={**fit.uncertainty, "friction": rough.stddev})
+        return fit_calibration(jaw, cases, settings, show)
 
 
 def fitted_values(fit: CalibrationFit) -> dict[str, float]:

@@ -18,8 +18,8 @@ from finforce.transforms import invert_pose, pose_from_quaternion
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.tracks import PoseTrack, Recording, Timed
+from finforce_ifea.contact_mechanics.friction import Coefficient
 from finforce_ifea.observation import Observation
-from finforce_ifea.tracking.friction import Coefficient
 
 # A pose of the object and one of the jaw are of the same image up to this distance of their stamps [ns].
 PAIRED = 50_000_000

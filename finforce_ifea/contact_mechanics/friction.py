@@ -17,6 +17,13 @@ from numpy.typing import NDArray
 _OPTIONS = {"cache": True, "error_model": "numpy"}
 
 
+class Coefficient(NamedTuple):
+    """A coefficient of friction and its standard deviation [-]."""
+
+    mean: float
+    stddev: float
+
+
 class Touch(NamedTuple):
     """What an object does to one surface point.
 
@@ -68,45 +75,6 @@ def constant_traction(ratio: float) -> Traction:
 FRICTIONLESS = constant_traction(0.0)
 
 
-class Friction:
-    """The friction of one object on a surface of some points.
-
-    Attributes:
-        coefficient: of the object, 0 for none.
-    """
-
-    def __init__(self, count: int, coefficient: float = 0.0) -> None:
-        """Start with points (count) that nothing has touched."""
-        self.coefficient = coefficient
-        self._count = count
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget what the points have done; the coefficient stays."""
-        self._shear = np.zeros(self._count)
-        self._before: tuple[NDArray, NDArray] | None = None
-
-    def shift(self, change: float) -> None:
-        """Count the object's x from another origin, `change` [m] more."""
-        if self._before is not None:
-            self._before = self._before[0], self._before[1] + np.array([change, 0.0])
-
-    def describe(self, origin: NDArray) -> Traction:
-        """Return what acts along the surface with the object's origin (x, z) [m]."""
-        before, start = self._before or (_NO_HISTORY[1], origin)
-        return Traction(0.0, self.coefficient, self._shear, before, origin - start)
-
-    def settle(self, shear: NDArray, points: NDArray, origin: NDArray) -> None:
-        """Remember an equilibrium.
-
-        Args:
-            shear: of each point (p,) [N].
-            points: deformed positions (p, 3) [m].
-            origin: of the object (x, z) [m].
-        """
-        self._before, self._shear = (points.copy(), origin.copy()), shear
-
-
 _SPRING, _CHANGE = 1, 3
 # What `add_traction` writes of each point: force, two columns of springs, four of changes, along x and z.
 POINT_SHAPE = (2, 7)
@@ -126,11 +94,7 @@ def _add_ratio(ratio, touch, out):
 
 @njit(**_OPTIONS)
 def add_traction(traction, touch, p, x, z, stiffness, out):
-    """Write point p, at x and z [m], with what acts along the surface to out (2, 7); see `POINT_SHAPE`.
-
-    Returns:
-        Its shear, and the most that the cone allows; zero where friction is not followed [N].
-    """
+    """Write point p, at x and z [m], with what acts along the surface to out (2, 7); see `POINT_SHAPE`."""
     fx, fz = touch.fx, touch.fz
     out[0, 0], out[0, 1], out[0, 2] = fx, touch.kxx, touch.kxz
     out[1, 0], out[1, 1], out[1, 2] = fz, touch.kxz, touch.kzz
@@ -140,10 +104,10 @@ def add_traction(traction, touch, p, x, z, stiffness, out):
         _add_ratio(traction.ratio, touch, out)
         out[0, 0] += traction.ratio * fz
         out[1, 0] -= traction.ratio * fx
-        return 0.0, 0.0
+        return
     normal = np.hypot(fx, fz)
     if normal <= 0.0:
-        return 0.0, 0.0
+        return
     tx, tz = fz / normal, -fx / normal
     slip, before = 0.0, traction.before
     if len(before) > 0:
@@ -160,4 +124,3 @@ def add_traction(traction, touch, p, x, z, stiffness, out):
             out[a, _CHANGE + 2] += stiffness * ta * tz
     out[0, 0] += shear * tx
     out[1, 0] += shear * tz
-    return shear, limit

@@ -1,7 +1,7 @@
 """Rigid objects pressed into a jaw: what they do to surface points in a contact state (depth, shape, height).
 
 The second number of a contact state is the one more thing that key points can tell of an object: of an unknown object
-its logarithmic radius, of a known outline its tilt.
+its radius, of a known outline its tilt.
 
 Surface points are pushed out by a smoothed penalty. The penetration into an outline is a smooth field, twice
 differentiable: signed distances to the polygons are the coefficients of a uniform cubic B-spline, which smooths over
@@ -284,7 +284,7 @@ class IndenterPose(NamedTuple):
 def pose_object(pressed, face_x, x):
     """Return the `IndenterPose` in a contact state (3,)."""
     if pressed.is_round:
-        radius = np.exp(x[1])
+        radius = x[1]
         return IndenterPose(face_x + radius - x[0], x[2], radius, 1.0, 0.0)
     return IndenterPose(face_x + pressed.front - x[0], x[2], 0.0, np.cos(x[1]), np.sin(x[1]))
 
@@ -306,7 +306,7 @@ def touch_object(pressed, pose, x, z, stiffness, weights):
     """Return the `Touch` of one point at x and z [m], derivatives by its shape; `weights` is (6, 4)."""
     if pressed.is_round:
         touch = _touch_cylinder(x, z, stiffness, pose.x, pose.z, pose.radius)
-        bx, bz = pose.radius * (touch.bx + touch.kxx), pose.radius * (touch.bz + touch.kxz)
+        bx, bz = touch.bx + touch.kxx, touch.bz + touch.kxz
         return Touch(touch.fx, touch.fz, touch.kxx, touch.kxz, touch.kzz, bx, bz)
     field = pressed.coefficients, pressed.low, CELL
     return _touch_field(x, z, stiffness, *field, pose.x, pose.z, pose.c, pose.s, weights)
@@ -332,7 +332,7 @@ def _find_first_touch(pressed, face, state):
     """Return the depth [m] at which an object with a contact state (3,) first touches an undeformed `FaceProfile`."""
     points = face.points
     if pressed.is_round:
-        radius = np.exp(state[1])
+        radius = state[1]
         least = 0.0 if face.is_flat else radius
         for p in range(0 if face.is_flat else len(points)):
             dz = points[p, 1] - state[2]
@@ -360,21 +360,18 @@ def flat_profile(low: float, high: float, x: float = 0.0) -> FaceProfile:
 
 @njit(**_OPTIONS)
 def _press_points(pressed, pose, traction, points, stiffness):
-    """Return forces, springs, changes, shear and the used share of the cone at points; see `PenaltyContact`."""
+    """Return forces, springs and changes at points; see `PenaltyContact`."""
     count, out, weights = len(points), np.zeros(POINT_SHAPE), np.zeros((6, 4))
     forces, springs, changes = np.zeros((count, 3)), np.zeros((count, 3, 3)), np.zeros((count, 3, 4))
-    shear, total, allowed = np.zeros(count), 0.0, 0.0
     for p in range(count):
         x, z = points[p, 0], points[p, 2]
         touch = touch_object(pressed, pose, x, z, stiffness[p], weights)
-        shear[p], limit = add_traction(traction, touch, p, x, z, stiffness[p], out)
-        total += shear[p]
-        allowed += limit
+        add_traction(traction, touch, p, x, z, stiffness[p], out)
         for a in range(2):
             forces[p, 2 * a], springs[p, 2 * a, 0], springs[p, 2 * a, 2] = out[a, 0], out[a, 1], out[a, 2]
             for i in range(4):
                 changes[p, 2 * a, i] = out[a, 3 + i]
-    return forces, springs, changes, shear, total / allowed if allowed > 0.0 else 0.0
+    return forces, springs, changes
 
 
 class PenaltyContact(NamedTuple):
@@ -385,15 +382,11 @@ class PenaltyContact(NamedTuple):
         springs: negative derivatives of the forces by the points' positions (p, 3, 3) [N/m].
         changes: derivatives of the forces by the object's depth, shape and height and by a traction ratio of all forces
             (p, 3, 4).
-        shear: along the tangents (p,) [N].
-        mobilised: what the shear adds up to over what the cone allows, from -1 to 1.
     """
 
     forces: NDArray
     springs: NDArray
     changes: NDArray | None = None
-    shear: NDArray | None = None
-    mobilised: float = 0.0
 
 
 class Indenter:
@@ -454,13 +447,12 @@ class Indenter:
 
 
 class RoundIndenter(Indenter):
-    """A cylinder of any radius, in states of depth [m], ln radius, and height of its axis [m].
+    """A cylinder of any radius, in states of depth [m], radius [m], and height of its axis [m].
 
     A larger radius moves the axis back, so that the depth stays.
     """
 
-    lowest, highest = float(np.log(3e-3)), float(np.log(0.2))
-    largest_change, settled_change = 0.15, 5e-2
+    lowest, highest, largest_change, settled_change = 3e-3, 0.2, 2e-3, 0.5e-3
     has_corners = False
     pressed = PressedObject(True, np.zeros((1, 1)), np.zeros(2), 0.0, np.zeros((0, 4)))
 
@@ -535,8 +527,8 @@ def expect_object(contact: Contact, settings: EstimatorSettings, known: Indenter
     outline = contact.outline
     if outline is None:
         height = np.average(contact.points[:, 2], weights=contact.weights)
-        mean = np.array([np.log(settings.radius), height])
-        own = np.array([settings.radius_log_stddev, settings.height_stddev])
+        mean = np.array([settings.radius, height])
+        own = np.array([settings.radius_stddev, settings.height_stddev])
         return ExpectedObject(indenter=RoundIndenter(), mean=mean, variance=own**2)
     same = isinstance(known, OutlineIndenter) and known.describes(outline)
     indenter = known if same else _build_outline(_Shape(outline.polygons))

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
 from finforce.kalman import Track
+from finforce_ifea.contact_mechanics.friction import Coefficient
 from finforce_ifea.contact_mechanics.pressed_jaw import RigidContact
+from finforce_ifea.filter.readout import LARGEST_RATIO
 from finforce_ifea.filter.slip_path import SlipPath
-from finforce_ifea.tracking.friction import Coefficient
 
 # Coefficients of friction that are weighed against each other, and the deviation of a coefficient up to which one is
 # enough: that is within what no friction explains.
@@ -17,8 +20,6 @@ _WELL_KNOWN = 0.05
 # They cover the expected coefficient by so many standard deviations, up to the largest [-].
 _SPAN = 2.5
 _LARGEST = 1.2
-# The largest traction ratio that the mechanics is asked for [-].
-LARGEST_RATIO = 0.9
 # Prior probability that only the jaws hold an object between two of them [-].
 _HELD = 0.5
 # A motion back by less than this is noise [sigma] while the object moves, and where it has stopped; and one along the
@@ -37,6 +38,16 @@ _TOUCH_STDDEV = 0.1e-3
 # Part of the path's deviation that is left while all of the contact slides.
 _SLIDING = 0.3
 _LEAST_PROBABILITY = 1e-6
+# Length of the path that can be taken back [m].
+_BRANCH = 1e-3
+
+
+class _Branch(NamedTuple):
+    """Part of the path in one direction: places (M, 2) [m] and traction ratios (M,) at its start, direction before."""
+
+    start: NDArray
+    ratios: NDArray
+    before: float
 
 
 class TractionHypotheses:
@@ -55,10 +66,6 @@ class TractionHypotheses:
     def __init__(self, friction: Coefficient, held: str) -> None:
         """Expect an object of a coefficient of friction; `held` as in `EstimatorSettings`."""
         self._held = {"yes": 1.0, "either": _HELD}.get(held, 0.0)
-        self.expect(friction)
-
-    def expect(self, friction: Coefficient) -> None:
-        """Expect another coefficient of friction."""
         mean, stddev = friction
         self.unweighed = stddev if stddev <= _WELL_KNOWN else 0.0
         if self.unweighed:
@@ -82,11 +89,20 @@ class TractionHypotheses:
         self._path.reset()
         self._anchor: NDArray | None = None
         self._anchor_stddev, self._direction, self.stddev = _TOUCH_STDDEV, 1.0, 0.0
+        self._branch: _Branch | None = None
 
     @property
     def prior(self) -> NDArray:
         """Log prior probabilities (N,), those of the grid first."""
-        parts = [np.log(self._prior * (1.0 - self._held))] if self._held < 1.0 else []
+        return self._join(self._prior)
+
+    def reweigh(self, log_weights: NDArray) -> NDArray:
+        """Return log probabilities (N,) in which that of "held" is the prior one again, and the coefficients' stay."""
+        return self._join(self._share(np.exp(log_weights)) if self.follows_path else self._prior)
+
+    def _join(self, shares: NDArray) -> NDArray:
+        """Return log probabilities (N,) for those of the coefficients (M,) where one of them holds."""
+        parts = [np.log((shares + 1e-300) * (1.0 - self._held))] if self._held < 1.0 else []
         return np.concatenate([*parts, [np.log(self._held)]]) if self._held > 0.0 else parts[0]
 
     @property
@@ -144,13 +160,15 @@ class TractionHypotheses:
         """Count the depth `change` [m] more."""
         if self._anchor is not None:
             self._anchor[:, 0] += change
+            self._branch.start[:, 0] += change
 
     def follow(
         self, contact: RigidContact, q: NDArray, x: NDArray, places: NDArray, track: Track, weights: NDArray
     ) -> None:
         """Follow the object to where it is now.
 
-        A motion back counts once it is no chance; what stopped short of it stopped where it is known best.
+        A motion back counts once it is no chance. What stopped short of where it seemed to be is taken back to where
+        it is known best, and its path with it.
 
         Args:
             contact: of the jaw.
@@ -163,6 +181,7 @@ class TractionHypotheses:
         places, own = places[: len(self.mu)], self._share(weights)
         if self._anchor is None:
             self._anchor = places.copy()
+            self._begin_branch(self._direction)
         motion = places - self._anchor
         motion[:, 1] -= np.clip(motion[:, 1], -_HEIGHT_PLAY, _HEIGHT_PLAY)
         deeper, stddev = float(own @ motion[:, 0]), float(np.sqrt(max(track.variance, 0.0)))
@@ -171,11 +190,18 @@ class TractionHypotheses:
             sigmas = _REVERSAL if track.rests < _MOVES else _REVERSAL_AT_REST
             if is_back and abs(deeper) < sigmas * np.hypot(stddev, self._anchor_stddev):
                 if stddev < _STOPPED * self._anchor_stddev:
-                    self._anchor, self._anchor_stddev = places.copy(), stddev
+                    self._take_back(contact, q, x, places, own)
+                    self._anchor_stddev = stddev
                 return
             if abs(deeper) < _SHORTEST:
                 return
-        self._anchor_stddev, self._direction = stddev, float(np.sign(deeper))
+        before, self._anchor_stddev, self._direction = self._direction, stddev, float(np.sign(deeper))
+        if (
+            self._direction != before
+            or motion[:, 1].any()
+            or own @ np.abs(self._anchor - self._branch.start)[:, 0] > _BRANCH
+        ):
+            self._begin_branch(before)
         self._anchor = self._anchor + motion
         self.motion += abs(deeper)
         self._path.move(contact, q, x, motion)
@@ -183,3 +209,18 @@ class TractionHypotheses:
         self.stddev = self._path.turn_at(float(own @ self._path.ratios)) * stddev
         if own @ slides > 0.5:
             self.stddev *= _SLIDING
+
+    def _begin_branch(self, before: float) -> None:
+        """Keep the path up to here, where the object had the direction `before`."""
+        self._branch = _Branch(self._anchor.copy(), self._path.ratios.copy(), before)
+
+    def _take_back(self, contact: RigidContact, q: NDArray, x: NDArray, places: NDArray, own: NDArray) -> None:
+        """Follow the path anew from the start of its branch to the places (M, 2); see `follow` for the arguments."""
+        start, ratios, before = self._branch
+        motion = np.zeros_like(places)
+        motion[:, 0] = places[:, 0] - start[:, 0]
+        self._path.ratios, self._anchor = ratios.copy(), places.copy()
+        if own @ motion[:, 0] * self._direction < 0.0:
+            self._direction = before
+        if own @ motion[:, 0] * self._direction > 0.0:
+            self._path.move(contact, q, x, motion)

@@ -56,6 +56,8 @@ OFFSET = Jump(np.array([HEIGHT]), np.array([15e-3]), 1e-4)
 # Log odds against a jump since the first image, its prior left out, after which the test begins anew.
 _UNLIKELY = -3.0
 NO_JUMP = -1
+# Error of the linearisation about the last state, as a share of the object's motion since.
+_NONLINEAR = 0.2
 
 
 @njit(**_OPTIONS)
@@ -102,11 +104,7 @@ def detect_jump(measured, ratios, x, log_weights, P, jumps, possible):
     H, rows, u, R = measured.H, measured.rows, measured.u, measured.R
     nu = np.dot(np.exp(log_weights), expect_innovations(measured, ratios, x))
     _, S = innovate(H, rows, u, P, R)
-    blocks = np.empty_like(R)
-    for i in range(len(R)):
-        blocks[i] = S[2 * i : 2 * i + 2, 2 * i : 2 * i + 2]
-    moved = nu - H[:, DEPTH] * find_depth_jump(H, R, nu)
-    weight = weigh(moved.reshape(-1, 2), blocks, measured.square)
+    weight = _weigh_innovations(measured, nu, S, P[DEPTH, DEPTH])
     extra = divide_noise(R, weight) - R
     for i in range(len(R)):
         S[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] += extra[i]
@@ -114,19 +112,36 @@ def detect_jump(measured, ratios, x, log_weights, P, jumps, possible):
     white_H, white = solve_lower(L, H), solve_lower(L, nu.reshape(-1, 1))
     rows_H = np.ascontiguousarray(white_H.T)
     information, score = np.dot(rows_H, white_H), np.dot(rows_H, white)[:, 0].copy()
-    found, most, entries, stddev = NO_JUMP, 0.0, jumps[0].entries, jumps[0].stddev
+    found, most = NO_JUMP, 0.0
     for index, jump in enumerate(jumps):
         if possible[index]:
             own, part = select_entries(jump.entries, information, score)
             odds = weigh_jump(jump, own, part)
             if odds > most:
                 found, most = index, odds
-                entries, stddev = jump.entries, jump.stddev
-    if found == NO_JUMP:
-        return weigh(nu.reshape(-1, 2), blocks, measured.square), found
-    for i in range(len(entries)):
-        P[entries[i], entries[i]] += stddev[i] ** 2
+    for index, jump in enumerate(jumps):
+        if index == found:
+            for i in range(len(jump.entries)):
+                P[jump.entries[i], jump.entries[i]] += jump.stddev[i] ** 2
     return weight, found
+
+
+@njit(**_OPTIONS)
+def _weigh_innovations(measured, nu, S, depth_variance):
+    """Return weights of the key points (m,) by their innovation (2 m,), the motion of the object taken out.
+
+    S has a depth of which nothing is known; here it is known as well as the median of the key points has it.
+    """
+    H, R = measured.H, measured.R
+    deeper, variance = find_depth_jump(H, R, nu)
+    moved, spread = nu - H[:, DEPTH] * deeper, variance + (_NONLINEAR * deeper) ** 2 - depth_variance
+    blocks = np.empty_like(R)
+    for i in range(len(R)):
+        h = H[2 * i : 2 * i + 2, DEPTH]
+        for a in range(2):
+            for b in range(2):
+                blocks[i, a, b] = S[2 * i + a, 2 * i + b] + spread * h[a] * h[b]
+    return weigh(moved.reshape(-1, 2), blocks, measured.square)
 
 
 class JumpWatch:

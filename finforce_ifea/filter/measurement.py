@@ -39,6 +39,8 @@ FREEDOM = 4.0
 # Weight up to which a key point is a gross error, and what is left of it: nothing that would matter.
 _GROSS = 0.1
 NO_WEIGHT = 1e-9
+# Variance of a median over that of a mean [-]: pi / 2.
+_MEDIAN = 1.57
 # Error of the mechanics along y, one sigma [m].
 LATERAL_ERROR = 0.1e-3
 
@@ -127,7 +129,13 @@ def weigh(left, covariance, square):
 
 @njit(**_OPTIONS)
 def find_depth_jump(H, R, nu):
-    """Return the median [m] of the depths that the key points ask for one by one, by H, R and the innovation nu."""
+    """Return the median [m] of the depths that the key points ask for one by one, and its variance [m^2].
+
+    Args:
+        H: see `Measurement`.
+        R: see `Measurement`.
+        nu: innovation (2 m,) [m].
+    """
     m = len(R)
     asked, information = np.empty(m), np.empty(m)
     for i in range(m):
@@ -136,9 +144,9 @@ def find_depth_jump(H, R, nu):
         det = a * c - b * b
         information[i] = (c * h0 * h0 - 2.0 * b * h0 * h1 + a * h1 * h1) / det
         asked[i] = (c * h0 * r0 - b * (h0 * r1 + h1 * r0) + a * h1 * r1) / det / max(information[i], 1e-300)
-    total, half = 0.0, 0.5 * information.sum()
+    total, known = 0.0, max(information.sum(), 1e-300)
     for i in np.argsort(asked):
         total += information[i]
-        if total >= half:
-            return asked[i]
-    return 0.0
+        if total >= 0.5 * known:
+            return asked[i], _MEDIAN / known
+    return 0.0, _MEDIAN / known

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from finforce_ifea.filter.measurement import NO_WEIGHT
-from finforce_ifea.filter.state import CAMERA_X, CAMERA_Z, DEPTH, HEIGHT, SHARED, TRACTION
-from finforce_ifea.tracking.contact_search import LOADED_DEPTH, TOUCH_DEPTH
+from finforce_ifea.filter.state import DEPTH, HEIGHT, SHARED, TRACTION
+from finforce_ifea.tracking.contact_state import LEAST_DEPTH, LOADED_DEPTH, TOUCH_DEPTH
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
 # Error of the force's direction [-]: it is considered and never estimated.
 _MISDIRECTED = 0.03
-# Below this depth the force goes linearly to zero [m].
-_LEAST_DEPTH = 3e-5
+# The largest traction ratio that the mechanics is asked for [-].
+LARGEST_RATIO = 0.9
 # Weight at which a key point still agrees.
 AGREES = 0.25
 
@@ -52,7 +53,7 @@ def read_out(state, force, modes, x, log_weights, P, shift, reduction, at, ratio
             covariance[a, b] += (spread + _MISDIRECTED**2) * modes[a, 3] * modes[b, 3]
             for i in range(count):
                 covariance[a, b] += w[i] * (forces[i, a] - found[a]) * (forces[i, b] - found[b])
-    continued, size, along = min(1.0, max(0.0, state.depth / _LEAST_DEPTH)), 0.0, 0.0
+    continued, size, along = min(1.0, max(0.0, state.depth / LEAST_DEPTH)), 0.0, 0.0
     for a in range(3):
         state.force[a], state.pressing[a] = continued * found[a], force[a]
         size += state.force[a] ** 2
@@ -66,6 +67,12 @@ def read_out(state, force, modes, x, log_weights, P, shift, reduction, at, ratio
     state.traction_ratio = kappa
     state.sound = state.sound and np.isfinite(covariance.sum() + found.sum())
     state.quiet, state.loaded = state.depth < TOUCH_DEPTH, state.depth > LOADED_DEPTH
+
+
+def find_upright_ratio(force: NDArray, ratio: float) -> float:
+    """Return the traction ratio at which a force (3,) [N] that has a ratio now has nothing along the finger."""
+    ahead, along = force[0] - ratio * force[2], force[2] + ratio * force[0]
+    return min(max(along / ahead, -LARGEST_RATIO), LARGEST_RATIO) if ahead != 0.0 else 0.0
 
 
 @njit(**_OPTIONS)
@@ -95,4 +102,3 @@ def judge_points(state, points, seen, mean, V, left, weight, expected_height):
         misfit += mean[i] ** 2 / V[i]
     state.misfit = np.sqrt(misfit / offsets)
     state.offset = mean[HEIGHT] - expected_height
-    state.motion = np.hypot(mean[CAMERA_X], mean[CAMERA_Z])

@@ -13,11 +13,20 @@ from numba import njit
 from numpy.typing import NDArray
 
 from finforce.kalman import MotionNoise, Track
-from finforce_ifea.contact_mechanics.friction import Traction, constant_traction
+from finforce_ifea.contact_mechanics.friction import Coefficient, constant_traction
 from finforce_ifea.contact_mechanics.pressed_jaw import PressedState, RigidContact, limit_step
 from finforce_ifea.filter.filter import Posterior, reduce_covariance, update
-from finforce_ifea.filter.friction_path import LARGEST_RATIO, TractionHypotheses
-from finforce_ifea.filter.jump import BUMPED, LIFTED, MISPLACED, NO_JUMP, NUDGED, OFFSET, JumpWatch, detect_jump
+from finforce_ifea.filter.friction_path import TractionHypotheses
+from finforce_ifea.filter.jump import (
+    BUMPED,
+    LIFTED,
+    MISPLACED,
+    NO_JUMP,
+    NUDGED,
+    OFFSET,
+    JumpWatch,
+    detect_jump,
+)
 from finforce_ifea.filter.measurement import Measurement, find_seen, observe
 from finforce_ifea.filter.process import (
     BUMPED_SHIFT,
@@ -37,15 +46,27 @@ from finforce_ifea.filter.process import (
     find_growth,
     predict,
 )
-from finforce_ifea.filter.readout import AGREES, judge_points, read_out
+from finforce_ifea.filter.readout import AGREES, LARGEST_RATIO, find_upright_ratio, judge_points, read_out
 from finforce_ifea.filter.state import CONTACT, DEPTH, HEIGHT, SHAPE, TRACTION, state_size
 from finforce_ifea.settings import EstimatorSettings
-from finforce_ifea.tracking.contact_search import LOADED_DEPTH, ContactSearch, find_x_model
-from finforce_ifea.tracking.contact_state import blank_contact_state
-from finforce_ifea.tracking.friction import Coefficient
-from finforce_ifea.tracking.held_weight import find_upright_ratio
+from finforce_ifea.tracking.contact_state import KEYPOINT, LEAST_DEPTH, LOADED_DEPTH, blank_contact_state
+from finforce_ifea.tracking.lateral_load import WEIGHT
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
+# What is expected of an object, and what the search for its contact is allowed.
+EXPECTATION = np.dtype(
+    [
+        ("mean", float, 2),  # of shape and height [m]
+        ("variance", float, 2),  # of both
+        ("lowest", float),  # shape
+        ("highest", float),  # shape
+        ("largest_change", float),  # of the shape at once
+        ("settled_change", float),  # of the shape that no longer matters
+        ("has_corners", bool),  # whether the object may rock
+        ("shared", float),  # standard deviation of a shift that all key points of an image share [m]
+    ],
+    align=True,
+)
 # Process noise of the depth: drift at rest [m/s^0.5], changes of the speed in motion [m/s^1.5], speed at which motion
 # starts [m/s], mean times of rest and motion [s]: jaws close at millimetres per second, and stop. Jumps [m] are images
 # that were missed, or another object.
@@ -92,31 +113,46 @@ class _Linearized(NamedTuple):
     motions: NDArray
 
 
-class FilterSearch(ContactSearch):
-    """Takes the place of `ContactSearch`.
+class ContactSearch:
+    """The contact of one jaw with one object, image after image.
 
     Attributes:
+        points: key points of the last image (K,), see `KEYPOINT`.
+        state: of the contact in the last image in which it was found, see `CONTACT_STATE`.
+        expectation: of the object, see `EXPECTATION`.
+        q: unknowns of the jaw (size,).
+        positions: of the key points in the model (K, 3) [m].
         hypotheses: of the object's traction.
         x: means of the hypotheses (N, n); None before the first image.
         P: covariance (n, n).
         log_weights: of the hypotheses (N,).
         track: of the depth.
+        weight: 1 sigma of the traction ratio by a weight that the jaws may lift [-].
     """
 
     def __init__(self, count: int, settings: EstimatorSettings) -> None:
         """Prepare the filter for `count` key points."""
-        super().__init__(count, settings)
+        self.settings = settings
+        self.points, self.positions = np.zeros(count, KEYPOINT), np.zeros((count, 3))
+        self.state, self.expectation = blank_contact_state(), np.zeros((), EXPECTATION)
         self._size, self._count = state_size(count), count
         self._watches = [JumpWatch(jump, self._size) for jump in (NUDGED, OFFSET)]
-        self.hypotheses = TractionHypotheses(Coefficient(settings.friction, settings.friction_stddev), settings.held)
+        self.weight = WEIGHT
+        self.expect_friction(Coefficient(settings.friction, settings.friction_stddev))
 
     def begin(self, contact: RigidContact, mean: NDArray) -> None:
-        """See `ContactSearch.begin`."""
-        super().begin(contact, mean)
-        self.x: NDArray | None = None
+        """Begin with the undeformed jaw and an object of expected shape and height (2,) that just touches."""
+        self.state = blank_contact_state()
+        self.state["x"][1:] = mean
+        self.state["x"][DEPTH] = contact.find_touch(self.state["x"])
+        self.resume(contact.begin(mean[1]))
         self._misplaced = False
         self.restart()
         self.hypotheses.reset()
+
+    def resume(self, q: NDArray) -> None:
+        """Continue from another shape of the jaw (size,), whose motions are not known yet."""
+        self.q, self._modes = q, np.zeros((len(q), 3))
 
     def forget(self, mean: NDArray) -> None:
         """Expect an object of any shape and height about the mean (2,) again; key points and friction stay."""
@@ -134,8 +170,9 @@ class FilterSearch(ContactSearch):
             self.P[i, i] = variance
 
     def restart(self) -> None:
-        """Start anew where the contact is now, as after another tare."""
-        self.x, self._bumped, self._smooth = None, False, 0.0
+        """Start anew where the contact is now, as after another tare; what is known of friction stays."""
+        self.x: NDArray | None = None
+        self._bumped, self._smooth = False, 0.0
         self._forget_innovations()
 
     def _forget_innovations(self) -> None:
@@ -144,21 +181,20 @@ class FilterSearch(ContactSearch):
 
     def expect_friction(self, friction: Coefficient) -> None:
         """Expect an object of another coefficient of friction, of which nothing was seen."""
-        self.hypotheses.expect(friction)
-        if self.x is not None:
-            self.x = np.tile(self.mean, (len(self.hypotheses.prior), 1))
-            self.log_weights = self.hypotheses.prior
+        self.hypotheses = TractionHypotheses(friction, self.settings.held)
+        self.log_weights = self.hypotheses.prior
+        self.restart()
 
     def let_go(self) -> None:
         """Weigh anew whether only the jaws hold the object."""
         if self.x is not None:
             self.x[:] = self.mean
-            self.log_weights = self.hypotheses.prior
+            self.log_weights = self.hypotheses.reweigh(self.log_weights)
             self.hypotheses.reset()
 
-    def lead(self, change: NDArray, kept: float) -> None:
-        """See `ContactSearch.lead`."""
-        super().lead(change, kept)
+    def lead(self, change: NDArray) -> None:
+        """Take shape and height along by a change (2,)."""
+        self.state["x"][1:] += change
         if self.x is None:
             return
         for i, each in zip((SHAPE, HEIGHT), change, strict=True):
@@ -166,16 +202,16 @@ class FilterSearch(ContactSearch):
             self.P[i, i] += (_SLIDE * each) ** 2
 
     def shift(self, change: float) -> None:
-        """See `ContactSearch.shift`."""
-        super().shift(change)
+        """Count the depth `change` [m] more, as of an object that was cut anew."""
+        self.state["x"][DEPTH] += change
+        self.state["x_model"][DEPTH] += change
         if self.x is not None:
             self.x[:, DEPTH] += change
             self.track.shift(change)
             self.hypotheses.shift(change)
 
     def lose(self, stddev: float) -> None:
-        """See `ContactSearch.lose`."""
-        super().lose(stddev)
+        """Widen the search for the next image by a standard deviation of the depth [m]."""
         if self.x is not None:
             self.track.widen(stddev**2)
 
@@ -192,7 +228,12 @@ class FilterSearch(ContactSearch):
     @property
     def friction(self) -> Coefficient:
         """What is known of the coefficient of friction."""
-        return self.hypotheses.estimate(np.exp(self.hypotheses.prior) if self.x is None else self.weights)
+        return self.hypotheses.estimate(self.weights)
+
+    @property
+    def ratio(self) -> float:
+        """Expected traction ratio [-]."""
+        return float(np.clip(self.weights @ self.hypotheses.ratios, -LARGEST_RATIO, LARGEST_RATIO))
 
     def _expect(self) -> Expectation:
         """Return what the state returns to."""
@@ -212,8 +253,6 @@ class FilterSearch(ContactSearch):
 
     def _predict(self, dt: float) -> None:
         """Predict the state of an image dt [s] after the last one."""
-        if self.x is None:
-            self.log_weights = self.hypotheses.prior
         expected, motion = self._expect(), self.hypotheses.take_motion()
         bent = _find_displacements(self.points, self.positions, self.x is not None)
         m, V = expect_state(expected, self.points["offset_variance"], bent)
@@ -229,17 +268,21 @@ class FilterSearch(ContactSearch):
         for watch in self._watches:
             watch.predict(a * growth)
 
-    def find(
-        self, contact: RigidContact, traction: Traction, probe: Any, dt: float, *, iterations: int, is_sudden: bool
-    ) -> bool:
-        """See `ContactSearch.find`; the filter knows traction and speed by itself."""
+    def find(self, contact: RigidContact, probe: Any, dt: float, *, iterations: int) -> bool:
+        """Find the contact in the image of `points`; False, all as it was, where too few key points agree.
+
+        Args:
+            contact: of the jaw with the object.
+            probe: of its key points.
+            dt: time since the last image [s].
+            iterations: at most; the next image goes on from there.
+        """
         self._predict(dt)
         points, expectation, seen = self.points, self.expectation, find_seen(self.points)
         if len(seen) < max(self.settings.minimum_keypoints, 3):
             return False
         self.log_weights = self.hypotheses.bound_held(self.log_weights)
-        ratios = self.hypotheses.ratios
-        ratio = float(np.clip(self.weights @ ratios, -LARGEST_RATIO, LARGEST_RATIO))
+        ratios, ratio = self.hypotheses.ratios, self.ratio
         x = self.mean[CONTACT]
         x[0], x[1] = self.track.x, min(max(x[1], expectation["lowest"]), expectation["highest"])
         q = self.q + self._modes @ (find_x_model(contact, x)[0] - self.state["x_model"])
@@ -340,7 +383,7 @@ class FilterSearch(ContactSearch):
         """
         s, pressed, smoothing = blank_contact_state(), at.pressed, self._smooth_depth(posterior)
         x_model, s["depth"] = find_x_model(contact, x)
-        s["x"], s["x_model"], s["x_asked"], s["speed"] = x, x_model, x, self.track.speed
+        s["x"], s["x_model"] = x, x_model
         s["pressure_point"], s["pressure_location"] = pressed.pressure_point, pressed.pressure_location
         s["extrapolation"], s["sound"] = pressed.extrapolation, pressed.smallest_det > 0.0
         s["mistaken"] = self._misplaced
@@ -349,8 +392,7 @@ class FilterSearch(ContactSearch):
         read_out(s, force, modes, self.x, self.log_weights, self.P, shift, smoothing, at.x, ratios, ratio, spread)
         self.state = s
         if s["magnitude"] > _LEAST_FORCE:
-            upright = find_upright_ratio(force, ratio)
-            self.hypotheses.upright = min(max(upright, -LARGEST_RATIO), LARGEST_RATIO)
+            self.hypotheses.upright = find_upright_ratio(force, ratio)
 
     def follow_path(self, contact: RigidContact) -> None:
         """Follow how the object uses its friction, which the force of the image did not wait for."""
@@ -365,6 +407,13 @@ class FilterSearch(ContactSearch):
     def contact_covariance(self) -> NDArray:
         """Return the covariance of depth, shape and height (3, 3)."""
         return self.P[np.ix_(CONTACT, CONTACT)]
+
+
+def find_x_model(contact: RigidContact, x: NDArray) -> tuple[NDArray, float]:
+    """Return the state (3,) at which the mechanics stands for x, never above the surface, and the depth below [m]."""
+    x_model, touch = x.copy(), contact.find_touch(x)
+    x_model[DEPTH] = max(x[DEPTH], touch + LEAST_DEPTH)
+    return x_model, x[DEPTH] - touch
 
 
 @njit(**_OPTIONS)

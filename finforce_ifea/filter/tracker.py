@@ -1,77 +1,388 @@
-"""Tracks the contact with the pressing object by the filter; see `finforce_ifea.filter`."""
+"""Depth, shape and height of the pressing object from key points, image after image, on the deformed jaw.
+
+The shape of an unknown object is its radius, that of a known outline its tilt.
+"""
 
 from __future__ import annotations
 
+from math import hypot, inf, nan, sqrt
+from typing import Any, NamedTuple
+
+import numpy as np
 from numpy.typing import NDArray
 
-from finforce_ifea.filter.search import FilterSearch
-from finforce_ifea.observation import Observation
-from finforce_ifea.tare import Tare
-from finforce_ifea.tracking.contact_search import TOUCH_DEPTH
-from finforce_ifea.tracking.contact_state import ContactState
-from finforce_ifea.tracking.contact_tracker import FULL_ITERATIONS, IMAGES_RELEASED, LOST_STDDEV, ContactTracker
-from finforce_ifea.tracking.friction import Coefficient
+from finforce_ifea.contact_mechanics.friction import Coefficient, constant_traction
+from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, SHAPE, OutlineIndenter, RoundIndenter, expect_object
+from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics, RigidContact, limit_step
+from finforce_ifea.filter.search import ContactSearch, find_x_model
+from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE
+from finforce_ifea.observation import Contact, Observation
+from finforce_ifea.settings import EstimatorSettings
+from finforce_ifea.tare import PointNoise, Tare
+from finforce_ifea.tracking.contact_state import (
+    MIDDLE_STDDEV,
+    TOUCH_DEPTH,
+    UNSEEN_TRACTION,
+    ContactState,
+)
+from finforce_ifea.tracking.influence import explain_offsets, measure_influence, press_lightly
+from finforce_ifea.tracking.lateral_load import LateralLoad, Torsion, share_weight
+
+# Images without touch after which the next object may be any.
+_IMAGES_RELEASED = 15
+# 1 sigma by which the depth is less known after an image that told nothing [m].
+_LOST_STDDEV = 1e-3
+# The height may leave what was given by this many of its standard deviations; beyond, the contact is another one.
+_FARTHEST_HEIGHT = 8.0
+# Shapes so many times as far from the stored ones as these are good for are left to the full mechanics, until the
+# object has gone back to this share of its depth.
+_BEYOND_STORED, _BACK = 1.0, 0.8
+# Iterations of the full mechanics in one image, each as long as a hundred others: a shape that asks for more is wrong,
+# or settles over the next images.
+_FULL_ITERATIONS = 3
+# Those that find the equilibrium of the full mechanics in the state at which they take over, and their last correction.
+_SETTLING, _SETTLED = 8, 2e-3
+# An object is apart from the jaw where its pose says so by this many standard deviations.
+_APART_SIGMAS = 3.0
+# So far from the pressure centre is elsewhere along the finger [m], of whose heights every third is asked.
+_ELSEWHERE, _EVERY = 5e-3, 3
+# Heights next to the clamp, as shares of the lowest at which key points show a force; objects farther off than this,
+# or deeper in, are surely so [m].
+_NEXT_TO_CLAMP, _WELL_CLEAR = np.array([0.2, 0.4, 0.6, 0.8, 1.0]), 3e-3
+_LEAST_VARIANCE = 1e-12
 
 
-class FilterTracker(ContactTracker):
-    """Takes the place of `ContactTracker`: objects, mechanics and lateral loads are its own.
+class _Fidelity(NamedTuple):
+    """One of the mechanics of a jaw: its contact, the probe of the key points, and these at rest (K, 3) [m]."""
 
-    Friction is a state with a prior that every image updates.
+    contact: RigidContact
+    probe: Any
+    rest: NDArray
+
+
+class ContactTracker:
+    """Tracks the contact with the pressing object; holds the jaw in equilibrium with it.
+
+    Where a reduced jaw bends as none of its stored shapes does, as around large flat things, the full one takes over.
+
+    Attributes:
+        response: of the unloaded jaw, see `InfluenceCoefficients`.
     """
 
-    search_type = FilterSearch
-    _search: FilterSearch
-    _tare: Tare | None = None
+    def __init__(
+        self,
+        mechanics: Mechanics,
+        keypoints: NDArray,
+        settings: EstimatorSettings,
+        torsion: Torsion | None = None,
+        *,
+        contact_range: tuple[float, float],
+    ) -> None:
+        """Attach the key points to the model.
+
+        Args:
+            mechanics: of the jaw.
+            keypoints: (K, 3) [m, undeformed].
+            settings: of the estimator.
+            torsion: response to what acts laterally; None where unknown.
+            contact_range: heights at which the jaw can be touched, see `Jaw.contact_range` [m].
+
+        Raises:
+            MeshError: A key point is off the jaw.
+        """
+        self.settings = settings
+        self._fidelities = [
+            _attach(each.contact, keypoints) for each in (mechanics, mechanics.full) if each is not None
+        ]
+        self._fidelity = 0
+        self._use(0)
+        self._search = ContactSearch(len(keypoints), settings)
+        self.response = measure_influence(self._contact, self._probe, len(keypoints))
+        self._outline: OutlineIndenter | None = None
+        self._is_apart = False
+        # height [m], stiffness [N/m], and standard deviation of what key points tell of a force there [N]
+        self._base = [(height, self._measure_stiffness(height), inf) for height in contact_range[0] * _NEXT_TO_CLAMP]
+        _, vague = self.response.fit_forces(np.ones(len(keypoints), bool))
+        self._along = list(zip(self.response.heights, self.response.stiffness, vague, strict=True))[::_EVERY]
+        self._lateral = LateralLoad(torsion, len(keypoints), UNSEEN_TRACTION * settings.friction)
+        self._tare: Tare | None = None
+        self.expect_friction(None)
+        self.reset()
+
+    def reset(self, height: float | None = None) -> None:
+        """Start anew, unloaded, with an unknown object that will first touch at `height` [m], the middle if None."""
+        settings = self.settings
+        self._given = height
+        self._use(0)
+        height = float(np.median(self._contact.surface.heights)) if height is None else height
+        self._press(RoundIndenter())
+        self._expect(
+            np.array([settings.radius, height]),
+            np.array([settings.radius_stddev, settings.height_stddev]) ** 2,
+        )
+        self._begin()
+
+    def _use(self, fidelity: int) -> None:
+        """Take one of the mechanics for the next images, with the object that was pressed into the one before."""
+        indenter = self._fidelities[self._fidelity].contact.indenter
+        self._fidelity = fidelity
+        self._contact, self._probe, self._rest = self._fidelities[fidelity]
+        self._contact.set_indenter(indenter)
+
+    def _press(self, indenter: RoundIndenter | OutlineIndenter) -> None:
+        """Take another object, and what the search is allowed with it."""
+        self._contact.set_indenter(indenter)
+        for name in ("lowest", "highest", "largest_change", "settled_change", "has_corners"):
+            self._search.expectation[name] = getattr(indenter, name)
+
+    def _expect(self, mean: NDArray, variance: NDArray) -> None:
+        """Expect an object of some shape and height (2,), each with its variance (2,)."""
+        self._search.expectation["mean"], self._search.expectation["variance"] = mean, variance
+
+    @property
+    def _mean(self) -> NDArray:
+        """Expected shape and height (2,)."""
+        return self._search.expectation["mean"]
+
+    def _change_fidelity(self, state: ContactState) -> None:
+        """Go on with the full mechanics where the shape is too far from those stored, and back where it bends less."""
+        pressed = float(state["x"][DEPTH])
+        is_beyond = state["extrapolation"] > _BEYOND_STORED and state["depth"] > TOUCH_DEPTH
+        if self._fidelity == 0 and is_beyond and len(self._fidelities) > 1:
+            self._left = (self.q.copy(), pressed)
+            q = self._contact.model.expand(self.q)
+            self._use(1)
+            q = self._settle(q, state["x_model"])
+        elif self._fidelity == 1 and pressed < _BACK * self._left[1]:
+            self._use(0)
+            # of the shape that was left and the unloaded jaw, the nearer one
+            is_near = pressed > 0.5 * self._left[1]
+            q = self._left[0] if is_near else self._contact.begin(float(state["x"][HEIGHT]))
+        else:
+            return
+        self._search.resume(q)
+
+    def _settle(self, q: NDArray, x: NDArray) -> NDArray:
+        """Return the shape (size,) of the jaw that is pressed in a state (3,), from one nearby."""
+        traction = constant_traction(self._search.ratio)
+        for _ in range(_SETTLING):
+            pressed = self._contact.linearize(q, x, traction)
+            if not pressed.touches or pressed.size < _SETTLED:
+                break
+            q = q + limit_step(self._contact.model, pressed.correction)
+        return q
+
+    def vertices(self) -> NDArray:
+        """Return the deformed mesh vertices (n, 3) [m], in mesh order."""
+        return self._contact.model.vertices(self.q)
+
+    @property
+    def q(self) -> NDArray:
+        """The jaw's unknowns (size,)."""
+        return self._search.q
+
+    @property
+    def used(self) -> NDArray:
+        """Which key points of the last image count (K,)."""
+        return self._search.points["weight"] > 0
+
+    def give_shape(self) -> NDArray:
+        """Return the shape (size,) for another tracker to begin with."""
+        return self.q if self._fidelity == 0 else self._left[0]
+
+    def _begin(self) -> None:
+        """Start with the undeformed jaw and an object that just touches."""
+        self._use(0)
+        self._search.begin(self._contact, self._mean)
+        self._led = self._mean.copy()
+        self._lateral.reset()
+        self._released, self._has_moved = 0, False
+
+    def _forget_contact(self) -> None:
+        """Expect any object again, as the next one may be."""
+        self._led = self._mean.copy()
+        self._search.forget(self._mean)
 
     def update(self, points: NDArray, tare: Tare, dt: float, observation: Observation) -> ContactState | None:
-        """See `ContactTracker.update`."""
+        """Take the key points of an image; return None when too few agree.
+
+        Args:
+            points: (K, 3) [m], NaN where unused.
+            tare: offsets and noise.
+            dt: time since the last image [s].
+            observation: that the points are of.
+        """
         search, measured = self._search, points - tare.offsets
         if tare is not self._tare:
             self._tare = tare
             search.restart()
         search.expectation["shared"] = observation.shared
+        search.weight, across = share_weight(observation.gravity)
         planar = measured - self._lateral.motions if self._is_known else measured
         self._fill(planar, tare, tare.point_noise(observation.stddev))
-        most = FULL_ITERATIONS if self._fidelity else self.settings.iterations
-        if not search.find(self._contact, self._traction, self._probe, dt, iterations=most, is_sudden=False):
-            search.lose(LOST_STDDEV)
+        most = _FULL_ITERATIONS if self._fidelity else self.settings.iterations
+        if not search.find(self._contact, self._probe, dt, iterations=most):
+            search.lose(_LOST_STDDEV)
             return None
         state = search.state
         self._released = self._released + 1 if state["depth"] < TOUCH_DEPTH else 0
-        if self._released == IMAGES_RELEASED:
+        if self._released == _IMAGES_RELEASED:
             self._forget_contact()
             if self.settings.may_be_held:
                 search.let_go()
         self._complete(state)
         if self._is_known:
             bend = search.positions[:, 0] - self._rest[:, 0]
-            self._lateral.update((measured - search.positions)[:, 1], bend, search.points, state)
+            motions, weight = (measured - search.positions)[:, 1], across if self.settings.may_be_held else None
+            self._lateral.update(motions, bend, search.points, state, dt, weight)
         self._change_fidelity(state)
-        self._slides = True
+        self._has_moved = True
         return state
 
-    def learn(self) -> None:
-        """Follow the path of the object, which the force of the last image did not wait for."""
-        if self._slides:
-            self._slides = False
-            self._search.follow_path(self._contact)
+    def _fill(self, measured: NDArray, tare: Tare, noise: PointNoise) -> None:
+        """Fill in the key points of an image, measured (K, 3) [m]."""
+        points = self._search.points
+        points["measured"], points["rest"] = measured, self._rest
+        points["tare_noise"], points["gain"] = noise.plane, noise.gain
+        points["width_variance"], points["trust"] = noise.width_variance, noise.trust
+        points["offset_variance"] = tare.offset_variance() + noise.bias
+
+    def significance(self, tare: Tare, stddev: float) -> float:
+        """Return by how many standard deviations a force explains the offsets of a tare; see `explain_offsets`."""
+        return explain_offsets(self.rest_modes(), tare, stddev)
+
+    def rest_modes(self) -> NDArray:
+        """Return how the key points of the undeformed jaw move in x and z by the depth (K, 2) [m/m]."""
+        q = np.zeros(self._contact.model.size)
+        pressed = self._contact.linearize(q, find_x_model(self._contact, np.r_[-1.0, self._mean])[0])
+        return self._contact.model.project(self._probe, q, pressed.modes)[:, [0, 2], DEPTH]
+
+    def forget(self) -> None:
+        """Forget what was learnt of the object."""
+        self._search.expect_friction(self._friction)
+        self.reset()
 
     def expect_friction(self, friction: Coefficient | None) -> None:
-        """See `ContactTracker.expect_friction`."""
-        unknown = Coefficient(self.settings.friction, self.settings.friction_stddev)
-        self._search.expect_friction(unknown if friction is None else friction)
+        """Expect an object of a stated coefficient of friction; None for one of which the settings say all."""
+        settings = self.settings
+        self._friction = Coefficient(settings.friction, settings.friction_stddev) if friction is None else friction
+        self._search.expect_friction(self._friction)
 
     @property
     def friction(self) -> Coefficient:
         """What is known of the object's coefficient of friction."""
         return self._search.friction
 
-    def _find_traction(self, normal: float) -> float:
-        """Return no further uncertainty of the traction: the covariance has it."""
-        return 0.0
+    @property
+    def _is_known(self) -> bool:
+        """Whether the object is known by its outline."""
+        return self._outline is self._contact.indenter
 
-    def _find_clearance_stddev(self, state: ContactState, height: float) -> float:
-        """See `ContactTracker`; the covariance is that of the filter's state."""
-        known = state.copy()
-        known["covariance"] = self._search.contact_covariance()
-        return super()._find_clearance_stddev(known, height)
+    def learn(self) -> None:
+        """Follow the path of the object, which the force of the last image did not wait for."""
+        if self._has_moved:
+            self._has_moved = False
+            self._search.follow_path(self._contact)
+
+    def resume(self, q: NDArray) -> None:
+        """Start anew from the shape (size,) that another tracker has found."""
+        self.reset()
+        self._search.resume(q.copy())
+
+    def follow(self, contact: Contact) -> None:
+        """Take over where a contact's object is: its outline, or its height as that of first touch."""
+        if contact.outline is not None:
+            self._follow_outline(contact)
+            return
+        height = float(expect_object(contact, self.settings).mean[1])
+        if self._given is None:
+            self.reset(height)
+        if abs(height - self._given) > _FARTHEST_HEIGHT * self.settings.height_stddev:
+            self._mean[1] = height
+            self._forget_contact()  # another object
+        self._given = self._mean[1] = height
+
+    def _follow_outline(self, contact: Contact) -> None:
+        """Take the outline's tilt and height as what is to be expected; an outline cut anew keeps the contact."""
+        before = self._contact.indenter
+        if contact.outline.across is not None:
+            self._lateral.expect(*contact.outline.across)
+        expected = expect_object(contact, self.settings, self._outline)
+        self._expect(expected.mean, expected.variance)
+        self._lead(contact.outline.stddev[[2, 1]])
+        self._outline = after = expected.indenter
+        self._press(after)
+        pressed_by_pose = self._contact.face_x + after.pressed.front - contact.outline.origin[0]
+        self._is_apart = bool(pressed_by_pose < -_APART_SIGMAS * contact.outline.stddev[0])
+        height = float(expected.mean[1])
+        self._given = None
+        is_off = abs(self._search.state["x"][HEIGHT] - height) > _FARTHEST_HEIGHT * self.settings.height_stddev
+        is_same = isinstance(before, OutlineIndenter) and after.resembles(before)
+        if isinstance(before, OutlineIndenter) and not is_same:
+            self._search.expect_friction(self._friction)
+        if is_off or not is_same:
+            self._begin()
+        elif after is not before:
+            self._search.shift(after.pressed.front - before.pressed.front)
+
+    def _lead(self, chance: NDArray) -> None:
+        """Take the contact along where the object slides or tilts, beyond what its pose may be off by chance."""
+        moved = self._mean - self._led
+        change = moved - np.clip(moved, -chance, chance)
+        if change.any():
+            self._led += change
+            self._search.lead(change)
+
+    def _complete(self, state: ContactState) -> None:
+        """Fill in what is known of the force across a contact, and what the jaw bears."""
+        traction = UNSEEN_TRACTION * self.settings.friction
+        load = self._lateral.load if self._is_known else (0.0, MIDDLE_STDDEV, nan, traction)
+        state["y"], state["y_stddev"], state["lateral_force"], state["lateral_stddev"] = load
+        state["hidden"] = self._find_hidden(state, hypot(state["force"][0], state["force"][2]))
+        state["bearable"] = self._fidelities[0].contact.bearable
+
+    def _find_hidden(self, state: ContactState, normal: float) -> float:
+        """Return the standard deviation of a force [N] elsewhere than the key points have it, which they hardly show.
+
+        Within the uncertainty of its state, as by rocking, an object that is clear of the base may press there, and one
+        that seems to press there may be clear of it; so may a flat one anywhere along a stiff finger. A force whose
+        centre is next to the clamp is not known at all.
+        """
+        if self._is_apart:
+            return 0.0
+        centre = state["pressure_location"][2]
+        if centre < self._base[-1][0]:
+            return normal
+        places = self._base + [place for place in self._along if abs(place[0] - centre) > _ELSEWHERE]
+        x, indenter, surface = state["x"], self._contact.indenter, self._contact.surface
+        near = [(place, c) for place in places if abs(c := indenter.find_clearance(x, 0.0, place[0])) < _WELL_CLEAR]
+        if not near:
+            return 0.0
+        moved, hidden = self._contact.place_points(self.q)[:, 0] - surface.points[:, 0], 0.0
+        for (height, stiffness, vague), clearance in near:
+            row = max(0, int(np.searchsorted(surface.heights, height)) - 1) * surface.across
+            beyond = self._find_clearance_stddev(state["x"], height) - abs(clearance - moved[row]) / _APART_SIGMAS
+            hidden = max(hidden, min(stiffness * beyond, vague))
+        return hidden
+
+    def _find_clearance_stddev(self, x: NDArray, height: float) -> float:
+        """Return the standard deviation of the object's clearance at a height in a state (3,) [m]."""
+        indenter = self._contact.indenter
+        slope, covariance = np.array([-1.0, 0.0, 0.0]), self._search.contact_covariance()
+        for i in (SHAPE, HEIGHT):
+            step = np.zeros(3)
+            step[i] = sqrt(max(covariance[i, i], _LEAST_VARIANCE))
+            change = [indenter.find_clearance(x + sign * step, 0.0, height) for sign in (-1.0, 1.0)]
+            slope[i] = 0.5 * (change[1] - change[0]) / step[i] if np.isfinite(change).all() else 0.0
+        return sqrt(max(float(slope @ covariance @ slope), 0.0))
+
+    def _measure_stiffness(self, height: float) -> float:
+        """Return the stiffness of the unloaded jaw at a height [m] against a round object [N/m]."""
+        _, pressed = press_lightly(self._contact, self.settings.radius, height)
+        return abs(float(pressed.force_modes[0, DEPTH]))
+
+
+def _attach(contact: RigidContact, keypoints: NDArray) -> _Fidelity:
+    """Return the mechanics of a contact with key points (K, 3) [m]; raises MeshError when one is off the jaw."""
+    probe = contact.model.attach(keypoints, KEYPOINT_DISTANCE)
+    return _Fidelity(contact, probe, contact.model.positions(probe, np.zeros(contact.model.size)))

@@ -1,5 +1,6 @@
 """What was identified on one finger, and its file."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from importlib import resources
 from pathlib import Path
@@ -7,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import yaml
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Field, model_validator
 
 from finforce.errors import suggest
 from finforce.typed_yaml import FileModel, Number, parse_model, read_model
@@ -43,13 +44,19 @@ class Calibration(FileModel):
     clamped_z: Number = Field(0.0, ge=0.0, le=0.05, description="Effective height of the clamp [m]")
     relaxation: Terms = Field((), description="Branches of the material's relaxation: share [-], time_constant [s]")
     force_error: Number = Field(0.02, ge=0.0, le=1.0, description="Relative standard deviation of forces left [-]")
-    friction: Number = Field(0.0, ge=0.0, le=2.0, description="Coefficient of the objects pressed, 0 without any [-]")
-    friction_stddev: Number = Field(0.02, ge=1e-3, le=2.0, description="Standard deviation of the friction [-]")
     jaw: str = Field("", description="Name of the jaw that it belongs to; empty: any")
     finger: str = Field("", description="Digest of that jaw's shape; empty: not known")
     solver: Literal["", "solid", "frame", "plane", "paper"] = Field("", description="Mechanics identified with")
     comment: str = Field("", description="Remark for people")
     uncertainty: dict[str, float] = Field({}, description="Standard deviations, for people")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _leave_friction_out(cls, values: Any) -> Any:
+        """Leave out the friction of the objects pressed, which older files have: it is the objects' own."""
+        if not isinstance(values, Mapping):
+            return values
+        return {name: value for name, value in values.items() if name not in ("friction", "friction_stddev")}
 
     def changed(self, **values: Any) -> "Calibration":
         """Return a calibration with other values.

@@ -331,7 +331,7 @@ class _Rod:
         self._contact, self._height = contact, height
         self._radius, self._deepest = _ROD * (high - low), _DEEPEST * (high - low)
         contact.set_indenter(RoundIndenter())
-        self._touch = contact.find_touch(np.array([0.0, np.log(self._radius), height]))
+        self._touch = contact.find_touch(np.array([0.0, self._radius, height]))
 
     def press(self, hardest: float) -> list[_Equilibrium]:
         """Return equilibria at rising depths below first touch, up to where the jaw gives way or resists."""
@@ -382,7 +382,7 @@ class _Rod:
     def _settle(self, depth: float, start: _Equilibrium | None, end: _Equilibrium | None = None) -> _Equilibrium | None:
         """Return the equilibrium at a depth [m] of the rod, by one above it and one below it if known; or None."""
         contact, model = self._contact, self._contact.model
-        place = np.array([self._touch + depth, np.log(self._radius), self._height])
+        place = np.array([self._touch + depth, self._radius, self._height])
         q, before, first = np.zeros(model.size), _NEAR, np.inf
         if start is not None and end is not None:
             q = _join(start, end)(depth)

@@ -19,15 +19,10 @@ CONTACT_STATE = np.dtype(
     [
         ("x", *_V),
         ("x_model", *_V),  # where the mechanics stands: never above the surface
-        ("x_asked", *_V),  # that the key points ask for
-        ("moved", *_V),  # of x_asked since the forecast
-        ("speed", float),  # of the depth [m/s]
-        ("spread", float, (2, 2)),  # covariance of depth and speed
         ("covariance", *_M),  # of what was estimated, the misfit included
         ("force", *_V),  # elastic force on the jaw [N]
         ("force_modes", *_M),  # its derivative by what was estimated
         ("pressing", *_V),  # force before the last step [N]
-        ("by_traction", *_V),  # derivative of the force by the traction ratio [N]
         ("pressure_point", *_V),  # pressure centre on the deformed surface [m]
         ("pressure_location", *_V),  # the same on the undeformed surface [m]
         ("traction_ratio", float),  # of tangential to normal force, with which the state was found
@@ -40,19 +35,13 @@ CONTACT_STATE = np.dtype(
         ("used", int),  # key points with a weight
         ("known", int),  # key points that were measured
         ("agreed", int),  # key points that agree with the forecast
-        ("jump", float),  # median depth that the key points ask for one by one, about the model's own [m]
-        ("jumped", bool),  # whether the depth changed beyond what was expected
         ("residual", float),  # weighted root mean square [m]
         ("misfit", float),  # averaged residuals over their standard deviations, about 1 where the model fits
-        ("scatter", float),  # the same, by errors that neighbours share
         ("kkt", float),  # what is left of the objective's gradient, relative to its parts
         ("offset", float),  # contact location that the key points alone ask for, from the stated one [m]
         ("mistaken", float),  # probability that the stated location is wrong
         ("location_error", float),  # relative standard deviation of the force that the location leaves
-        ("stiffening", float),  # force over depth relative to that of first touch
         ("extrapolation", float),  # distance of the shape from the stored ones, as a share of what these are good for
-        ("bumped", float),  # probability that all key points have moved together since the tare
-        ("motion", float),  # of the key points by that [m]
         ("ambiguity", float),  # change of the force by an iteration that did not converge [N]
         ("bearable", float),  # force beyond which no equilibrium is believed [N]
         ("y", float),  # of the pressure along the width [m]
@@ -82,23 +71,15 @@ KEYPOINT = np.dtype(
         ("width_variance", float),  # along y in such an image [m^2]
         ("trust", float),  # variance in the tare over that in this image
         ("offset_variance", float),  # of what is constant [m^2]
-        ("sight", float),  # part of it that the detector errs by in the sight of this shape [m^2]
-        ("likeness", float),  # correlation of that with the next point below; 0 where there is none
-        ("above", int),  # 1 + index of the point whose next one below this is; 0 where there is none
-        ("r", float, 2),  # residual in the plane about the forecast, zero where unused [m]
-        ("modes", float, (2, 4)),  # its derivatives by x and by the traction ratio
         ("weight", float),  # agreement times trust, 0 to 1
-        ("noise", float, (2, 2)),  # covariance in the plane in an image as noisy as this one [m^2]
-        ("bias", float),  # variance that no averaging removes [m^2]
-        ("lateral", float),  # residual along y, zero where unused [m]
-        ("lateral_noise", float),  # its variance [m^2]
     ]
 )
 
-# Residuals of a key point averaged over the last images. An image in which the finger was hardly pressed tells hardly
-# anything of shape, height and traction: the derivatives are averaged alike.
-AVERAGE = np.dtype([("residual", float, 2), ("modes", float, (2, 4)), ("count", float)])
-
+# The mechanics is evaluated at this depth [m] at least; below it shapes and forces are continued linearly.
+LEAST_DEPTH = 3e-5
+# Depths below which nothing seems to press, and above which something surely does [m].
+TOUCH_DEPTH = 0.15e-3
+LOADED_DEPTH = 0.5e-3
 # Half of the friction cone is one standard deviation of an unseen traction ratio.
 UNSEEN_TRACTION = 0.5
 # Standard deviation of an unknown lateral location [m].
@@ -108,7 +89,6 @@ MIDDLE_STDDEV = 3e-3
 def blank_contact_state() -> ContactState:
     """Return a contact state in which nothing was estimated and nothing is wrong."""
     state = np.zeros((), CONTACT_STATE)
-    state["stiffening"] = 1.0
     state["ambiguity"] = state["bearable"] = np.inf
     state["used"] = state["known"] = state["agreed"] = 1
     return state
@@ -116,9 +96,8 @@ def blank_contact_state() -> ContactState:
 
 # An ambiguous state, as between two corners of an object, matters where the force changes by more than this [N].
 _AMBIGUOUS = 0.15
-# Beyond these a force is rejected: misfit of the shape, stiffening, standard deviation [N], its share of the force.
+# Beyond these a force is rejected: misfit of the shape, standard deviation [N], its share of the force.
 _LARGEST_MISFIT = 2.0
-_LARGEST_STIFFENING = 5.0
 _VAGUE_FORCE, _VAGUE_SHARE = 1.0, 0.25
 # Shapes so many times as far from the stored ones as they are good for.
 _FARTHEST_SHAPE = 2.0
@@ -130,8 +109,6 @@ _MISTAKEN, _LEAST_OFFSET = 0.99, 4e-3
 # within 0.6 mm or 1 %, even at a height that is not quite right; in a zoomed or empty picture 1.2 mm and more remain.
 # Key points that were noisy when the jaw was tared leave more, by so many standard deviations.
 LARGEST_RESIDUAL, _RESIDUAL_SHARE, _NOISY = 1e-3, 0.015, 3.0
-# A camera that has more probably moved than not.
-BUMPED = 0.5
 # An object would have to pull by so many standard deviations of the depth, from the least to the most [m].
 _PULLING, _LEAST_PULL, _MOST_PULL = 3.0, 0.5e-3, 0.9e-3
 
@@ -163,9 +140,6 @@ def find_rejection_reason(state: ContactState, *, largest_residual: float, settl
     if state["misfit"] > _LARGEST_MISFIT:
         misfit = f"{state['misfit']:.1f} standard deviations"
         return f"the key points do not fit this contact ({misfit}); is its location right?"
-    if state["stiffening"] > _LARGEST_STIFFENING:
-        times = f"{state['stiffening']:.0f} times"
-        return f"the jaw seems {times} as stiff as at the given height; is the contact elsewhere?"
     if agreement <= _MAJORITY:
         return f"only {100 * agreement:.0f} % of the key points agree with the jaw's shape"
     if state["mistaken"] > _MISTAKEN and abs(state["offset"]) > _LEAST_OFFSET:
@@ -183,9 +157,6 @@ def find_rejection_reason(state: ContactState, *, largest_residual: float, settl
 
 def _find_ambiguity(state: ContactState, magnitude: float) -> str:
     """Return why the force of a contact that fits the key points may still be another one."""
-    if state["bumped"] > BUMPED:
-        motion = f"all key points have moved together by {1e3 * state['motion']:.1f} mm since the tare"
-        return f"{motion}: the camera was bumped (open the jaw and tare), or the contact is elsewhere"
     pulled = -float(state["depth"])
     if pulled > np.clip(_PULLING * np.sqrt(state["depth_variance"]), _LEAST_PULL, _MOST_PULL):
         bent = f"the jaw is bent towards the object, as if that pulled by {1e3 * pulled:.1f} mm"

@@ -13,7 +13,6 @@ from finforce_ifea.observation import Contact, Observation
 from finforce_ifea.paper_inverse import InverseResult, Problem, solve_inverse
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tare import Tare
-from finforce_ifea.tracking.contact_filter import LONGEST_AVERAGE, question_location
 from finforce_ifea.tracking.contact_state import (
     MIDDLE_STDDEV,
     UNSEEN_TRACTION,
@@ -227,6 +226,8 @@ class GivenContactTracker:
 # No averaging makes the place that key points ask for surer than this share of the heights that the face has: their
 # answers are those of the unloaded jaw.
 _SUREST = 0.03
+# Images over which they are averaged.
+_LONGEST_AVERAGE = 45.0
 _ACROSS_CONTACT = np.linspace(-1.0, 1.0, 41)
 
 
@@ -247,9 +248,9 @@ class _LocationWatch:
         """Keep the answers of the unloaded jaw and how well heights are known."""
         self._response = response
         self._prior_variance = settings.height_stddev**2
-        self._radius = settings.radius * float(np.exp(settings.radius_log_stddev**2))  # root mean square
+        self._radius = float(np.hypot(settings.radius, settings.radius_stddev))  # root mean square
         self._surest = _SUREST * float(response.heights[-1] - response.heights[0])
-        self._memory = LONGEST_AVERAGE
+        self._memory = _LONGEST_AVERAGE
         self._height, self._spread = float(np.median(response.heights)), 0.0
         self.reset()
 
@@ -289,7 +290,7 @@ class _LocationWatch:
         travel = self._radius * self._response.turn_at(self._height) * depth
         given = self._prior_variance + self._spread + travel**2 + self._shift_pressure(depth) ** 2
         spread = 1.0 / max(self._information, 1e-9) + self._surest**2
-        mistaken, beyond = question_location(self._offset, spread, given, 0.0)
+        mistaken, beyond = _question_location(self._offset, spread, given, 0.0)
         share = given / (given + spread)
         stddev = float(np.sqrt((share * self._offset) ** 2 + share * spread + beyond))
         state["offset"], state["mistaken"] = self._offset, mistaken
@@ -317,3 +318,32 @@ class _LocationWatch:
         if information > 0.0:
             self._offset = (kept * self._offset + information * asked) / (kept + information)
         self._information = kept + information
+
+
+# A stated height is that of another contact once in so many times, and then anywhere within this [m].
+_MISTAKEN = 0.01
+_ANYWHERE = 0.03
+
+
+def _question_location(offset: float, spread: float, prior_variance: float, found: float) -> tuple[float, float]:
+    """Return the probability that a stated contact location is wrong, and what that adds to its variance [m^2].
+
+    The key points alone have the contact D = offset from there, with the variance s^2 = spread. It is another one,
+    N(0, R^2), with the probability p:
+
+        p / (1 - p) = p0 N(D; 0, v + s^2 + R^2) / N(D; 0, v + s^2) / (1 - p0).
+
+    What exceeds p0 of it adds the distance of that contact from the location that was found.
+
+    Args:
+        offset: D [m].
+        spread: s^2 [m^2].
+        prior_variance: v, of the stated location [m^2].
+        found: distance of the location that was found from the stated one [m].
+    """
+    near, far = prior_variance + spread, prior_variance + spread + _ANYWHERE**2
+    odds = 0.5 * offset**2 * (1.0 / near - 1.0 / far) + 0.5 * np.log(near / far) + np.log(_MISTAKEN / (1.0 - _MISTAKEN))
+    mistaken = 1.0 / (1.0 + np.exp(-min(max(odds, -50.0), 50.0)))
+    shrunk = _ANYWHERE**2 / (_ANYWHERE**2 + spread)
+    variance = max(0.0, mistaken - _MISTAKEN) * ((shrunk * offset - found) ** 2 + shrunk * spread)
+    return mistaken, variance

@@ -105,9 +105,9 @@ def measure_influence(contact: RigidContact, probe: Any, keypoints: int) -> Infl
     # the ends of the surface are left out: next to the clamp a force moves hardly anything
     heights = np.linspace(low + 0.12 * (high - low), high - 0.05 * (high - low), _HEIGHTS)
     motions, (stiffness, turns) = np.zeros((_HEIGHTS, keypoints, 2)), np.zeros((2, _HEIGHTS))
-    shape = 0.5 * (contact.indenter.lowest + contact.indenter.highest)
+    radius = float(np.sqrt(contact.indenter.lowest * contact.indenter.highest))
     for row, height in enumerate(heights):
-        q, state = press_lightly(contact, shape, height)
+        q, state = press_lightly(contact, radius, height)
         stiffness[row] = np.linalg.norm(state.force_modes[:, DEPTH])
         modes = contact.model.project(probe, q, state.modes)
         motions[row] = modes[:, ::2, DEPTH] / stiffness[row]

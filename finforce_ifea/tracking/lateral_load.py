@@ -146,35 +146,67 @@ def _answer_at_rest(jaw: Jaw, mesh: VolumeMesh) -> _Answers | None:
 
 
 # Pressure is spread evenly: its centre strays from the middle by this share of what touches, and by less where that is
-# the whole width of the finger: by what is left of a square, at least the share below. Standard deviations of the
-# traction ratio, and of what the linear jaw makes of it [-].
+# the whole width of the finger: by what is left of a square, at least the share below.
+_EVEN = 0.4
 _WIDE = 0.15
-_EVEN, _TRACTION, _NONLINEAR = 0.4, 0.1, 0.04
 # One over the core of a rectangular section, as a share of half its width.
 _CORE = 3.0
+# Time over which the pressure stays where it is [s].
+_LOCATION_TIME = 10.0
+# 1 sigma of the lateral traction ratio [-] and the time over which it stays the same [s].
+_TRACTION = 0.1
+_TRACTION_TIME = 60.0
+# The same of a weight that the jaws have lifted and turn.
+WEIGHT = 0.3
+_WEIGHT_TIME = 1.0
+# The smallest part of such a weight that is expected where gravity has none [-].
+_ASIDE = 0.1
+# Log prior odds of a lift in an image, and the log odds against one, prior left out, after which the test begins anew.
+_LIFTED = np.log(1e-4)
+_UNLIKELY = -3.0
+# 1 sigma of what the linear jaw makes of the ratio [-].
+_NONLINEAR = 0.04
 # A ratio of so many standard deviations is believed by half; less is next to nothing.
 _CLEAR = 3.0
-# Images averaged, and the force below which nothing is learnt [N].
-_MEMORY, _LEAST_FORCE = 45.0, 0.3
+# Force below which nothing is learnt [N].
+_LEAST_FORCE = 0.3
+# 1 sigma of an error of the mechanics along y [m], and the motion [m] and time [s] over which it stays the same.
 _FLOOR = 0.02e-3
+_OFFSET_LENGTH = 10e-3
+_OFFSET_TIME = 60.0
 # Error of what a turn moves a bent finger, as a share of it.
 _TURN_ERROR = 0.5
 # A key point nearer to the middle plane does not show how its section turns, and one so little above another is of the
 # same section [m].
 _LEAST_ARM, _LEAST_RISE = 1e-3, 2e-3
-# Of a key point over the last images: residual along y [m], its derivatives by y_c and t, and images that count.
-_MEANS = np.dtype([("residual", float), ("modes", float, 2), ("count", float)])
+
+
+def share_weight(gravity: NDArray | None) -> tuple[float, float]:
+    """Return 1 sigma of the traction ratios along and across a finger by a weight [-]; its direction (3,) if known."""
+    if gravity is None:
+        return WEIGHT, WEIGHT
+    along, across = np.maximum(np.abs(gravity[[2, 1]]) / np.linalg.norm(gravity), _ASIDE)
+    return WEIGHT * float(along), WEIGHT * float(across)
+
+
+class _Estimate(NamedTuple):
+    """Mean (2 + K,) and covariance (2 + K, 2 + K) of location [m], ratio [-] and the offset of each key point [m]."""
+
+    x: NDArray
+    P: NDArray
 
 
 class LateralLoad:
-    """Averages what the key points show across one finger.
+    """Follows what the key points show across one finger, by a Kalman filter.
+
+    Its state is the location of the pressure, the lateral traction ratio, and an offset along y for each key point. Two
+    hypotheses differ in the ratio: it stays as it was, or the jaws have lifted a weight. Their likelihoods decide.
 
     Attributes:
         motions: of the key points by what acts laterally (K, 3) [m]; zero where nothing does.
-        by_force: of the key points by a lateral force (K, 3) [m/N], where the last one pressed; zero before.
-        by_moment: the same by a moment about the finger (K, 3) [m/(N m)].
         load: location along y [m], its standard deviation [m], lateral force [N], and the standard deviation of that
             as a share of all force (4,).
+        is_lifted: whether the jaws have lifted a weight.
     """
 
     def __init__(self, torsion: Torsion | None, count: int, traction: float) -> None:
@@ -186,15 +218,11 @@ class LateralLoad:
         self._expected = (0.0, MIDDLE_STDDEV)
         self.reset()
 
-    @property
-    def half_width(self) -> float:
-        """Of the inner face [m]; 0 where unknown."""
-        return self._torsion.half_width if self._torsion else 0.0
-
     def reset(self) -> None:
         """Forget what was seen; where the object is expected stays."""
-        self._means = np.zeros(self._count, _MEANS)
-        self.motions, self.by_force, self.by_moment = (np.zeros((self._count, 3)) for _ in range(3))
+        self._known: _Estimate | None = None
+        self._depth, self.is_lifted = 0.0, False
+        self.motions = np.zeros((self._count, 3))
         self.load = np.array([*self._expected, 0.0, self._traction])
 
     def expect(self, location: float, stddev: float) -> None:
@@ -205,23 +233,92 @@ class LateralLoad:
         uneven = _EVEN + (1.0 - _EVEN) * min(_CORE * abs(location) / half, 1.0) if half > 0.0 else 1.0
         self._expected = min(max(float(location), -half), half), uneven * narrow * float(stddev)
 
-    def update(self, motions: NDArray, bend: NDArray, points: NDArray, state: ContactState) -> None:
-        """Take the key points' motions along y (K,) [m], NaN where unused, with their weights and the contact.
+    def update(
+        self, motions: NDArray, bend: NDArray, points: NDArray, state: ContactState, dt: float, weight: float | None
+    ) -> None:
+        """Take the motions of the key points along y in an image.
 
         Args:
-            motions: measured along y (K,) [m].
+            motions: measured along y (K,) [m], NaN where unused.
             bend: of the model along x (K,) [m].
             points: see `KEYPOINT`.
             state: see `CONTACT_STATE`.
+            dt: time since the last image [s].
+            weight: 1 sigma of the lateral traction ratio by a weight that may have been lifted; None where none may.
         """
         torsion, force, height = self._torsion, state["force"], float(state["pressure_location"][2])
-        if torsion is None or not np.hypot(force[0], force[2]) > _LEAST_FORCE or not np.isfinite(height):
+        normal = float(np.hypot(force[0], force[2]))
+        if torsion is None or not normal > _LEAST_FORCE or not np.isfinite(height):
             self.reset()
             return
-        self.by_moment, self.by_force, roll = torsion.at(height)
-        turned = np.stack([turn_bent(each[:, 0], points["rest"], bend) for each in (self.by_moment, self.by_force)])
-        response = self.by_moment, self.by_force, turned, roll, torsion.half_width
-        self.motions = _update(self._means, motions, points, force, response, self._expected, self.load)
+        by_moment, by_force, roll = torsion.at(height)
+        turns = turn_bent(by_moment[:, 0], points["rest"], bend)
+        moment, across = by_moment[:, 1] + turns, by_force[:, 1] + turn_bent(by_force[:, 0], points["rest"], bend)
+        rolled = force[0] ** 2 * roll * self.load[0]  # -F_x r, with r = roll (-y F_x)
+        seen = np.flatnonzero(np.isfinite(motions) & (points["weight"] > 0.0))
+        noise = points["width_variance"] / (points["trust"] * np.maximum(points["weight"], 1e-9))
+        noise += (_TURN_ERROR * turns * self.load[0] * normal) ** 2
+        measured = normal * np.stack([moment, across], axis=1)[seen], (motions - across * rolled)[seen], noise[seen]
+        offsets, moved = points["offset_variance"] + _FLOOR**2, abs(float(state["depth"]) - self._depth)
+        self._depth = float(state["depth"])
+        self._follow(seen, measured, offsets, moved, dt, weight)
+        x, P, half = *self._known, torsion.half_width
+        location, stddev = min(max(x[0], -half), half), float(np.hypot(np.sqrt(P[1, 1]), _NONLINEAR))
+        # unless a weight was lifted, chance and what the linear jaw errs by are no force
+        clear = np.inf if self.is_lifted else (x[1] / (_CLEAR * stddev)) ** 4
+        total = rolled + x[1] * normal / (1.0 + 1.0 / max(clear, 1e-300))
+        self.load[:] = location, np.sqrt(P[0, 0]), total, stddev
+        self.motions = by_moment * (-location * force[0]) + by_force * total
+
+    def _follow(
+        self, seen: NDArray, measured: tuple, offsets: NDArray, moved: float, dt: float, weight: float | None
+    ) -> None:
+        """Take an image into both hypotheses, and decide between them.
+
+        Args:
+            seen: numbers of the key points (m,).
+            measured: derivatives by location and ratio (m, 2), motions (m,) [m], and variances (m,) [m^2].
+            offsets: stationary variance of each key point's offset (K,) [m^2].
+            moved: of the object in depth since the last image [m].
+            dt: time since then [s].
+            weight: see `update`.
+        """
+        mean, V = np.zeros(2 + self._count), np.r_[self._expected[1] ** 2, _TRACTION**2, offsets]
+        mean[0] = self._expected[0]
+        a = np.full(2 + self._count, np.exp(-moved / _OFFSET_LENGTH - dt / _OFFSET_TIME))
+        a[:2] = np.exp(-dt / _LOCATION_TIME), np.exp(-dt / _TRACTION_TIME)
+        if self._known is None:
+            self._known = self._candidate = _Estimate(mean.copy(), np.diag(V))
+            self._odds = 0.0
+        held, rate = V.copy(), a.copy()
+        if weight is not None:
+            held[1], rate[1] = weight**2 + _TRACTION**2, np.exp(-dt / _WEIGHT_TIME)
+        if self.is_lifted:
+            self._known = _step(*self._known, rate, mean, held, seen, *measured)[0]
+            return
+        before = self._known
+        self._known, likely = _step(*before, a, mean, V, seen, *measured)
+        if weight is None:
+            return
+        self._candidate, other = _step(*self._candidate, rate, mean, held, seen, *measured)
+        self._odds += other - likely
+        if self._odds < _UNLIKELY:
+            self._candidate, self._odds = self._known, 0.0
+        elif self._odds + _LIFTED > 0.0:
+            self._known, self.is_lifted = self._candidate, True
+
+
+def _step(
+    x: NDArray, P: NDArray, a: NDArray, mean: NDArray, V: NDArray, seen: NDArray, H: NDArray, z: NDArray, R: NDArray
+) -> tuple[_Estimate, float]:
+    """Return the estimate after an image, and the logarithm of its likelihood; see `LateralLoad`."""
+    x, P = mean + a * (x - mean), P * np.outer(a, a) + np.diag((1.0 - a**2) * V)
+    rows = np.zeros((len(seen), len(x)))
+    rows[:, :2], rows[np.arange(len(seen)), 2 + seen] = H, 1.0
+    HP, nu = rows @ P, z - rows @ x
+    L = np.linalg.cholesky(HP @ rows.T + np.diag(R))
+    A, white = np.linalg.solve(L, HP), np.linalg.solve(L, nu)
+    return _Estimate(x + A.T @ white, P - A.T @ A), float(-0.5 * white @ white - np.log(np.diag(L)).sum())
 
 
 @njit(**_OPTIONS)
@@ -248,41 +345,3 @@ def turn_bent(along_x, rest, bend):
             middle, own, slope, turn = steps[j]
             moved[k] += turn * (bend[k] - own - slope * (rest[k, 2] - middle))
     return moved
-
-
-@njit(**_OPTIONS)
-def _update(means, motions, points, force, response, expected, load):
-    """Add an image to the means; update the load (4,) and return the motions (K, 3) that it causes."""
-    by_moment, by_force, turned, roll, half_width = response
-    normal = np.hypot(force[0], force[2])
-    rolled = force[0] ** 2 * roll * load[0]  # -F_x r, with r = roll (-y F_x)
-    A = np.array([[1.0 / expected[1] ** 2, 0.0], [0.0, 1.0 / _TRACTION**2]])
-    g = np.array([expected[0] / expected[1] ** 2, 0.0])
-    row = np.empty(2)
-    for k in range(len(motions)):
-        point, mean = points[k], means[k]
-        share = point.weight if np.isfinite(motions[k]) else 0.0
-        gain = share / (min(mean.count, _MEMORY) + 1.0)
-        mean.count = min(mean.count * (1.0 - 1.0 / _MEMORY) + share, _MEMORY)
-        if share > 0.0:
-            mean.residual += gain * (motions[k] - (by_force[k, 1] + turned[1, k]) * rolled - mean.residual)
-            mean.modes[0] += gain * (normal * (by_moment[k, 1] + turned[0, k]) - mean.modes[0])
-            mean.modes[1] += gain * (normal * (by_force[k, 1] + turned[1, k]) - mean.modes[1])
-        if mean.count <= 0.5:
-            continue
-        variance = point.width_variance / max(mean.count, 1.0) + point.offset_variance + _FLOOR**2
-        weight = 1.0 / (variance + (_TURN_ERROR * turned[0, k] * load[0] * normal) ** 2)
-        row[0], row[1] = mean.modes[0], mean.modes[1]
-        for i in range(2):
-            g[i] += weight * row[i] * mean.residual
-            for j in range(2):
-                A[i, j] += weight * row[i] * row[j]
-    det = A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0]
-    location, ratio = (A[1, 1] * g[0] - A[0, 1] * g[1]) / det, (A[0, 0] * g[1] - A[1, 0] * g[0]) / det
-    location = min(max(location, -half_width), half_width)
-    # chance and what the linear jaw errs by are no force
-    stddev = np.sqrt(A[0, 0] / det + _NONLINEAR**2)
-    clear = (ratio / (_CLEAR * stddev)) ** 4
-    total = rolled + ratio * clear / (1.0 + clear) * normal
-    load[0], load[1], load[2], load[3] = location, np.sqrt(A[1, 1] / det), total, stddev
-    return by_moment * (-location * force[0]) + by_force * total

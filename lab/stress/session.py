@@ -25,6 +25,8 @@ LIKELIHOOD = 0.95
 ACROSS, ALONG = 0.2e-3, 0.45e-3
 SIGHT = np.array([0.25, -0.95, 0.18]) / np.linalg.norm([0.25, -0.95, 0.18])
 OFFSET = 0.2e-3
+# What an estimator is told of objects that slide without friction.
+FRICTIONLESS = {"friction": 0.0, "friction_stddev": 0.03}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -193,7 +195,7 @@ class Bench:
         calibration = Calibration(
             young_modulus=modulus * jaw.material.young_modulus, force_error=FORCE_ERROR, clamped_z=0.0
         )
-        chosen = EstimatorSettings(solver=plan.solver, mesh=plan.mesh, **settings)
+        chosen = EstimatorSettings(solver=plan.solver, mesh=plan.mesh, **{**FRICTIONLESS, **settings})
         self.estimator = ForceEstimator(jaw, settings=chosen, calibration=calibration)
         self.estimator.warm_up()
         self.jaw = self.estimator.jaw

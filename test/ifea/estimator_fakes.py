@@ -19,6 +19,8 @@ from finforce_ifea.settings import EstimatorSettings
 from lab.presses import RigidOutline, press_jaw
 
 PERIOD = 1 / 30
+# The objects of the truth have no friction.
+SMOOTH = {"friction": 0.0, "friction_stddev": 0.03}
 TRUTH = np.load(Path(__file__).parents[2] / "lab" / "data" / "pressed_bench.npz")
 PLACES = {20: "lower", 40: "middle", 60: "upper"}
 # The modulus of the truth; the mechanics is 2 % off on the average, see test_truth.py.
@@ -92,7 +94,7 @@ def record(depths, *, diameter=25, height=40, seed=0, noise=1.0, offsets=1.0, co
 
 
 def make_estimator(jaw=BENCH, *, calibration=CALIBRATION, **options):
-    return ForceEstimator(jaw, settings=EstimatorSettings(**options), calibration=calibration)
+    return ForceEstimator(jaw, settings=EstimatorSettings(**{**SMOOTH, **options}), calibration=calibration)
 
 
 @lru_cache(maxsize=8)

@@ -11,16 +11,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from estimator_fakes import BENCH, PERIOD, circle
+from estimator_fakes import BENCH, PERIOD, SMOOTH, circle
 from scipy.interpolate import interp1d
 
+from finforce_ifea.contact_mechanics.friction import constant_traction
 from finforce_ifea.errors import ContactError
 from finforce_ifea.estimator import ForceEstimator
+from finforce_ifea.filter.tracker import ContactTracker
 from finforce_ifea.jaw.calibration import Calibration, load_calibration
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.observation import Contact, ObjectOutline, Observation
 from finforce_ifea.settings import EstimatorSettings
-from finforce_ifea.tracking.contact_tracker import ContactTracker
 from finforce_ifea.tracking.lateral_load import measure_torsion, turn_bent
 
 _DATA = Path(__file__).parents[1] / "data"
@@ -60,7 +61,7 @@ def play(name, seed=0, across=None, deepest=None):
     course = np.concatenate([np.zeros(75), np.arange(0.0, last, 2.0 * PERIOD), np.full(90, last)])
     points, true = interp1d(depths, moved, axis=0)(course), interp1d(depths, force, axis=0)(course)
     random = np.random.default_rng(seed)
-    estimator = ForceEstimator(BENCH, calibration=CALIBRATION, settings=EstimatorSettings(smooth_share=1.0))
+    estimator = ForceEstimator(BENCH, calibration=CALIBRATION, settings=EstimatorSettings(**SMOOTH))
     where = np.array([[BENCH.inner_face_x, 0.0, SHAPES[name][1]]])
     contact = Contact(points=where, weights=np.ones(1), outline=outline_of(name, across))
     solutions = []
@@ -145,7 +146,8 @@ def test_the_full_mechanics_take_over_in_equilibrium(monkeypatch):
         before = tracker._fidelity
         change(tracker, state)
         if tracker._fidelity > before:
-            sizes.append(tracker._contact.linearize(tracker.q, state["x_model"], tracker._traction).size)
+            traction = constant_traction(tracker._search.ratio)
+            sizes.append(tracker._contact.linearize(tracker.q, state["x_model"], traction).size)
 
     monkeypatch.setattr(ContactTracker, "_change_fidelity", watch)
     play.__wrapped__("box50_z42")

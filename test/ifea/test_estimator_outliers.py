@@ -20,7 +20,6 @@ from estimator_fakes import (
     rms,
     run,
     solved,
-    statuses,
 )
 from mechanics_fakes import BENCH
 
@@ -48,21 +47,18 @@ def swap(points, likelihood):
     likelihood[[2, 8, 12]] = 0.95
 
 
-@pytest.mark.parametrize(("solver", "height", "bound"), [*((one, 20, 0.12) for one in MODELS), ("frame", 40, 0.05)])
+@pytest.mark.parametrize(("solver", "height", "bound"), [*((one, 20, 0.05) for one in MODELS), ("frame", 40, 0.015)])
 @pytest.mark.parametrize("change", [misidentify(4), swap], ids=["27 %", "the same"])
 def test_gross_errors_of_high_likelihood_do_not_move_the_force(change, height, bound, solver):
     recording = pressed(height)
     spoilt = recording.changed(range(REST, len(STEPS)), change)
-    moved = magnitudes(run(spoilt, solver=solver)) - magnitudes(solved(height, solver))
-    # measured: at most 0.09 and 0.03 N, where the announced standard deviation is 0.08 and 0.03
-    assert np.isfinite(moved[loaded_frames(recording)]).all()
-    assert np.nanmax(np.abs(moved)) < bound
-
-
-def test_without_the_robust_weights_the_same_gross_errors_do_move_it_or_leave_no_answer():
-    spoilt = pressed(20).changed(range(REST, len(STEPS)), misidentify(3))
-    moved = magnitudes(run(spoilt, solver="frame", gate=100.0)) - magnitudes(solved(20))
-    assert np.nan_to_num(np.abs(moved[REST + 15 :]), nan=np.inf).max() > 0.3
+    solutions, loaded = run(spoilt, solver=solver), loaded_frames(recording)
+    moved = (magnitudes(solutions) - magnitudes(solved(height, solver)))[loaded]
+    stated = np.array([solution.magnitude_stddev for solution in solutions])[loaded]
+    # measured: 0.04 and 0.01 N, and 0.16 and 0.07 N at most in one image
+    assert np.isfinite(moved).all()
+    assert rms(moved) < bound
+    assert np.abs(moved / stated).max() < 3.0
 
 
 def test_gross_errors_are_not_reported_as_used():
@@ -239,26 +235,23 @@ BUMPS = {
 
 @pytest.mark.parametrize(
     ("height", "motion"),
-    [*((40, motion) for motion in BUMPS.values()), *((height, BUMPS["1 mm along x"]) for height in (20, 60))],
+    [
+        *((40, motion) for motion in BUMPS.values()),
+        *((height, BUMPS["1 mm along x"]) for height in (20, 60)),
+        (40, (0.3e-3, 0, 0, 0, 0, 0)),
+        (40, (-0.4e-3, 0, 0, 0, 0, 0)),
+        (40, (0, 0, 0.3e-3, 0, 0, 0)),
+    ],
 )
-def test_camera_that_was_bumped_under_load_is_noticed_within_a_third_of_a_second(height, motion):
+def test_camera_that_is_bumped_under_load_costs_no_answer_and_moves_no_force(height, motion):
     recording = pressed(height)
     spoilt = recording.changed(range(HELD_5, len(STEPS)), bump(motion))
-    solutions = run(spoilt, solver="frame")[HELD_5 + 10 : HELD_5 + 35]
-    assert statuses(solutions) == {"unobservable"}
-    assert any("all key points have moved together" in solution.message for solution in solutions)
-
-
-@pytest.mark.parametrize("motion", [(0.3e-3, 0, 0), (-0.4e-3, 0, 0), (0, 0, 0.3e-3)], ids=str)
-def test_motion_of_a_third_of_a_millimetre_shows_after_two_seconds(motion):
-    recording = pressed(40)
-    spoilt = recording.changed(range(HELD_5, HELD_5 + 90), bump((*motion, 0, 0, 0)))
-    assert statuses(run(spoilt, solver="frame")[HELD_5 + 60 : HELD_5 + 90]) == {"unobservable"}
-
-
-@pytest.mark.parametrize("height", [20, 40, 60])
-def test_camera_that_stands_still_is_not_said_to_have_moved(height):
-    assert not any("moved together" in solution.message for solution in solved(height))
+    solutions, after = run(spoilt, solver="frame"), slice(HELD_5 + 3, len(STEPS))
+    found, stated = errors(recording, solutions)[after], np.array([s.magnitude_stddev for s in solutions[after]])
+    assert np.isfinite(found).mean() > 0.97
+    # what shows over several images only is told a little late
+    assert np.nanmean(np.abs(found) < 3.0 * stated) > (0.98 if np.linalg.norm(motion) > 0.5e-3 else 0.95)
+    assert np.nanmax(np.abs(found)) < 0.35
 
 
 def test_tare_of_the_opened_jaw_takes_a_bump_up():
@@ -270,7 +263,7 @@ def test_tare_of_the_opened_jaw_takes_a_bump_up():
         solutions.append(estimator.update(observation, apart if index < REST else recording.contact))
         if index == REST - 1:
             assert "tared 15 key points" in estimator.tare()
-    assert "moved together" in solutions[REST - 5].message
+    assert solutions[REST - 5].magnitude_stddev * 3.0 > np.linalg.norm(solutions[REST - 5].force)
     assert rms(errors(recording, solutions)[REST + 5 :]) < 0.1
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from estimator_fakes import BENCH, PERIOD, circle, contact_with
 
-from finforce_ifea.contact_mechanics.friction import constant_traction
+from finforce_ifea.contact_mechanics.friction import Coefficient, constant_traction
 from finforce_ifea.contact_mechanics.indenter import RoundIndenter
 from finforce_ifea.contact_mechanics.pressed_jaw import limit_step
 from finforce_ifea.estimator import ForceEstimator
@@ -26,7 +26,6 @@ from finforce_ifea.jaw.calibration import Calibration, load_calibration
 from finforce_ifea.mechanics import build_chosen
 from finforce_ifea.observation import Observation
 from finforce_ifea.settings import EstimatorSettings
-from finforce_ifea.tracking.friction import Coefficient
 
 RUBBED = np.load(Path(__file__).parents[1] / "data" / "rubbed_bench.npz")
 HEIGHTS = {"lower": 0.020, "middle": 0.040, "upper": 0.060}
@@ -156,7 +155,7 @@ class TestSlipPath:
         depths, forces = 1e-3 * RUBBED[f"25_{name}_depth"], RUBBED[f"25_{name}_force"]
         for depth, force in zip(depths, forces, strict=True):
             for at in np.linspace(before, depth, max(2, round(abs(depth - before) / 0.1e-3) + 1))[1:]:
-                x = np.array([at, np.log(12.5e-3), height])
+                x = np.array([at, 12.5e-3, height])
                 q, _ = press(contact, x, path.ratios[0], q)
                 path.move(contact, q, x, np.array([[at - before, 0.0]]))
                 before = at
@@ -171,7 +170,7 @@ class TestSlipPath:
         contact.set_indenter(RoundIndenter())
         q = contact.begin(0.040)
         for depth in (0.5e-3, 1e-3, 2e-3, 3e-3):
-            x = np.array([depth, np.log(12.5e-3), 0.040])
+            x = np.array([depth, 12.5e-3, 0.040])
             q, _ = press(contact, x, 0.0, q)
         path.move(contact, q, x, np.tile([5e-3, 0.0], (3, 1)))
         np.testing.assert_allclose(path.ratios, [0.1, 0.3, 0.5])
@@ -211,14 +210,12 @@ CALIBRATION = Calibration(**{**load_calibration("bench").__dict__, "relaxation":
 NOISE = np.array([0.2e-3, 0.2e-3, 0.45e-3])
 
 
-def run(name, steps=18, hold=12, shift=None, tracker="filter", **settings):
+def run(name, steps=18, hold=12, shift=None, **settings):
     """Force, deviation and truth along the path of a rubbed cylinder, as (n, 3) each, with the estimator.
 
     Key points are moved by `shift` [m] once the object is deepest.
     """
-    estimator = ForceEstimator(
-        BENCH, settings=EstimatorSettings(tracker=tracker, **settings).resolve_held(both=False), calibration=CALIBRATION
-    )
+    estimator = ForceEstimator(BENCH, settings=EstimatorSettings(**settings), calibration=CALIBRATION)
     random, height, rows, image = np.random.default_rng(5), HEIGHTS[name], [], 0
     rest = 1e-3 * RUBBED["keypoints0"]
     offset = estimator.jaw.keypoints - rest
@@ -288,7 +285,7 @@ class TestBumpedCamera:
         assert within.mean() > 0.9
 
     def test_a_new_tare_forgets_the_bump(self):
-        estimator = ForceEstimator(BENCH, settings=EstimatorSettings(tracker="filter").resolve_held(both=False))
+        estimator = ForceEstimator(BENCH)
         random, contact, image = np.random.default_rng(2), contact_with(circle(12.5e-3), 0.040), 0
 
         def see(shift, count):
@@ -311,7 +308,7 @@ class TestBumpedCamera:
 class TestGarbage:
     @pytest.mark.parametrize("kind", ["scattered", "far away"])
     def test_it_gives_no_force_and_is_forgotten_at_once(self, kind):
-        estimator = ForceEstimator(BENCH, settings=EstimatorSettings(tracker="filter").resolve_held(both=False))
+        estimator = ForceEstimator(BENCH)
         random, contact = np.random.default_rng(4), contact_with(circle(12.5e-3), 0.040)
         trusted = []
         for image in range(80):

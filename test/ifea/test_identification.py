@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from estimator_fakes import magnitudes, make_estimator, ramp, record, run
+from estimator_fakes import SMOOTH, magnitudes, make_estimator, ramp, record, run
 from mechanics_fakes import BENCH, MODULUS
 
 from finforce_ifea.errors import CalibrationError
@@ -15,7 +15,7 @@ from finforce_ifea.relaxation import RelaxationTerm, apply_relaxation
 from finforce_ifea.settings import EstimatorSettings
 
 TERMS = (RelaxationTerm(share=0.12, time_constant=1.5), RelaxationTerm(share=0.06, time_constant=12.0))
-FRAME = EstimatorSettings(solver="frame")
+FRAME = EstimatorSettings(solver="frame", **SMOOTH)
 COURSE = ramp(2, 4, 6, 4, 2, 0, hold=3.0)
 COSTS = []  # that the fit below has told
 

@@ -9,7 +9,6 @@ from estimator_fakes import Recording as Press
 from mechanics_fakes import BENCH
 
 from finforce_ifea.observation import Contact, Observation
-from finforce_ifea.tracking.contact_filter import FORECAST, widen_forecast
 
 NOISE = np.array([0.15e-3, 0.30e-3, 0.15e-3])
 REST, TARGET, SEEN = 60, 0.004, 0.1
@@ -45,9 +44,9 @@ def count_late_images(speed, seeds=SEEDS):
 # A force rises through 0.1 N between two images: half an image more passes on the average before one can show it.
 @pytest.mark.parametrize("speed", [0.010, 0.020])
 def test_the_image_that_first_shows_a_force_gives_it(speed):
-    late = count_late_images(speed)
+    late = count_late_images(speed, range(16))
     assert late.max() <= 1
-    assert late.mean() <= 0.25  # measured 0.08 over 60 presses at 10 mm/s, 0.00 at 20 mm/s
+    assert late.mean() <= 0.25  # measured 0.08 over 24 presses at 10 mm/s, 0.00 at 20 mm/s
 
 
 def test_a_slow_touch_is_seen_within_an_image():
@@ -84,35 +83,3 @@ def jump(depth):
         Observation(stamp=1.0 + PERIOD * i, points=part, likelihood=likelihood) for i, part in enumerate(points)
     ]
     return Press(observations=observations, contact=Contact.fixed(BENCH, 0.04), depths=depths, forces=forces)
-
-
-def forecast(unsure):
-    expected = np.zeros((), FORECAST)[()]
-    expected["spread"], expected["unsure"] = np.diag([0.02e-3, 1e-3]) ** 2, unsure
-    return expected
-
-
-def test_a_jump_at_rest_is_a_new_speed():
-    jump, noise = 0.4e-3, 0.09e-3**2
-    spread = widen_forecast(forecast(PERIOD), jump, noise)
-    gain = spread[0] / (spread[0, 0] + noise)
-    assert gain[0] * jump == pytest.approx(jump, rel=0.06)
-    assert gain[1] * jump == pytest.approx(jump / PERIOD, rel=0.06)
-
-
-def test_a_jump_under_load_leaves_the_speed_to_the_images_that_follow():
-    spread = widen_forecast(forecast(0.0), 0.4e-3, 0.09e-3**2)
-    assert spread[0, 0] > 0.3e-3**2
-    assert spread[0, 1] == 0.0
-
-
-def test_no_object_is_faster_than_the_fastest():
-    jump, noise = 4e-3, 0.09e-3**2
-    spread = widen_forecast(forecast(PERIOD), jump, noise)
-    assert spread[1, 0] / spread[0, 0] * jump == pytest.approx(0.05, rel=0.01)
-
-
-@pytest.mark.parametrize("unsure", [0.0, PERIOD])
-def test_chance_is_no_manoeuvre(unsure):
-    expected = forecast(unsure)
-    np.testing.assert_array_equal(widen_forecast(expected, 0.2e-3, 0.09e-3**2), expected["spread"])

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
+from estimator_fakes import SMOOTH
 from mechanics_fakes import compute_volume
 from section_fakes import BASE, LENGTH, MILLIMETRE, TPU, draw_keypoints, draw_polygon, make_section, write_section_jaw
 
@@ -247,7 +248,7 @@ def test_first_touch_of_a_curved_face_is_where_it_stands_out(curved):
     contact = build_mechanics(curved, EstimatorSettings(solver="plane", mesh="coarse")).contact
     radius, places = 1e-3, {}
     for height in (0.022, 0.041, 0.060):
-        place = np.array([0.0, np.log(radius), height])
+        place = np.array([0.0, radius, height])
         places[height] = contact.find_touch(place)
         gap = contact.indenter.find_gap(contact.place_points(np.zeros(contact.model.size)), contact.face_x, place)
         assert gap > -1e-6
@@ -270,7 +271,7 @@ def test_curved_face_has_the_solid_finger_s_force(curved):
 @pytest.mark.parametrize("height", [0.030, 0.052])
 def test_force_on_a_curved_face_is_estimated(curved, height):
     """Key points of the plane model under a rod, by stored equilibria: within 3 % and three deviations."""
-    settings = EstimatorSettings(solver="reduced", mesh="coarse", radius=0.0125, radius_log_stddev=0.05)
+    settings = EstimatorSettings(solver="reduced", mesh="coarse", radius=0.0125, radius_stddev=0.6e-3, **SMOOTH)
     modelled = replace(curved, material=curved.material.model_copy(update={"spread": 0.0}))
     estimator = ForceEstimator(modelled, settings=settings)
     mechanics = build_mechanics(modelled, replace(settings, solver="plane"))

@@ -13,7 +13,7 @@ from finforce_ifea.observation import Contact
 from lab.presses import RigidCylinder, press_jaw
 
 MODELS = [("coarse", "solid"), ("default", "frame")]
-PLACE = np.array([0.004, np.log(0.0125), 0.030])
+PLACE = np.array([0.004, 0.0125, 0.030])
 # Steps of depth [m], log radius and height [m] for central differences.
 STEPS = {DEPTH: 1e-7, SHAPE: 1e-5, HEIGHT: 1e-7}
 
@@ -31,7 +31,7 @@ def settle(contact, q, place):
 @pytest.fixture(scope="module", params=MODELS, ids=str)
 def pressed(request):
     mechanics = bench_mechanics(*request.param)
-    radius = float(np.exp(PLACE[SHAPE]))
+    radius = float(PLACE[SHAPE])
     result = press_jaw(
         mechanics.model,
         mechanics.contact.surface,
@@ -85,8 +85,8 @@ def test_jaw_that_has_lost_contact_comes_back_to_touch(pressed):
     assert contact.linearize(q, place).touches
     # it stops at the object: the whole step would carry it a millimetre into it
     points = contact.model.positions(contact.surface.probe, q)
-    centre = np.array([contact.face_x + np.exp(place[SHAPE]) - place[DEPTH], place[HEIGHT]])
-    assert np.linalg.norm(points[:, [0, 2]] - centre, axis=1).min() > np.exp(place[SHAPE]) - 0.05e-3
+    centre = np.array([contact.face_x + place[SHAPE] - place[DEPTH], place[HEIGHT]])
+    assert np.linalg.norm(points[:, [0, 2]] - centre, axis=1).min() > place[SHAPE] - 0.05e-3
     assert settle(contact, q, place)[1].touches
 
 
