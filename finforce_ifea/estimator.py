@@ -145,6 +145,11 @@ class ForceEstimator:
         return self._tracked.friction
 
     @property
+    def friction_source(self) -> str:
+        """Where that comes from: "stated", "expected" by the settings, or "learned" from the object's path."""
+        return self._tracked.friction_source
+
+    @property
     def touch_probability(self) -> float:
         """Probability that the object touched in the last image, 0 where no force was found."""
         if self._pressed is None:

@@ -355,8 +355,8 @@ class IfeaSolverNode(ros.ImageNode):
         """Return how this node is doing."""
         limit = max(1.0, self.parameters.max_age)
         alarms = [*alarms, *peer_alarms(self.parameters.peer, self.pairing.silence, limit)]
-        mean, stddev = self.estimator.friction
-        tared = {"tared": str(self.estimator.tared), "friction": f"{mean:.2f} ± {stddev:.2f}"}
+        (mean, stddev), source = self.estimator.friction, self.estimator.friction_source
+        tared = {"tared": str(self.estimator.tared), "friction": f"{mean:.2f} ± {stddev:.2f}, {source}"}
         tared["touch probability"] = f"{self.estimator.touch_probability:.2f}"
         health = self.health[self.parameters.jaw_name]
         return health.report(alarms, describe_solution(self.last) | tared | self.skips.describe())

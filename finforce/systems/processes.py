@@ -165,7 +165,10 @@ def node_process(name: str, asked: Mapping[str, Any], options: SolverOptions) ->
 
 def solver_process(side: str, options: SolverOptions, **parameters: Any) -> Process:
     """Return the solver of one jaw; `parameters` are added to those that the options name."""
-    height = None if math.isnan(options.contact_height) else options.contact_height
+    height, *friction = (
+        None if math.isnan(number) else number
+        for number in (options.contact_height, options.friction, options.friction_stddev)
+    )
     asked = {
         "jaw_name": side,
         "jaw_file": options.jaw_file,
@@ -173,6 +176,8 @@ def solver_process(side: str, options: SolverOptions, **parameters: Any) -> Proc
         # NaN overrules a height in the parameter file
         "contact_height": math.nan if options.object_mesh else height,
         "estimator.solver": options.solver,
+        "estimator.friction": friction[0],
+        "estimator.friction_stddev": friction[1],
         **parameters,
     }
     return replace(node_process("ifea_solver", asked, options), name=f"{side}_ifea_solver")
@@ -310,6 +315,12 @@ class SolverOptions:
     calibration_file: str = setting("", "Calibration file or name of an included one; none: material of the jaw file")
     contact_height: float = setting(
         math.nan, "Height of first touch above the clamped base; nan: contacts come by topic", "m", 0.0, 0.5
+    )
+    friction: float = setting(
+        math.nan, "Coefficient of friction of the object on the finger; nan: unknown", "", 0.0, 2.0
+    )
+    friction_stddev: float = setting(
+        math.nan, "Standard deviation of the coefficient of friction; nan: that of an unknown one", "", 1e-3, 2.0
     )
     object_mesh: str = setting("", "Mesh file of the object, from which contacts are estimated")
     object_mesh_unit: str = setting("", "Unit of the mesh file: m, cm, mm or inch")

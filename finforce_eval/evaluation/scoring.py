@@ -82,6 +82,7 @@ class CaseScore:
         load: of them, on the way in.
         unload: of them, on the way out.
         moving: errors over all other images with a truth, as on ramps; of none without phases.
+        stages: errors over the record phases by direction and cycle, as "load 1"; none without phases.
         step_ms: time per step, `p50`, `p95`, `p99` and `max`.
         cycles: "all", "load", "unload" -> number `n` of loading cycles, `mean` and sample standard deviation `std` of
             `rmse_N` and `nrmsd_pct` over them.
@@ -104,6 +105,7 @@ class CaseScore:
     load: Stats
     unload: Stats
     moving: Stats
+    stages: Mapping[str, Stats]
     step_ms: Numbers
     cycles: Mapping[str, Numbers]
     mean_rmse_N: float | None
@@ -189,6 +191,7 @@ def score_case(cases: Sequence[ForceSeries], span: float) -> CaseScore:
         record_frames=sum(int(case.scored.sum()) for case in cases),
         record_skipped=sum(int((case.scored & ~case.solved).sum()) for case in cases),
         **{name: _score_rows(cases, asked, span) for name, asked in rows.items()},
+        stages=_score_stages(cases, rows, span),
         step_ms=_times(case.column("step_ms") for case in cases),
         cycles={phase: _cycle_stats(cases, phase, span) for phase in PHASES},
         mean_rmse_N=_spread([compute_stats(case.error[case.counted], span).rmse_N for case in cases])["mean"],
@@ -217,6 +220,19 @@ def _score_rows(cases: Sequence[ForceSeries], asked: Sequence[NDArray[np.bool_]]
         if all(turned):
             found |= compare_torques(*(_join(cases, chosen, name) for name in ("torque", "true_torque")))
     return replace(stats, **found)
+
+
+def _score_stages(
+    cases: Sequence[ForceSeries], rows: Mapping[str, Sequence[NDArray[np.bool_]]], span: float
+) -> Mapping[str, Stats]:
+    """Return the errors by direction and cycle, in the order of time, over the rows of each direction."""
+    found = {}
+    for cycle in np.unique(np.concatenate([case.column("cycle")[case.scored] for case in cases])):
+        for phase in PHASES[1:]:
+            asked = [own & (case.column("cycle") == cycle) for case, own in zip(cases, rows[phase], strict=True)]
+            if any(own.any() for own in asked):
+                found[f"{phase} {cycle}"] = _score_rows(cases, asked, span)
+    return found
 
 
 def _is_phase(case: ForceSeries, phase: str) -> NDArray[np.bool_]:

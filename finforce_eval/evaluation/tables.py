@@ -19,7 +19,8 @@ _CONTACT = (
     "of a step of the contact estimator."
 )
 _VECTOR = (
-    "Force as a vector, in the record phases (record) and in all other images with a true force (moving): RMSE of the "
+    "Force as a vector, in the record phases (record; below, by direction and cycle of all cases) and in all other "
+    "images with a true force (moving): RMSE of the "
     "vector and along x, y, z of the jaw; images within three stated standard deviations; sharpness: RMS of the stated "
     "standard deviation over RMS of the error, 1 to 2 is good, below 1 too small, above 4 of no use; off: images with "
     "an error above 0.3 N along an axis."
@@ -79,7 +80,8 @@ def vector_table(evaluation: Evaluation) -> pd.DataFrame:
     head = [("", "images"), ("", "n"), ("", "RMSE/N"), *((group, axis) for group in groups for axis in AXES)]
     rows = []
     for name, score in _score_rows(evaluation):
-        for images, stats in (("record", score.all), ("moving", score.moving)):
+        stages = score.stages.items() if name == "all" else ()
+        for images, stats in (("record", score.all), *stages, ("moving", score.moving)):
             if stats.axis_rmse_N is None:
                 continue
             within, sharp = stats.within_3_sigma_pct or [None] * 3, stats.sharpness or [None] * 3

@@ -50,6 +50,8 @@ _ELSEWHERE, _EVERY = 5e-3, 3
 # or deeper in, are surely so [m].
 _NEXT_TO_CLAMP, _WELL_CLEAR = np.array([0.2, 0.4, 0.6, 0.8, 1.0]), 3e-3
 _LEAST_VARIANCE = 1e-12
+# Share of the expected deviation of a coefficient of friction below which something was learnt of it.
+_LEARNT = 0.75
 
 
 class _Fidelity(NamedTuple):
@@ -264,7 +266,7 @@ class ContactTracker:
 
     def expect_friction(self, friction: Coefficient | None) -> None:
         """Expect an object of a stated coefficient of friction; None for one of which the settings say all."""
-        settings = self.settings
+        settings, self._is_unstated = self.settings, friction is None
         self._friction = Coefficient(settings.friction, settings.friction_stddev) if friction is None else friction
         self._search.expect_friction(self._friction)
 
@@ -272,6 +274,13 @@ class ContactTracker:
     def friction(self) -> Coefficient:
         """What is known of the object's coefficient of friction."""
         return self._search.friction
+
+    @property
+    def friction_source(self) -> str:
+        """Where the coefficient of friction comes from: "stated", "expected" by the settings, or "learned"."""
+        if self.friction.stddev < _LEARNT * self._friction.stddev:
+            return "learned"
+        return "expected" if self._is_unstated else "stated"
 
     @property
     def _is_known(self) -> bool:

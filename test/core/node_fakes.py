@@ -60,7 +60,7 @@ class FakeEstimator:
     surface_triangles = np.array([[0, 1, 2], [0, 2, 3]])
     tared = is_idle = False
     friction = (0.0, 0.02)
-    touch_probability = 0.0
+    touch_probability, friction_source = 0.0, "expected"
 
     def __init__(self, **answer):
         self.answer = answer

@@ -97,7 +97,14 @@ def test_a_launch_file_starts_a_solver_with_its_configuration(recorded_launch, p
 def test_an_argument_reaches_the_node_with_its_type(recorded_launch):
     (solver,) = start(ROOT / "launch" / "bench.launch.py", contact_height="0.04", jaw="right").values()
     assert solver["parameters"][1]["contact_height"] == 0.04
+    assert "estimator.friction" not in solver["parameters"][1]
     assert solver["name"] == "right_ifea_solver"
+
+
+def test_friction_of_the_object_is_an_argument(recorded_launch):
+    (solver,) = start(ROOT / "launch" / "bench.launch.py", friction="0.3", friction_stddev="0.05").values()
+    assert solver["parameters"][1]["estimator.friction"] == 0.3
+    assert solver["parameters"][1]["estimator.friction_stddev"] == 0.05
 
 
 def test_an_argument_is_read_under_its_former_name(recorded_launch):

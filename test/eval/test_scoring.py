@@ -212,6 +212,16 @@ def test_without_stated_deviations_nothing_is_said_of_them():
     assert stats.within_3_sigma_pct is stats.sharpness is None and stats.vector_rmse_N is not None
 
 
+def test_each_direction_and_cycle_has_its_own_errors():
+    truth = np.tile(vectors().true_force[:1], (4, 1))
+    force = truth + np.outer([0.1, 0.2, 0.3, 0.4], [0.0, 0.0, 1.0])
+    stages = {"direction": np.array(["load", "unload", "load", "unload"]), "cycle": np.array([1, 1, 2, 2])}
+    case = vectors().at(np.zeros(4, int)).with_columns(true_force=truth, force=force, **stages)
+    found = {name: stats.axis_rmse_N[2] for name, stats in score_case([case], span=1.0).stages.items()}
+    assert found == pytest.approx({"load 1": 0.1, "unload 1": 0.2, "load 2": 0.3, "unload 2": 0.4})
+    assert not score_case([case.with_columns(direction=np.full(4, ""))], span=1.0).stages
+
+
 def test_a_truth_that_is_a_magnitude_along_x_says_nothing_of_the_vector():
     stats = score_case([make_result(truth=[1.0, 2.0], force=[1.1, 2.0])], span=1.0).all
     assert (stats.vector_rmse_N, stats.axis_rmse_N, stats.within_3_sigma_pct) == (None, None, None)

@@ -147,13 +147,16 @@ class TestCoefficient:
         estimator = ForceEstimator(BENCH, calibration=CALIBRATION)
         estimator.expect_friction(Coefficient(0.6, 0.05))
         assert estimator.friction == pytest.approx((0.6, 0.05))
+        assert estimator.friction_source == "stated"
         estimator.expect_friction(None)
+        assert estimator.friction_source == "expected"
         assert estimator.friction.mean == pytest.approx(estimator.settings.friction, abs=0.05)
 
     def test_another_object_begins_anew(self):
         _, _, estimator = play(RUBBED, "middle")
         learnt, first = estimator.friction, ForceEstimator(BENCH, calibration=CALIBRATION).friction
         assert learnt.stddev < 0.5 * first.stddev
+        assert estimator.friction_source == "learned"
         estimator.reset()
         assert estimator.friction == learnt
         estimator.forget()
