@@ -222,6 +222,9 @@ class GraspSettings(_Bounded):
         1400.0, "Maximum stiffness of jaws and object per opening, assumed until it is learned", "N/m", 50.0, 1e5
     )
     approach_speed: float = setting(0.004, "Maximum speed of the opening before contact", "m/s", 1e-4, 0.1)
+    probe: float = setting(
+        0.0, "Way back at half of the set force, from which friction shows in the first grasp; 0: none", "m", 0.0, 0.01
+    )
     reaction: float = setting(0.05, "Delay from a command to the motion of the gripper", "s", 0.0, 1.0)
     stale_after: float = setting(0.25, "Maximum age of the newest force; a grasp ends beyond it", "s", 0.05, 2.0)
     force_timeout: float = setting(

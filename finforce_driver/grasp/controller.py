@@ -11,6 +11,7 @@ from statistics import median
 from finforce_driver.errors import BackOffError, GraspError, UnseenForceError
 from finforce_driver.grasp.load_watch import NOISE, ForceFeed, ForceSample, JawPosition, LoadWatch, TouchSample
 from finforce_driver.grasp.plan import DEVIATIONS, FRICTION, MOTOR_MARGIN, GraspPlan
+from finforce_driver.grasp.probe import FrictionProbe
 from finforce_driver.settings import GraspGoal, GraspSettings, GripperSettings
 from finforce_driver.state import USABLE, GraspPhase, GraspStatus, GripperState, MoveRequest
 
@@ -61,6 +62,7 @@ class ForceGrasp:
         self._load = LoadWatch(self.settings, min(_ONSET_FORCE, 0.5 * goal.force))
         self._position = JawPosition(opening=math.nan, resting=False)
         self._plan = GraspPlan(goal, self.settings, self._load, self._feed, self._jaws, resolution)
+        self._probe = FrictionProbe(self.settings.probe)
         self._pending: deque[ForceSample | TouchSample] = deque()
         self.phase, self._reason = GraspPhase.APPROACH, "waits for the first force"
         self._began = self._held_at = self._reserve = self._saturated = math.nan
@@ -245,11 +247,23 @@ class ForceGrasp:
         if self._load.suspect:
             return self._pause(state, now)
         self._plan.note_rest()
+        if self._probe.is_due:
+            return self._probe_friction(state, now)
         ideal = self._plan.ideal_target(self.set_force)
         target = self._plan.limit(ideal)
         self._watch(ideal, target, state, now)
         speed = self._plan.choose_speed(target)
         return self._move(target, speed, state, now) if self._plan.is_worth(target, speed, state.opening) else None
+
+    def _probe_friction(self, state: GripperState, now: float) -> MoveRequest | None:
+        """Return the next move until the object was probed, None where the jaws are to go on as they do."""
+        plan = self._plan
+        target = self._probe.find_target(plan, self._load, self.set_force)
+        if abs(target - plan.target) > 0.5 * plan.step and self._probe.goes_back:
+            self._reason = "goes back a little, to see how rough the object is"
+            return self._move(target, self.goal.speed, state, now)
+        speed = plan.choose_speed(target)
+        return self._move(target, speed, state, now) if plan.is_worth(target, speed, state.opening) else None
 
     def _watch(self, ideal: float, target: float, state: GripperState, now: float) -> None:
         """See whether the force is held, and whether the least opening keeps it from being reached."""

@@ -268,3 +268,23 @@ def test_a_force_that_drifts_away_while_it_is_held_squeezes_no_harder_than_relax
     assert "slips or yields" in course.status.reason
     # 0.4 of the set force and three steps, and another two for the stiffness being learnt only
     assert course.peak < 1.4 * force + 5 * STEP * stiffness
+
+
+class TestProbe:
+    @pytest.mark.parametrize("stiffness", [500.0, 1500.0, 4000.0])
+    def test_the_jaws_go_back_once_and_on_and_keep_the_object(self, stiffness):
+        goal, fingers = GraspGoal(force=3.0), Fingers(force_at=spring(stiffness))
+        course = Bench(goal=goal, settings=GraspSettings(probe=2e-3), fingers=fingers).run(12.0)
+        end = course.times.index(next(t for t in course.times if t >= course.held_after()))
+        way = np.array(course.openings[:end])
+        back = way - np.minimum.accumulate(way)
+        assert 1.5 * STEP < back.max() < 2e-3 + STEP
+        forces = np.array(course.forces[:end])
+        assert forces[np.argmax(forces > 1.5) :].min() > 0.3
+        assert course.overshoot(3.0) < max(0.3, stiffness * STEP)
+
+    def test_without_one_they_only_close(self):
+        course = Bench(goal=GraspGoal(force=3.0), fingers=Fingers(force_at=spring(800.0))).run(12.0)
+        end = course.times.index(next(t for t in course.times if t >= course.held_after()))
+        way = np.array(course.openings[:end])
+        assert (way - np.minimum.accumulate(way)).max() < 1.5 * STEP
