@@ -3,7 +3,7 @@
 `from finforce import NAME` gives what most programs need, and loads its package only then:
 
 - images to forces: `ForceSensor` and what it returns, `GripperForces`; `CameraIntrinsics`, `read_camera`;
-- the force: `ForceEstimator`, `Observation`, `Contact`, `Solution`, `load_jaw`;
+- the force: `ForceEstimator`, `EstimatorSettings`, `Observation`, `Contact`, `Solution`, `load_jaw`;
 - the material: `load_calibration`, `save_calibration`, `calibrate_with_scale`;
 - the contact: `load_object_mesh`, `ContactEstimator`, and `ForceLoop`, contact and force together;
 - the images: `KeypointDetector`, `build_detector`, `RgbdImage`;

@@ -20,6 +20,7 @@ from finforce_ifea.jaw.jaw import load_jaw as load_jaw
 from finforce_ifea.observation import Contact as Contact
 from finforce_ifea.observation import Observation as Observation
 from finforce_ifea.observation import Solution as Solution
+from finforce_ifea.settings import EstimatorSettings as EstimatorSettings
 from finforce_keypoints.build import build_detector as build_detector
 from finforce_keypoints.detector import KeypointDetector as KeypointDetector
 from finforce_keypoints.images import RgbdImage as RgbdImage

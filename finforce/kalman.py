@@ -86,9 +86,9 @@ class Track:
         """Add a variance to the position."""
         self._state[4:6] += variance
 
-    def predict(self, dt: float) -> None:
-        """Advance by a time [s]."""
-        starts, stops = 1.0 - exp(-dt / self.noise.rest_time), 1.0 - exp(-dt / self.noise.motion_time)
+    def predict(self, dt: float, rest_time: float | None = None) -> None:
+        """Advance by a time [s]; a mean time of rest [s] goes before that of the noise."""
+        starts, stops = 1.0 - exp(-dt / (rest_time or self.noise.rest_time)), 1.0 - exp(-dt / self.noise.motion_time)
         _mix(self._state, starts, stops, self.noise.start)
         _advance(self._state, dt, self.noise.drift, self.noise.acceleration)
 

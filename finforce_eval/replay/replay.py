@@ -21,7 +21,7 @@ from finforce_eval.evaluation.gripper import with_distances
 from finforce_eval.evaluation.keypoint_source import IMAGES, TRUTH, KeypointSource, awaiting_keypoints
 from finforce_eval.evaluation.scoring import Evaluation, GraspScore, score_grasp, score_results
 from finforce_eval.evaluation.setup import EvaluationSetup
-from finforce_eval.recordings.objects import find_mesh, require_mesh
+from finforce_eval.recordings.objects import find_mesh, read_friction, require_mesh
 from finforce_eval.recordings.tracks import Recording
 from finforce_eval.recordings.writer import write_recording
 from finforce_eval.replay.live import ReplayLog, live_result, with_heard_keypoints
@@ -197,6 +197,8 @@ def _for_scores(
     """Return the processes: they answer every image, so that each is scored, as the options of the command say."""
     more = {name: {"skip_off": [IDLE, STILL]} for name in ("keypoint_detector", "contact_estimator", "ifea_solver")}
     more["ifea_solver"] |= {"estimator.mesh": setup.settings.mesh}
+    if (friction := read_friction(recording)) is not None:
+        more["ifea_solver"] |= {"estimator.friction": friction.mean, "estimator.friction_stddev": friction.stddev}
     if (mode := _contact_mode(recording, setup.contacts)) != FIXED:
         density = {} if setup.settings.solver == "paper" else {"contact.mesh": setup.settings.mesh}
         more["contact_estimator"] |= {"contact.mode": mode, **density}

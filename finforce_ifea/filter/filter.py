@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from finforce_ifea.filter.measurement import weigh
+from finforce_ifea.filter.measurement import measure_distances, weigh
 from finforce_ifea.filter.state import SHARED, TRACTION
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
@@ -37,7 +37,8 @@ class Posterior(NamedTuple):
         nu: mean innovation (2 m,) [m].
         own: covariance of the first four entries by the noise of this image alone, K R K^T (4, 4).
         left: residuals of the key points (m, 2) [m].
-        weight: of the key points by these residuals (m,).
+        distances: their squares, normalised (m,).
+        weight: of the key points by these (m,).
     """
 
     x: NDArray
@@ -48,6 +49,7 @@ class Posterior(NamedTuple):
     nu: NDArray
     own: NDArray
     left: NDArray
+    distances: NDArray
     weight: NDArray
 
 
@@ -150,6 +152,7 @@ def update(measured, weight, ratios, x, log_weights, P):
     log_weights = normalize(log_weights - 0.5 * (white**2).sum(axis=0))
     w = np.exp(log_weights)
     left = np.dot(w, expect_innovations(measured, ratios, updated)).reshape(-1, 2)
+    distances = measure_distances(left, measured.R, measured.square)
     return Posterior(
         updated,
         log_weights,
@@ -159,7 +162,8 @@ def update(measured, weight, ratios, x, log_weights, P):
         np.dot(before, nu),
         _spread_noise(A, L, R),
         left,
-        weigh(left, measured.R, measured.square),
+        distances,
+        weigh(distances),
     )
 
 

@@ -23,7 +23,7 @@ from finforce_ifea.filter.filter import (
     project_columns,
     solve_lower,
 )
-from finforce_ifea.filter.measurement import Measurement, find_depth_jump, weigh
+from finforce_ifea.filter.measurement import Measurement, find_depth_jump, measure_distances, weigh
 from finforce_ifea.filter.state import CAMERA_TURN, CAMERA_X, CAMERA_Z, DEPTH, HEIGHT, TRACTION
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
@@ -141,7 +141,7 @@ def _weigh_innovations(measured, nu, S, depth_variance):
         for a in range(2):
             for b in range(2):
                 blocks[i, a, b] = S[2 * i + a, 2 * i + b] + spread * h[a] * h[b]
-    return weigh(moved.reshape(-1, 2), blocks, measured.square)
+    return weigh(measure_distances(moved.reshape(-1, 2), blocks, measured.square))
 
 
 class JumpWatch:

@@ -79,7 +79,7 @@ def find_seen(points):
 
 
 @njit(**_OPTIONS)
-def observe(points, seen, positions, motions, at, ratio):
+def observe(points, seen, positions, motions, at, ratio, level):
     """Return the measurement by key points.
 
     Args:
@@ -89,6 +89,7 @@ def observe(points, seen, positions, motions, at, ratio):
         motions: their derivatives by depth, shape, height and traction ratio (K, 3, 4).
         at: depth, shape and height at which the mechanics stands (3,).
         ratio: traction ratio at which it stands.
+        level: variance of the noise over that in the tare.
     """
     m = len(seen)
     H, rows, u, z = np.zeros((2 * m, SHARED)), np.empty(2 * m, np.int64), np.empty(2 * m), np.empty(2 * m)
@@ -97,7 +98,9 @@ def observe(points, seen, positions, motions, at, ratio):
         k = seen[i]
         point, p = points[k], positions[k]
         lateral = point.measured[1] - p[1]
-        square[i] = lateral * lateral / (point.width_variance / point.trust + point.offset_variance + LATERAL_ERROR**2)
+        square[i] = (
+            lateral * lateral / (level * point.width_variance / point.trust + point.offset_variance + LATERAL_ERROR**2)
+        )
         size = np.hypot(p[0] - point.rest[0], p[2] - point.rest[2])
         for a in range(2):
             row, motion = 2 * i + a, motions[k, 2 * a]
@@ -107,7 +110,7 @@ def observe(points, seen, positions, motions, at, ratio):
             z[row] = point.measured[2 * a] - p[2 * a] - point.gain[a] * lateral + motion[3] * ratio
             z[row] += motion[0] * at[0] + motion[1] * at[1] + motion[2] * at[2]
             for b in range(2):
-                R[i, a, b] = point.tare_noise[a, b] / point.trust
+                R[i, a, b] = level * point.tare_noise[a, b] / point.trust
         H[2 * i, CAMERA_X], H[2 * i + 1, CAMERA_Z] = 1.0, 1.0
         H[2 * i, CAMERA_TURN], H[2 * i + 1, CAMERA_TURN] = p[2], -p[0]
         H[2 * i + 1, CAMERA_STRETCH] = p[2]
@@ -115,16 +118,21 @@ def observe(points, seen, positions, motions, at, ratio):
 
 
 @njit(**_OPTIONS)
-def weigh(left, covariance, square):
-    """Return the weights (m,) of residuals (m, 2) with a covariance (m, 2, 2), `square` (m,) along y included."""
-    weights = np.empty(len(left))
+def measure_distances(left, covariance, square):
+    """Return D^2 (m,) of residuals (m, 2) with a covariance (m, 2, 2), `square` (m,) along y included."""
+    distances = np.empty(len(left))
     for i in range(len(left)):
         r0, r1 = left[i]
         a, b, c = covariance[i, 0, 0], covariance[i, 0, 1], covariance[i, 1, 1]
-        distance = (c * r0 * r0 - 2.0 * b * r0 * r1 + a * r1 * r1) / (a * c - b * b) + square[i]
-        weight = min(1.0, (FREEDOM + 3.0) / (FREEDOM + distance))
-        weights[i] = weight if weight > _GROSS else NO_WEIGHT
-    return weights
+        distances[i] = (c * r0 * r0 - 2.0 * b * r0 * r1 + a * r1 * r1) / (a * c - b * b) + square[i]
+    return distances
+
+
+@njit(**_OPTIONS)
+def weigh(distances):
+    """Return the weights (m,) for D^2 (m,)."""
+    weights = np.minimum(1.0, (FREEDOM + 3.0) / (FREEDOM + distances))
+    return np.where(weights > _GROSS, weights, NO_WEIGHT)
 
 
 @njit(**_OPTIONS)

@@ -32,6 +32,8 @@ MODEL_RELATIVE = 0.01
 # Motion [m] and time [s] over which such an error stays the same.
 MODEL_LENGTH = 10e-3
 MODEL_TIME = 60.0
+# Motion over which what a detector errs by in the sight of one shape stays the same [m]: a pixel or two.
+SIGHT_LENGTH = 0.5e-3
 # Time over which the relative error stays the same [s].
 RELATIVE_TIME = 200.0
 # 1 sigma of the traction ratio beyond friction: at least [-], and relative to the coefficient of friction.
@@ -98,14 +100,24 @@ def expect_state(expected, offset_variance, displacement):
 
 
 @njit(**_OPTIONS)
-def find_decay(keypoints, dt, motion, camera_time):
-    """Return a (n,) after a time dt [s] and a motion of the object [m]."""
+def find_decay(sight, dt, motion, camera_time):
+    """Return a (n,) after a time dt [s] and a motion of the object [m].
+
+    Args:
+        sight: share of each key point's offset that a detector errs by in the sight of one shape (K,) [-].
+        dt: see above.
+        motion: see above.
+        camera_time: see `Expectation`.
+    """
+    keypoints = len(sight)
     a = np.ones(SHARED + 4 * keypoints)
     a[SHAPE] = a[HEIGHT] = np.exp(-dt / OBJECT_TIME)
     a[TRACTION] = np.exp(-motion / TRACTION_LENGTH - dt / MODEL_TIME)
     a[APPARENT] = np.exp(-dt / APPARENT_TIME)
     a[CAMERA_X : CAMERA_STRETCH + 1] = np.exp(-dt / camera_time)
-    a[SHARED : SHARED + 2 * keypoints] = np.exp(-motion / MODEL_LENGTH - dt / MODEL_TIME)
+    lasts, seen = np.exp(-motion / MODEL_LENGTH - dt / MODEL_TIME), np.exp(-motion / SIGHT_LENGTH)
+    for k in range(keypoints):
+        a[SHARED + 2 * k : SHARED + 2 * k + 2] = lasts * (1.0 - sight[k] + sight[k] * seen)
     a[SHARED + 2 * keypoints :] = np.exp(-dt / RELATIVE_TIME)
     return a
 

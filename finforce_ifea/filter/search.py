@@ -47,7 +47,7 @@ from finforce_ifea.filter.process import (
     predict,
 )
 from finforce_ifea.filter.readout import AGREES, LARGEST_RATIO, find_upright_ratio, judge_points, read_out
-from finforce_ifea.filter.state import CONTACT, DEPTH, HEIGHT, SHAPE, TRACTION, state_size
+from finforce_ifea.filter.state import CONTACT, DEPTH, HEIGHT, SHAPE, SHARED, TRACTION, state_size
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tracking.contact_state import KEYPOINT, LEAST_DEPTH, LOADED_DEPTH, blank_contact_state
 from finforce_ifea.tracking.lateral_load import WEIGHT
@@ -79,10 +79,18 @@ _DEPTH_NOISE = MotionNoise(
     jump=(5e-3) ** 2,
     jump_probability=1e-3,
 )
+# Mean time of rest of an object that hardly presses: jaws that are open are about to close [s].
+_FREE_TIME = 0.15
 # 1 sigma of the depth at the beginning [m].
 _FIRST_DEPTH = 0.1e-3
 # Standard deviation of a slide's length, relative to what the object's pose says [-].
 _SLIDE = 0.3
+# Images from which the noise is learnt, the largest change that one of them shows, and the largest noise, as variances
+# over that in the tare; and the median of D^2 for three normal numbers, less what the contact takes up.
+_LEVEL_IMAGES = 8.0
+_LARGEST_CHANGE = 9.0
+_LARGEST_LEVEL = 25.0
+_MEDIAN_SQUARE = 2.05
 # Largest change of the depth and of the height at once [m], and the changes that no longer matter [m].
 _LARGEST_MOVE = 0.7e-3
 _LARGEST_SHIFT = 0.3e-3
@@ -172,7 +180,7 @@ class ContactSearch:
     def restart(self) -> None:
         """Start anew where the contact is now, as after another tare; what is known of friction stays."""
         self.x: NDArray | None = None
-        self._bumped, self._smooth = False, 0.0
+        self._bumped, self._smooth, self._level = False, 0.0, 1.0
         self._forget_innovations()
 
     def _forget_innovations(self) -> None:
@@ -261,8 +269,9 @@ class ContactSearch:
             self.x, self.P, self._V = np.tile(m, (len(self.log_weights), 1)), np.diag(V), V
             self.track = Track(_DEPTH_NOISE, float(m[DEPTH]), _FIRST_DEPTH**2)
         growth, self._V = find_growth(self._V, V, self._count), V
-        a = find_decay(self._count, dt, motion, expected.camera_time)
-        self.track.predict(dt)
+        sight = self.points["sight"] / V[SHARED : SHARED + 2 * self._count : 2]
+        a = find_decay(sight, dt, motion, expected.camera_time)
+        self.track.predict(dt, _FREE_TIME if self.state["depth"] < LOADED_DEPTH else None)
         self.x[:, DEPTH] += self.track.x - self.weights @ self.x[:, DEPTH]
         predict(self.x, self.P, a, m, V, growth)
         for watch in self._watches:
@@ -294,7 +303,7 @@ class ContactSearch:
             if made is None:
                 continue
             at = made
-            measured = observe(points, seen, at.positions, at.motions, at.x, ratio)
+            measured = observe(points, seen, at.positions, at.motions, at.x, ratio, self._level)
             if weight is None:
                 possible = self._find_possible_jumps()
                 weight, jump = detect_jump(measured, ratios, self.x, self.log_weights, P, _JUMPS, possible)
@@ -311,6 +320,7 @@ class ContactSearch:
             return False
         self.q, self._modes, self.positions = q, at.pressed.modes[:, :3], at.positions
         self._take_jump(jump)
+        self._level = _follow_level(self._level, posterior.distances)
         self.x, self.P, self.log_weights = posterior.x, reduce_covariance(P, posterior.A), posterior.log_weights
         if settled:
             self._watch(measured, posterior)
@@ -440,6 +450,13 @@ def _bound_step(aim, last, share, expectation):
         step[1:] *= 0.5
         share *= 0.5
     return step, share
+
+
+@njit(**_OPTIONS)
+def _follow_level(level, distances):
+    """Return the variance of the noise over that in the tare, for what was expected and D^2 (m,) of the residuals."""
+    seen = min(np.median(distances) / _MEDIAN_SQUARE, _LARGEST_CHANGE)
+    return min(max(level * (1.0 + (seen - 1.0) / _LEVEL_IMAGES), 1.0), _LARGEST_LEVEL)
 
 
 @njit(**_OPTIONS)

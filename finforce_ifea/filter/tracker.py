@@ -247,7 +247,7 @@ class ContactTracker:
         points["measured"], points["rest"] = measured, self._rest
         points["tare_noise"], points["gain"] = noise.plane, noise.gain
         points["width_variance"], points["trust"] = noise.width_variance, noise.trust
-        points["offset_variance"] = tare.offset_variance() + noise.bias
+        points["offset_variance"], points["sight"] = tare.offset_variance() + noise.bias, noise.bias
 
     def significance(self, tare: Tare, stddev: float) -> float:
         """Return by how many standard deviations a force explains the offsets of a tare; see `explain_offsets`."""

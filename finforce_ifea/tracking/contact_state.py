@@ -71,6 +71,7 @@ KEYPOINT = np.dtype(
         ("width_variance", float),  # along y in such an image [m^2]
         ("trust", float),  # variance in the tare over that in this image
         ("offset_variance", float),  # of what is constant [m^2]
+        ("sight", float),  # part of it that the detector errs by in the sight of this shape [m^2]
         ("weight", float),  # agreement times trust, 0 to 1
     ]
 )

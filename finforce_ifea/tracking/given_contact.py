@@ -248,7 +248,7 @@ class _LocationWatch:
         """Keep the answers of the unloaded jaw and how well heights are known."""
         self._response = response
         self._prior_variance = settings.height_stddev**2
-        self._radius = float(np.hypot(settings.radius, settings.radius_stddev))  # root mean square
+        self._radius = settings.radius + settings.radius_stddev  # root mean square
         self._surest = _SUREST * float(response.heights[-1] - response.heights[0])
         self._memory = _LONGEST_AVERAGE
         self._height, self._spread = float(np.median(response.heights)), 0.0

@@ -92,7 +92,7 @@ def circle(gap):
 @cache
 def watched(*, far=True, near=NEAR):
     """Solutions of a press whose object is known to be far away at first, and in which images the jaw was idle."""
-    settings = EstimatorSettings(solver="frame")
+    settings = EstimatorSettings(solver="frame", friction=0.0, friction_stddev=0.03)
     recording = record(DEPTHS)
     estimator = ForceEstimator(BENCH, settings=settings, calibration=CALIBRATION)
     away, solutions, idle = circle(FAR if far else 1e-3), [], []

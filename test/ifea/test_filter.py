@@ -18,7 +18,7 @@ from finforce_ifea.estimator import ForceEstimator
 from finforce_ifea.filter.filter import expect_innovations, innovate, reduce_covariance, update
 from finforce_ifea.filter.friction_path import NODES, TractionHypotheses
 from finforce_ifea.filter.jump import BUMPED, LIFTED, MISPLACED, weigh_jump
-from finforce_ifea.filter.measurement import FREEDOM, NO_WEIGHT, Measurement, weigh
+from finforce_ifea.filter.measurement import FREEDOM, NO_WEIGHT, Measurement, measure_distances, weigh
 from finforce_ifea.filter.process import CAMERA_TIME, FREE_DEPTH, Expectation, expect_state, find_decay, predict
 from finforce_ifea.filter.slip_path import SlipPath
 from finforce_ifea.filter.state import DEPTH, SHARED, TRACTION, state_size
@@ -92,7 +92,7 @@ class TestProcess:
         m, V = expect_state(EXPECTED, np.full(COUNT, 1e-8), np.zeros(COUNT))
         x, P = np.zeros((2, SIZE)), np.diag(V)
         for _ in range(50):
-            predict(x, P, find_decay(COUNT, 100.0, 0.1, CAMERA_TIME), m, V, np.ones(SIZE))
+            predict(x, P, find_decay(np.zeros(COUNT), 100.0, 0.1, CAMERA_TIME), m, V, np.ones(SIZE))
         np.testing.assert_allclose(x[:, 1:], np.tile(m[1:], (2, 1)), atol=1e-9)
         np.testing.assert_allclose(np.diag(P)[1:], V[1:], rtol=1e-9)
         assert P[DEPTH, DEPTH] == FREE_DEPTH**2
@@ -101,7 +101,7 @@ class TestProcess:
         m, V = expect_state(EXPECTED, np.full(COUNT, 1e-8), np.zeros(COUNT))
         x, P = np.random.default_rng(0).standard_normal((2, SIZE)), 0.5 * np.diag(V)
         before = x.copy()
-        predict(x, P, find_decay(COUNT, 0.0, 0.0, CAMERA_TIME), m, V, np.ones(SIZE))
+        predict(x, P, find_decay(np.zeros(COUNT), 0.0, 0.0, CAMERA_TIME), m, V, np.ones(SIZE))
         np.testing.assert_allclose(x, before, rtol=1e-12)
         np.testing.assert_allclose(np.diag(P)[1:], 0.5 * V[1:])
 
@@ -118,13 +118,13 @@ class TestJump:
 class TestWeights:
     def test_a_gross_error_has_no_weight_and_chance_has_all(self):
         noise, square = np.tile((0.2e-3) ** 2 * np.eye(2), (2, 1, 1)), np.zeros(2)
-        weights = weigh(np.array([[0.2e-3, 0.0], [10e-3, 0.0]]), noise, square)
+        weights = weigh(measure_distances(np.array([[0.2e-3, 0.0], [10e-3, 0.0]]), noise, square))
         assert weights[0] == 1.0
         assert weights[1] == NO_WEIGHT
 
     def test_between_them_it_is_that_of_students_t(self):
         noise, square = np.tile((0.2e-3) ** 2 * np.eye(2), (1, 1, 1)), np.zeros(1)
-        weights = weigh(np.array([[1e-3, 0.0]]), noise, square)
+        weights = weigh(measure_distances(np.array([[1e-3, 0.0]]), noise, square))
         assert weights[0] == pytest.approx((FREEDOM + 3.0) / (FREEDOM + 25.0))
 
 
