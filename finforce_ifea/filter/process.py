@@ -32,8 +32,8 @@ MODEL_RELATIVE = 0.01
 # Motion [m] and time [s] over which such an error stays the same.
 MODEL_LENGTH = 10e-3
 MODEL_TIME = 60.0
-# Motion over which what a detector errs by in the sight of one shape stays the same [m]: a pixel or two.
-SIGHT_LENGTH = 0.5e-3
+# Motion over which what a detector errs by in the sight of one shape stays the same [m]: half a pixel.
+SIGHT_LENGTH = 0.1e-3
 # Time over which the relative error stays the same [s].
 RELATIVE_TIME = 200.0
 # 1 sigma of the traction ratio beyond friction: at least [-], and relative to the coefficient of friction.

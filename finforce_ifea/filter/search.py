@@ -222,6 +222,7 @@ class ContactSearch:
         """Widen the search for the next image by a standard deviation of the depth [m]."""
         if self.x is not None:
             self.track.widen(stddev**2)
+            self.hypotheses.motion += stddev
 
     @property
     def weights(self) -> NDArray:

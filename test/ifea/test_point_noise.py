@@ -208,8 +208,8 @@ def test_a_detector_that_errs_anew_in_every_shape_is_believed_as_far_as_it_says(
         found[name] = np.mean(
             [solution.trusted for solution, is_loaded in zip(solutions, loaded, strict=True) if is_loaded]
         )
-    assert found["stated"] == 1.0
-    assert found["silent"] < 0.9
+    assert found["stated"] > 0.9  # what moves on after a rest is believed from the second image on
+    assert found["silent"] < 0.5 * found["stated"]
 
 
 def spoiled(value):
