@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import product
 from typing import NamedTuple
 
@@ -19,19 +19,27 @@ from finforce_contact.parameters import TrackerSettings
 from finforce_contact.pose.alignment import DepthImage, Effort, MeshAligner
 
 PIXELS = 400  # of the object that are compared in an image
-TOLERANCE = 0.003  # [m], six standard deviations of `pose_bias`: farther off, surface and depth disagree
+# Farther off, surface and depth disagree: six standard deviations of `pose_bias` [m], errors of depth [-] of a distance.
+TOLERANCE, DEPTH_ERROR = 0.003, 0.01
 SHORTEST_ARM = 0.04  # [m], of the part of an object that a gripper holds: by how much a turn moves that
 LEAST_IMAGES, MOST_IMAGES = 3, 12  # before a verdict, and that it rests on
 FIRST_PERIOD, PERIOD = 0.3, 2.0  # [s] from one comparison to the next, of the first images and of those that follow
 LEAST_PIXELS = 30  # per image that a verdict rests on
 BEHIND = 0.12  # [-], share of the surface that the camera sees through, from which on the mesh is another one
-LEAST_GAIN = 0.5  # [-], of the visible surface, from which on a mesh fits
+LEAST_GAIN = 0.35  # [-], of the visible surface, from which on a mesh fits
+NO_GAIN = 0.25  # [-], of the visible surface, below which an aligned mesh has another shape
 NAMED_IN = 3  # images that another reading is looked for in
 _NEAR, _FAR = (0.01, 0.006), (0.02, 0.01, 0.006)  # [m], gates of the alignment of a mesh that fits as posed, or not
+FARTHEST = 0.045  # [m], of a shift that is named: farther off, a table may look like the object
 _REACH = 0.012 * np.arange(-2, 3)  # [m], shifts along each axis of the camera that are tried
 _UNITS = np.array([1e-3, 1e-2, 0.0254, 0.1, 10.0, 1.0 / 0.0254, 100.0, 1e3])
 _SCALES = np.concatenate((2.0 ** (np.arange(-8, 9) / 6.0), _UNITS))
 _FINER = np.linspace(0.92, 1.08, 9)  # [-], of the best scale
+
+
+def _tolerance(distance: NDArray | float) -> NDArray | float:
+    """Return by how much surface and depth may differ at a distance [m] from the camera [m]."""
+    return np.maximum(TOLERANCE, DEPTH_ERROR * distance)
 
 
 def is_due(count: int, elapsed: float) -> bool:
@@ -59,11 +67,21 @@ class Fit(NamedTuple):
 
 
 class _Evidence(NamedTuple):
-    """What one image says: fits as posed and as aligned, and what alignment changes in the object's frame (4, 4)."""
+    """What one image says.
+
+    Attributes:
+        posed: fit of the mesh as posed.
+        aligned: fit of the mesh as aligned.
+        change: (4, 4) by alignment, in the object's frame.
+        rotation: (3, 3) from the object's axes to those of the camera.
+        distance: of the object from the camera [m].
+    """
 
     posed: Fit
     aligned: Fit
     change: NDArray
+    rotation: NDArray
+    distance: float
 
 
 class _View(NamedTuple):
@@ -130,7 +148,8 @@ class MeshCheck:
         effort = Effort(gates=_NEAR if posed.fits else _FAR, steps=2, points=PIXELS)
         change = invert_pose(T_camera_object) @ self._align(view, effort)
         self._views.append(view)
-        self._evidence.append(_Evidence(posed, self._compare(view.moved(change)), change))
+        aligned, distance = self._compare(view.moved(change)), float(self._aligner.middle_of(T_camera_object)[2])
+        self._evidence.append(_Evidence(posed, aligned, change, T_camera_object[:3, :3], distance))
         trouble = self._find_trouble()
         if trouble and self._reading is None:
             self._reading = self._find_reading()
@@ -145,17 +164,26 @@ class MeshCheck:
             return ""
         if posed.behind > BEHIND * posed.seen and posed.seen >= LEAST_PIXELS * len(evidence):
             return f"it sees through {100.0 * posed.behind / posed.seen:.0f} % of its surface"
-        shift, turn = self._mean_change()
-        if aligned.fits and aligned.gain > posed.gain and max(shift, turn * SHORTEST_ARM) > TOLERANCE:
-            return f"it sees the surface {1e3 * max(shift, turn * SHORTEST_ARM):.0f} mm elsewhere"
+        fitting = [each for each in evidence if each.aligned.fits and each.aligned.gain > each.posed.gain]
+        off = self._find_distance(fitting) if 2 * len(fitting) > len(evidence) else 0.0
+        if off > _tolerance(np.mean([each.distance for each in evidence])):
+            return f"it sees the surface {1e3 * off:.0f} mm elsewhere"
+        if posed.gain < LEAST_GAIN * posed.seen and aligned.gain < NO_GAIN * aligned.seen:
+            return "its surface has another shape"
         return ""
 
-    def _mean_change(self) -> tuple[float, float]:
-        """Return the lengths of the mean shift of the object's middle [m] and of its mean turn [rad] by alignment."""
+    def _find_distance(self, evidence: Sequence[_Evidence]) -> float:
+        """Return how far alignment moves what is held of the object [m], by the medians of shift and turn."""
+        shifts = np.array([self._shift(each.change) for each in evidence])
+        turns = Rotation.from_matrix([each.change[:3, :3] for each in evidence]).as_rotvec()
+        # what is wrong may move with the object, as a shifted mesh, or with the camera, as one that is too small
+        seen = np.array([each.rotation @ shift for each, shift in zip(evidence, shifts, strict=True)])
+        return max(float(np.linalg.norm(np.median(each, axis=0))) for each in (shifts, seen, SHORTEST_ARM * turns))
+
+    def _shift(self, change: NDArray) -> NDArray:
+        """Return the shift (3,) of the object's middle [m] by a change (4, 4) of the mesh's frame, along its axes."""
         middle = self._aligner.middle
-        shifts = [each.change[:3, :3] @ middle + each.change[:3, 3] - middle for each in self._evidence]
-        turns = Rotation.from_matrix([each.change[:3, :3] for each in self._evidence]).as_rotvec()
-        return float(np.linalg.norm(np.mean(shifts, axis=0))), float(np.linalg.norm(turns.mean(axis=0)))
+        return change[:3, :3] @ middle + change[:3, 3] - middle
 
     def _align(self, view: _View, effort: Effort) -> NDArray:
         return self._aligner.align(view.T_camera_object, view.image, effort).T_camera_object
@@ -167,15 +195,16 @@ class MeshCheck:
         inner = np.isfinite(expected)
         inner[1:-1, 1:-1] &= inner[:-2, 1:-1] & inner[2:, 1:-1] & inner[1:-1, :-2] & inner[1:-1, 2:]
         behind = (image.depth[::step, ::step] - expected)[inner]
-        behind = behind[behind > -TOLERANCE]
-        gain = np.clip(1.0 - np.abs(behind) / TOLERANCE, -1.0, 1.0).sum()
-        return Fit(float(gain), len(behind), int((behind > 2.0 * TOLERANCE).sum()))
+        tolerance = _tolerance(expected[inner])
+        hidden = behind <= -tolerance
+        gains = np.clip(1.0 - np.abs(behind) / tolerance, -1.0, 1.0)[~hidden & np.isfinite(behind)]
+        return Fit(float(gains.sum()), len(gains), int((behind > 2.0 * tolerance).sum()))
 
     def _find_reading(self) -> str:
         """Return which turn, scale or shift of the mesh fits best, in words."""
-        best = max(self._tried(), key=lambda tried: tried[1].gain)
-        if best[1].fits:
-            return f"the mesh fits when {best[0].text}"
+        fitting = [(fit.gain, reading.text) for reading, fit in self._tried() if fit.fits]
+        if fitting:
+            return f"the mesh fits when {max(fitting, key=lambda each: each[0])[1]}"
         return "no turn, scale or shift of it fits: is it the mesh of this object, in this frame?"
 
     def _tried(self) -> Iterator[tuple[_Reading, Fit]]:
@@ -189,7 +218,8 @@ class MeshCheck:
             mirror = np.diag(np.where(np.arange(4) == axis, -1.0, 1.0))
             yield _Reading(f"mirrored along {name}", mirror), self._fit(mirror)
         change = self._find_shift()
-        yield _Reading(self._describe_shift(change), change), self._fit(change)
+        if np.linalg.norm(self._shift(change)) <= FARTHEST:
+            yield _Reading(self._describe_shift(change), change), self._fit(change)
 
     def _fit(self, change: NDArray) -> Fit:
         return _sum(self._compare(view.moved(change)) for view in self._views)
@@ -207,8 +237,7 @@ class MeshCheck:
 
     def _describe_shift(self, change: NDArray) -> str:
         """Return a change of the mesh's frame (4, 4) in words."""
-        middle = self._aligner.middle
-        x, y, z = np.rint(1e3 * (change[:3, :3] @ middle + change[:3, 3] - middle)).astype(int)
+        x, y, z = np.rint(1e3 * self._shift(change)).astype(int)
         turn = np.degrees(rotation_between(np.eye(4), change))
         turned = f" and turned by {turn:.0f} degrees about its middle" if turn >= 1.0 else ""
         return f"shifted by ({x}, {y}, {z}) mm along its axes{turned}"
