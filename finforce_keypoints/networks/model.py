@@ -333,6 +333,11 @@ class KeypointModel:
         return self._input.height, self._input.width
 
     @property
+    def sees_whole(self) -> bool:
+        """Whether a cut-out of a picture changes all of the network's answer, as group normalisation does."""
+        return self._network.sees_whole
+
+    @property
     def training_size(self) -> tuple[int, int] | None:
         """Height and width of the images to be given [px]: frozen, or kept in the metadata; else None."""
         frozen = self.frozen_size if None not in self.frozen_size else None
