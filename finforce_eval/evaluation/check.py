@@ -24,6 +24,7 @@ from finforce_eval.recordings.tracks import Recording
 from finforce_ifea.jaw.jaw import Jaw, list_shipped_jaws, load_jaw
 from finforce_keypoints.errors import KeypointError
 from finforce_keypoints.geometry.extrinsics import Extrinsics
+from finforce_keypoints.geometry.jaw_localizer import DEPTH_OFF, describe_depth
 from finforce_keypoints.geometry.side_picture import find_side, project_plane
 from finforce_keypoints.geometry.template import find_shape
 from finforce_keypoints.images import RgbdImage
@@ -65,7 +66,8 @@ def check_recording(
         FinforceError: an image is damaged, or the detector cannot be built.
     """
     parameters = build_records(source.node_parameters(recording)).parameters
-    recording = replace(recording, images=choose_images(recording, parameters.depth))
+    images = replace(choose_images(recording, parameters.depth), depth_scale=parameters.depth_scale)
+    recording = replace(recording, images=images)
     mean = _mean_image(recording)
     findings = [*_describe_camera(recording, parameters.depth), *judge_picture(mean.color)]
     jaws = {side: load_jaw(source.jaw_file, side) for side in recording.jaws}
@@ -79,6 +81,8 @@ def check_recording(
         seen = np.isfinite(jaw.pixels).all(axis=1)
         findings.append(Finding(OK, f"{side} jaw: {seen.sum()} of {len(seen)} key points seen"))
     findings += _judge_pose(found, look, recording, parameters.camera_pose)
+    if abs(look.depth_ratio - 1.0) > DEPTH_OFF:
+        findings.append(Finding(FAULT, describe_depth(look.depth_ratio)))
     if found.residual > GOOD_RESIDUAL:
         findings += _find_reasons(mean, source, recording, parameters.camera_pose)
     return findings, _draw(mean, jaws, parameters.camera_pose, found, look)

@@ -91,6 +91,11 @@ def test_what_fits_passes_with_depth_and_without(still, capsys, tmp_path):
         assert ("colour alone" in said) == bool(options)
 
 
+def test_depth_of_another_unit_is_named(still, capsys, tmp_path):
+    status, said = check(still, capsys, tmp_path, "--detector", "depth_scale=0.01")
+    assert status == 1 and "the depth at the jaw is 10 times that of its place" in said and "depth_scale" in said
+
+
 def test_a_camera_that_is_elsewhere_is_told_where_it_is(still, capsys, tmp_path):
     T = ROBOT_CAMERA.copy()
     T[1, 3] += 0.008
