@@ -30,6 +30,8 @@ LEAST_RATE, MOST_RATE = 1e-2, 1e4  # Hz of frames
 Rate = Annotated[Number, Field(ge=LEAST_RATE, le=MOST_RATE)]
 STILL_RATE = 1.0  # Hz of pictures that say nothing of their times
 LARGEST_PICTURE = 1 << 27  # bytes
+# What FFmpeg may take a file for: nothing that names other files, as its lists and playlists do.
+_ALONE = {"format_whitelist": "mov,mp4,m4a,3gp,matroska,webm,avi", "protocol_whitelist": "file"}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -127,7 +129,7 @@ def _open_video(path: Path, name: str) -> Iterator[tuple[Any, Any]]:
     av = import_library("av", "reading videos", "'finforce[video]'")
     try:
         check_plain(path)
-        with av.open(str(path)) as container:
+        with av.open(str(path), options=_ALONE) as container:
             yield container, container.streams.video[0]
     except (FileError, av.FFmpegError, IndexError) as error:
         raise RecordingError(f"{name}: {path.parent.name}/{path.name}: {error}; expected a video") from error
