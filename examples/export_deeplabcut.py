@@ -26,7 +26,9 @@ if len(sys.argv) != 2:
     sys.exit("usage: python export_deeplabcut.py exported-models-pytorch/DLC_.../DLC_....pt")
 saved = torch.load(sys.argv[1], map_location="cpu", weights_only=True)
 if "config" not in saved:
-    sys.exit(f"{sys.argv[1]} is a snapshot without its configuration; give the file that deeplabcut.export_model writes")
+    sys.exit(
+        f"{sys.argv[1]} is a snapshot without its configuration; give the file that deeplabcut.export_model writes"
+    )
 model = PoseModel.build(saved["config"]["model"])
 model.load_state_dict(saved["pose"])
 folder = Path("network")

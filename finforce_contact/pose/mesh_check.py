@@ -19,7 +19,7 @@ from finforce_contact.parameters import TrackerSettings
 from finforce_contact.pose.alignment import DepthImage, Effort, MeshAligner
 
 PIXELS = 400  # of the object that are compared in an image
-# Farther off, surface and depth disagree: six standard deviations of `pose_bias` [m], errors of depth [-] of a distance.
+# Farther off, surface and depth disagree: six standard deviations of `pose_bias` [m], error of depth by distance [-].
 TOLERANCE, DEPTH_ERROR = 0.003, 0.01
 SHORTEST_ARM = 0.04  # [m], of the part of an object that a gripper holds: by how much a turn moves that
 LEAST_IMAGES, MOST_IMAGES = 3, 12  # before a verdict, and that it rests on
@@ -153,7 +153,9 @@ class MeshCheck:
         trouble = self._find_trouble()
         if trouble and self._reading is None:
             self._reading = self._find_reading()
-        self.contradiction = trouble and f"the camera contradicts the mesh {self._mesh.name}: {trouble}; {self._reading}"
+        self.contradiction = (
+            trouble and f"the camera contradicts the mesh {self._mesh.name}: {trouble}; {self._reading}"
+        )
         return self.contradiction
 
     def _find_trouble(self) -> str:

@@ -167,7 +167,9 @@ class MeshFeed:
             if not self.is_due:
                 return
             mesh = self._mesh
-            self._arrival.wait_for(lambda: self._poses.entries(POSES)[-1].stamp >= stamp - self._tolerance, LONGEST_WAIT)
+            self._arrival.wait_for(
+                lambda: self._poses.entries(POSES)[-1].stamp >= stamp - self._tolerance, LONGEST_WAIT
+            )
             pose = self._poses.find(POSES, stamp)
             if pose is None or self._mesh is not mesh:
                 return

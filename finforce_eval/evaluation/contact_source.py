@@ -97,18 +97,26 @@ class RecordedCheck:
         recording: with depth images.
         mesh: of the object.
         track: its poses in the camera's frame at stamps of the images.
+        at_once: compare as few images as a verdict needs, of all that there are.
     """
 
-    def __init__(self, recording: Recording, mesh: Any, track: ObjectTrack) -> None:
+    def __init__(self, recording: Recording, mesh: Any, track: ObjectTrack, *, at_once: bool = False) -> None:
         from finforce_contact.pose.mesh_check import LEAST_IMAGES, MeshCheck, is_due
 
         self._check, self._least = MeshCheck(mesh, recording.images.camera), LEAST_IMAGES
         chosen: list[int] = []
-        for index, stamp in enumerate(track.stamps_ns.tolist()):
+        if at_once:
+            chosen += np.unique(np.linspace(0, len(track.stamps_ns) - 1, LEAST_IMAGES).astype(int)).tolist()
+        for index, stamp in enumerate(() if at_once else track.stamps_ns.tolist()):
             if is_due(len(chosen), SECOND * (stamp - track.stamps_ns[chosen[-1]]) if chosen else math.inf):
                 chosen.append(index)
         self._poses = dict(zip(track.stamps_ns[chosen].tolist(), track.poses[chosen], strict=True))
         self._images, self._left = iter(recording.images.at(track.stamps_ns[chosen])), deque(self._poses)
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether there are images enough for a verdict."""
+        return len(self._poses) >= self._least
 
     def at(self, stamp: int) -> str:
         """Return what contradicts the mesh by the first images and those up to a stamp [ns], "" for nothing.
@@ -123,12 +131,17 @@ class RecordedCheck:
         return self._check.contradiction
 
 
-def check_mesh(recording: Recording, mesh: Any) -> RecordedCheck | None:
-    """Return the comparison of a mesh with the images of a recording; None without depth and poses of one frame."""
+def check_mesh(recording: Recording, mesh: Any, *, at_once: bool = False) -> RecordedCheck | None:
+    """Return the comparison of a mesh with the images of a recording; None without depth and poses of one frame.
+
+    See `RecordedCheck`.
+    """
     from finforce_contact.parameters import ContactParameters
 
     track = pose_object_in_images(recording, round(ContactParameters().pose_tolerance / SECOND))
-    return RecordedCheck(recording, mesh, track) if track is not None and len(track.stamps_ns) else None
+    if track is None or not len(track.stamps_ns):
+        return None
+    return RecordedCheck(recording, mesh, track, at_once=at_once)
 
 
 # Least number of poses from which the location of first touch is averaged.

@@ -40,7 +40,11 @@ def test_the_right_mesh_is_not_contradicted_by_noise_or_by_what_hides_it(name):
 @pytest.mark.parametrize(
     ("name", "change", "words"),
     [
-        ("mug", lambda v: v @ Rotation.from_euler("x", -90, degrees=True).as_matrix().T, "turned by 90 degrees about x"),
+        (
+            "mug",
+            lambda v: v @ Rotation.from_euler("x", -90, degrees=True).as_matrix().T,
+            "turned by 90 degrees about x",
+        ),
         ("mug", lambda v: 0.6 * v, "scaled by 1.6"),
         ("mug", lambda v: 1.6 * v, "scaled by 0.6"),
         ("mug", lambda v: v + [0.012, 0.0, 0.0], "shifted by (-12, 0, 0) mm"),
