@@ -96,15 +96,19 @@ def test_depth_of_another_unit_is_named(still, capsys, tmp_path):
     assert status == 1 and "the depth at the jaw is 10 times that of its place" in said and "depth_scale" in said
 
 
-def test_a_mesh_that_is_not_what_the_camera_sees_is_named(still, capsys, tmp_path):
+def test_a_mesh_that_is_not_what_the_camera_sees_is_named(footage, capsys, tmp_path):
     import trimesh
 
+    found, count = footage[0], 9  # of which every third has a pose of the object
+    frames = tuple(replace(frame, jaws={}) for frame in islice(found, count))
+    still = write_footage(StillFrames(found, frames, lambda color: color), tmp_path / "still")
     mesh = trimesh.load(next(still.glob("*.stl")))
     mesh.apply_scale(1.5)
     mesh.export(tmp_path / "large.stl")
-    status, said = check(still, capsys, tmp_path, "--object", str(tmp_path / "large.stl"))
+    more = ("--images", str(count))
+    status, said = check(still, capsys, tmp_path, *more, "--object", str(tmp_path / "large.stl"))
     assert status == 1 and "the camera contradicts the mesh large.stl" in said and "scaled by 0.6" in said
-    status, said = check(still, capsys, tmp_path)
+    status, said = check(still, capsys, tmp_path, *more)
     assert status == 0 and "object.stl is where the camera sees it" in said
 
 
