@@ -27,7 +27,7 @@ class ContactEstimate:
 
     Attributes:
         stamp: of the image [s].
-        status: "touching", "apart", "no_object" or "no_pose".
+        status: "touching", "apart", "no_object", "no_pose" or "contradicted".
         message: what to tell the user, empty when there is nothing to tell.
         contact: where the object touches or would touch first, as one point, with its outline in mode "estimate";
             whether it touches is what pose and mesh say. Without points when there is no object; None when nobody
@@ -54,7 +54,8 @@ _JAW_SAMPLES, _BACK = 300, 1.0 / 3.0
 _SURROUNDED = 0.5  # share of these that lies within an object around the jaw
 # An object with its origin farther off [m] is out of reach.
 _OUT_OF_REACH = 1.0
-_REASONS = ("solved", "no_object", "no_pose", "surrounded", "out_of_reach", "late pose", "odd pose")
+CONTRADICTED = "contradicted"  # status of an image whose object is not where mesh and pose say
+_REASONS = ("solved", "no_object", "no_pose", CONTRADICTED, "surrounded", "out_of_reach", "late pose", "odd pose")
 
 
 class ContactEstimator:
@@ -65,6 +66,7 @@ class ContactEstimator:
         settings: of this estimator.
         face: the inner surface of the jaw's mesh.
         counts: images and poses by what was done with them, or why nothing was.
+        contradiction: why the mesh cannot be where its poses say, as a `MeshCheck` found; "" for nothing.
     """
 
     def __init__(self, jaw: Jaw, *, mesh: ObjectMesh | None = None, settings: ContactSettings | None = None) -> None:
@@ -85,6 +87,11 @@ class ContactEstimator:
         """Whether the deformed surface of the jaw is looked at."""
         return self._localizer is not None and self._localizer.needs_surface
 
+    @property
+    def mesh(self) -> ObjectMesh | None:
+        """Of the object; None while it is unknown."""
+        return self._mesh
+
     def set_object(self, mesh: ObjectMesh | None) -> None:
         """Take another object, or none; its pose is not known yet.
 
@@ -104,7 +111,8 @@ class ContactEstimator:
         self.reset()
 
     def reset(self) -> None:
-        """Forget poses, contact and counts; jaw and object stay."""
+        """Forget poses, contact, counts and contradiction; jaw and object stay."""
+        self.contradiction = ""
         self._poses.reset()
         if self._localizer is not None:
             self._localizer.reset()
@@ -173,6 +181,8 @@ class ContactEstimator:
             return self._give_up(stamp, "no_object", "no object mesh: load one, or give the contact's height")
         if self._poses.stamp is None:
             return self._give_up(stamp, "no_pose", f"no pose of {self._mesh.name} has come yet")
+        if self.contradiction:
+            return self._give_up(stamp, CONTRADICTED, self.contradiction)
         age = stamp - self._poses.believed
         if age > self.settings.pose_timeout:
             message = f"the last pose of {self._mesh.name} is {age:.1f} s old, expected one every second"
@@ -241,7 +251,10 @@ class ContactEstimator:
         self._slips.release()
         nothing = Contact(points=np.empty((0, 3)), weights=np.empty(0), touching=False)
         return ContactEstimate(
-            stamp=stamp, status=status, message=message, contact=None if status == "no_pose" else nothing
+            stamp=stamp,
+            status=status,
+            message=message,
+            contact=None if status in ("no_pose", CONTRADICTED) else nothing,
         )
 
 

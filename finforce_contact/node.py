@@ -17,11 +17,11 @@ from finforce.messages import SECOND, stamp_of
 from finforce.ros import node as ros
 from finforce.settings import check_bounds
 from finforce.transforms import pose_numbers
-from finforce_contact.estimator import ContactEstimate
+from finforce_contact.estimator import CONTRADICTED, ContactEstimate
 from finforce_contact.loop import TimedEstimate
 from finforce_contact.mesh.object_mesh import describe_mesh
 from finforce_contact.parameters import ContactParameters, ContactSettings, TrackerSettings
-from finforce_contact.pose.source import StampedPose
+from finforce_contact.pose.source import MeshFeed, StampedPose
 from finforce_contact.session import ContactSession, detections_type
 from finforce_contact.slip import Slip
 from finforce_ifea.messages import columns_from_contact, columns_from_outline
@@ -140,11 +140,37 @@ class ContactEstimatorNode(ros.ImageNode):
             self.objects = stage.subscription(ros.PoseStamped, "object_pose", self._on_object, ros.SENSOR)
         else:
             self.objects = stage.subscription(detections_type(), "object_detections", self._on_object, ros.SENSOR)
+        if self.session.check:
+            self._subscribe_to_check(self.session.check)
         for side in self.sides:
             if self._follows_surface:
                 stage.subscription(ros.PointCloud2, f"{side}/surface", partial(self._on_surface, side), ros.SENSOR)
             find = partial(self._on_jaw_pose, side)
             stage.subscription(ros.PoseStamped, f"{side}/jaw_pose", find, ros.BUFFERED, can_wait=True)
+
+    def _subscribe_to_check(self, check: MeshFeed) -> None:
+        """Subscribe to depth images, while one is due, for the comparison with the mesh."""
+        parameters, group = self.parameters, MutuallyExclusiveCallbackGroup()
+        info = partial(self._on_camera, check)
+        self.stage.subscription(ros.CameraInfo, parameters.info_topic, info, ros.SENSOR, callback_group=group)
+        ros.ImageInput(
+            self.stage,
+            parameters.depth_topic,
+            self._on_compared,
+            parameters.image_transport,
+            end=COMPRESSED_DEPTH,
+            is_wanted=lambda: check.is_due,
+            callback_group=group,
+        )
+
+    def _on_camera(self, check: MeshFeed, info: ros.CameraInfo) -> None:
+        """Keep the intrinsics of the depth images."""
+        with self.rejections():
+            check.take_camera(info)
+
+    async def _on_compared(self, _topic: str, image: Any) -> None:
+        """Compare the mesh with a depth image, while other callbacks go on."""
+        await ros.run_aside(self, partial(self.session.compare, image))
 
     def _take_changes(self, changed: ContactParameters) -> None:
         """Take parameters that were set at run time."""
@@ -215,7 +241,7 @@ class ContactEstimatorNode(ros.ImageNode):
         for timed in estimates:
             self.gates[side].check_age(timed.stamp, self.now())
             outcome = outcome_of_estimate(timed.estimate)
-            if timed.estimate.status == "no_pose":
+            if timed.estimate.status in ("no_pose", CONTRADICTED):
                 self.reject(outcome, side)
                 continue
             self.out.send_contact(side, timed)
@@ -244,6 +270,9 @@ def describe(session: ContactSession, side: str) -> dict[str, str]:
     """Return what is known of the object and of its contact with one jaw, as text."""
     loop, mesh, pose = session.jaws[side].loop, session.mesh, session.pose
     values = {"object": describe_mesh(mesh) if mesh else "unknown"}
+    if mesh and session.check:
+        check = session.check
+        values["mesh"] = check.contradiction or check.trouble or f"compared with {check.compared} depth images"
     if mesh and pose:
         values |= {"pose source": pose.source, "pose fitness": f"{pose.fitness:.2f}"}
     if loop.last is not None:

@@ -91,10 +91,15 @@ class ContactParameters(TimeParameters):
         "subtracted, as by isaac_ros_foundationpose up to release 4.4)",
         choices=tuple(ORIGINS),
     )
+    compare_mesh: bool = setting(
+        True, "Whether the mesh, in poses from outside, is compared with depth images; a contradiction gives no contact"
+    )
     pose_tolerance: float = setting(
         0.017, "Maximum stamp difference between a jaw pose and its object pose", "s", 0.0, 1.0
     )
-    depth_topic: str = setting(relative(DEPTH_TOPIC), "Topic of depth images for the tracker", topic=True)
+    depth_topic: str = setting(
+        relative(DEPTH_TOPIC), "Topic of depth images for the tracker and the comparison", topic=True
+    )
     info_topic: str = setting(relative(INFO_TOPIC), "Topic of the intrinsics of the depth images", topic=True)
     image_transport: str = setting(AUTO, "Transport of images, as for the detector", choices=TRANSPORTS)
     depth_scale: float = setting(0.001, "Unit of 16-bit depth images", "m", 1e-6, 0.01)

@@ -30,7 +30,7 @@ from finforce_contact.loop import ContactLoop, TimedEstimate
 from finforce_contact.mesh.object_mesh import ObjectMesh, describe_mesh, load_object_mesh
 from finforce_contact.paper_contact import check_surface
 from finforce_contact.parameters import ContactParameters, ContactSettings, TrackerSettings, load_generated, load_jaws
-from finforce_contact.pose.source import DepthFeed, ExternalPoseSource, StampedPose
+from finforce_contact.pose.source import DepthFeed, ExternalPoseSource, MeshFeed, StampedPose
 from finforce_contact.pose.tracker import ObjectPose
 
 
@@ -238,6 +238,7 @@ class ContactSession:
         jaws: by side.
         stream: of the camera, in the frame of the first image or pose of a jaw unless the parameters name it.
         camera: finds the object's pose in depth images; None where it comes by topic.
+        check: compares the mesh with depth images, where its pose comes by topic; None where it is not asked for.
 
     Args:
         parameters: of the node.
@@ -261,6 +262,8 @@ class ContactSession:
         self._origin = parameters.pose_origin
         self._source = ExternalPoseSource(self.stream)
         self.camera = DepthFeed(parameters, tracker, self.stream) if parameters.tracks else None
+        is_checked = parameters.compare_mesh and not parameters.tracks
+        self.check = MeshFeed(parameters, self.stream) if is_checked else None
         self._lock = RLock()
 
     def load_mesh(self, parameters: ContactParameters) -> str:
@@ -318,6 +321,8 @@ class ContactSession:
                 jaw.set_object(mesh)
             if self.camera:
                 self.camera.set_object(mesh, guesses)
+            if self.check:
+                self.check.set_object(mesh)
 
     def reset(self) -> str:
         """Forget poses, contacts and images; the object stays."""
@@ -327,6 +332,8 @@ class ContactSession:
                 jaw.reset()
             if self.camera:
                 self.camera.reset()
+            if self.check:
+                self.check.reset()
         return "contacts and poses are cleared; the object is kept"
 
     def restart(self, side: str) -> None:
@@ -334,6 +341,8 @@ class ContactSession:
         with self._lock:
             self.jaws[side].reset()
             self._source.reset()
+            if self.check:
+                self.check.reset()
 
     @property
     def pose(self) -> ObjectPose | None:
@@ -382,7 +391,17 @@ class ContactSession:
         """
         with self._lock:
             pose = self._source.take(message)
-        return pose and StampedPose(stamp_of(message), pose)
+        found = pose and StampedPose(stamp_of(message), pose)
+        if found and self.check:
+            self.check.take_pose(found)
+        return found
+
+    def compare(self, image: Any) -> None:
+        """Compare the mesh with a depth image, once its pose has come; what contradicts it holds for all jaws."""
+        self.check.take_depth(image)
+        with self._lock:
+            for jaw in self.jaws.values():
+                jaw.loop.estimator.contradiction = self.check.contradiction
 
 
 def surface_from_cloud(cloud: Any, frame: str) -> NDArray:

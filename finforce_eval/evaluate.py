@@ -10,7 +10,7 @@ from typing import Any
 
 from finforce.errors import FinforceError
 from finforce_eval.errors import RecordingError
-from finforce_eval.evaluation.forces import evaluate_jaws, truth_sides
+from finforce_eval.evaluation.forces import describe_contradictions, evaluate_jaws, truth_sides
 from finforce_eval.evaluation.keypoint_source import parse_source
 from finforce_eval.evaluation.scoring import Evaluation, score_results, score_series, true_range
 from finforce_eval.evaluation.setup import EvaluationSetup, describe_options, print_notes, share_setup
@@ -105,7 +105,8 @@ def evaluate_task(name: str, path: str, target: str, options: argparse.Namespace
     cases = {case: asdict(score) for case, score in score_results(results, [recording]).scores.items()}
     about = {"about": dict(setup.about), "path": path, "true_range_N": true_range(recording), "keypoint_names": names}
     write_table(Path(target), results, about | {"cases": cases})
-    notes = [*recording.notes, *(note_left_out(recording, result) for result in results if setup.as_live)]
+    notes = [*recording.notes, *describe_contradictions(results)]
+    notes += [note_left_out(recording, result) for result in results if setup.as_live]
     return {"cases": cases, "notes": notes, "version": setup.about["version"]}
 
 

@@ -161,6 +161,11 @@ class KeypointDetector:
         return {side: "; ".join(texts) for side, texts in said.items() if texts}
 
     @property
+    def depth_ratio(self) -> float:
+        """Measured depth over that of the jaws' places by their colours [-]; NaN where that is not known."""
+        return max((jaw.depth_ratio for jaw in self._jaws.values()), key=lambda ratio: abs(ratio - 1.0))
+
+    @property
     def _off_centre(self) -> float:
         """By how much the middle between two jaws is off the gripper's [m]; 0 with one jaw."""
         return abs(sum(jaw.place for jaw in self._jaws.values()) / 2.0) if len(self._jaws) == 2 else 0.0

@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 # What pictures that are turned over are called, and what to do, by the signs of columns and rows.
 FLIPS = {
     (1, 1): "",
-    (-1, -1): "the pictures are upside down: rotate them by 180 degrees",
+    (-1, -1): "the pictures are upside down: if turned, rotate them by 180 degrees; if flipped from top to bottom, "
+    "flip them, which looks the same where left and right jaw are alike: writing in the picture, or tags, tell",
     (-1, 1): "the pictures are mirrored from left to right: give them as the camera of the rig took its own",
     (1, -1): "the pictures are mirrored from top to bottom: give them as the camera of the rig took its own",
 }

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from threading import RLock
+from math import inf
+from threading import Condition, RLock
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.camera import ImageError
-from finforce.errors import PoseError
+from finforce.errors import MissingDependencyError, ObservationError, PoseError
 from finforce.messages import (
     SECOND,
     CameraStream,
@@ -22,9 +23,11 @@ from finforce.messages import (
 from finforce_contact.mesh.object_mesh import ObjectMesh
 from finforce_contact.parameters import ORIGINS, ContactParameters, TrackerSettings
 from finforce_contact.pose.alignment import DepthImage
+from finforce_contact.pose.mesh_check import MeshCheck, is_due
 from finforce_contact.pose.tracker import ObjectPose, PoseTracker, check_camera_outside
 
-DEPTH, MASK = "depth images", "masks"
+DEPTH, MASK, POSES = "depth images", "masks", "poses"
+LONGEST_WAIT = 1.0  # [s] of an image for its pose
 KEPT = 32  # images that may wait for their mask, which a segmentation takes a while to find
 
 
@@ -99,6 +102,89 @@ def _pose_of_detection(detection: Any) -> Any:
         if any((place.x, place.y, place.z, turn.x, turn.y, turn.z)):
             return pose
     raise PoseError("Detection3DArray: got a detection with neither bbox.center nor results[0].pose.pose set")
+
+
+class MeshFeed:
+    """Compares the mesh, in the poses that another program tells, with a depth image now and then.
+
+    Several threads may call it. An image waits for its pose, which comes later.
+
+    Attributes:
+        contradiction: as of `MeshCheck`.
+        compared: images so far.
+        trouble: why the last image could not be compared; empty when it could.
+
+    Args:
+        parameters: topics, and greatest distance of stamps.
+        stream: of the camera, from which images and poses must be.
+    """
+
+    def __init__(self, parameters: ContactParameters, stream: CameraStream) -> None:
+        self._stream, self._info_topic = stream, parameters.info_topic
+        self._tolerance = round(parameters.pose_tolerance / SECOND)
+        self._arrival = Condition(RLock())
+        self.set_object(None)
+
+    def set_object(self, mesh: ObjectMesh | None) -> None:
+        """Compare another object from now on."""
+        with self._arrival:
+            self._mesh = mesh
+            self.reset()
+
+    def reset(self) -> None:
+        """Forget poses and images."""
+        with self._arrival:
+            self._check: MeshCheck | None = None
+            self._poses = Synchronizer({POSES: KEPT}, self._tolerance)
+            self._last = -inf
+            self.contradiction = self.trouble = ""
+            self.compared = 0
+
+    def take_camera(self, info: Any) -> None:
+        """Take a sensor_msgs/CameraInfo; see `DepthFeed.take_camera`."""
+        with self._arrival:
+            if self._stream.take_info(info):
+                self._check = None
+
+    def take_pose(self, found: StampedPose) -> None:
+        """Take a pose of the object."""
+        with self._arrival:
+            self._poses.add(POSES, found.stamp, found.pose.T_camera_object)
+            self._arrival.notify_all()
+
+    @property
+    def is_due(self) -> bool:
+        """Whether a depth image is wanted."""
+        with self._arrival:
+            poses = self._poses.entries(POSES)
+            elapsed = SECOND * poses[-1].stamp - self._last if poses else 0.0
+            return self._mesh is not None and bool(poses) and (elapsed < 0.0 or is_due(self.compared, elapsed))
+
+    def take_depth(self, image: Any) -> None:
+        """Compare a depth image once the object's pose in it has come; without one the image is dropped."""
+        stamp = stamp_of(image)
+        with self._arrival:
+            if not self.is_due:
+                return
+            mesh = self._mesh
+            self._arrival.wait_for(
+                lambda: self._poses.entries(POSES)[-1].stamp >= stamp - self._tolerance, LONGEST_WAIT
+            )
+            pose = self._poses.find(POSES, stamp)
+            if pose is None or self._mesh is not mesh:
+                return
+            self._last, check = SECOND * stamp, self._check
+        try:
+            camera = self._stream.known_camera(self._info_topic)
+            check = check or MeshCheck(mesh, camera)
+            contradiction = check.add(self._stream.read_depth(image), pose.value)
+        except (ImageError, ObservationError, MissingDependencyError) as error:
+            self.trouble = str(error)
+            return
+        with self._arrival:
+            if self._mesh is mesh:
+                self._check, self.contradiction, self.trouble = check, contradiction, ""
+                self.compared += 1
 
 
 class DepthFeed:

@@ -22,7 +22,13 @@ from finforce.files import FileError, check_inside
 from finforce.messages import read_stamp
 from finforce_eval.annotation.video import write_video
 from finforce_eval.errors import OptionError, RecordingError, UnseenError
-from finforce_eval.evaluation.forces import estimate_forces, no_force_reasons, share_reached, why_unanswered
+from finforce_eval.evaluation.forces import (
+    describe_contradictions,
+    estimate_forces,
+    no_force_reasons,
+    share_reached,
+    why_unanswered,
+)
 from finforce_eval.evaluation.gripper import combine_jaws
 from finforce_eval.evaluation.keypoint_source import KeypointSource, parse_source
 from finforce_eval.evaluation.setup import share_setup
@@ -89,6 +95,7 @@ def annotate_bag(source: Path, target: Path, options: argparse.Namespace, settin
     jaws = estimate_forces(recording, setup, tares=tares)
     why = why_unanswered(jaws.values())
     notes = [*describe_unseen(recording, keypoints, jaws), *recording.notes, *compared]
+    notes += describe_contradictions(jaws.values())
     if why:
         raise RecordingError(f"{target.name}: {'; '.join((*notes, why))}")
     figures = without_nan(_describe(jaws, recording) | {"notes": notes})
@@ -130,13 +137,14 @@ def _describe(jaws: Mapping[str, ForceSeries], recording: Recording) -> dict[str
     sides = {}
     for side, forces in jaws.items():
         words, counts = np.unique(forces.column("status")[~forces.solved], return_counts=True)
-        known = bool(forces.solved.any())
+        known, residual = bool(forces.solved.any()), forces.column("residual")[forces.solved]
+        residual = residual[np.isfinite(residual)]  # an image of a jaw at rest has none
         sides[side] = {
             "images": len(forces),
             "answered": int(forces.solved.sum()),
             "unanswered": dict(zip(words.tolist(), counts.tolist(), strict=True)),
             "largest_N": float(np.nanmax(forces.magnitude)) if known else None,
-            "residual_mm": 1e3 * float(np.median(forces.column("residual")[forces.solved])) if known else None,
+            "residual_mm": 1e3 * float(np.median(residual)) if len(residual) else None,
             "within_reach": share_reached(forces, recording.jaw(side).detection),
         }
     stamps = np.concatenate([forces.stamps_ns for forces in jaws.values()])

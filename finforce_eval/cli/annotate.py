@@ -184,7 +184,7 @@ def _print_outcome(line: dict[str, Any]) -> None:
     print_notes(name, line["figures"].get("notes", ()))
     for side, jaw in line["figures"].get("jaws", {}).items():
         words = [f"{name}: {side} {jaw['answered']} of {jaw['images']} images, {jaw['largest_N'] or 0.0:.2f} N at most"]
-        if jaw.get("within_reach") is not None:
+        if jaw.get("residual_mm") is not None and jaw.get("within_reach") is not None:
             words.append(
                 f"key points {jaw['residual_mm']:.2f} mm off, {100 * jaw['within_reach']:.0f} % within the jaw's reach"
             )

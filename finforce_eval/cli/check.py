@@ -10,11 +10,12 @@ from tempfile import TemporaryDirectory
 from finforce.camera_topics import COLOR_TOPIC, COMPRESSED_COLOR, DEPTH_TOPIC, INFO_TOPIC
 from finforce.errors import MissingDependencyError
 from finforce.messages import read_stamp
+from finforce_contact.mesh.object_mesh import UNITS
 from finforce_eval.cli.extrinsics import read_at_rest
 from finforce_eval.cli.parser import BAG_HELP, CommandResult, add_rest_options
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.at_rest import ROUNDS
-from finforce_eval.evaluation.check import FAULT, check_recording
+from finforce_eval.evaluation.check import FAULT, check_object, check_recording
 from finforce_eval.recordings.images import CAMERA_INFO, COMPRESSED, IMAGE
 from finforce_eval.recordings.writer import Entry, typestore, write_entries
 from finforce_eval.tasks import progress_bar
@@ -33,6 +34,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--topics", nargs="*", metavar="TOPIC", help=text)
     add_rest_options(parser, images=30)
+    text = "compare this mesh, in the recorded object poses, with the depth images (the mesh that case.json names)"
+    parser.add_argument("--object", metavar="MESH", help=text)
+    parser.add_argument("--object-unit", default="m", choices=tuple(UNITS), help="unit of the mesh (m)")
     parser.add_argument("--report", default=".", metavar="DIR", help=f"folder for {PICTURE} (current folder)")
 
 
@@ -99,6 +103,7 @@ def _check(options: argparse.Namespace) -> CommandResult:
     source, recording = read_at_rest(options)
     with progress_bar(ROUNDS * len(recording.images), "image") as bar:
         found, picture = check_recording(recording, source, bar.update)
+    found += check_object(recording, options.object, options.object_unit)
     for line in found:
         print(f"{line.severity:<8}{line.text}")
     folder = Path(options.report)

@@ -36,10 +36,17 @@ def first_images(recording: Recording, count: int) -> Recording:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class JawsAtRest:
-    """What a detector saw: the jaws, and where it took them to be, T_camera_jaw (4, 4) of every image by side."""
+    """What a detector saw.
+
+    Attributes:
+        jaws: by side.
+        poses: where it took them to be, T_camera_jaw (4, 4) of every image by side.
+        depth_ratio: measured depth over that of the jaws' places [-]; NaN where it is not known.
+    """
 
     jaws: Mapping[str, SeenJaw]
     poses: Mapping[str, Sequence[NDArray]]
+    depth_ratio: float
 
 
 def average_at_rest(
@@ -68,7 +75,7 @@ def average_at_rest(
         side: SeenJaw(points=jaw.keypoints, pixels=_average(np.array(pixels[side])), turn=detector.mounts[side].turn)
         for side, jaw in jaws.items()
     }
-    return JawsAtRest(jaws=seen, poses=poses)
+    return JawsAtRest(jaws=seen, poses=poses, depth_ratio=detector.depth_ratio)
 
 
 def _average(pixels: NDArray) -> NDArray:

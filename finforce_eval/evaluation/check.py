@@ -15,15 +15,19 @@ from finforce.errors import FinforceError, one_line
 from finforce.gripper_frames import HALF_TURN, OpeningRange, jaw_in_camera
 from finforce.optional import import_cv2
 from finforce.transforms import invert_pose, pose_numbers, rotation_between
+from finforce_contact.mesh.object_mesh import load_object_mesh
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.at_rest import JawsAtRest, approach
+from finforce_eval.evaluation.contact_source import check_mesh
 from finforce_eval.evaluation.keypoint_source import KeypointSource, build_records, choose_images
 from finforce_eval.evaluation.unseen import explain_unseen
 from finforce_eval.recordings.frames import STILL_RATE, FrameImages
+from finforce_eval.recordings.objects import find_mesh
 from finforce_eval.recordings.tracks import Recording
 from finforce_ifea.jaw.jaw import Jaw, list_shipped_jaws, load_jaw
 from finforce_keypoints.errors import KeypointError
 from finforce_keypoints.geometry.extrinsics import Extrinsics
+from finforce_keypoints.geometry.jaw_localizer import DEPTH_OFF, describe_depth
 from finforce_keypoints.geometry.side_picture import find_side, project_plane
 from finforce_keypoints.geometry.template import find_shape
 from finforce_keypoints.images import RgbdImage
@@ -65,7 +69,8 @@ def check_recording(
         FinforceError: an image is damaged, or the detector cannot be built.
     """
     parameters = build_records(source.node_parameters(recording)).parameters
-    recording = replace(recording, images=choose_images(recording, parameters.depth))
+    images = replace(choose_images(recording, parameters.depth), depth_scale=parameters.depth_scale)
+    recording = replace(recording, images=images)
     mean = _mean_image(recording)
     findings = [*_describe_camera(recording, parameters.depth), *judge_picture(mean.color)]
     jaws = {side: load_jaw(source.jaw_file, side) for side in recording.jaws}
@@ -79,9 +84,29 @@ def check_recording(
         seen = np.isfinite(jaw.pixels).all(axis=1)
         findings.append(Finding(OK, f"{side} jaw: {seen.sum()} of {len(seen)} key points seen"))
     findings += _judge_pose(found, look, recording, parameters.camera_pose)
+    if abs(look.depth_ratio - 1.0) > DEPTH_OFF:
+        findings.append(Finding(FAULT, describe_depth(look.depth_ratio)))
     if found.residual > GOOD_RESIDUAL:
         findings += _find_reasons(mean, source, recording, parameters.camera_pose)
     return findings, _draw(mean, jaws, parameters.camera_pose, found, look)
+
+
+def check_object(recording: Recording, object_file: str | None, unit: str) -> list[Finding]:
+    """Return whether the images show the mesh of the object where its poses say; empty without a mesh.
+
+    Raises:
+        FinforceError: the mesh or an image cannot be used.
+    """
+    path = find_mesh(recording, object_file)
+    if path is None:
+        return []
+    mesh = load_object_mesh(path, unit=unit)
+    check = check_mesh(recording, mesh, at_once=True)
+    if check is None or not check.is_sure:
+        text = f"{mesh.name} is not compared: that needs depth images and /object_pose in their frame"
+        return [Finding(WARNING, text)]
+    said = check.at(int(recording.images.stamps_ns[-1]))
+    return [Finding(FAULT, said) if said else Finding(OK, f"{mesh.name} is where the camera sees it")]
 
 
 def judge_picture(color: NDArray) -> list[Finding]:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 import sys
+from collections import deque
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -12,13 +14,22 @@ from typing import Any
 
 import numpy as np
 
+from finforce.camera import ImageError
 from finforce.errors import PoseError
 from finforce.health import Idling
 from finforce.messages import SECOND
 from finforce_contact.loop import ContactLoop, ContactSource, GivenContact, Surface
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.scoring import ONSET_FORCE
-from finforce_eval.recordings.objects import ObjectTrack, find_mesh, has_object, mean_pose, require_mesh, track_object
+from finforce_eval.recordings.objects import (
+    ObjectTrack,
+    find_mesh,
+    has_object,
+    mean_pose,
+    pose_object_in_images,
+    require_mesh,
+    track_object,
+)
 from finforce_eval.recordings.tracks import Recording
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_ifea.observation import Contact
@@ -34,12 +45,19 @@ class RecordedContact(ContactLoop):
         track: the object's poses in the jaw frame.
         name: for reports.
         idling: passes images over as the contact estimator's node does; None for none.
+        check: compares the mesh with the images of the recording; None where there are none.
     """
 
     def __init__(
-        self, estimator: Any, track: ObjectTrack, name: str = "estimate", idling: Idling | None = None
+        self,
+        estimator: Any,
+        track: ObjectTrack,
+        name: str = "estimate",
+        idling: Idling | None = None,
+        check: RecordedCheck | None = None,
     ) -> None:
         super().__init__(estimator)
+        self._check = check
         self._idling = idling
         self.name, self._track, self._next = name, track, 0
 
@@ -52,6 +70,8 @@ class RecordedContact(ContactLoop):
         while self._next < len(self._track.stamps_ns) and self._track.stamps_ns[self._next] <= stamp + ROUNDING:
             self._take_recorded(self._next)
             self._next += 1
+        if self._check is not None:
+            self.estimator.contradiction = self._check.at(stamp)
         if self._idling is None:
             return super().contact_at(stamp, surface)
         if self._idling.passes(stamp):
@@ -68,6 +88,60 @@ class RecordedContact(ContactLoop):
             self.take_pose(stamp, self._track.poses[index], camera=camera)
         except PoseError as error:
             raise RecordingError(f"object pose at {SECOND * stamp:.3f} s: {error}") from error
+
+
+class RecordedCheck:
+    """The mesh of a recording compared with its depth images, as the contact estimator's node compares it live.
+
+    Args:
+        recording: with depth images.
+        mesh: of the object.
+        track: its poses in the camera's frame at stamps of the images.
+        at_once: compare as few images as a verdict needs, of all that there are.
+    """
+
+    def __init__(self, recording: Recording, mesh: Any, track: ObjectTrack, *, at_once: bool = False) -> None:
+        from finforce_contact.pose.mesh_check import LEAST_IMAGES, MeshCheck, is_due
+
+        self._check, self._least = MeshCheck(mesh, recording.images.camera), LEAST_IMAGES
+        chosen: list[int] = []
+        if at_once:
+            chosen += np.unique(np.linspace(0, len(track.stamps_ns) - 1, LEAST_IMAGES).astype(int)).tolist()
+        for index, stamp in enumerate(() if at_once else track.stamps_ns.tolist()):
+            if is_due(len(chosen), SECOND * (stamp - track.stamps_ns[chosen[-1]]) if chosen else math.inf):
+                chosen.append(index)
+        self._poses = dict(zip(track.stamps_ns[chosen].tolist(), track.poses[chosen], strict=True))
+        self._images, self._left = iter(recording.images.at(track.stamps_ns[chosen])), deque(self._poses)
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether there are images enough for a verdict."""
+        return len(self._poses) >= self._least
+
+    def at(self, stamp: int) -> str:
+        """Return what contradicts the mesh by the first images and those up to a stamp [ns], "" for nothing.
+
+        Raises:
+            RecordingError: an image is damaged.
+        """
+        while self._left and (self._left[0] <= stamp or len(self._poses) - len(self._left) < self._least):
+            shown = next(self._images)
+            with suppress(ImageError):  # without any depth
+                self._check.add(shown.image.depth, self._poses[self._left.popleft()])
+        return self._check.contradiction
+
+
+def check_mesh(recording: Recording, mesh: Any, *, at_once: bool = False) -> RecordedCheck | None:
+    """Return the comparison of a mesh with the images of a recording; None without depth and poses of one frame.
+
+    See `RecordedCheck`.
+    """
+    from finforce_contact.parameters import ContactParameters
+
+    track = pose_object_in_images(recording, round(ContactParameters().pose_tolerance / SECOND))
+    if track is None or not len(track.stamps_ns):
+        return None
+    return RecordedCheck(recording, mesh, track, at_once=at_once)
 
 
 # Least number of poses from which the location of first touch is averaged.
@@ -95,7 +169,7 @@ def build_source(
         return GivenContact(Contact.fixed(jaw, height), f"fixed:{1e3 * height:g}")
     estimator = build_estimator(choice, mode, recording, jaw, mesh)
     track, idling = track_object(recording, jaw.side), Idling() if as_live else None
-    return RecordedContact(estimator, track, mode, idling)
+    return RecordedContact(estimator, track, mode, idling, check_mesh(recording, estimator.mesh))
 
 
 def build_estimator(choice: ContactChoice, mode: str, recording: Recording, jaw: Jaw, mesh: str = "default") -> Any:

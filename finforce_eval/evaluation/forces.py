@@ -13,6 +13,7 @@ import numpy as np
 from finforce.errors import ObservationError
 from finforce.gripper_frames import SIDES
 from finforce.health import Idling
+from finforce_contact.estimator import CONTRADICTED
 from finforce_contact.loop import ContactSource, ForceLoop, GivenContact
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.gripper import with_distances
@@ -282,6 +283,8 @@ class _JawRun:
         row |= {"used": solution.keypoints_used, "residual": solution.residual}
         if loop.contact.estimate is not None:
             row |= {"touching": solution.touching, "contact_status": loop.contact.estimate.status}
+            if loop.contact.estimate.status == CONTRADICTED:
+                row["message"] = loop.contact.estimate.message
         if self._lines is not None:
             line = self._lines.points[index], self._lines.directions[index]
             row["true_height"] = self._face.cut(loop.force.surface(), *line)
@@ -351,9 +354,15 @@ def no_force_reasons(forces: ForceSeries) -> list[str]:
     return ["" if solved else str(message or status) for solved, message, status in columns]
 
 
+def describe_contradictions(jaws: Collection[ForceSeries]) -> list[str]:
+    """Return what the images last said against the mesh of the object, once each; empty where nothing does."""
+    told = [each.column("message")[each.column("contact_status") == CONTRADICTED] for each in jaws]
+    return list(dict.fromkeys(str(texts[-1]) for texts in told if len(texts)))
+
+
 def share_reached(forces: ForceSeries, detection: DetectionTrack | None) -> float | None:
     """Return which share of the key points accepted in answered images the mechanics can reach; None if unknown."""
     if detection is None or not forces.solved.any():
         return None
     accepted = detection.accepted[np.searchsorted(detection.stamps_ns, forces.stamps_ns[forces.solved])]
-    return float((forces.column("used")[forces.solved] & accepted).sum() / accepted.sum())
+    return float((forces.column("used")[forces.solved] & accepted).sum() / accepted.sum()) if accepted.any() else None

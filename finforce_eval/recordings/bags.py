@@ -6,6 +6,7 @@ import re
 import struct
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from errno import EDQUOT, ENOSPC
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -262,9 +263,10 @@ BAGS = ("metadata.yaml", "*.mcap", "*.db3", "meta/info.json")  # what makes a fo
 _OTHERS = {
     ".bag": "a ROS 1 bag: rosbags-convert --src FILE --dst FOLDER makes a ROS 2 bag of it",
     ".hdf5": "HDF5, as ALOHA and robomimic write it: make a LeRobot dataset of it, with LeRobotDataset.create",
+    ".zstd": "compressed as a whole: unpack it with zstd -d FILE",
     ".zip": "a zip file; a replay buffer of UMI is called NAME.zarr.zip",
 }
-_OTHERS[".h5"] = _OTHERS[".hdf5"]
+_OTHERS |= {".h5": _OTHERS[".hdf5"], ".zst": _OTHERS[".zstd"]}
 
 
 def bag_source(path: Path) -> Path:
@@ -388,6 +390,10 @@ def damage_reported(name: str) -> Iterator[None]:
         raise OutOfBoundsError(f"{name}: {str(error).removeprefix(f'{name}: ')}") from error
     except (FinforceError, KeyboardInterrupt):
         raise
+    except OSError as error:
+        if error.errno in (ENOSPC, EDQUOT):  # of where a damaged file is copied to
+            raise
+        raise DamagedError(f"{name}: truncated or damaged: {one_line(error)}") from error
     except MemoryError as error:
         limit = raise_budget(STEP_MEMORY) // MEGABYTE
         raise OutOfBoundsError(f"{name}: a part of it takes more than {limit} MB of memory; {_HINT}") from error

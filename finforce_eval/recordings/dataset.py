@@ -9,25 +9,27 @@ Source: the formats as LeRobot 0.1 to 0.4 writes and reads them.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
+from pydantic import BeforeValidator, ConfigDict, Field
 
 from finforce.camera import CameraIntrinsics, ImageError, decode_picture
 from finforce.errors import one_line
 from finforce.files import FileError, check_inside, check_plain, parse_json, raise_budget, read_json, read_text
 from finforce.sandbox import MEMORY, limit_growth
+from finforce.typed_yaml import FileModel, parse_model
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.recordings.bags import allowed_bytes
-from finforce_eval.recordings.frames import FrameImages, choose_camera, decode_video
+from finforce_eval.recordings.frames import FrameImages, Rate, choose_camera, decode_video
 from finforce_eval.recordings.images import ImageChoice
 from finforce_eval.recordings.tracks import Recording
 
@@ -41,6 +43,17 @@ _BYTES_PER_CELL = 8  # of a table, once it is read
 _MOST_FRAMES = 1_000_000  # of an episode: nine hours at 30 Hz
 # what stands for the numbers of an episode and its files in the paths of `info.json`
 _NUMBER = re.compile(r"\{(episode_chunk|episode_index|chunk_index|file_index|video_key)(:0?[1-9]d)?\}")
+
+
+class _InfoNumbers(FileModel):
+    """The numbers of `meta/info.json`; an empty one stands for its default."""
+
+    model_config = ConfigDict(extra="ignore")
+    fps: Rate = Field(description="Frames per second [Hz]")
+    total_frames: int = Field(strict=True, ge=0, description="Of all episodes")
+    chunks_size: Annotated[int, Field(strict=True, ge=1), BeforeValidator(lambda size: size or 1000)] = Field(
+        1000, description="Episodes in a folder"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,14 +118,33 @@ def read_episode(folder: Path, choice: ImageChoice, sides: Sequence[str] = ()) -
 def recording_of(dataset: Dataset, episode: Episode, camera: CameraIntrinsics, sides: Sequence[str] = ()) -> Recording:
     """Return an episode as a recording whose jaws are still to be found."""
     name, fps = f"{dataset.folder.name}/episode_{episode.index:06d}", float(dataset.info["fps"])
+    _check_times(episode, fps, name)
     if episode.video is not None:
-        read = partial(decode_video, episode.video, name, episode.begin - 0.5 / fps)
+        own = episode.length if dataset.info["codebase_version"] != "v3.0" else None  # else a file of many episodes
+        read = partial(decode_video, episode.video, name, episode.begin - 0.5 / fps, own)
     else:
         read = partial(_read_column, episode, dataset.camera, name)
     images = FrameImages(
         name=name, fps=fps, camera=camera, count=episode.length, read=read, is_video=episode.video is not None
     )
     return images.make_recording(episode.data, sides)
+
+
+def _check_times(episode: Episode, fps: float, name: str) -> None:
+    """Refuse rows whose times are not those of the pictures; raises RecordingError.
+
+    LeRobot pairs both by time, and forces go by their numbers.
+    """
+    if not episode.data.exists() or "timestamp" not in pq.read_schema(episode.data).names:
+        return
+    rows = rows_of(read_parquet(episode.data, ("timestamp", "episode_index")), episode, name)
+    steps = np.diff(rows["timestamp"].to_numpy())
+    worst = int(np.abs(steps - 1.0 / fps).argmax()) if len(steps) else 0
+    if len(steps) and not abs(steps[worst] - 1.0 / fps) < 0.5 / fps:
+        raise RecordingError(
+            f"{name}: its times jump by {steps[worst]:.3f} s after row {worst}; expected {1.0 / fps:.3f} s, as of the "
+            "pictures: row and picture would not be of one time"
+        )
 
 
 def is_dataset(path: Path) -> bool:
@@ -160,9 +192,12 @@ def _read_info(folder: Path) -> dict[str, Any]:
         info = read_json(check_inside(folder / INFO, folder))
         version, paths = info["codebase_version"], [info["data_path"], info.get("video_path") or ""]
         is_sound = isinstance(info["features"], dict) and all(isinstance(path, str) for path in paths)
-        is_sound = is_sound and 0 < float(info["fps"]) < 1e4 and int(info["total_frames"]) >= 0
     except (FileError, ValueError, KeyError, TypeError) as error:
         raise RecordingError(f"{folder.name}: {INFO}: {type(error).__name__}: {error}") from error
+    try:
+        info |= parse_model(info, _InfoNumbers, RecordingError).model_dump()
+    except RecordingError as error:
+        raise RecordingError(f"{folder.name}: {INFO}: {error}") from error
     if version not in _VERSIONS:
         raise RecordingError(f"{folder.name}: layout {version}; expected {', '.join(_VERSIONS)}")
     if not is_sound:
@@ -213,7 +248,7 @@ def _make_episode(folder: Path, info: Mapping[str, Any], camera: str, entry: Map
     """Return one episode; its files need not be there."""
     index, is_video = int(entry["episode_index"]), bool(camera) and info["features"][camera]["dtype"] == "video"
     head, begin = f"videos/{camera}/", 0.0
-    data = {"episode_chunk": index // int(info.get("chunks_size") or 1000), "episode_index": index}
+    data = {"episode_chunk": index // info["chunks_size"], "episode_index": index}
     video = {**data, "video_key": camera}
     if info["codebase_version"] == "v3.0":
         data |= {name: entry[f"data/{name}"] for name in ("chunk_index", "file_index")}
@@ -232,17 +267,22 @@ def _make_episode(folder: Path, info: Mapping[str, Any], camera: str, entry: Map
     )
 
 
-def read_parquet(path: Path) -> pa.Table:
-    """Return a Parquet file, rows in the groups that it has; raises RecordingError where it is missing or damaged."""
+def read_parquet(path: Path, columns: Collection[str] = ()) -> pa.Table:
+    """Return a Parquet file or some of its columns; raises RecordingError where it is missing or damaged.
+
+    The rows are in the groups that the file has.
+    """
     try:
         check_plain(path)
         file, allowed = pq.ParquetFile(path), allowed_bytes(path)
         groups = [file.metadata.row_group(number) for number in range(file.metadata.num_row_groups)]
-        cells = sum(each.column(number).num_values for each in groups for number in range(each.num_columns))
+        parts = [each.column(number) for each in groups for number in range(each.num_columns)]
+        cells = sum(part.num_values for part in parts if not columns or part.path_in_schema in columns)
         if _BYTES_PER_CELL * cells > allowed:
             raise MemoryError
         with limit_growth(allowed):
-            return file.read(use_threads=False)
+            wanted = [name for name in columns if name in file.schema_arrow.names] if columns else None
+            return file.read(columns=wanted, use_threads=False)
     except MemoryError as error:
         what = f"takes more than {allowed_bytes(path) >> 20} MB of memory, far more than its size allows for"
         raise RecordingError(f"{path.parent.name}/{path.name}: {what}") from error

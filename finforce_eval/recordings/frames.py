@@ -7,16 +7,18 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from finforce.camera import MILLIMETRE, CameraIntrinsics, ImageError, decode_picture
 from finforce.files import FileError, check_plain, read_bytes
 from finforce.gripper_frames import SIDES
 from finforce.messages import NANOSECONDS
 from finforce.optional import import_library
+from finforce.typed_yaml import Number
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.recordings.bags import list_pictures
 from finforce_eval.recordings.image_files import read_intrinsics
@@ -24,8 +26,12 @@ from finforce_eval.recordings.images import ImageChoice, StampedImage
 from finforce_eval.recordings.tracks import JawTrack, KeypointTrack, Recording, Timed, WrenchTrack
 from finforce_keypoints.images import RgbdImage, check_image
 
+LEAST_RATE, MOST_RATE = 1e-2, 1e4  # Hz of frames
+Rate = Annotated[Number, Field(ge=LEAST_RATE, le=MOST_RATE)]
 STILL_RATE = 1.0  # Hz of pictures that say nothing of their times
 LARGEST_PICTURE = 1 << 27  # bytes
+# What FFmpeg may take a file for: nothing that names other files, as its lists and playlists do.
+_ALONE = {"format_whitelist": "mov,mp4,m4a,3gp,matroska,webm,avi", "protocol_whitelist": "file"}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -123,15 +129,20 @@ def _open_video(path: Path, name: str) -> Iterator[tuple[Any, Any]]:
     av = import_library("av", "reading videos", "'finforce[video]'")
     try:
         check_plain(path)
-        with av.open(str(path)) as container:
+        with av.open(str(path), options=_ALONE) as container:
             yield container, container.streams.video[0]
     except (FileError, av.FFmpegError, IndexError) as error:
         raise RecordingError(f"{name}: {path.parent.name}/{path.name}: {error}; expected a video") from error
 
 
-def decode_video(path: Path, name: str, begin: float = 0.0) -> Iterator[NDArray[np.uint8]]:
-    """Yield the frames (h, w, 3) RGB of a video from a time [s] on; see `_open_video`."""
+def decode_video(path: Path, name: str, begin: float = 0.0, count: int | None = None) -> Iterator[NDArray[np.uint8]]:
+    """Yield the frames (h, w, 3) RGB of a video from a time [s] on; see `_open_video`.
+
+    A video that says of itself that it has another number of frames than `count` is refused, too.
+    """
     with _open_video(path, name) as (container, stream):
+        if count is not None and stream.frames not in (0, count):
+            raise RecordingError(f"{name}: {path.name} has {stream.frames} frames; expected {count}, one for each row")
         if begin > 0.0:
             container.seek(int(begin / stream.time_base), stream=stream)
         for frame in container.decode(stream):
@@ -164,7 +175,7 @@ def read_frames(path: Path, choice: ImageChoice, sides: Sequence[str] = ()) -> R
         with _open_video(path, name) as (container, stream):
             count = stream.frames or sum(bool(packet.size) for packet in container.demux(stream))
             fps, shape = float(stream.average_rate or 0.0), (stream.height, stream.width)
-        if not (count and fps > 0.0):
+        if not (count and LEAST_RATE <= fps <= MOST_RATE):
             raise RecordingError(f"{name}: {path.name}: {count} frames at {fps:g} Hz; expected a video")
         read = partial(decode_video, path, name)
     camera = choose_camera(choice, shape, name)

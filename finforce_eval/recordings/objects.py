@@ -16,6 +16,7 @@ from finforce.errors import PoseError
 from finforce.messages import SECOND, find_nearest
 from finforce.transforms import invert_pose, pose_from_quaternion
 from finforce_eval.errors import RecordingError
+from finforce_eval.recordings.images import ALONE
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.tracks import PoseTrack, Recording, Timed
 from finforce_ifea.contact_mechanics.friction import Coefficient
@@ -135,6 +136,29 @@ def track_object(recording: Recording, side: str) -> ObjectTrack:
         poses=T_jaw_camera @ T_parent_object[paired],
         cameras=T_jaw_camera[:, :3, 3],
     )
+
+
+def pose_object_in_images(recording: Recording, tolerance: int) -> ObjectTrack | None:
+    """Return the object's poses T_camera_object at the stamps of depth images; None where there are no such poses.
+
+    Args:
+        recording: any.
+        tolerance: greatest distance of the stamps of a pose and an image that belong together [ns].
+
+    Raises:
+        RecordingError: a pose is none.
+    """
+    objects, images = recording.object_pose, recording.images
+    if objects is None or images is None or not images.has_depth or not len(objects.stamps_ns):
+        return None
+    if objects.frame_id.lstrip("/") != images.frame_id.lstrip("/"):
+        return None
+    stamps = images.stamps_ns[images.depth_stamps != ALONE]
+    order = np.argsort(objects.stamps_ns, kind="stable")
+    nearest = order[find_nearest(objects.stamps_ns[order], stamps)]
+    paired = np.abs(objects.stamps_ns[nearest] - stamps) <= tolerance
+    poses = _matrices(objects, "/object_pose", recording.name)
+    return ObjectTrack(stamps_ns=stamps[paired], poses=poses[nearest[paired]])
 
 
 class RecordedImage(NamedTuple):

@@ -56,7 +56,8 @@ class WholeImageDetector:
 
     A network of both jaws sees the image once. A network of one jaw sees one part of it for each jaw, in one batch:
     around the jaw where it is expected, else the half of the image on the jaw's side; the right jaw is mirrored, so
-    that it looks like the left one that the network knows.
+    that it looks like the left one that the network knows. Where statistics of the whole picture enter the answer, as
+    by group normalisation, what is cut out does not follow the jaws.
     """
 
     def __init__(
@@ -81,11 +82,13 @@ class WholeImageDetector:
         self._points = {side: np.vstack((jaw.keypoints, jaw.reference_point)) for side, jaw in jaws.items()}
 
     def detect(self, image: RgbdImage, expected: Mapping[str, NDArray | None]) -> Mapping[str, PixelDetection]:
-        """Return the key points of every jaw; see `PixelDetector`.
+        """Return the key points of every jaw that is asked for; see `PixelDetector`.
 
         Raises:
             DetectionError: the image is not of the training's size, or the network gives no sensible offsets.
         """
+        if not expected:
+            return {}
         color = np.asarray(image.color)
         scale = self._find_scale(color.shape[:2])
         views = self._plan(image.camera, expected)
@@ -123,7 +126,8 @@ class WholeImageDetector:
     def _plan(self, camera: CameraIntrinsics, expected: Mapping[str, NDArray | None]) -> list[_CropView]:
         """Return what the network is shown."""
         whole = Crop(x=0, y=0, width=camera.width, height=camera.height)
-        boxes = {side: self._expect(camera, side, pose) for side, pose in expected.items()}
+        poses = dict.fromkeys(expected) if self._model.sees_whole else expected
+        boxes = {side: self._expect(camera, side, pose) for side, pose in poses.items()}
         if not self._names.is_of_one_jaw:
             known = [box for box in boxes.values() if box is not None]
             is_whole = self._is_frozen or len(known) < len(boxes)

@@ -7,6 +7,7 @@ camera's errors move them across it, too. By both, the two are told apart.
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -34,6 +35,8 @@ from finforce_keypoints.tags import CORNER_STDDEV
 GATES = (5e-3, 2e-3)  # [m] off the known side plane, then off the one found, beyond which depth is not the finger's
 LEAST_DEPTHS, LEAST_SHARE = 6, 0.4  # samples of the finger with depth that a key point needs, and their share of all
 DEPTH_NOISE = 0.06e-3  # [m] error of the depth that the samples of one point share
+DEPTH_IMAGES = 5  # with depth at the jaw, over which that is compared with the jaw's place
+DEPTH_OFF = 0.2  # [-] of depth at the jaw by its place, above which it is of another unit or another picture
 MISFIT = 5.0  # standard deviations of its depth off the fit, above which a key point is not there
 TAGGED_STDDEV = 0.5e-3  # [m] of a shift that all points share beside a tag: holder and network give by so much
 MOST_SLIP = 6e-3  # [m] along its z that a jaw in a holder is off its place; more is another camera or rig
@@ -100,6 +103,7 @@ class JawLocalizer:
         self._track = OriginTrack(settings, self._origin.largest_stddev)
         self._patch, self._rest_check = ReferencePatch(jaw), _RestCheck(jaw.keypoints)
         self._unconfirmed, self._slip, self._astray, self._is_tag_elsewhere = 0, 0.0, 0.0, False
+        self._ratios: deque[float] = deque(maxlen=DEPTH_IMAGES)
         self._samples = build_side_samples(jaw)
         self._rest = np.vstack((jaw.keypoints, jaw.reference_point))
         self._model = SideModel(places=self._rest[:, ::2])
@@ -115,6 +119,7 @@ class JawLocalizer:
         self._patch.reset()
         self._rest_check.reset()
         self._unconfirmed, self._slip, self._astray, self._is_tag_elsewhere = 0, 0.0, 0.0, False
+        self._ratios: deque[float] = deque(maxlen=DEPTH_IMAGES)
 
     @property
     def warning(self) -> str:
@@ -126,12 +131,19 @@ class JawLocalizer:
                 f"the jaw lies {1e3 * self._astray:+.0f} mm along its z from where the rig has it: is the image zoomed "
                 "or stabilised, or of another rig?"
             )
+        if abs(self.depth_ratio - 1.0) > DEPTH_OFF:
+            return describe_depth(self.depth_ratio)
         distance = self._rest_check.distance
         if not distance > self._settings.rest_tolerance:
             return ""
         return (
             f"the key points at rest lie {1e3 * distance:.1f} mm from the jaw file: are the camera's extrinsics right?"
         )
+
+    @property
+    def depth_ratio(self) -> float:
+        """Measured depth over that of the jaw's place by its colours [-], over some images; NaN before."""
+        return float(np.median(self._ratios)) if len(self._ratios) == DEPTH_IMAGES else float("nan")
 
     @property
     def is_lost(self) -> bool:
@@ -314,6 +326,10 @@ class JawLocalizer:
             return fit, np.full(len(expected), self._settings.plane_depth)
         points = sight.camera + expected[:, None] * sight.rays
         excess = sample_depths(image.depth, image.camera, points, self._samples, T_camera_jaw)
+        known = np.isfinite(excess) & likely[:, None]
+        if known.any():
+            away = excess[known] / np.broadcast_to(expected[:, None], excess.shape)[known]
+            self._ratios.append(1.0 + float(np.median(away)))
         fit = None
         for gate in GATES:
             away = np.zeros(len(expected)) if fit is None else fit.y / sight.rays[:, 1]
@@ -345,6 +361,14 @@ class JawLocalizer:
             outside,
         )
         return np.where(self._visible, np.select(against, REASONS[:-1], default=""), REASONS[-1])[:-1]
+
+
+def describe_depth(ratio: float) -> str:
+    """Return what to say of depth that is so many times that of the jaw's place."""
+    return (
+        f"the depth at the jaw is {ratio:.3g} times that of its place by the colours: check the unit of the depth "
+        "images, depth_scale, and that they are aligned to the colours"
+    )
 
 
 def _tag_stddev(image: RgbdImage) -> float:

@@ -72,6 +72,12 @@ class ModelMetadata(FileModel):
     model_config = ConfigDict(extra="ignore")
 
     bodyparts: tuple[str, ...] = _key("metadata.bodyparts", ..., "Names in the order of the heatmaps", min_length=1)
+    method: str = _key("method", "bu", "Whether the network sees whole images, bu, or what a detector cuts out, td")
+    resize: dict | bool | None = _key("data.inference.resize", None, "Size that images are scaled to, not followed")
+    longest_max_size: int | None = _key("data.inference.longest_max_size", None, "Likewise, of the longer side [px]")
+    scale_to_unit_range: StrictBool | None = _key(
+        "data.inference.scale_to_unit_range", None, "Whether colours go to 1, as here without normalize_images"
+    )
     individuals: tuple[str, ...] = _key("metadata.individuals", (), "Names of the animals")
     colormode: Colours = _key("data.colormode", "RGB", "Order of the colours that the network was trained on")
     normalize_images: StrictBool = _key("data.inference.normalize_images", True, "Whether ImageNet's mean is removed")
@@ -129,6 +135,23 @@ class ModelMetadata(FileModel):
         if len(names) > 1:
             raise ValueError(f"got {len(names)}, expected one; name the points of the two jaws left_... and right_...")
         return names
+
+    @model_validator(mode="after")
+    def _check_inference(self) -> ModelMetadata:
+        """Refuse what a network is given in DeepLabCut and would not be given here."""
+        if self.method.lower() == "td":
+            raise ValueError("method: got td, whose network sees what a detector cuts out; expected bu, whole images")
+        if self.resize or self.longest_max_size:
+            raise ValueError(
+                "data.inference: images are not scaled as by resize or longest_max_size; train on the camera's size "
+                "without them, or set finforce.training_size and allow_resize"
+            )
+        if self.scale_to_unit_range is not None and self.scale_to_unit_range == self.normalize_images:
+            raise ValueError(
+                f"data.inference: got scale_to_unit_range and normalize_images both {self.normalize_images}; expected "
+                "one of them"
+            )
+        return self
 
     @property
     def stride(self) -> float | None:

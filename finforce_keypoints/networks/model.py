@@ -222,6 +222,7 @@ _LOCREF_WORDS = ("locref", "offset")
 # ImageNet's, which DeepLabCut takes off
 _MEAN = np.array([0.485, 0.456, 0.406], np.float32)
 _STD = np.array([0.229, 0.224, 0.225], np.float32)
+SNAPSHOTS = (".pt", ".pth")  # of PyTorch
 _PROBE = 256  # px, of the picture that a network of any size is tried with
 # A border of up to one cell and a half is a network's habit; a stride off by a factor of two is an error.
 _STRIDE_TOLERANCE = 0.6  # of log2(H / h / stride)
@@ -331,6 +332,11 @@ class KeypointModel:
     def frozen_size(self) -> tuple[int | None, int | None]:
         """Height and width that are frozen into the network [px]; None where any will do."""
         return self._input.height, self._input.width
+
+    @property
+    def sees_whole(self) -> bool:
+        """Whether a cut-out of a picture changes all of the network's answer, as group normalisation does."""
+        return self._network.sees_whole
 
     @property
     def training_size(self) -> tuple[int, int] | None:
@@ -491,13 +497,19 @@ def find_network(path: str | Path) -> Path:
     """
     path = Path(path)
     try:
-        if path.is_file():
+        if path.is_file() and path.suffix not in SNAPSHOTS:
             return path
-        found = sorted(path.glob("*.onnx"))
+        files = sorted(path.glob("*"))
+        found = [file for file in files if file.suffix == ".onnx"]
     except OSError as error:
         raise ModelError(
             f"model: cannot be looked for ({error.strerror}); expected a folder with one .onnx file"
         ) from error
+    snapshots = [path] if path.suffix in SNAPSHOTS else [file for file in files if file.suffix in SNAPSHOTS]
+    if snapshots and not found:
+        raise ModelError(
+            f"{snapshots[0]}: a PyTorch file; expected an ONNX network: export it with examples/export_deeplabcut.py"
+        )
     if len(found) != 1:
         names = ", ".join(file.name for file in found) or "none"
         raise ModelError(f"{path}: expected a folder with one .onnx file and its metadata, found {names}")

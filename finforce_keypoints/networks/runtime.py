@@ -34,6 +34,8 @@ LARGEST = 512 << 20  # bytes of a file
 SECONDS, MEMORY = 20, 1536 << 20  # of a first run, onnxruntime's own memory included [bytes]
 COLOURS, FREE_SIDE, LARGEST_SIDE = 3, 256, 4096  # [px] of an axis that takes any size, and of one that is frozen
 _EDITION = 2
+# Operators that gather statistics over a whole picture; group normalisation is exported as the first or the second.
+_GLOBAL = (b"InstanceNormalization", b"GroupNormalization", b"LayerNormalization", b"GlobalAveragePool")
 INPUT_TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(uint8)": np.uint8}
 
 
@@ -174,6 +176,7 @@ class Network:
     Attributes:
         inputs: name, shape (numbers, or names of free axes) and type of each.
         output_names: of its outputs.
+        sees_whole: whether every output depends on the whole picture, so that a cut-out of it changes all of them.
 
     Args:
         path: the .onnx file.
@@ -189,6 +192,8 @@ class Network:
         self._session = open_session(path, threads)
         self.inputs = [(item.name, item.shape, item.type) for item in self._session.get_inputs()]
         self.output_names = tuple(item.name for item in self._session.get_outputs())
+        content = path.read_bytes()
+        self.sees_whole = any(name in content for name in _GLOBAL)
 
     def run(self, tensor: NDArray) -> list[NDArray]:
         """Return all outputs for an input tensor of the network's own layout, any number of images.

@@ -205,3 +205,65 @@ def test_large_images_come_again_where_their_publisher_keeps_them(probe, camera)
     for topic in ("/camera/camera/aligned_depth_to_color/image_raw", "/object_mask"):
         (heard,) = probe.get_subscriptions_info_by_topic(topic)
         assert heard.qos_profile.reliability == ReliabilityPolicy.RELIABLE
+
+
+class ComparedBench(ContactBench):
+    """A contact estimator whose poses come by topic, before a depth camera."""
+
+    def __init__(self, probe, camera, **parameters):
+        super().__init__(probe, max_age=MAX_AGE, **parameters)
+        self.info = probe.speak("/camera/camera/color/camera_info", CameraInfo)
+        self.depth = probe.speak("/camera/camera/aligned_depth_to_color/image_raw", Image)
+        probe.connected(self.info)
+        self.camera = camera
+
+    def show(self, depth, until):
+        """Send images with their poses until something is so."""
+
+        def shown():
+            stamp = time_ns()
+            self.info.publish(camera_info(stamp, self.camera))
+            self.depth.publish(depth_image(stamp, depth))
+            self.object_out.publish(pose(stamp, T_CAMERA_JAW @ cylinder_before_jaw()))
+            self.jaw_out.publish(pose(stamp, T_CAMERA_JAW))
+            self.probe.spin(0.05)
+            return until()
+
+        self.probe.wait_for(shown, 60.0)
+
+
+@pytest.fixture(scope="module")
+def lying_mesh(tmp_path_factory):
+    """The cylinder with its axes turned."""
+    import trimesh
+
+    mesh = trimesh.load(MESH)
+    mesh.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0]))
+    path = tmp_path_factory.mktemp("meshes") / "lying.stl"
+    mesh.export(path)
+    return str(path)
+
+
+def test_a_mesh_with_turned_axes_gives_no_contact_and_is_named(probe, camera, scene, lying_mesh):
+    bench = ComparedBench(probe, camera, object_mesh=lying_mesh)
+    session = bench.node.session
+    loop = session.jaws["left"].loop
+    bench.show(scene[0], lambda: loop.estimate is not None and loop.estimate.status == "contradicted")
+    state = bench.diagnosis(level=Level.WARN, word="turned by")
+    assert "the camera contradicts the mesh" in {value.key: value.value for value in state.values}["mesh"]
+    bench.contacts.clear()
+    bench.image(cylinder_before_jaw())
+    probe.spin(0.3)
+    assert not bench.contacts
+
+
+def test_the_right_mesh_is_compared_and_goes_on_giving_contacts(probe, camera, scene):
+    bench = ComparedBench(probe, camera)
+    bench.show(scene[0], lambda: bench.node.session.check.compared >= 3)
+    assert bench.node.session.check.contradiction == ""
+    bench.diagnosis(level=Level.OK)
+    bench.wait_for_contacts()
+
+
+def test_the_comparison_can_be_turned_off(probe, lying_mesh):
+    assert ContactBench(probe, object_mesh=lying_mesh, compare_mesh=False).node.session.check is None

@@ -358,10 +358,10 @@ def cut_video(folder):
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
-        (lengthen, "3 pictures; expected 4"),
+        (lengthen, "3 rows; expected 4"),
         (change_info(total_frames=7), "expected the 7 of"),
         (change_info(codebase_version="v1.6"), "layout v1.6; expected v2.0, v2.1, v3.0"),
-        (change_info(fps=0), "expected features, fps"),
+        (change_info(fps=0), "fps: got 0, expected"),
         (lambda folder: (folder / "meta/info.json").write_text("{"), "info.json"),
         (lambda folder: (folder / "meta/episodes.jsonl").unlink(), "episodes.jsonl"),
         (cut_video, "episode_000000"),

@@ -2,6 +2,7 @@
 
 import functools
 import os
+import pickle
 import shutil
 import sqlite3
 import struct
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import meshio
 import numpy as np
+import pyarrow
 import pytest
 import trimesh
 from eval_fakes import make_recording, pack_mcap
@@ -18,12 +20,16 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from keypoint_scene_fakes import Fake, write_model
 from PIL import Image
+from pyarrow import parquet
 from zstandard import ZstdCompressor
 
 import finforce_ifea
 import finforce_keypoints
 from finforce.errors import FinforceError
 from finforce_contact.mesh.object_mesh import load_object_mesh
+from finforce_eval.errors import RecordingError
+from finforce_eval.recordings.dataset import read_parquet
+from finforce_eval.recordings.frames import decode_video
 from finforce_eval.recordings.image_files import read_depth, read_image, read_intrinsics
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.writer import write_recording
@@ -188,6 +194,40 @@ def make_bomb(path):
     path.write_bytes(b"\x89MCAP0\r\n" + struct.pack("<BQ", 6, len(chunk)) + chunk + b"\x89MCAP0\r\n")
 
 
+def make_planted_code(path):
+    """Write a pickle, as numba caches code, that would make a file."""
+
+    class Planted:
+        def __reduce__(self):
+            return Path.touch, (path.with_suffix(".ran"),)
+
+    path.write_bytes(pickle.dumps(Planted()))
+
+
+def make_stored_pickle(path):
+    np.savez(path, np.array([{"a": 1}], dtype=object))
+
+
+def make_video_list(path):
+    """Write a list of videos, which FFmpeg would follow, in place of one."""
+    path.with_suffix(".ts").write_bytes(bytes(188))
+    path.write_text(f"ffconcat version 1.0\nfile {path.with_suffix('.ts').name}\n")
+
+
+def make_playlist(path):
+    path.write_text("#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\nhttp://127.0.0.1:9/x.ts\n#EXT-X-ENDLIST\n")
+
+
+def read_video(path):
+    return list(decode_video(path, path.name))
+
+
+def make_parquet_bomb(path):
+    """Write a table of a few bytes that unpacks to some gigabytes."""
+    column = pyarrow.DictionaryArray.from_arrays(np.zeros(1 << 24, np.int32), pyarrow.array(["x" * 256]))
+    parquet.write_table(pyarrow.table({f"c{number}": column for number in range(16)}), path)
+
+
 def make_pickle(path):
     np.save(path, np.array([{"a": 1}], dtype=object), allow_pickle=True)
 
@@ -216,6 +256,11 @@ HARMFUL = {
     "bomb.mcap": (make_bomb, read_recording),
     "huge.png": (functools.partial(make_png, side=100_000), read_image),
     "pickle.npy": (make_pickle, read_depth),
+    "pickle.npz": (make_stored_pickle, read_depth),
+    "planted.npy": (make_planted_code, read_depth),
+    "list.mp4": (make_video_list, read_video),
+    "playlist.mp4": (make_playlist, read_video),
+    "bomb.parquet": (make_parquet_bomb, read_parquet),
 }
 
 
@@ -225,9 +270,24 @@ def test_a_harmful_file_is_refused(tmp_path, name):
     make(tmp_path / name)
     with pytest.raises(FinforceError):
         read(tmp_path / name)
+    assert not list(tmp_path.glob("*.ran"))
 
 
-def test_a_pipe_is_not_waited_for(tmp_path):
-    os.mkfifo(tmp_path / "jaw.yaml")
+def test_a_list_of_videos_opens_none_of_them(tmp_path):
+    from lerobot_fakes import write_video
+
+    write_video(tmp_path / "real.mp4", [np.full((48, 64, 3), 90, np.uint8)] * 3)
+    assert len(read_video(tmp_path / "real.mp4")) == 3
+    (tmp_path / "list.mp4").write_text("ffconcat version 1.0\nfile real.mp4\n")
+    with pytest.raises(RecordingError, match="expected a video"):
+        read_video(tmp_path / "list.mp4")
+
+
+@pytest.mark.parametrize(
+    ("name", "read"),
+    [("jaw.yaml", load_jaw), ("depth.npz", read_depth), ("depth.npy", read_depth), ("video.mp4", read_video)],
+)
+def test_a_pipe_is_not_waited_for(tmp_path, name, read):
+    os.mkfifo(tmp_path / name)
     with pytest.raises(FinforceError):
-        load_jaw(tmp_path / "jaw.yaml")
+        read(tmp_path / name)

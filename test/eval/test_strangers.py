@@ -228,6 +228,47 @@ def test_a_dataset_in_which_no_jaw_is_seen_is_not_annotated(dataset, capsys):
     assert "no key points in" in told.err and not (dataset.parent / "out" / "noise").exists()
 
 
+def change_info(**changes):
+    def change(folder):
+        info = json.loads((folder / "meta/info.json").read_text())
+        (folder / "meta/info.json").write_text(json.dumps(info | changes))
+
+    return change
+
+
+def lengthen_video(folder):
+    from lerobot_fakes import write_video
+
+    pictures = [frame.color for frame in make_footage(FakeGripper(count=8))]
+    write_video(next((folder / "videos").rglob("episode_000000.mp4")), pictures)
+
+
+def delay_row(folder):
+    import pyarrow
+
+    path = next((folder / "data").rglob("episode_000000.parquet"))
+    table = parquet.read_table(path)
+    times = pyarrow.array(table["timestamp"].to_numpy() + np.array([0.0, 0.0, 0.4], np.float32))
+    parquet.write_table(table.set_column(table.schema.get_field_index("timestamp"), "timestamp", times), path)
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (lengthen_video, "has 8 frames; expected 3, one for each row"),
+        (delay_row, "times jump by 0.433 s after row 1; expected 0.033 s"),
+        (change_info(fps=1e-300), "fps: got 1e-300, expected"),
+        (change_info(fps="fast"), "fps: got the text 'fast'"),
+        (change_info(chunks_size=0.5), "chunks_size: got 0.5, expected"),
+    ],
+)
+def test_rows_pictures_and_numbers_that_disagree_are_refused_in_one_line(damage, words, dataset, capsys):
+    damage(dataset)
+    assert annotate(dataset) == 2
+    told = capsys.readouterr().err
+    assert words in told and "Traceback" not in told
+
+
 def test_what_a_dataset_lacks_is_said_in_one_line_before_its_videos_are_read(dataset, capsys, monkeypatch):
     monkeypatch.setattr("finforce_eval.recordings.dataset.decode_video", lambda *given: 1 / 0)
     assert annotate(dataset, *DATASET[:4]) == 2

@@ -91,6 +91,27 @@ def test_what_fits_passes_with_depth_and_without(still, capsys, tmp_path):
         assert ("colour alone" in said) == bool(options)
 
 
+def test_depth_of_another_unit_is_named(still, capsys, tmp_path):
+    status, said = check(still, capsys, tmp_path, "--detector", "depth_scale=0.01")
+    assert status == 1 and "the depth at the jaw is 10 times that of its place" in said and "depth_scale" in said
+
+
+def test_a_mesh_that_is_not_what_the_camera_sees_is_named(footage, capsys, tmp_path):
+    import trimesh
+
+    found, count = footage[0], 9  # of which every third has a pose of the object
+    frames = tuple(replace(frame, jaws={}) for frame in islice(found, count))
+    still = write_footage(StillFrames(found, frames, lambda color: color), tmp_path / "still")
+    mesh = trimesh.load(next(still.glob("*.stl")))
+    mesh.apply_scale(1.5)
+    mesh.export(tmp_path / "large.stl")
+    more = ("--images", str(count))
+    status, said = check(still, capsys, tmp_path, *more, "--object", str(tmp_path / "large.stl"))
+    assert status == 1 and "the camera contradicts the mesh large.stl" in said and "scaled by 0.6" in said
+    status, said = check(still, capsys, tmp_path, *more)
+    assert status == 0 and "object.stl is where the camera sees it" in said
+
+
 def test_a_camera_that_is_elsewhere_is_told_where_it_is(still, capsys, tmp_path):
     T = ROBOT_CAMERA.copy()
     T[1, 3] += 0.008

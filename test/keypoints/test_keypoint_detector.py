@@ -279,6 +279,18 @@ def test_a_jaw_that_no_depth_confirms_is_lost_and_found_again_by_one_that_does()
     assert set(detector.detect(replace(flat, stamp=0.53))) == {"left", "right"}  # counted anew
 
 
+def test_depth_of_another_unit_is_warned_of():
+    scene, depth, pixel_detector, detector = build()
+    image = bare_image(0.0, depth.astype(np.float32))
+    for n in range(10):
+        detector.detect(replace(image, stamp=n / RATE))
+    assert not detector.warnings and detector.depth_ratio == pytest.approx(1.0, abs=0.02)
+    detector.reset()
+    for n in range(10):
+        detector.detect(replace(image, stamp=n / RATE, depth=1e3 * image.depth))
+    assert "times that of its place" in detector.warnings["left"] and 900.0 < detector.depth_ratio < 1100.0
+
+
 def test_a_jaw_whose_reference_point_is_hidden_for_a_moment_goes_on():
     scene, depth, pixel_detector, detector = build()
     image = bare_image(0.0, depth.astype(np.float32))

@@ -1,8 +1,10 @@
 """Key points of whole images and cut-outs, by networks that find coloured squares."""
 
 import numpy as np
+import onnx
 import pytest
-from keypoint_scene_fakes import COLOURS, Fake, paint, small_jaws, write_model
+from keypoint_scene_fakes import COLOURS, Fake, build_network, paint, small_jaws, write_model
+from onnx import helper, numpy_helper
 
 from finforce.camera import CameraIntrinsics
 from finforce.gripper_frames import ROBOT_CAMERA, jaw_in_camera
@@ -76,6 +78,28 @@ def test_while_tracked_only_the_jaws_are_cut_out(tmp_path, monkeypatch):
         assert np.abs(found[side].pixels - list(squares.values())).max() <= CELL
     pixel_detector.detect(image, expected_poses() | {"left": None})
     assert shapes[1] == (1, 480, 640, 3)
+
+
+def test_a_network_with_group_normalisation_always_sees_the_whole_image(tmp_path, monkeypatch):
+    model = build_network(both_jaws())
+    statistics = helper.make_node("InstanceNormalization", ["pooled", "gain", "shift_of_mean"], ["normal"])
+    model.graph.node.append(statistics)
+    for name, value in (("gain", 1.0), ("shift_of_mean", 0.0)):
+        model.graph.initializer.append(numpy_helper.from_array(np.full(3, value, np.float32), name))
+    onnx.save(model, write_model(tmp_path, both_jaws()) / "network.onnx")
+    jaws = small_jaws(("left", "right"))
+    network = KeypointModel(tmp_path, threads=1)
+    pixel_detector = WholeImageDetector(network, build_name_map(network.names, jaws), jaws)
+    shapes = shown_shapes(pixel_detector, monkeypatch)
+    pixel_detector.detect(image_of(SQUARES | OTHERS), expected_poses())
+    assert shapes == [(1, 480, 640, 3)]
+
+
+def test_no_jaw_that_is_asked_for_is_none_that_is_found(tmp_path, monkeypatch):
+    for number, fake in enumerate((both_jaws(), one_jaw())):
+        pixel_detector = detector_of(tmp_path / str(number), fake)
+        shapes = shown_shapes(pixel_detector, monkeypatch)
+        assert pixel_detector.detect(image_of(SQUARES | OTHERS), {}) == {} and shapes == []
 
 
 def test_a_pose_behind_the_camera_or_beside_the_image_counts_as_lost(tmp_path, monkeypatch):
