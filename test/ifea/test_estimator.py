@@ -125,7 +125,7 @@ def test_standard_deviation_grows_with_the_noise_and_with_hidden_points():
     )
     hidden = pressed(20).changed(range(REST + 10, 180), lambda _, likelihood: likelihood.put(range(2, 14), 0.1))
     assert loud > 1.4 * quiet
-    assert run(hidden, solver="frame", friction=0.0)[150].magnitude_stddev > 1.2 * sliding(20)[150].magnitude_stddev
+    assert run(hidden, solver="frame", friction=0.0)[150].magnitude_stddev > 1.15 * sliding(20)[150].magnitude_stddev
 
 
 # --- determinism and symmetry
