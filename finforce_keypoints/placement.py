@@ -19,12 +19,12 @@ from scipy.optimize import least_squares, minimize
 from scipy.spatial.transform import Rotation
 
 from finforce.camera import CameraIntrinsics, project
-from finforce.gripper_frames import SIDES, jaw_in_camera, jaw_in_gripper, look_at
+from finforce.gripper_frames import SIDES, OpeningRange, jaw_in_camera, jaw_in_gripper, look_at
 from finforce.optional import import_cv2
 from finforce.transforms import invert_pose, move_pose
 from finforce_keypoints.detectors.side_plane import AnyFinger
 from finforce_keypoints.errors import GeometryError
-from finforce_keypoints.geometry.rib_pattern import Moments, RibPattern, correlate, weigh_evidence
+from finforce_keypoints.geometry.rib_pattern import Moments, RibPattern, correlate, subtract_pattern, weigh_evidence
 from finforce_keypoints.geometry.side_picture import (
     PlaneGrid,
     SidePlane,
@@ -44,15 +44,18 @@ COARSER = 4  # times as large as those of the network's pictures are the pixels 
 AROUND = 0.1  # of the finger's length: what surrounds the outline
 UNHELD = 0.35  # of the finger's length: what is below is likely to be covered by a holder
 DARK = 30.0  # of 255: what is added to the brightness by which colours are divided
-# Directions of a holder's edge, shares of the finger beyond it, and what a share of it costs in contrast.
-EDGES, HELD, HELD_COST = 12, (0.15, 0.3, 0.45), 0.15
+# Directions of a holder's edge, none of which leaves the base and covers the tip, shares of the finger beyond it, and
+# what a share of it costs in contrast.
+EDGES, HELD, HELD_COST = 7, (0.15, 0.3, 0.45), 0.15
 BEYOND = 0.3  # share of the compared pixels outside the image, from which on nothing is said
+OPENING_STEP = 1e-3  # [m] between the places where jaws are looked for
 WHOLE = 0  # the edge beyond which there is nothing
 # Where wrist cameras are, in the gripper: y, z [m], tilt down [rad], half opening of the jaws [m].
 LOW, HIGH = np.array([0.04, -0.15, -0.2, 0.015]), np.array([0.18, 0.05, 0.9, 0.08])
 STARTS, KEPT, STEPS = 3000, 4, 300  # places that are tried; improved, whole and up to an edge; and in how many steps
 POLISHED, POLISH = 2, 400  # of each of these, places whose jaws are turned, too, and in how many steps
 SIMPLEX = np.array([0.008, 0.008, 0.05, 0.008, 0.006, 0.02, 0.05])  # [m, m, rad, m, m, rad, rad]
+NEWTON, DAMPED, STEP, SETTLED = 15, 4, 0.02, 1e-4  # steps to a pattern, trials of each, its [of 5 mm], least gain
 PRIOR = 0.003  # of the squares of what is off beforehand, in contrast or correlation
 # Where outlines leave a finger, as shares of its length, rise along its width, and ribs along itself.
 STRETCHES = np.linspace(0.85, 1.15, 11)
@@ -63,8 +66,8 @@ TIPWARDS = 12  # an edge beyond which the tips lie
 PLACES = 5  # that fit the pattern best, of all starts
 COMPARED = 2  # pictures in which starts are compared; all refine what is best in these
 WORSE = 0.03  # by which the pattern may correlate less where the network's points are
-# Least correlation of the pattern, and by how much less it has to be elsewhere.
-LEAST_CORRELATION, APART = 0.4, 0.12
+# Least correlation of the pattern, and what may be told elsewhere at most, as a share.
+LEAST_CORRELATION, MOST_RIVAL = 0.4, 0.85
 LEAST_SHOWN = 0.25  # the same of a finger that is there at all
 ROUNDS = 6  # of finding key points with the place found before
 ALIKE = 8.0  # independent points that all the points of a jaw in a picture are worth: what they err by is shared
@@ -140,6 +143,25 @@ class KnownSizes:
         return [(float(edges.mean()) / self.tag_size - 1.0) / deviation, *(moved / TAG_PLACE).ravel()]
 
 
+@dataclass(frozen=True, kw_only=True)
+class PlacementComparison:
+    """How well the ribs in pictures fit a place.
+
+    Attributes:
+        correlation: of the pictures with the pattern of the ribs there.
+        rival: what ribs and outlines tell where they fit best, half a rib away and more, as a share of what they tell
+            there; 0 without such a place.
+    """
+
+    correlation: float
+    rival: float
+
+    @property
+    def is_right(self) -> bool:
+        """Whether the ribs are there, and nowhere else rather."""
+        return self.correlation >= LEAST_CORRELATION and self.rival <= 1.0
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CameraPlacement:
     """Where a camera is and how jaws stand before it.
@@ -151,7 +173,7 @@ class CameraPlacement:
         correlation: of the pictures with the pattern of the ribs, 0 to 1.
         residual: root mean square distance of the points seen from where they should be [px].
         seen: side -> pixels of the points in each picture (n, K + 1, 2), NaN where one was not seen.
-        rival: the same where the pattern fits next best, half a rib and more away.
+        rival: what ribs and outlines tell where they fit next best, half a rib and more away, as a share of this.
     """
 
     T_gripper_camera: NDArray
@@ -165,7 +187,7 @@ class CameraPlacement:
     @property
     def is_sure(self) -> bool:
         """Whether the ribs say that the key points are here and nowhere else."""
-        return self.correlation >= LEAST_CORRELATION and self.correlation - self.rival >= APART
+        return self.correlation >= LEAST_CORRELATION and self.rival <= MOST_RIVAL
 
     def pose(self, side: str, number: int) -> NDArray:
         """Return T_camera_jaw (4, 4) in a picture."""
@@ -199,7 +221,7 @@ class OutlineContrast:
         rows, columns = np.nonzero(self._near)
         places = self._grid.places(np.column_stack((columns, rows)))
         self.edges = [(0.0, np.zeros(2), -1.0)]
-        for angle in np.linspace(0.0, 2.0 * np.pi, EDGES, endpoint=False):
+        for angle in np.linspace(0.0, np.pi, EDGES):
             across = np.array([np.cos(angle), np.sin(angle)])
             beyond = np.quantile(places[filled[self._near] > 0] @ across, HELD)
             self.edges += [(share, across, float(edge)) for share, edge in zip(HELD, beyond, strict=True)]
@@ -342,13 +364,43 @@ def find_placement(
         found.append(place.settle())
         progress(STEPS)
     best = max(found, key=lambda each: each.evidence)
+    again = sorted(best.try_places(), key=lambda each: each.evidence, reverse=True)
+    found += [place.settle() for place in again[:COMPARED]]
+    best = max(found, key=lambda each: each.evidence)
     found += best.shift_by_ribs()
     best = max(found, key=lambda each: each.evidence)
-    rivals = [each.correlation for each in found if best.is_elsewhere(each)]
+    rivals = [each.evidence / best.evidence for each in found if best.is_elsewhere(each)]
     for _ in range(ROUNDS):
         best.improve()
         progress(len(images))
     return replace(best.describe(), rival=max(rivals, default=0.0))
+
+
+def compare_placement(
+    images: Sequence[NDArray],
+    camera: CameraIntrinsics,
+    jaws: Mapping[str, Jaw],
+    T_gripper_camera: NDArray,
+    mounts: Mapping[str, JawMount],
+    opening: OpeningRange,
+) -> PlacementComparison:
+    """Return how well the ribs in pictures fit a known place of camera and jaws, and any other.
+
+    Args:
+        images: (h, w, 3) uint8 RGB, of open and unloaded jaws.
+        camera: intrinsics.
+        jaws: by side.
+        T_gripper_camera: (4, 4).
+        mounts: how the jaws are mounted, by side.
+        opening: where the jaws can be.
+    """
+    fit = _Fit(_Scene(images, camera, jaws, None, KnownSizes()), T_gripper_camera, opening.farthest)
+    fit.open_jaws(mounts, opening)
+    tried = sorted(fit.try_places(), key=lambda each: each.evidence, reverse=True)
+    others = [place.settle() for place in tried[:COMPARED]]
+    others += others[0].shift_by_ribs()
+    rivals = [each.evidence / max(fit.evidence, 1e-9) for each in others if fit.is_elsewhere(each)]
+    return PlacementComparison(correlation=fit.correlation, rival=max(rivals, default=0.0))
 
 
 def find_points(
@@ -440,7 +492,7 @@ class _Scene:
         images: Sequence[NDArray],
         camera: CameraIntrinsics,
         jaws: Mapping[str, Jaw],
-        locator: AnyFinger,
+        locator: AnyFinger | None,
         known: KnownSizes,
     ) -> None:
         self.images, self.camera, self.jaws, self.locator, self.known = images, camera, jaws, locator, known
@@ -516,32 +568,95 @@ class _Fit:
         self._climb(lambda x, edge: float(self._contrasts(x, edge)[0]), POLISH)
 
     def polish_pattern(self) -> None:
-        """Move camera and jaws until the ribs show best, beyond that edge of a holder of which they tell most."""
+        """Move camera and jaws until the ribs show best."""
         for _ in range(2):
-            self._climb(lambda x, edge: correlate(self._compare(x, edge)), POLISH)
-            opens = next(iter(self._scene.patterns.values())).opens
-            told = [self._compare(self._x, edge) for edge in range(len(opens))]
-            evidence = [weigh_evidence(each, len(part.places)) for each, part in zip(told, opens, strict=True)]
-            self._edge = int(np.argmax(evidence))
-            self.correlation, self.evidence = correlate(told[self._edge]), max(evidence)
+            self._match_pattern()
+            self._weigh()
 
-    def _climb(self, measure: Callable[[NDArray, int], float], steps: int) -> None:
-        def judge(x: NDArray) -> float:
-            off = self._known_misses(x * self._scale)
-            return PRIOR * float(off @ off) - measure(x * self._scale, self._edge)
+    def _match_pattern(self, first: int = 0) -> None:
+        """Move what begins with the first number until the pattern leaves least, by damped Gauss-Newton steps."""
+        x, damping, left = self._x / self._scale, 1e-2, self._left_over(self._x)
+        for _ in range(NEWTON):
+            slopes = np.zeros((len(left), len(x)))
+            for number in range(first, len(x)):
+                beside = x.copy()
+                beside[number] += STEP
+                slopes[:, number] = (self._left_over(beside * self._scale) - left) / STEP
+            normal = slopes.T @ slopes
+            for _ in range(DAMPED):
+                size = normal + damping * (np.diag(np.diag(normal)) + 1e-6 * np.eye(len(x)))
+                moved = x - np.linalg.solve(size, slopes.T @ left)
+                there = self._left_over(moved * self._scale)
+                if there @ there < left @ left:
+                    break
+                damping *= 10.0
+            else:
+                break
+            gain = left @ left - there @ there
+            x, left, damping = moved, there, 0.1 * damping
+            if gain < SETTLED:
+                break
+        self._x = x * self._scale
 
-        fit = minimize(judge, self._x / self._scale, method="L-BFGS-B", options={"maxfun": steps, "eps": 0.02})
-        self._x = fit.x * self._scale
+    def _left_over(self, x: NDArray) -> NDArray:
+        """Return what the pattern leaves in the pictures, and what is off what is known beforehand."""
+        scene, poses = self._scene, self._poses(x)
+        samples = [
+            scene.patterns[side].sample(color, pose, scene.camera, self._edge)
+            for side in poses
+            for color, pose in zip(scene.images, poses[side], strict=True)
+        ]
+        return np.concatenate((subtract_pattern(samples), np.sqrt(PRIOR) * self._known_misses(x)))
+
+    def _weigh(self) -> None:
+        """Take that edge of a holder beyond which ribs and outline tell most."""
+        opens = next(iter(self._scene.patterns.values())).opens
+        told = [self._compare(self._x, edge) for edge in range(len(opens))]
+        outlines = self._contrasts(self._x)
+        evidence = [
+            weigh_evidence(each, len(part.places), float(outline))
+            for each, part, outline in zip(told, opens, outlines, strict=True)
+        ]
+        self._edge = int(np.argmax(evidence))
+        self.correlation, self.evidence = correlate(told[self._edge]), max(evidence)
+
+    def _climb(self, measure: Callable[[NDArray, int], float], steps: int, first: int = 0) -> None:
+        """Move what begins with the first number until a measure is best."""
+        whole = self._x / self._scale
+
+        def judge(part: NDArray) -> float:
+            x = np.concatenate((whole[:first], part)) * self._scale
+            off = self._known_misses(x)
+            return PRIOR * float(off @ off) - measure(x, self._edge)
+
+        fit = minimize(judge, whole[first:], method="L-BFGS-B", options={"maxfun": steps, "eps": 0.02})
+        self._x = np.concatenate((whole[:first], fit.x)) * self._scale
+
+    def open_jaws(self, mounts: Mapping[str, JawMount], opening: OpeningRange) -> None:
+        """Find where the jaws stand in each picture, camera and turns being known."""
+        scene, first = self._scene, 6 + 3 * len(mounts)
+        self._x[6:first] = np.concatenate([mounts[side].turn for side in scene.jaws])
+        T, turns, origins = self._split(self._x)
+        for side, places in origins.items():
+            poses = opening.place_jaw(T, side, OPENING_STEP, turns[side])
+            for n, color in enumerate(scene.images):
+                shown = [scene.outlines[side].contrasts(color, pose, scene.camera).max() for pose in poses]
+                places[n] = (T @ poses[int(np.argmax(shown))])[0, 3]
+        self._edge = int(np.argmax(self._contrasts(self._x)))
+        self._climb(lambda x, edge: float(self._contrasts(x, edge)[0]), POLISH, first)
+        self._weigh()
+        self._match_pattern(first)
+        self._weigh()
 
     def try_places(self) -> list[_Place]:
         """Return where the pattern shows best, the finger stretched, slanted and shifted along itself on its side."""
         points = next(iter(self._scene.points.values()))[:, ::2]
         tip = np.array([points[:, 0].max(), points[:, 1].max()])
         tried = [
-            self._try(_Place(fit=self, edge=edge, tip=tip, stretch=stretch, slant=slant, along=shift * self._scene.pitch))
+            self._try(_Place(fit=self, edge=edge, tip=tip, stretch=stretch, slant=slant, along=along))
             for stretch in STRETCHES
             for slant in SLANTS
-            for shift in SHIFTS
+            for along in SHIFTS * self._scene.pitch
             for edge in {self._edge, TIPWARDS}
         ]
         tried.sort(key=lambda each: each.evidence, reverse=True)

@@ -29,8 +29,8 @@ from finforce_keypoints.networks.side_network import SideNetwork
 from finforce_keypoints.parameters import NO_DEPTH
 from finforce_keypoints.placement import (
     KEPT,
-    POLISHED,
     PLACES,
+    POLISHED,
     ROUNDS,
     STARTS,
     STEPS,
@@ -98,8 +98,8 @@ def run(options: argparse.Namespace) -> CommandResult:
     print(describe_placement(found, jaws))
     if not found.is_sure and not options.force:
         raise OptionError(
-            f"two places explain the pictures alike (ribs {found.correlation:.2f}, next best {found.rival:.2f}), no rig "
-            f"is written: see {picture}; give sharper or more pictures at several openings, --tags, --stroke or "
+            f"two places explain the pictures alike (ribs {found.correlation:.2f}, the next best tells {found.rival:.0%}), no "
+            f"rig is written: see {picture}; give sharper or more pictures at several openings, --tags, --stroke or "
             "--extrinsics, or --force"
         )
     rig = build_rig(found, recording, options.jaw, options.tag_family)
@@ -144,8 +144,8 @@ def find_tags(colors: list[NDArray], options: argparse.Namespace) -> list[dict[i
         anything = TagFinder(options.tag_family)
         others = sorted({number for color in colors for number in anything.find(color)} - set(options.tags))
         raise OptionError(
-            f"tag {', '.join(map(str, missing))} is in none of the {len(colors)} pictures; seen of {options.tag_family}: "
-            f"{', '.join(map(str, sorted(there) + others)) or 'none'}: give these numbers, another --tag-family, or "
+            f"tag {', '.join(map(str, missing))} is in none of the {len(colors)} pictures; of {options.tag_family} they "
+            f"show {', '.join(map(str, sorted(there) + others)) or 'none'}: give these numbers, another --tag-family, or "
             "sharper pictures"
         )
     return seen
@@ -194,8 +194,8 @@ def describe_placement(found: CameraPlacement, jaws) -> str:
     """Return what was found in words."""
     x, y, z = 1e3 * found.T_gripper_camera[:3, 3]
     lines = [
-        f"camera at {x:.1f}, {y:.1f}, {z:.1f} mm of the gripper; ribs {found.correlation:.2f}, next best place "
-        f"{found.rival:.2f}; {found.residual:.2f} px left over"
+        f"camera at {x:.1f}, {y:.1f}, {z:.1f} mm of the gripper; ribs {found.correlation:.2f}, the next best place tells "
+        f"{found.rival:.0%} of this; {found.residual:.2f} px left over"
     ]
     for side, mount in found.mounts.items():
         seen, count = int(mount.seen_points(jaws[side])[:-1].sum()), len(jaws[side].keypoints)
@@ -238,7 +238,7 @@ def draw_placement(found: CameraPlacement, color: NDArray, recording: Recording,
 def draw_found_jaw(
     found: CameraPlacement, color: NDArray, camera: CameraIntrinsics, side: str, jaw: Jaw
 ) -> NDArray[np.uint8]:
-    """Return a jaw enlarged with its ribs and the names of its key points, and beside it what the side shows of ribs."""
+    """Return a jaw enlarged with its ribs and the names of its key points; beside it are its side and the model's."""
     cv2, T, plane, seen = import_cv2(), found.pose(side, 0), find_side(jaw), found.seen[side][0]
     grid = fit_grid(find_shape(jaw))
     corners = grid.places(np.array([[0, 0], [grid.width, 0], [0, grid.height], [grid.width, grid.height]]))

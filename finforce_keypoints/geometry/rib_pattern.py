@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from finforce.camera import CameraIntrinsics
 from finforce.optional import import_cv2
-from finforce_keypoints.geometry.side_picture import project_side, find_side
+from finforce_keypoints.geometry.side_picture import find_side, project_side
 from finforce_keypoints.geometry.template import draw_template, find_shape, fit_grid
 
 if TYPE_CHECKING:
@@ -27,6 +27,7 @@ EVERY = 2  # [px] of the network's pictures between samples each way: a third of
 # Powers of x and z of the shading that is no pattern: it changes over the whole finger, ribs within a tenth of it.
 ORDERS = [(i, j) for i in range(4) for j in range(9 - 2 * i)]
 NOISE = 2.0  # variance [of 255 squared] that a camera adds to each colour
+USUAL = 3.0  # median deviations from their median, of colours beyond which a picture is taken to show something else
 LEAST_SAMPLES = 100  # of an open part: fewer tell nothing
 
 
@@ -110,66 +111,61 @@ class RibPattern:
             edge: number of the holder's edge.
             move: where places (n, 2) of the side [m] lie instead.
         """
-        part = self.opens[edge]
-        places = np.ascontiguousarray(part.places if move is None else move(part.places), dtype=float)
-        T = np.ascontiguousarray(T_camera_jaw, dtype=float)
-        pixels = project_side(camera.lens, T, self._side.numbers, places)
-        moments, shading, size, count = _sum_moments(color, pixels, part.smooth, part.pattern)
-        share = count / max(len(places), 1)
+        samples = self.sample(color, T_camera_jaw, camera, edge, move)
+        count = np.count_nonzero(samples[:, 3])
+        share = count / max(len(samples), 1)
         if count < LEAST_SAMPLES:
             return Moments(along=np.zeros(3), among=np.eye(3) / 3.0, share=share)
-        if count < len(places):  # of all samples the smooth functions are orthonormal, of a part of them not quite
-            moments = moments - shading.T @ np.linalg.solve(size + 1e-6 * np.eye(len(size)), shading)
-        else:
-            moments = moments - shading.T @ shading
+        moments = samples.T @ samples
         among = moments[:3, :3] + NOISE * count * np.eye(3)
         trace = float(np.trace(among))
         along = moments[:3, 3] / np.sqrt(trace * max(float(moments[3, 3]), 1e-9))
         return Moments(along=along, among=among / trace, share=share)
 
+    def sample(
+        self,
+        color: NDArray,
+        T_camera_jaw: NDArray,
+        camera: CameraIntrinsics,
+        edge: int,
+        move: Callable[[NDArray], NDArray] | None = None,
+    ) -> NDArray:
+        """Return red, green, blue and pattern (n, 4) without what is smooth, 0 where the image does not show it.
+
+        The arguments are those of `compare`.
+        """
+        part = self.opens[edge]
+        places = np.ascontiguousarray(part.places if move is None else move(part.places), dtype=float)
+        T = np.ascontiguousarray(T_camera_jaw, dtype=float)
+        values, inside = _sample(color, project_side(camera.lens, T, self._side.numbers, places), part.pattern)
+        count = np.count_nonzero(inside)
+        if count:  # a holder, a screw or a pocket is not worth more than ribs
+            middle = np.median(values[inside, :3], axis=0)
+            reach = USUAL * np.median(np.abs(values[inside, :3] - middle), axis=0) + 1.0
+            values[:, :3] = np.clip(values[:, :3], middle - reach, middle + reach) * inside[:, None]
+        if count < len(places):  # of all samples the smooth functions are orthonormal, of a part of them not quite
+            smooth = part.smooth * inside[:, None]
+            size = smooth.T @ smooth + 1e-6 * np.eye(smooth.shape[1])
+            return values - smooth @ np.linalg.solve(size, smooth.T @ values)
+        return values - part.smooth @ (part.smooth.T @ values)
+
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _sum_moments(color, pixels, smooth, pattern):
-    """Return sums over the samples that lie in an image: colours and pattern with themselves (4, 4), with the smooth
-    functions (m, 4), these with each other (m, m) where samples are missing, and how many there are.
-
-    Args:
-        color: (h, w, 3) uint8.
-        pixels: of the samples (n, 2).
-        smooth: (n, m).
-        pattern: (n,).
-    """
+def _sample(color, pixels, pattern):
+    """Return colours and pattern (n, 4) of samples at pixels (n, 2) of an image (h, w, 3), and which lie in it (n,)."""
     height, width = color.shape[:2]
-    kinds = smooth.shape[1]
-    moments, shading, size = np.zeros((4, 4)), np.zeros((kinds, 4)), np.zeros((kinds, kinds))
-    inside = np.zeros(len(pixels), np.bool_)
-    values = np.empty(4)
+    values, inside = np.zeros((len(pixels), 4)), np.zeros(len(pixels), np.bool_)
     for i in range(len(pixels)):
         x, y = pixels[i]
-        if not (x >= 0.0 and y >= 0.0 and x < width - 1 and y < height - 1):
-            continue
-        inside[i] = True
-        column, row = int(x), int(y)
-        u, v = x - column, y - row
-        for k in range(3):
-            upper = (1.0 - u) * color[row, column, k] + u * color[row, column + 1, k]
-            lower = (1.0 - u) * color[row + 1, column, k] + u * color[row + 1, column + 1, k]
-            values[k] = (1.0 - v) * upper + v * lower
-        values[3] = pattern[i]
-        for a in range(4):
-            for b in range(4):
-                moments[a, b] += values[a] * values[b]
-        for m in range(kinds):
-            for a in range(4):
-                shading[m, a] += smooth[i, m] * values[a]
-    count = inside.sum()
-    if count < len(pixels):
-        for i in range(len(pixels)):
-            if inside[i]:
-                for m in range(kinds):
-                    for n in range(kinds):
-                        size[m, n] += smooth[i, m] * smooth[i, n]
-    return moments, shading, size, count
+        if x >= 0.0 and y >= 0.0 and x < width - 1 and y < height - 1:
+            inside[i], column, row = True, int(x), int(y)
+            u, v = x - column, y - row
+            for k in range(3):
+                upper = (1.0 - u) * color[row, column, k] + u * color[row, column + 1, k]
+                lower = (1.0 - u) * color[row + 1, column, k] + u * color[row + 1, column + 1, k]
+                values[i, k] = (1.0 - v) * upper + v * lower
+            values[i, 3] = pattern[i]
+    return values, inside
 
 
 def correlate(moments: Sequence[Moments]) -> float:
@@ -183,7 +179,29 @@ def correlate(moments: Sequence[Moments]) -> float:
     return float(np.sqrt(max(along @ np.linalg.solve(among, along), 0.0)))
 
 
-def weigh_evidence(moments: Sequence[Moments], samples: int) -> float:
-    """Return the logarithm of how much likelier a pattern of so many samples makes a picture's colours than chance."""
+def subtract_pattern(samples: Sequence[NDArray]) -> NDArray:
+    """Return what that mixture of colours that goes best with the pattern leaves of it in each picture.
+
+    Args:
+        samples: of pictures (n, 4), see `RibPattern.sample`.
+    """
+    scaled = []
+    for each in samples:
+        size = np.linalg.norm(each[:, :3]) + np.sqrt(NOISE * len(each)), max(float(np.linalg.norm(each[:, 3])), 1e-9)
+        scaled.append(each / np.array([size[0]] * 3 + [size[1]]))
+    values = np.concatenate(scaled) / np.sqrt(len(scaled))
+    colours, pattern = values[:, :3], values[:, 3]
+    return pattern - colours @ np.linalg.solve(colours.T @ colours + 1e-3 * np.eye(3) / 3.0, colours.T @ pattern)
+
+
+def weigh_evidence(moments: Sequence[Moments], samples: int, outline: float = 0.0) -> float:
+    """Return the logarithm of how much likelier a pattern makes a picture's colours than chance.
+
+    Args:
+        moments: of the pictures with the pattern.
+        samples: their number.
+        outline: share of the outline's variance that the colours explain, see `OutlineContrast`.
+    """
     shown = samples * float(np.mean([each.share for each in moments]))
-    return -0.5 * shown * float(np.log1p(-min(correlate(moments), 0.999) ** 2))
+    explained = min(correlate(moments), 0.999) ** 2, float(np.clip(outline, 0.0, 0.999))
+    return -0.5 * shown * float(np.log1p(-explained[0]) + np.log1p(-explained[1]))
