@@ -1,7 +1,6 @@
 """Claims about jaws whose holders hide them, and about a camera whose place nobody has measured."""
 
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -25,9 +24,9 @@ from finforce_keypoints.networks.side_network import Places, Template
 from finforce_keypoints.parameters import DetectorParameters, DetectorSettings, JawMount, find_mounts
 from finforce_keypoints.placement import (
     CameraPlacement,
+    KnownSizes,
     OutlineContrast,
     find_covered,
-    KnownSizes,
     find_placement,
 )
 from finforce_keypoints.rig import Rig, RigCamera, RigJaw, RigTag, read_rig, write_rig
