@@ -377,7 +377,7 @@ def find_placement(
     if not agreed:
         raise failures[0]
     best, placement = max(agreed, key=lambda each: each[0].evidence)
-    rivals = [other.evidence / best.evidence for other, _ in agreed if best.is_elsewhere(other)]
+    rivals = [other.evidence / best.evidence for other in found if best.is_elsewhere(other)]
     return replace(placement, rival=max(rivals, default=0.0))
 
 
