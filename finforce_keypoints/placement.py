@@ -64,8 +64,7 @@ SHIFTS = np.arange(-2.0, 2.01, 0.25)
 ASIDES = (-1.5e-3, 0.0, 1.5e-3)  # [m] across it
 TIPWARDS = 12  # an edge beyond which the tips lie
 PLACES = 5  # that fit the pattern best, of all starts
-COMPARED = 2  # pictures in which starts are compared; all refine what is best in these
-WORSE = 0.03  # by which the pattern may correlate less where the network's points are
+COMPARED = 2  # pictures in which starts are compared, and places that are; all pictures refine the best
 # Least correlation of the pattern, and what may be told elsewhere at most, as a share.
 LEAST_CORRELATION, MOST_RIVAL = 0.4, 0.85
 LEAST_SHOWN = 0.25  # the same of a finger that is there at all
@@ -353,27 +352,33 @@ def find_placement(
     else:
         starts = search_camera(images, camera, jaws, progress)
     tried: list[_Place] = []
+    found: list[_Fit] = []
     for T, opening, edge in starts:
         fit = _Fit(scene, T, opening)
         fit.polish_outline(edge)
         tried += fit.try_places()
+        found.append(fit.follow_network())
         progress(STEPS)
     tried.sort(key=lambda each: each.evidence, reverse=True)
-    found = []
     for place in tried[:PLACES]:
         found.append(place.settle())
         progress(STEPS)
-    best = max(found, key=lambda each: each.evidence)
-    again = sorted(best.try_places(), key=lambda each: each.evidence, reverse=True)
-    found += [place.settle() for place in again[:COMPARED]]
-    best = max(found, key=lambda each: each.evidence)
-    found += best.shift_by_ribs()
-    best = max(found, key=lambda each: each.evidence)
-    rivals = [each.evidence / best.evidence for each in found if best.is_elsewhere(each)]
-    for _ in range(ROUNDS):
-        best.improve()
-        progress(len(images))
-    return replace(best.describe(), rival=max(rivals, default=0.0))
+    found += max(found, key=lambda each: each.evidence).shift_by_ribs()
+    found.sort(key=lambda each: each.evidence, reverse=True)
+    agreed: list[tuple[_Fit, CameraPlacement]] = []
+    failures: list[GeometryError] = []
+    for fit in found:
+        for _ in range(ROUNDS):
+            fit.improve()
+        try:
+            agreed.append((fit, fit.describe()))
+        except GeometryError as error:
+            failures.append(error)
+    if not agreed:
+        raise failures[0]
+    best, placement = max(agreed, key=lambda each: each[0].evidence)
+    rivals = [other.evidence / best.evidence for other in found if best.is_elsewhere(other)]
+    return replace(placement, rival=max(rivals, default=0.0))
 
 
 def compare_placement(
@@ -755,11 +760,28 @@ class _Fit:
 
     def improve(self) -> None:
         """Find the points, and with them camera, turns and origins; where the ribs show less, nothing moves."""
+        moved = self._at(self._x, self._edge)
+        moved._follow_points()
+        moved._weigh()
+        if moved.evidence > self.evidence:
+            self._x, self._edge = moved._x, moved._edge
+            self.correlation, self.evidence = moved.correlation, moved.evidence
+
+    def follow_network(self) -> _Fit:
+        """Return the fit to the points that the network finds from here, and to the pattern from there."""
+        fit = self._at(self._x, self._edge)
+        best = fit
+        for _ in range(ROUNDS):
+            fit = fit._at(fit._x, fit._edge)
+            fit._follow_points()
+            fit._weigh()
+            best = max(best, fit, key=lambda each: each.evidence)
+        return best
+
+    def _follow_points(self) -> None:
+        """Find the points, and with them camera, turns and origins."""
         self._look()
-        x = least_squares(self._misses, self._x, x_scale=self._scale, loss="soft_l1").x
-        correlation = correlate(self._compare(x, self._edge))
-        if correlation > self.correlation - WORSE:
-            self._x, self.correlation = x, correlation
+        self._x = least_squares(self._misses, self._x, x_scale=self._scale, loss="soft_l1").x
 
     def describe(self) -> CameraPlacement:
         """Return what was found, and which points are never seen.

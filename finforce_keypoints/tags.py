@@ -18,7 +18,7 @@ FAMILIES = ("4x4_50", "5x5_50", "6x6_50", "apriltag_16h5", "apriltag_25h9", "apr
 CORNERS = 4
 CORNER_STDDEV = 0.3  # [px] of a corner
 _MARGIN = 1.0  # widths of a tag around the last ones, within which they are looked for first
-_UNSEEN = 30  # images without a tag: of the first of so many the enlarged and the mirrored picture are looked at, too
+_UNSEEN = 30  # images without one of the tags: the first of so many is also looked at enlarged and mirrored
 _LARGER, _LEGIBLE = 4, 60  # times as large small tags are looked for; length of an edge [px] from which this is in vain
 _SCATTER = 2e-3  # [m] by which a corner may move in the frame of a jaw: more of it, and the tag is not on its holder
 # A calibrated camera's pictures of a tag fit it to this [px].
@@ -67,10 +67,11 @@ class TagFinder:
         found = self._detect_near(grey) if len(self._last) == len(self._ids) else {}
         if len(found) < len(self._ids):
             found = self._detect(grey)
-        is_first = not self._last and self._unseen % _UNSEEN == 0
-        if len(found) < len(self._ids) and is_first:
+        is_missing = len(found) < len(self._ids)
+        is_first = is_missing and self._unseen % _UNSEEN == 0
+        if is_first:
             found = self._detect(grey, _LARGER) | found
-        self._last, self._unseen = found, 0 if found else self._unseen + 1
+        self._last, self._unseen = found, self._unseen + 1 if is_missing else 0
         if found:
             self.mirrored = {}
         elif is_first:

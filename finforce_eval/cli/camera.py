@@ -98,9 +98,9 @@ def run(options: argparse.Namespace) -> CommandResult:
     print(describe_placement(found, jaws))
     if not found.is_sure and not options.force:
         raise OptionError(
-            f"two places explain the pictures alike (ribs {found.correlation:.2f}, the next best tells {found.rival:.0%}), no "
-            f"rig is written: see {picture}; give sharper or more pictures at several openings, --tags, --stroke or "
-            "--extrinsics, or --force"
+            "two places explain the pictures alike, no rig is written: "
+            f"ribs {found.correlation:.2f}, the next best place tells {found.rival:.0%} of this; see {picture}; give "
+            "sharper or more pictures at several openings, --tags, --stroke or --extrinsics, or --force"
         )
     rig = build_rig(found, recording, options.jaw, options.tag_family)
     write_rig(rig, output)
@@ -144,9 +144,9 @@ def find_tags(colors: list[NDArray], options: argparse.Namespace) -> list[dict[i
         anything = TagFinder(options.tag_family)
         others = sorted({number for color in colors for number in anything.find(color)} - set(options.tags))
         raise OptionError(
-            f"tag {', '.join(map(str, missing))} is in none of the {len(colors)} pictures; of {options.tag_family} they "
-            f"show {', '.join(map(str, sorted(there) + others)) or 'none'}: give these numbers, another --tag-family, or "
-            "sharper pictures"
+            f"tag {', '.join(map(str, missing))} is in none of the {len(colors)} pictures; of {options.tag_family} "
+            f"they show {', '.join(map(str, sorted(there) + others)) or 'none'}: give these numbers, another "
+            "--tag-family, or sharper pictures"
         )
     return seen
 
@@ -194,8 +194,8 @@ def describe_placement(found: CameraPlacement, jaws) -> str:
     """Return what was found in words."""
     x, y, z = 1e3 * found.T_gripper_camera[:3, 3]
     lines = [
-        f"camera at {x:.1f}, {y:.1f}, {z:.1f} mm of the gripper; ribs {found.correlation:.2f}, the next best place tells "
-        f"{found.rival:.0%} of this; {found.residual:.2f} px left over"
+        f"camera at {x:.1f}, {y:.1f}, {z:.1f} mm of the gripper; ribs {found.correlation:.2f}, the next best place "
+        f"tells {found.rival:.0%} of this; {found.residual:.2f} px left over"
     ]
     for side, mount in found.mounts.items():
         seen, count = int(mount.seen_points(jaws[side])[:-1].sum()), len(jaws[side].keypoints)
