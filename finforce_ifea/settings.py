@@ -25,7 +25,12 @@ class EstimatorSettings:
     ignored_keypoints: str = setting("", "names of unused key points, comma-separated")
     minimum_keypoints: int = setting(3, "minimum number of used key points for a force", "1", 1, 100)
     gate: float = setting(
-        4.5, "residual at which a key point has a quarter of its weight", "sigma", 1.0, 100.0, parameter=False
+        4.5,
+        "residual at which a key point has a quarter of its weight at a given contact",
+        "sigma",
+        1.0,
+        100.0,
+        parameter=False,
     )
     friction: float = setting(0.45, "expected coefficient of friction of an object", "1", 0.0, 2.0)
     friction_stddev: float = setting(0.25, "standard deviation of that coefficient (1 sigma)", "1", 1e-3, 2.0)

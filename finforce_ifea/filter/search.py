@@ -143,8 +143,8 @@ class ContactSearch:
         self.settings = settings
         self.points, self.positions = np.zeros(count, KEYPOINT), np.zeros((count, 3))
         self.state, self.expectation = blank_contact_state(), np.zeros((), EXPECTATION)
-        self._size, self._count = state_size(count), count
-        self._watches = [JumpWatch(jump, self._size) for jump in (NUDGED, OFFSET)]
+        self._count = count
+        self._watches = [JumpWatch(jump, state_size(count)) for jump in (NUDGED, OFFSET)]
         self.weight = WEIGHT
         self.expect_friction(Coefficient(settings.friction, settings.friction_stddev))
 
