@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from finforce.camera import CameraIntrinsics, project
 from finforce.gripper_frames import OpeningRange, jaw_in_camera
 from finforce_keypoints.geometry.side_picture import find_side
-from finforce_keypoints.placement import OutlineContrast, find_points
+from finforce_keypoints.placement import LEAST_FOUND, LEAST_GUESSED, OutlineContrast, find_points
 
 if TYPE_CHECKING:
     from finforce_ifea.jaw.jaw import Jaw
@@ -34,9 +34,6 @@ FLIPS = {
     (-1, 1): "the pictures are mirrored from left to right: give them as the camera of the rig took its own",
     (1, -1): "the pictures are mirrored from top to bottom: give them as the camera of the rig took its own",
 }
-# Contrast of outlines that are there for certain, and least of those that are there at all: a grey finger before a
-# textured ground shows with 0.44.
-LEAST_PLAIN, LEAST_SHOWN = 0.75, 0.3
 SURE = 0.7  # likelihood of points in pictures that show the jaws
 FLIPPED = 0.2  # of likelihood and contrast that turning over wins: networks dream, outlines look like something else
 ZOOMS = 1.1 ** np.arange(-6.0, 7.0)  # tried; outlines are found from half as far away
@@ -163,7 +160,7 @@ class PictureChanges:
     def explain(self, colors: Sequence[NDArray]) -> str:
         """Return what was done to pictures (h, w, 3) of one video, and what to do; "" where it is nothing known."""
         near = [self.find_near(color) for color in colors]
-        is_plain = all(each.likelihood >= SURE and each.contrast >= LEAST_PLAIN for each in near)
+        is_plain = all(each.likelihood >= SURE and each.contrast >= LEAST_FOUND for each in near)
         if is_plain and not describe_changes(near, self._camera.width):
             return ""
         flip, best = (1, 1), -np.inf
@@ -177,7 +174,7 @@ class PictureChanges:
         if len(changes) < max(min(FEWEST, len(colors)), FEWEST_SHARE * len(colors)):
             shown = np.median([self._scan(color, (1.0,))[0] for color in colors])
             hidden = "nothing of such jaws shows where the rig has them: hidden, out of the picture, or another rig?"
-            return hidden if shown < LEAST_SHOWN else ""
+            return hidden if shown < LEAST_GUESSED else ""
         return FLIPS[flip] or describe_changes(changes, self._camera.width)
 
     def _find_points(self, color: NDArray, x: NDArray) -> tuple[NDArray, NDArray]:

@@ -31,8 +31,7 @@ from finforce_keypoints.geometry.jaw_localizer import DEPTH_OFF, describe_depth
 from finforce_keypoints.geometry.side_picture import find_side, project_plane
 from finforce_keypoints.geometry.template import find_shape
 from finforce_keypoints.images import RgbdImage
-from finforce_keypoints.parameters import NO_DEPTH, find_mounts
-from finforce_keypoints.placement import COMPARED, compare_placement
+from finforce_keypoints.parameters import NO_DEPTH
 
 OK, WARNING, FAULT = "ok", "warning", "fault"
 DARK, BRIGHT = 25.0, 235.0  # of 255: mean brightness beyond which a picture shows little
@@ -108,37 +107,6 @@ def check_object(recording: Recording, object_file: str | None, unit: str) -> li
         return [Finding(WARNING, text)]
     said = check.at(int(recording.images.stamps_ns[-1]))
     return [Finding(FAULT, said) if said else Finding(OK, f"{mesh.name} is where the camera sees it")]
-
-
-def check_rig(recording: Recording, source: KeypointSource) -> Finding:
-    """Return whether the ribs in a few images are where a rig has them, by pictures that it was not made from.
-
-    Args:
-        recording: with images of jaws that are open and unloaded.
-        source: the detector's parameters, those of the rig among them.
-    """
-    records = build_records(source.node_parameters(recording))
-    parameters, settings = records.parameters, records.settings
-    images = choose_images(recording, NO_DEPTH)
-    chosen = np.unique(np.linspace(0, len(images) - 1, COMPARED).round().astype(int))
-    colors = [image.color for _, image in images.at(images.stamps_ns[chosen])]
-    jaws = {side: load_jaw(source.jaw_file, side) for side in recording.jaws}
-    found = compare_placement(
-        colors,
-        images.camera,
-        jaws,
-        parameters.camera_pose,
-        find_mounts(parameters, jaws),
-        OpeningRange(nearest=settings.opening_min, farthest=settings.opening_max),
-    )
-    if found.is_right:
-        return Finding(OK, f"the ribs are where the rig has them: correlation {found.correlation:.2f}")
-    return Finding(
-        FAULT,
-        f"the ribs are not where the rig has them: correlation {found.correlation:.2f}, and elsewhere ribs and "
-        f"outlines tell {found.rival:.1f} times as much; make the rig anew with "
-        "finforce camera, or give pictures of open, unloaded jaws",
-    )
 
 
 def judge_picture(color: NDArray) -> list[Finding]:

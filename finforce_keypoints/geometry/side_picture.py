@@ -103,11 +103,11 @@ def find_side(jaw: Jaw) -> SidePlane:
 def project_plane(places: NDArray, side: SidePlane, T_camera_jaw: NDArray, camera: CameraIntrinsics) -> NDArray:
     """Return the image pixels (n, 2) of places x, z (n, 2) [m] on a jaw's side."""
     places = np.ascontiguousarray(places, dtype=float)
-    return project_side(camera.lens, np.ascontiguousarray(T_camera_jaw, dtype=float), side.numbers, places)
+    return _project_side(camera.lens, np.ascontiguousarray(T_camera_jaw, dtype=float), side.numbers, places)
 
 
 @njit(**_OPTIONS)
-def project_side(lens, T, side, places):
+def _project_side(lens, T, side, places):
     """Return the pixels (n, 2) of places x, z (n, 2) [m] on a side (level, slopes) (3,) of a jaw at T (4, 4)."""
     pixels = np.empty(places.shape)
     for i in range(len(places)):
@@ -166,7 +166,7 @@ def _map_side(lens, T, side, grid, width, height):
     for knot in range(rows * columns):
         places[knot, 0] = grid[1] + grid[0] * COARSE * (knot % columns)
         places[knot, 1] = grid[2] + grid[0] * COARSE * (knot // columns)
-    exact = project_side(lens, T, side, places)
+    exact = _project_side(lens, T, side, places)
     knots = np.empty((rows, columns, 2), np.float32)
     for knot in range(rows * columns):
         for k in range(2):

@@ -1,6 +1,7 @@
 """Claims about jaws whose holders hide them, and about a camera whose place nobody has measured."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -24,10 +25,10 @@ from finforce_keypoints.networks.side_network import Places, Template
 from finforce_keypoints.parameters import DetectorParameters, DetectorSettings, JawMount, find_mounts
 from finforce_keypoints.placement import (
     CameraPlacement,
-    KnownSizes,
     OutlineContrast,
     find_covered,
     find_placement,
+    measure_rival,
 )
 from finforce_keypoints.rig import Rig, RigCamera, RigJaw, RigTag, read_rig, write_rig
 from finforce_sim.sensor import build_d405_vga
@@ -247,10 +248,9 @@ def paint(poses, jaws, ground=(180, 170, 160)):
 
     color = np.full((480, 640, 3), ground, np.uint8)
     for side, T in poses.items():
-        rings = [project_plane(ring, find_side(jaws[side]), T, CAMERA) for ring in find_shape(jaws[side]).rings]
-        for ring in rings:
-            import_cv2().fillPoly(color, [np.round(ring).astype(np.int32)], (200, 95, 12))
-        import_cv2().fillPoly(color, [np.round(ring).astype(np.int32) for ring in rings], (240, 120, 20))
+        for ring in find_shape(jaws[side]).rings:
+            line = project_plane(ring, find_side(jaws[side]), T, CAMERA)
+            import_cv2().fillPoly(color, [np.round(line).astype(np.int32)], (240, 120, 20))
     return color
 
 
@@ -315,7 +315,7 @@ def test_the_place_of_a_jaw_in_a_holder_is_stated_apart_from_its_points():
 
 def test_a_picture_without_jaws_is_refused(monkeypatch):
     monkeypatch.setattr(placement, "ROUNDS", 2)
-    monkeypatch.setattr(placement, "POLISH", 150)
+    monkeypatch.setattr(placement, "POLISH", 2)
     jaws = {side: load_jaw("bench", side) for side in ("left", "right")}
 
     class Dreamer:
@@ -332,13 +332,11 @@ def test_a_picture_without_jaws_is_refused(monkeypatch):
             )
 
     poses = {side: jaw_in_camera(ROBOT_CAMERA, side, x) for side, x in (("left", -0.045), ("right", 0.045))}
-    known = KnownSizes(guess=ROBOT_CAMERA, stddev=np.repeat((2e-3, 0.01), 3))
-    found = find_placement([paint(poses, jaws)], CAMERA, jaws, Dreamer(), known)
-    assert found.is_sure and np.linalg.norm(found.T_gripper_camera[:3, 3] - ROBOT_CAMERA[:3, 3]) < 2e-3
-    assert not any(mount.covered for mount in found.mounts.values())
+    found = find_placement([paint(poses, jaws)], CAMERA, jaws, Dreamer(), ROBOT_CAMERA)
+    assert found.contrast > 0.8 and not any(mount.covered for mount in found.mounts.values())
     blank = np.random.default_rng(0).integers(0, 255, (480, 640, 3), dtype=np.uint8)
     with pytest.raises(GeometryError, match="do not show the finger .* finforce jaw PHOTO"):
-        find_placement([blank], CAMERA, jaws, Dreamer(), known)
+        find_placement([blank], CAMERA, jaws, Dreamer(), ROBOT_CAMERA)
 
 
 def test_a_rig_file_says_what_was_written(tmp_path):
@@ -422,13 +420,36 @@ def test_a_zoomed_picture_of_jaws_in_holders_is_named(slip, told):
     assert re.search(told, localizer.warning) if told else not localizer.warning
 
 
+@pytest.mark.parametrize(("contrast", "told"), [(0.88, True), (0.7, False)])
+def test_another_place_that_explains_the_pictures_as_well_is_named(contrast, told):
+    jaws = {"left": load_jaw("bench")}
+
+    def placed(x, contrast):
+        return CameraPlacement(
+            T_gripper_camera=ROBOT_CAMERA,
+            mounts={"left": JawMount()},
+            origins={"left": np.array([x, x])},
+            contrast=contrast,
+            residual=0.5,
+            seen={},
+        )
+
+    best, other = placed(-0.04, 0.9), placed(-0.033, contrast)
+    rival = measure_rival(best, other, jaws, CAMERA)
+    assert rival > 10.0 if told else rival == 0.0
+    assert measure_rival(best, best, jaws, CAMERA) == 0.0
+    assert ("WARNING" in describe_placement(replace(best, rival=rival), jaws)) == told
+    alone = replace(best, origins={"left": np.array([-0.04])})
+    assert "one picture hardly tells" in describe_placement(alone, jaws)
+
+
 @pytest.mark.parametrize(("degrees", "told"), [(6.7, True), (-6.7, True), (3.2, False)])
 def test_a_jaw_that_is_mounted_far_askew_is_named(degrees, told):
     found = CameraPlacement(
         T_gripper_camera=ROBOT_CAMERA,
         mounts={"left": JawMount(turn=np.radians([0.0, 1.0, degrees]))},
         origins={"left": np.array([-0.04, -0.03])},
-        correlation=0.9,
+        contrast=0.9,
         residual=0.5,
         seen={},
     )

@@ -119,7 +119,7 @@ def test_a_tag_is_put_on_the_jaw_that_carries_it():
 def test_finforce_camera_writes_tags_into_the_rig():
     mounts, origins = {side: JawMount() for side in PLACES}, {side: np.array([X[side]] * 2) for side in PLACES}
     placement = CameraPlacement(
-        T_gripper_camera=ROBOT_CAMERA, mounts=mounts, origins=origins, correlation=1.0, residual=0.0, seen={}
+        T_gripper_camera=ROBOT_CAMERA, mounts=mounts, origins=origins, contrast=1.0, residual=0.0, seen={}
     )
     options = Namespace(tags=[0, 1], tag_family=FAMILY, tag_size=SIZE)
     color = picture(*(see(tag_of(side).corners, pose(side)) for side in PLACES))
@@ -189,12 +189,3 @@ def test_tags_on_the_wrong_sides_and_mirrored_images_are_named_and_give_no_key_p
 def test_a_parameter_that_is_no_tag_is_refused(numbers):
     with pytest.raises(DetectorSettingsError, match="left_tag: got .* expected a tag's number"):
         find_mounts(DetectorParameters(left_tag=numbers), {"left": load_jaw("bench")})
-
-
-def test_small_tags_are_found_in_the_enlarged_picture_and_missing_ones_are_named():
-    corners = [see(tag_of(side).corners, pose(side)) for side in PLACES]
-    small = cv2.resize(picture(*corners), None, fx=0.27, fy=0.27, interpolation=cv2.INTER_AREA)
-    edge = 0.27 * np.linalg.norm(corners[0][1] - corners[0][0])
-    assert edge < 20.0 and sorted(TagFinder(FAMILY, (0, 1)).find(small)) == [0, 1]
-    with pytest.raises(OptionError, match="tag 5 is in none of the 1 pictures; .*show 0, 1"):
-        find_tags([small], Namespace(tags=[0, 5], tag_family=FAMILY))
