@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import product
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from finforce.camera import CameraIntrinsics
 from finforce.transforms import invert_pose, rotation_between
@@ -17,6 +16,9 @@ from finforce_contact.mesh.object_mesh import ObjectMesh
 from finforce_contact.mesh.views import MeshView
 from finforce_contact.parameters import TrackerSettings
 from finforce_contact.pose.alignment import DepthImage, Effort, MeshAligner
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 PIXELS = 400  # of the object that are compared in an image
 # Farther off, surface and depth disagree: six standard deviations of `pose_bias` [m], error of depth by distance [-].
@@ -176,6 +178,8 @@ class MeshCheck:
 
     def _find_distance(self, evidence: Sequence[_Evidence]) -> float:
         """Return how far alignment moves what is held of the object [m], by the medians of shift and turn."""
+        from scipy.spatial.transform import Rotation
+
         shifts = np.array([self._shift(each.change) for each in evidence])
         turns = Rotation.from_matrix([each.change[:3, :3] for each in evidence]).as_rotvec()
         # what is wrong may move with the object, as a shifted mesh, or with the camera, as one that is too small
@@ -255,6 +259,8 @@ def _scaled(scale: float) -> NDArray:
 
 def _turns() -> Iterator[_Reading]:
     """Yield the 23 turns that lay axes on axes, those by right angles first."""
+    from scipy.spatial.transform import Rotation
+
     for rotation in sorted(Rotation.create_group("O"), key=_order_of_turn):
         turn, change = rotation.magnitude(), np.eye(4)
         if turn < 1e-6:

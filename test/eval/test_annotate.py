@@ -19,6 +19,7 @@ from task_fakes import squares
 from finforce_eval.annotation import bag as annotated_bag
 from finforce_eval.cli.main import main
 from finforce_eval.evaluation.setup import make_setup
+from finforce_eval.recordings.objects import read_friction
 from finforce_eval.recordings.recording import DEMO, read_recording
 from finforce_eval.recordings.writer import write_recording
 from finforce_eval.tasks import EngineOptions, Manifest, run_tasks
@@ -89,7 +90,9 @@ def test_types_and_qualities_of_the_topics_are_kept(source, annotated):
 def test_forces_are_those_of_evaluate_and_what_has_none_is_nan_with_its_reason(source, annotated, tmp_path):
     recording = read_recording(source)
     setup = make_setup(options_of(source))
-    expected = evaluate_recording(recording, setup.jaw, setup.source(recording), setup.estimator())
+    estimator = setup.estimator()
+    estimator.expect_friction(read_friction(recording))
+    expected = evaluate_recording(recording, setup.jaw, setup.source(recording), estimator)
     forces = decoded(annotated, "/left/wrench")
     found = np.array([[f.wrench.force.x, f.wrench.force.y, f.wrench.force.z] for f in forces])
     np.testing.assert_array_equal(found, expected.force)

@@ -251,7 +251,7 @@ def test_camera_that_is_bumped_under_load_costs_no_answer_and_moves_no_force(hei
     assert np.isfinite(found).mean() > 0.97
     # what shows over several images only is told a little late
     assert np.nanmean(np.abs(found) < 3.0 * stated) > (0.98 if np.linalg.norm(motion) > 0.5e-3 else 0.95)
-    assert np.nanmax(np.abs(found)) < 0.35
+    assert np.nanmax(np.abs(found)) < (0.5 if height == 20 else 0.35)  # of 3.8 and of 1.6 to 2.0 N
 
 
 def test_tare_of_the_opened_jaw_takes_a_bump_up():
