@@ -258,7 +258,8 @@ class LateralLoad:
         seen = np.flatnonzero(np.isfinite(motions) & (points["weight"] > 0.0))
         noise = points["width_variance"] / (points["trust"] * np.maximum(points["weight"], 1e-9))
         noise += (_TURN_ERROR * turns * self.load[0] * normal) ** 2
-        measured = normal * np.stack([moment, across], axis=1)[seen], (motions - across * rolled)[seen], noise[seen]
+        rows = np.ascontiguousarray(normal * np.stack([moment, across], axis=1)[seen])
+        measured = rows, (motions - across * rolled)[seen], noise[seen]
         offsets, moved = points["offset_variance"] + _FLOOR**2, abs(float(state["depth"]) - self._depth)
         self._depth = float(state["depth"])
         self._follow(seen, measured, offsets, moved, dt, weight)
@@ -308,17 +309,30 @@ class LateralLoad:
             self._known, self.is_lifted = self._candidate, True
 
 
-def _step(
-    x: NDArray, P: NDArray, a: NDArray, mean: NDArray, V: NDArray, seen: NDArray, H: NDArray, z: NDArray, R: NDArray
-) -> tuple[_Estimate, float]:
+@njit(**_OPTIONS)
+def _step(x, P, a, mean, V, seen, H, z, R):
     """Return the estimate after an image, and the logarithm of its likelihood; see `LateralLoad`."""
-    x, P = mean + a * (x - mean), P * np.outer(a, a) + np.diag((1.0 - a**2) * V)
-    rows = np.zeros((len(seen), len(x)))
-    rows[:, :2], rows[np.arange(len(seen)), 2 + seen] = H, 1.0
-    HP, nu = rows @ P, z - rows @ x
-    L = np.linalg.cholesky(HP @ rows.T + np.diag(R))
+    n, m = len(x), len(seen)
+    x, P = mean + a * (x - mean), P.copy()
+    for i in range(n):
+        for j in range(n):
+            P[i, j] *= a[i] * a[j]
+        P[i, i] += (1.0 - a[i] ** 2) * V[i]
+    HP, nu, S = np.empty((m, n)), np.empty((m, 1)), np.empty((m, m))
+    for i in range(m):
+        k = 2 + seen[i]
+        nu[i, 0] = z[i] - H[i, 0] * x[0] - H[i, 1] * x[1] - x[k]
+        for j in range(n):
+            HP[i, j] = H[i, 0] * P[0, j] + H[i, 1] * P[1, j] + P[k, j]
+    for i in range(m):
+        for j in range(m):
+            S[i, j] = HP[i, 0] * H[j, 0] + HP[i, 1] * H[j, 1] + HP[i, 2 + seen[j]]
+        S[i, i] += R[i]
+    L = np.linalg.cholesky(S)
     A, white = np.linalg.solve(L, HP), np.linalg.solve(L, nu)
-    return _Estimate(x + A.T @ white, P - A.T @ A), float(-0.5 * white @ white - np.log(np.diag(L)).sum())
+    A_T = np.ascontiguousarray(A.T)
+    likely = -0.5 * (white**2).sum() - np.log(np.diag(L)).sum()
+    return _Estimate(x + np.dot(A_T, white)[:, 0], P - np.dot(A_T, A)), likely
 
 
 @njit(**_OPTIONS)
