@@ -165,7 +165,7 @@ def node_process(name: str, asked: Mapping[str, Any], options: SolverOptions) ->
 
 def solver_process(side: str, options: SolverOptions, **parameters: Any) -> Process:
     """Return the solver of one jaw; `parameters` are added to those that the options name."""
-    height, *friction = (
+    height, friction, friction_stddev = (
         None if math.isnan(number) else number
         for number in (options.contact_height, options.friction, options.friction_stddev)
     )
@@ -176,8 +176,8 @@ def solver_process(side: str, options: SolverOptions, **parameters: Any) -> Proc
         # NaN overrules a height in the parameter file
         "contact_height": math.nan if options.object_mesh else height,
         "estimator.solver": options.solver,
-        "estimator.friction": friction[0],
-        "estimator.friction_stddev": friction[1],
+        "estimator.friction": friction,
+        "estimator.friction_stddev": friction_stddev,
         **parameters,
     }
     return replace(node_process("ifea_solver", asked, options), name=f"{side}_ifea_solver")

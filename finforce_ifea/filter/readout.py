@@ -38,7 +38,7 @@ def read_out(state, force, modes, x, log_weights, P, shift, reduction, at, ratio
         spread: variance of the traction ratio within the hypotheses.
     """
     state, w, count = state[()], np.exp(log_weights), len(x)
-    forces, found, kappa = np.zeros((count, 3)), np.zeros(3), 0.0
+    forces, found = np.zeros((count, 3)), np.zeros(3)
     for i in range(count):
         offset = (x[i, 0] + shift - at[0], x[i, 1] - at[1], x[i, 2] - at[2], ratios[i] + x[i, TRACTION] - ratio)
         for a in range(3):
@@ -46,7 +46,6 @@ def read_out(state, force, modes, x, log_weights, P, shift, reduction, at, ratio
             for c in range(4):
                 forces[i, a] += modes[a, c] * offset[c]
             found[a] += w[i] * forces[i, a]
-        kappa += w[i] * (ratios[i] + x[i, TRACTION])
     covariance = np.dot(modes, np.dot(P[:4, :4] + reduction, np.ascontiguousarray(modes.T)))
     for a in range(3):
         for b in range(3):
@@ -55,7 +54,7 @@ def read_out(state, force, modes, x, log_weights, P, shift, reduction, at, ratio
                 covariance[a, b] += w[i] * (forces[i, a] - found[a]) * (forces[i, b] - found[b])
     continued, size, along = min(1.0, max(0.0, state.depth / LEAST_DEPTH)), 0.0, 0.0
     for a in range(3):
-        state.force[a], state.pressing[a] = continued * found[a], force[a]
+        state.force[a] = continued * found[a]
         size += state.force[a] ** 2
         for b in range(3):
             state.covariance[a, b] = covariance[a, b]
@@ -64,7 +63,6 @@ def read_out(state, force, modes, x, log_weights, P, shift, reduction, at, ratio
     state.magnitude = np.sqrt(size)
     state.stddev = np.sqrt(max(along / size if size > 0.0 else covariance[0, 0], 0.0))
     state.depth_variance, state.height_stddev = P[DEPTH, DEPTH], np.sqrt(P[HEIGHT, HEIGHT])
-    state.traction_ratio = kappa
     state.sound = state.sound and np.isfinite(covariance.sum() + found.sum())
     state.quiet, state.loaded = state.depth < TOUCH_DEPTH, state.depth > LOADED_DEPTH
 

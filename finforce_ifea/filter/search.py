@@ -17,16 +17,7 @@ from finforce_ifea.contact_mechanics.friction import Coefficient, constant_tract
 from finforce_ifea.contact_mechanics.pressed_jaw import PressedState, RigidContact, limit_step
 from finforce_ifea.filter.filter import Posterior, reduce_covariance, update
 from finforce_ifea.filter.friction_path import TractionHypotheses
-from finforce_ifea.filter.jump import (
-    BUMPED,
-    LIFTED,
-    MISPLACED,
-    NO_JUMP,
-    NUDGED,
-    OFFSET,
-    JumpWatch,
-    detect_jump,
-)
+from finforce_ifea.filter.jump import BUMPED, LIFTED, MISPLACED, NO_JUMP, NUDGED, OFFSET, JumpWatch, detect_jump
 from finforce_ifea.filter.measurement import Measurement, find_seen, observe
 from finforce_ifea.filter.process import (
     BUMPED_SHIFT,
@@ -50,7 +41,6 @@ from finforce_ifea.filter.readout import AGREES, LARGEST_RATIO, find_upright_rat
 from finforce_ifea.filter.state import CONTACT, DEPTH, HEIGHT, SHAPE, SHARED, TRACTION, state_size
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tracking.contact_state import KEYPOINT, LEAST_DEPTH, LOADED_DEPTH, blank_contact_state
-from finforce_ifea.tracking.lateral_load import WEIGHT
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
 # What is expected of an object, and what the search for its contact is allowed.
@@ -135,7 +125,6 @@ class ContactSearch:
         P: covariance (n, n).
         log_weights: of the hypotheses (N,).
         track: of the depth.
-        weight: 1 sigma of the traction ratio by a weight that the jaws may lift [-].
     """
 
     def __init__(self, count: int, settings: EstimatorSettings) -> None:
@@ -145,7 +134,6 @@ class ContactSearch:
         self.state, self.expectation = blank_contact_state(), np.zeros((), EXPECTATION)
         self._count = count
         self._watches = [JumpWatch(jump, state_size(count)) for jump in (NUDGED, OFFSET)]
-        self.weight = WEIGHT
         self.expect_friction(Coefficient(settings.friction, settings.friction_stddev))
 
     def begin(self, contact: RigidContact, mean: NDArray) -> None:

@@ -19,14 +19,9 @@ from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE
 from finforce_ifea.observation import Contact, Observation
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tare import PointNoise, Tare
-from finforce_ifea.tracking.contact_state import (
-    MIDDLE_STDDEV,
-    TOUCH_DEPTH,
-    UNSEEN_TRACTION,
-    ContactState,
-)
+from finforce_ifea.tracking.contact_state import MIDDLE_STDDEV, TOUCH_DEPTH, UNSEEN_TRACTION, ContactState
 from finforce_ifea.tracking.influence import explain_offsets, measure_influence, press_lightly
-from finforce_ifea.tracking.lateral_load import LateralLoad, Torsion, share_weight
+from finforce_ifea.tracking.lateral_load import LateralLoad, Torsion, expect_weight
 
 # Images without touch after which the next object may be any.
 _IMAGES_RELEASED = 15
@@ -219,7 +214,6 @@ class ContactTracker:
             self._tare = tare
             search.restart()
         search.expectation["shared"] = observation.shared
-        search.weight, across = share_weight(observation.gravity)
         planar = measured - self._lateral.motions if self._is_known else measured
         self._fill(planar, tare, tare.point_noise(observation.stddev))
         most = _FULL_ITERATIONS if self._fidelity else self.settings.iterations
@@ -235,8 +229,8 @@ class ContactTracker:
         self._complete(state)
         if self._is_known:
             bend = search.positions[:, 0] - self._rest[:, 0]
-            motions, weight = (measured - search.positions)[:, 1], across if self.settings.may_be_held else None
-            self._lateral.update(motions, bend, search.points, state, dt, weight)
+            weight = expect_weight(observation.gravity) if self.settings.may_be_held else None
+            self._lateral.update((measured - search.positions)[:, 1], bend, search.points, state, dt, weight)
         self._change_fidelity(state)
         self._has_moved = True
         return state

@@ -22,10 +22,8 @@ CONTACT_STATE = np.dtype(
         ("covariance", *_M),  # of what was estimated, the misfit included
         ("force", *_V),  # elastic force on the jaw [N]
         ("force_modes", *_M),  # its derivative by what was estimated
-        ("pressing", *_V),  # force before the last step [N]
         ("pressure_point", *_V),  # pressure centre on the deformed surface [m]
         ("pressure_location", *_V),  # the same on the undeformed surface [m]
-        ("traction_ratio", float),  # of tangential to normal force, with which the state was found
         ("magnitude", float),  # of the force [N]
         ("stddev", float),  # of the force along itself [N]
         ("hidden", float),  # standard deviation of a force elsewhere, which key points hardly show [N]

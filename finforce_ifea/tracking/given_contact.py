@@ -290,7 +290,7 @@ class _LocationWatch:
         travel = self._radius * self._response.turn_at(self._height) * depth
         given = self._prior_variance + self._spread + travel**2 + self._shift_pressure(depth) ** 2
         spread = 1.0 / max(self._information, 1e-9) + self._surest**2
-        mistaken, beyond = _question_location(self._offset, spread, given, 0.0)
+        mistaken, beyond = _question_location(self._offset, spread, given)
         share = given / (given + spread)
         stddev = float(np.sqrt((share * self._offset) ** 2 + share * spread + beyond))
         state["offset"], state["mistaken"] = self._offset, mistaken
@@ -325,7 +325,7 @@ _MISTAKEN = 0.01
 _ANYWHERE = 0.03
 
 
-def _question_location(offset: float, spread: float, prior_variance: float, found: float) -> tuple[float, float]:
+def _question_location(offset: float, spread: float, prior_variance: float) -> tuple[float, float]:
     """Return the probability that a stated contact location is wrong, and what that adds to its variance [m^2].
 
     The key points alone have the contact D = offset from there, with the variance s^2 = spread. It is another one,
@@ -333,17 +333,16 @@ def _question_location(offset: float, spread: float, prior_variance: float, foun
 
         p / (1 - p) = p0 N(D; 0, v + s^2 + R^2) / N(D; 0, v + s^2) / (1 - p0).
 
-    What exceeds p0 of it adds the distance of that contact from the location that was found.
+    What exceeds p0 of it adds the distance of that contact from the stated location.
 
     Args:
         offset: D [m].
         spread: s^2 [m^2].
         prior_variance: v, of the stated location [m^2].
-        found: distance of the location that was found from the stated one [m].
     """
     near, far = prior_variance + spread, prior_variance + spread + _ANYWHERE**2
     odds = 0.5 * offset**2 * (1.0 / near - 1.0 / far) + 0.5 * np.log(near / far) + np.log(_MISTAKEN / (1.0 - _MISTAKEN))
     mistaken = 1.0 / (1.0 + np.exp(-min(max(odds, -50.0), 50.0)))
     shrunk = _ANYWHERE**2 / (_ANYWHERE**2 + spread)
-    variance = max(0.0, mistaken - _MISTAKEN) * ((shrunk * offset - found) ** 2 + shrunk * spread)
+    variance = max(0.0, mistaken - _MISTAKEN) * ((shrunk * offset) ** 2 + shrunk * spread)
     return mistaken, variance

@@ -157,7 +157,7 @@ _LOCATION_TIME = 10.0
 _TRACTION = 0.1
 _TRACTION_TIME = 60.0
 # The same of a weight that the jaws have lifted and turn.
-WEIGHT = 0.3
+_WEIGHT = 0.3
 _WEIGHT_TIME = 1.0
 # The smallest part of such a weight that is expected where gravity has none [-].
 _ASIDE = 0.1
@@ -181,12 +181,9 @@ _TURN_ERROR = 0.5
 _LEAST_ARM, _LEAST_RISE = 1e-3, 2e-3
 
 
-def share_weight(gravity: NDArray | None) -> tuple[float, float]:
-    """Return 1 sigma of the traction ratios along and across a finger by a weight [-]; its direction (3,) if known."""
-    if gravity is None:
-        return WEIGHT, WEIGHT
-    along, across = np.maximum(np.abs(gravity[[2, 1]]) / np.linalg.norm(gravity), _ASIDE)
-    return WEIGHT * float(along), WEIGHT * float(across)
+def expect_weight(gravity: NDArray | None) -> float:
+    """Return 1 sigma of the traction ratio across a finger by a weight [-], whose direction (3,) may be known."""
+    return _WEIGHT if gravity is None else _WEIGHT * max(abs(gravity[1]) / float(np.linalg.norm(gravity)), _ASIDE)
 
 
 class _Estimate(NamedTuple):
@@ -206,7 +203,6 @@ class LateralLoad:
         motions: of the key points by what acts laterally (K, 3) [m]; zero where nothing does.
         load: location along y [m], its standard deviation [m], lateral force [N], and the standard deviation of that
             as a share of all force (4,).
-        is_lifted: whether the jaws have lifted a weight.
     """
 
     def __init__(self, torsion: Torsion | None, count: int, traction: float) -> None:
@@ -221,7 +217,7 @@ class LateralLoad:
     def reset(self) -> None:
         """Forget what was seen; where the object is expected stays."""
         self._known: _Estimate | None = None
-        self._depth, self.is_lifted = 0.0, False
+        self._depth, self._is_lifted = 0.0, False
         self.motions = np.zeros((self._count, 3))
         self.load = np.array([*self._expected, 0.0, self._traction])
 
@@ -266,7 +262,7 @@ class LateralLoad:
         x, P, half = *self._known, torsion.half_width
         location, stddev = min(max(x[0], -half), half), float(np.hypot(np.sqrt(P[1, 1]), _NONLINEAR))
         # unless a weight was lifted, chance and what the linear jaw errs by are no force
-        clear = np.inf if self.is_lifted else (x[1] / (_CLEAR * stddev)) ** 4
+        clear = np.inf if self._is_lifted else (x[1] / (_CLEAR * stddev)) ** 4
         total = rolled + x[1] * normal / (1.0 + 1.0 / max(clear, 1e-300))
         self.load[:] = location, np.sqrt(P[0, 0]), total, stddev
         self.motions = by_moment * (-location * force[0]) + by_force * total
@@ -294,7 +290,7 @@ class LateralLoad:
         held, rate = V.copy(), a.copy()
         if weight is not None:
             held[1], rate[1] = weight**2 + _TRACTION**2, np.exp(-dt / _WEIGHT_TIME)
-        if self.is_lifted:
+        if self._is_lifted:
             self._known = _step(*self._known, rate, mean, held, seen, *measured)[0]
             return
         before = self._known
@@ -306,7 +302,7 @@ class LateralLoad:
         if self._odds < _UNLIKELY:
             self._candidate, self._odds = self._known, 0.0
         elif self._odds + _LIFTED > 0.0:
-            self._known, self.is_lifted = self._candidate, True
+            self._known, self._is_lifted = self._candidate, True
 
 
 @njit(**_OPTIONS)

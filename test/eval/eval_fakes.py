@@ -1,5 +1,6 @@
 """Recordings, estimators that answer by rule, and pictures for tests of evaluation."""
 
+import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -295,3 +296,13 @@ def evaluate_recording(recording, jaw, source, estimator, side="left"):
     result = find_forces(recording, jaw, source, estimator, side)
     check_solved(result, recording)
     return result
+
+
+def change_info(**changes):
+    """What changes entries of the `meta/info.json` in a dataset's folder."""
+
+    def change(folder):
+        info = json.loads((folder / "meta/info.json").read_text())
+        (folder / "meta/info.json").write_text(json.dumps(info | changes))
+
+    return change

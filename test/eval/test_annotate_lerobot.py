@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip("av")
 parquet = pytest.importorskip("pyarrow.parquet")
 
-from eval_fakes import QUICK_GRASP  # noqa: E402
+from eval_fakes import QUICK_GRASP, change_info  # noqa: E402
 from lerobot_fakes import CAMERA, FPS, write_dataset  # noqa: E402
 
 from finforce_eval.cli.main import main  # noqa: E402
@@ -340,14 +340,6 @@ def lengthen(folder):
     path.write_text(path.read_text().replace('"length": 3', '"length": 4'))
     info = json.loads((folder / "meta/info.json").read_text())
     (folder / "meta/info.json").write_text(json.dumps(info | {"total_frames": info["total_frames"] + 1}))
-
-
-def change_info(**changes):
-    def change(folder):
-        info = json.loads((folder / "meta/info.json").read_text())
-        (folder / "meta/info.json").write_text(json.dumps(info | changes))
-
-    return change
 
 
 def cut_video(folder):

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from eval_fakes import FakeEstimator, FakeJaw, evaluate_recording, make_recording
+from eval_fakes import FakeEstimator, FakeJaw, change_info, evaluate_recording, make_recording
 from rgbd_fakes import CAMERA, FakeDetector, FakeGripper, make_footage
 
 from finforce.camera_topics import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
@@ -226,14 +226,6 @@ def test_a_dataset_in_which_no_jaw_is_seen_is_not_annotated(dataset, capsys):
     assert "0 of 2 annotated" in told.out and "no force in any of its 2 episodes" in told.err
     assert "a force in 0 of 8 images" in told.err
     assert "no key points in" in told.err and not (dataset.parent / "out" / "noise").exists()
-
-
-def change_info(**changes):
-    def change(folder):
-        info = json.loads((folder / "meta/info.json").read_text())
-        (folder / "meta/info.json").write_text(json.dumps(info | changes))
-
-    return change
 
 
 def lengthen_video(folder):

@@ -17,10 +17,11 @@ from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE
 from finforce_ifea.observation import Contact, ObjectOutline, Observation, Solution
 from finforce_ifea.settings import EstimatorSettings
 from lab.presses import RigidOutline, press_jaw
+from lab.stress.session import FRICTIONLESS
 
 PERIOD = 1 / 30
 # The objects of the truth have no friction.
-SMOOTH = {"friction": 0.0, "friction_stddev": 0.03}
+SMOOTH = FRICTIONLESS
 TRUTH = np.load(Path(__file__).parents[2] / "lab" / "data" / "pressed_bench.npz")
 PLACES = {20: "lower", 40: "middle", 60: "upper"}
 # The modulus of the truth; the mechanics is 2 % off on the average, see test_truth.py.
