@@ -32,13 +32,11 @@ from finforce_ifea.filter.process import (
     TRACTION_FLOOR,
     TRACTION_SHARE,
     Expectation,
-    expect_state,
-    find_decay,
-    find_growth,
-    predict,
+    advance,
+    start,
 )
 from finforce_ifea.filter.readout import AGREES, LARGEST_RATIO, find_upright_ratio, judge_points, read_out
-from finforce_ifea.filter.state import CONTACT, DEPTH, HEIGHT, SHAPE, SHARED, TRACTION, state_size
+from finforce_ifea.filter.state import CONTACT, DEPTH, HEIGHT, SHAPE, TRACTION, state_size
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tracking.contact_state import KEYPOINT, LEAST_DEPTH, LOADED_DEPTH, blank_contact_state
 
@@ -250,21 +248,17 @@ class ContactSearch:
 
     def _predict(self, dt: float) -> None:
         """Predict the state of an image dt [s] after the last one."""
-        expected, motion = self._expect(), self.hypotheses.take_motion()
-        bent = _find_displacements(self.points, self.positions, self.x is not None)
-        m, V = expect_state(expected, self.points["offset_variance"], bent)
+        expected, positions, passed = self._expect(), self.positions, (dt, self.hypotheses.take_motion())
         if self.x is None:
-            m[CONTACT] = self.state["x"]
-            self.x, self.P, self._V = np.tile(m, (len(self.log_weights), 1)), np.diag(V), V
+            m, self._V = start(expected, self.points, self.state["x"])
+            self.x, self.P = np.tile(m, (len(self.log_weights), 1)), np.diag(self._V)
             self.track = Track(_DEPTH_NOISE, float(m[DEPTH]), _FIRST_DEPTH**2)
-        growth, self._V = find_growth(self._V, V, self._count), V
-        sight = self.points["sight"] / V[SHARED : SHARED + 2 * self._count : 2]
-        a = find_decay(sight, dt, motion, expected.camera_time)
+            positions, passed = np.ascontiguousarray(self.points["rest"]), (0.0, 0.0)
         self.track.predict(dt, _FREE_TIME if self.state["depth"] < LOADED_DEPTH else None)
         self.x[:, DEPTH] += self.track.x - self.weights @ self.x[:, DEPTH]
-        predict(self.x, self.P, a, m, V, growth)
+        transition = advance(self.x, self.P, self._V, expected, self.points, positions, passed)
         for watch in self._watches:
-            watch.predict(a * growth)
+            watch.predict(transition)
 
     def find(self, contact: RigidContact, probe: Any, dt: float, *, iterations: int) -> bool:
         """Find the contact in the image of `points`; False, all as it was, where too few key points agree.
@@ -416,16 +410,6 @@ def find_x_model(contact: RigidContact, x: NDArray) -> tuple[NDArray, float]:
 
 
 @njit(**_OPTIONS)
-def _find_displacements(points, positions, is_known):
-    """Return by how much the key points are displaced in the plane (K,) [m], zero before anything is known."""
-    out = np.zeros(len(points))
-    for k in range(len(points)):
-        if is_known:
-            out[k] = np.hypot(positions[k, 0] - points[k].rest[0], positions[k, 2] - points[k].rest[2])
-    return out
-
-
-@njit(**_OPTIONS)
 def _bound_step(aim, last, share, expectation):
     """Return a step (3,) within a share of where the linearisation holds, and the share of the next one.
 
@@ -458,7 +442,11 @@ def _is_settled(moved, missing, share, expectation):
     return True
 
 
-def _is_believed(posterior: Posterior, V: NDArray) -> bool:
+@njit(**_OPTIONS)
+def _is_believed(posterior, V):
     """Whether most key points agree, and the camera has moved no farther than a bump, or V (n,), allows."""
-    moved = np.abs(posterior.mean[BUMPED.entries]) / np.maximum(BUMPED.stddev, np.sqrt(V[BUMPED.entries]))
-    return bool((posterior.weight > AGREES).mean() > _MAJORITY and (moved < _LARGEST_BUMP).all())
+    for i in range(len(BUMPED.entries)):
+        entry = BUMPED.entries[i]
+        if not abs(posterior.mean[entry]) < _LARGEST_BUMP * max(BUMPED.stddev[i], np.sqrt(V[entry])):
+            return False
+    return (posterior.weight > AGREES).mean() > _MAJORITY
