@@ -304,7 +304,8 @@ class ContactTracker:
         self._expect(expected.mean, expected.variance)
         self._lead(contact.outline.stddev[[2, 1]])
         self._outline = after = expected.indenter
-        self._press(after)
+        if after is not before:
+            self._press(after)
         pressed_by_pose = self._contact.face_x + after.pressed.front - contact.outline.origin[0]
         self._is_apart = bool(pressed_by_pose < -APART_SIGMAS * contact.outline.stddev[0])
         height = float(expected.mean[1])
