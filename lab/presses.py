@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
+from finforce_ifea.contact_mechanics.friction import FRICTIONLESS, Traction, measure_shear
 from finforce_ifea.contact_mechanics.indenter import (
     SMOOTH_DEPTH,
     OutlineIndenter,
@@ -16,7 +17,7 @@ from finforce_ifea.contact_mechanics.indenter import (
     RoundIndenter,
     flat_profile,
 )
-from finforce_ifea.contact_mechanics.pressed_jaw import ContactSurface, limit_step
+from finforce_ifea.contact_mechanics.pressed_jaw import ContactSurface, PressedState, RigidContact, limit_step
 from finforce_ifea.errors import ContactError
 from finforce_ifea.fem.model import JawModel
 
@@ -29,6 +30,10 @@ _SHORTEST_STEP = 1e-6
 # A falling force that loses more than this share of the step's work, or any that gains as much, is a snap to another
 # shape; smooth limit points keep the balance within 3 %.
 _SNAP = 0.1
+# Newton steps that are taken in full.
+_FULL_STEPS = 12
+# Last Newton step of a jaw with friction, as a share of the model's reach.
+_SETTLED = 1e-4
 _Press = Callable[[NDArray, float], PenaltyContact]
 
 
@@ -187,6 +192,42 @@ def _find_equilibrium(
         if np.abs(step).max() < tolerance:
             return _describe(model, surface, press, q, depth, state.energy) if factor.positive else None
     return None
+
+
+def rub_jaw(contact: RigidContact, states: Sequence[NDArray], coefficient: float) -> list[tuple[NDArray, PressedState]]:
+    """Return the unknowns (size,) and the equilibrium of a jaw along the path of an object with Coulomb friction.
+
+    Args:
+        contact: of the jaw with the object.
+        states: of the contact (3,), depth [m], shape and height [m]; their steps should not exceed 0.1 mm.
+        coefficient: of friction [-].
+
+    Raises:
+        ContactError: No equilibrium is found; the message says at which depth.
+    """
+    q, shear, before = contact.begin(float(states[0][2])), np.zeros(len(contact.surface.points)), contact.surface.points
+    last, results = np.asarray(states[0], float), []
+    for x in states:
+        # towards the jaw is along -x, and the height along z
+        traction = Traction(0.0, coefficient, shear, before, np.array([last[0] - x[0], x[2] - last[2]]))
+        for iteration in range(_ITERATIONS):
+            pressed = contact.linearize(q, x, traction)
+            if not pressed.touches:
+                step = contact.approach(q, pressed.correction, x)
+                q = q + step
+                if np.array_equal(step, pressed.correction):  # nothing was met on the way to rest
+                    break
+                continue
+            # points that stick and slide in turn keep full steps from settling
+            q = q + limit_step(contact.model, pressed.correction) * (1.0 if iteration < _FULL_STEPS else 0.3)
+            if pressed.size < _SETTLED:
+                break
+        else:
+            raise ContactError(f"no equilibrium with friction at a depth of {1e3 * x[0]:.3f} mm")
+        before, last = contact.place_points(q), x
+        shear = measure_shear(contact.press(before, x, traction).forces, contact.press(before, x, FRICTIONLESS).forces)
+        results.append((q, pressed))
+    return results
 
 
 def _snaps(before: PressState, after: PressState) -> bool:

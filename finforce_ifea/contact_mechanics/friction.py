@@ -124,3 +124,15 @@ def add_traction(traction, touch, p, x, z, stiffness, out):
             out[a, _CHANGE + 2] += stiffness * ta * tz
     out[0, 0] += shear * tx
     out[1, 0] += shear * tz
+
+
+def measure_shear(forces: NDArray, pressure: NDArray) -> NDArray:
+    """Return the tangential force (p,) [N] at each point, for the next step's `Traction.shear`.
+
+    Args:
+        forces: of the contact at points (p, 3) [N].
+        pressure: the same without friction (p, 3) [N].
+    """
+    size = np.hypot(pressure[:, 0], pressure[:, 2])
+    along = (forces - pressure)[:, 0] * pressure[:, 2] - (forces - pressure)[:, 2] * pressure[:, 0]
+    return np.divide(along, size, out=np.zeros(len(size)), where=size > 0.0)

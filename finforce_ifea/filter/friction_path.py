@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -35,8 +36,11 @@ _MOVES = 0.2
 _STOPPED = 0.7
 # 1 sigma of the depth of first touch [m].
 _TOUCH_STDDEV = 0.1e-3
-# Part of the path's deviation that is left while all of the contact slides.
+# Part of the path's deviation that is left while all of the contact slides, which it does where this much of the
+# probability is within so little of the cone [-].
 _SLIDING = 0.3
+_MOST = 0.5
+_AT_CONE = 1e-6
 _LEAST_PROBABILITY = 1e-6
 # Length of the path that can be taken back [m].
 _BRANCH = 1e-3
@@ -60,6 +64,7 @@ class TractionHypotheses:
         upright: traction ratio of an object that only the jaws hold [-].
         motion: of the object along the path since it was last asked for [m].
         stddev: of the traction ratio by errors of the path [-].
+        doubt: change of the traction ratio if a motion back that may be chance is none [-].
         unweighed: standard deviation of the coefficient of friction that no hypothesis stands for [-].
     """
 
@@ -88,7 +93,7 @@ class TractionHypotheses:
         """Forget the path, as once nothing touches."""
         self._path.reset()
         self._anchor: NDArray | None = None
-        self._anchor_stddev, self._direction, self.stddev = _TOUCH_STDDEV, 1.0, 0.0
+        self._anchor_stddev, self._direction, self.stddev, self.doubt = _TOUCH_STDDEV, 1.0, 0.0, 0.0
         self._branch: _Branch | None = None
 
     @property
@@ -108,10 +113,49 @@ class TractionHypotheses:
     @property
     def ratios(self) -> NDArray:
         """Traction ratio kappa of each hypothesis (N,) [-]."""
-        parts = [self._path.ratios] if self._held < 1.0 else []
+        return self._bound(self._path.ratios)
+
+    def _bound(self, ratios: NDArray) -> NDArray:
+        """Return the traction ratio of each hypothesis (N,) for those of the coefficients (M,)."""
+        parts = [ratios] if self._held < 1.0 else []
         if self._held > 0.0:
             parts.append(np.array([self.upright]))
         return np.clip(np.concatenate(parts), -LARGEST_RATIO, LARGEST_RATIO)
+
+    def preview(self, places: NDArray, track: Track, weights: NDArray) -> NDArray:
+        """Return the traction ratio of each hypothesis (N,) with the object in other places; see `follow`."""
+        if not self.follows_path:
+            return self.ratios
+        own = self._share(weights)
+        if self._anchor is None:  # it may stick either way
+            self.doubt = float(own @ self.mu)
+            return self.ratios
+        motion = self._find_motion(places[: len(self.mu)])
+        deeper = float(own @ motion[:, 0])
+        if not motion[:, 1].any() and self._is_chance(deeper, track):
+            self.doubt = self._path.turn_at(float(own @ self._path.ratios)) * abs(deeper)
+            return self.ratios
+        ratios = self._path.preview(motion)
+        self.doubt = sqrt(max(self._find_stddev(ratios, own, track) ** 2 - self.stddev**2, 0.0))
+        return self._bound(ratios)
+
+    def _find_stddev(self, ratios: NDArray, own: NDArray, track: Track) -> float:
+        """Return the standard deviation of the traction ratio by that of the depth, at ratios of the path (M,)."""
+        slides = np.abs(np.abs(ratios) - self.mu) < _AT_CONE
+        share = _SLIDING if own @ slides > _MOST else 1.0
+        return share * self._path.turn_at(float(own @ ratios)) * sqrt(max(track.variance, 0.0))
+
+    def _find_motion(self, places: NDArray) -> NDArray:
+        """Return the motion (M, 2) [m] from where the path ends to places (M, 2) [m], less the play of the height."""
+        motion = places - self._anchor
+        motion[:, 1] -= np.clip(motion[:, 1], -_HEIGHT_PLAY, _HEIGHT_PLAY)
+        return motion
+
+    def _is_chance(self, deeper: float, track: Track) -> bool:
+        """Return whether a motion [m] may be one back by chance."""
+        sigmas = _REVERSAL if track.rests < _MOVES else _REVERSAL_AT_REST
+        stddev = np.sqrt(max(track.variance, 0.0))
+        return deeper * self._direction < 0.0 and abs(deeper) < sigmas * np.hypot(stddev, self._anchor_stddev)
 
     @property
     def follows_path(self) -> bool:
@@ -183,14 +227,12 @@ class TractionHypotheses:
         places, own = places[: len(self.mu)], self._share(weights)
         if self._anchor is None:
             self._anchor = places.copy()
+            self._path.begin(contact, q, x)
             self._begin_branch(self._direction)
-        motion = places - self._anchor
-        motion[:, 1] -= np.clip(motion[:, 1], -_HEIGHT_PLAY, _HEIGHT_PLAY)
+        motion = self._find_motion(places)
         deeper, stddev = float(own @ motion[:, 0]), float(np.sqrt(max(track.variance, 0.0)))
         if not motion[:, 1].any():
-            is_back = deeper * self._direction < 0.0
-            sigmas = _REVERSAL if track.rests < _MOVES else _REVERSAL_AT_REST
-            if is_back and abs(deeper) < sigmas * np.hypot(stddev, self._anchor_stddev):
+            if self._is_chance(deeper, track):
                 if stddev < _STOPPED * self._anchor_stddev:
                     self._take_back(contact, q, x, places, own)
                     self._anchor_stddev = stddev
@@ -207,10 +249,7 @@ class TractionHypotheses:
         self._anchor = self._anchor + motion
         self.motion += abs(deeper)
         self._path.move(contact, q, x, motion)
-        slides = np.abs(np.abs(self._path.ratios) - self.mu) < 1e-6
-        self.stddev = self._path.turn_at(float(own @ self._path.ratios)) * stddev
-        if own @ slides > 0.5:
-            self.stddev *= _SLIDING
+        self.stddev = self._find_stddev(self._path.ratios, own, track)
 
     def _begin_branch(self, before: float) -> None:
         """Keep the path up to here, where the object had the direction `before`."""

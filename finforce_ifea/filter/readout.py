@@ -53,9 +53,11 @@ def read_out(state, force, modes, x, log_weights, P, shift, smoothing, at, ratio
         inner[c, 0] += (lessened - 1.0) * own[c, 0]
     inner[0, 0] += (lessened - 1.0) ** 2 * own[0, 0]
     covariance = np.dot(modes, np.dot(inner, np.ascontiguousarray(modes.T)))
+    # where the linearisation has found less of a force, it turns less by the traction ratio, too
+    grown = max(np.sqrt((found**2).sum() / max((force**2).sum(), 1e-300)), 1.0) ** 2
     for a in range(3):
         for b in range(3):
-            covariance[a, b] += (spread + _MISDIRECTED**2) * modes[a, 3] * modes[b, 3]
+            covariance[a, b] += (spread + _MISDIRECTED**2) * grown * modes[a, 3] * modes[b, 3]
             for i in range(count):
                 covariance[a, b] += w[i] * (forces[i, a] - found[a]) * (forces[i, b] - found[b])
     continued, size, along = min(1.0, max(0.0, state.depth / LEAST_DEPTH)), 0.0, 0.0

@@ -88,6 +88,8 @@ _SETTLED = 0.1e-3
 _SETTLED_CORRECTION = 0.05
 # Steps shortened to less than this factor are taken as they are: the key points cannot decide between two corners.
 _UNDECIDED = 0.2
+# Change of a traction ratio that does not matter [-].
+_SAME_RATIO = 0.02
 # Least force at which the inclination of the faces is asked for [N].
 _LEAST_FORCE = 0.1
 _LEAST_VARIANCE = 1e-14
@@ -271,8 +273,8 @@ class ContactSearch:
         if len(seen) < max(self.settings.minimum_keypoints, 3):
             return False
         self.log_weights = self.hypotheses.bound_held(self.log_weights)
-        ratios, ratio = self.hypotheses.ratios, self.ratio
-        x = self.mean[CONTACT]
+        ratios = self._preview(self.x, 0.0)
+        ratio, x = float(self.weights @ ratios), self.mean[CONTACT]
         x[0], x[1] = self.track.x, min(max(x[1], expectation["lowest"]), expectation["highest"])
         q = self.q + self._modes @ (find_x_model(contact, x)[0] - self.state["x_model"])
         settled, iteration, share, last = False, 0, 1.0, np.zeros(3)
@@ -297,6 +299,9 @@ class ContactSearch:
             settled = at.pressed.size < _SETTLED_CORRECTION and _is_settled(moved, aim - last, share, expectation)
         if at is None or not _is_believed(posterior, self._V):
             return False
+        before, ratios = ratios, self._preview(posterior.x, x[0] - posterior.mean[DEPTH])
+        if np.abs(ratios - before).max() > _SAME_RATIO:
+            posterior, _ = correct(measured, weight, ratios, self.x, self.log_weights, P, _JUMPS, possible)
         self.q, self._modes, self.positions = q, at.pressed.modes[:, :3], at.positions
         self._take_jump(jump)
         self._level = _follow_level(self._level, posterior.distances)
@@ -308,6 +313,12 @@ class ContactSearch:
         self.state["iterations"], self.state["converged"] = iteration, settled
         self.state["ambiguity"] = 0.0 if settled else np.linalg.norm(at.pressed.force_modes[:, :3] @ moved)
         return True
+
+    def _preview(self, x: NDArray, shift: float) -> NDArray:
+        """Return the traction ratios (N,) with the object where hypotheses x (N, n) have it, `shift` [m] deeper."""
+        places = x[:, [DEPTH, HEIGHT]]
+        places[:, 0] += shift
+        return self.hypotheses.preview(places, self.track, self.weights)
 
     def _linearize(
         self, contact: RigidContact, probe: Any, q: NDArray, x: NDArray, ratio: float
@@ -376,7 +387,8 @@ class ContactSearch:
         s["extrapolation"], s["sound"] = pressed.extrapolation, pressed.smallest_det > 0.0
         s["mistaken"] = self._misplaced
         force, modes, (ratios, ratio) = pressed.force, np.ascontiguousarray(pressed.force_modes), traction
-        shift, spread = self._smooth + x_model[0] - x[0], self.hypotheses.spread_cells(self.weights)
+        shift = self._smooth + x_model[0] - x[0]
+        spread = self.hypotheses.spread_cells(self.weights) + self.hypotheses.doubt**2
         smoothing = posterior.own, lessened
         read_out(s, force, modes, self.x, self.log_weights, self.P, shift, smoothing, at.x, ratios, ratio, spread)
         self.state = s

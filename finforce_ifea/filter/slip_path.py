@@ -6,22 +6,27 @@ surface tells; it slides once the traction ratio kappa reaches the cone. For eac
     kappa <- clamp(kappa + (1 + kappa^2) s(kappa) . delta, -mu, mu),
 
 with the motion delta of the object in depth and height, and the turn s [1/m] of the force by it, relative to the force
-of an object that slides without friction. This is the play operator of Prandtl; see Visintin, Differential Models of
-Hysteresis, 1994, ch. III.
+of an object that slides without friction. An object that touches first sticks, however little it presses: its path
+begins with the ratio at which a stuck contact gives way, within the cone. This is the play operator of Prandtl; see
+Visintin, Differential Models of Hysteresis, 1994, ch. III.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from finforce_ifea.contact_mechanics.friction import FRICTIONLESS, Traction
 from finforce_ifea.contact_mechanics.pressed_jaw import RigidContact
 
+_OPTIONS = {"cache": True, "error_model": "numpy"}
 # Coefficient of friction of a contact that does not slide [-].
 _STICKS = 1e3
 # Traction ratios at which the turn of the force is measured [-].
-_RATIOS = (-0.4, 0.0, 0.4)
+_RATIOS = np.array([-0.4, 0.0, 0.4])
+# The one of them with which nothing acts along the surface.
+_UPRIGHT = 1
 # Motion after which the turn is measured again [m].
 _FRESH = 0.3e-3
 # Longest step of the path at once [m].
@@ -45,6 +50,7 @@ class SlipPath:
         """Forget the path."""
         self.ratios = np.zeros(len(self.coefficients))
         self._turns: NDArray | None = None
+        self._stuck = 0.0
         self._at = np.zeros(2)
 
     def turn_at(self, ratio: float) -> float:
@@ -62,35 +68,66 @@ class SlipPath:
         """
         if not self.coefficients.any():
             return
+        self._measure(contact, q, x)
+        self.ratios = self.preview(motion)
+
+    def begin(self, contact: RigidContact, q: NDArray, x: NDArray) -> None:
+        """Begin with an object that has just touched; see `move` for the arguments."""
+        stuck = self._measure(contact, q, x) if self.coefficients.any() else 0.0
+        self.ratios = np.clip(np.full(len(self.coefficients), stuck), -self.coefficients, self.coefficients)
+
+    def _measure(self, contact: RigidContact, q: NDArray, x: NDArray) -> float:
+        """Measure the turns anew where the object has moved; return the ratio of a contact that began by sticking."""
         place = x[[0, 2]]
         if self._turns is None or np.abs(place - self._at).max() > _FRESH:
-            self._turns, self._at = measure_turns(contact, q, x), place
-        if self._turns is None:
-            return
-        steps = max(1, int(np.ceil(np.abs(motion).max() / _STEP)))
+            self._turns, self._stuck, self._at = *measure_turns(contact, q, x), place
+        return self._stuck
+
+    def preview(self, motion: NDArray) -> NDArray:
+        """Return the traction ratios (N,) after a motion in depth and height (N, 2) [m], by the last turn."""
+        if self._turns is None or not self.coefficients.any():
+            return self.ratios
+        return _turn_path(self.ratios, self.coefficients, self._turns, motion)
+
+
+@njit(**_OPTIONS)
+def _turn_path(ratios, coefficients, turns, motion):
+    """Return the ratios (N,) after a motion (N, 2) [m]; see the module and `measure_turns`."""
+    out, largest = ratios.copy(), 0.0
+    for i in range(len(motion)):
+        largest = max(largest, abs(motion[i, 0]), abs(motion[i, 1]))
+    steps = max(1, int(np.ceil(largest / _STEP)))
+    for i in range(len(out)):
         for _ in range(steps):
-            turn = np.stack([np.interp(self.ratios, _RATIOS, turns) for turns in self._turns], axis=1)
-            change = (1.0 + self.ratios**2) * (motion / steps * turn).sum(axis=1)
-            self.ratios = np.clip(self.ratios + change, -self.coefficients, self.coefficients)
+            change = 0.0
+            for a in range(2):
+                change += motion[i, a] / steps * np.interp(out[i], _RATIOS, turns[a])
+            change *= 1.0 + out[i] ** 2
+            out[i] = min(max(out[i] + change, -coefficients[i]), coefficients[i])
+    return out
 
 
-def measure_turns(contact: RigidContact, q: NDArray, x: NDArray) -> NDArray | None:
+def measure_turns(contact: RigidContact, q: NDArray, x: NDArray) -> tuple[NDArray | None, float]:
     """Return the turn of the force by depth and height of an object that sticks (2, 3) [1/m], None without contact.
 
-    It is that at three traction ratios, less the turn of an object that slides without friction.
+    It is that at three traction ratios, less the turn of an object that slides without friction. With it comes the
+    traction ratio of a contact that has stuck since it began.
     """
     points = contact.place_points(q)
     forces = contact.press(points, x, FRICTIONLESS).forces
     normal = np.hypot(forces[:, 0], forces[:, 2])
     if not normal.any():
-        return None
+        return None, 0.0
     smooth = contact.linearize(q, x, FRICTIONLESS)
-    slides, turns = _measure_turn(smooth.force, smooth.force_modes), []
+    slides, turns, by_depth = _measure_turn(smooth.force, smooth.force_modes), [], []
     for ratio in _RATIOS:
         stuck = contact.linearize(q, x, Traction(0.0, _STICKS, ratio * normal, points, np.zeros(2)))
         force = np.array([smooth.force[0] + ratio * smooth.force[2], 0.0, smooth.force[2] - ratio * smooth.force[0]])
         turns.append(slides - _measure_turn(force, stuck.force_modes))
-    return np.array(turns).T
+        by_depth.append(stuck.force_modes[:, 0])
+    ahead, along = smooth.force[[0, 2]], smooth.force[[2, 0]] * [1.0, -1.0]
+    gained = by_depth[_UPRIGHT][[0, 2]]
+    return np.array(turns).T, float(gained @ along / (gained @ ahead))
 
 
 def _measure_turn(force: NDArray, modes: NDArray) -> NDArray:
