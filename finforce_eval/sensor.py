@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -34,10 +33,6 @@ from finforce_keypoints.images import RgbdImage
 from finforce_keypoints.rig import read_rig
 
 Camera = CameraIntrinsics | str | Path | ArrayLike
-_SHORTEST_PERIOD = 1e-3  # [s] between images: no RGB-D camera takes 1000 a second
-_LONGEST_PERIOD = 5.0  # [s] between images: rarer ones show no grasp
-_USUAL_PERIOD = 1 / 30  # [s] between images, by which the unit of other stamps is guessed
-_UNITS = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}  # [s]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -114,7 +109,6 @@ class ForceSensor:
         else:
             parameters = {"T_gripper_camera": pose_numbers(read_extrinsics(extrinsics))}
         self.camera = camera
-        self._stamps: deque[float] = deque(maxlen=3)
         jaws = {side: load_jaw(jaw or "bench", side) for side in sides}
         records = build_records({**parameters, **(detector or {})})
         self._detector = build_detector(jaws, *records, watched=not is_video)
@@ -150,8 +144,6 @@ class ForceSensor:
         if depth is not None:
             depth = decode_depth(depth, "16UC1" if np.asarray(depth).dtype.kind in "iu" else "32FC1")
         seen = self._detector.detect(RgbdImage(stamp=stamp, color=rgb, depth=depth, camera=self.camera))
-        self._stamps.append(stamp)
-        check_periods(self._stamps)
         T = None if T_camera_object is None else check_pose(T_camera_object, "T_camera_object")
         found = {side: self._solve(loop, seen.get(side), stamp, T) for side, loop in self._loops.items()}
         return combine_solutions(stamp, {side: found[side] if side in seen else None for side in found})
@@ -166,7 +158,6 @@ class ForceSensor:
     def reset(self) -> None:
         """Forget everything that images have shown, the tare included; for a new recording or episode."""
         self._detector.reset()
-        self._stamps.clear()
         for loop in self._loops.values():
             loop.force.forget()
             loop.contact.reset()
@@ -186,28 +177,6 @@ class ForceSensor:
         if seen is None or T_camera_object is None:
             return loop.update(observation)
         return loop.update(observation, [(stamp, invert_pose(seen.T_camera_jaw) @ T_camera_object)])
-
-
-def check_periods(stamps: Sequence[float]) -> None:
-    """Refuse rising stamps of three images in a row that are not in seconds; a single gap is a pause.
-
-    Raises:
-        ObservationError: they are whole numbers, or closer or further apart than a camera's images.
-    """
-    if len(stamps) < 3:
-        return
-    periods = np.diff(np.asarray(stamps, dtype=float))
-    if all(float(stamp).is_integer() for stamp in stamps):
-        raise ObservationError(
-            f"stamps {', '.join(f'{stamp:g}' for stamp in stamps)}, expected seconds: if these are frame numbers, "
-            "divide them by the frame rate"
-        )
-    if periods.max() < _SHORTEST_PERIOD or periods.min() > _LONGEST_PERIOD:
-        unit = min(_UNITS, key=lambda name: abs(np.log(_UNITS[name] * periods.min() / _USUAL_PERIOD)))
-        likely = f"; the stamps look like {unit}" if periods.min() > _LONGEST_PERIOD else ""
-        raise ObservationError(
-            f"images {periods.min():.4g} s apart, expected {_SHORTEST_PERIOD:g} to {_LONGEST_PERIOD:g} s{likely}"
-        )
 
 
 def observe_jaw(seen: JawKeypoints | None, stamp: float, count: int) -> Observation:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from numbers import Integral
 from typing import NamedTuple
@@ -20,8 +21,11 @@ TRUSTED = ("ok", "unloaded")
 # the images of an unloaded jaw.
 _TOUCHING = 0.5
 _UNIT = 1e-3  # by which the length of a unit vector may be off
-# Images are at least so long apart [s]; what comes sooner is the same one, stamped again.
-_SHORTEST_PERIOD = 0.5e-3
+_SAME_IMAGE = 0.5e-3  # [s] between two stamps within which one image came twice
+_SHORTEST_PERIOD = 1e-3  # [s] between three images in a row: no RGB-D camera takes 1000 a second
+_LONGEST_PERIOD = 5.0  # [s] between three images in a row: rarer ones show no grasp
+_USUAL_PERIOD = 1 / 30  # [s] between images, by which the unit of other stamps is guessed
+_UNITS = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}  # [s]
 # Maximum coordinate of a key point [m]: fingers are 0.25 m long at most.
 _FARTHEST = 1.0
 # Maximum capture time [s] since 1970: the year 5138. Milliseconds since 1970 are ten times as many.
@@ -178,12 +182,17 @@ def blank_solution(stamp: float, status: str, message: str, used: NDArray, itera
     )
 
 
-def check_observation(observation: Observation, count: int, last_stamp: float | None) -> None:
+def check_observation(observation: Observation, count: int, earlier: Sequence[float] = ()) -> None:
     """Refuse what cannot be an image's key points.
+
+    Args:
+        observation: the key points of the image.
+        count: number of key points of the jaw.
+        earlier: stamps of the images before [s], the newest last.
 
     Raises:
         ObservationError: Wrong shapes, infinite values, a likelihood outside [0, 1], a standard deviation that is none,
-            a direction of gravity of another length than 1, stamps that do not rise by a camera's period.
+            a direction of gravity of another length than 1, stamps that do not rise by a camera's period in seconds.
     """
     points, likelihood = np.asarray(observation.points, float), np.asarray(observation.likelihood, float)
     if points.shape != (count, 3) or likelihood.shape != (count,):
@@ -210,29 +219,55 @@ def check_observation(observation: Observation, count: int, last_stamp: float | 
     gravity = observation.gravity
     if gravity is not None and not (np.shape(gravity) == (3,) and abs(np.linalg.norm(gravity) - 1.0) < _UNIT):
         raise ObservationError(f"gravity {np.asarray(gravity).tolist()}, expected a unit vector of three numbers")
-    check_stamp(observation.stamp)
-    if last_stamp is not None and observation.stamp <= last_stamp:
-        raise ObservationError(
-            f"stamp {observation.stamp:.6f} s after {last_stamp:.6f} s, expected rising stamps; "
-            "reset for a new recording"
-        )
-    if last_stamp is not None and observation.stamp < last_stamp + _SHORTEST_PERIOD:
-        raise ObservationError(
-            f"stamp {observation.stamp - last_stamp:.3g} s after the last, expected at least {_SHORTEST_PERIOD:g} s: "
-            "one image came twice"
-        )
+    check_stamp(observation.stamp, earlier)
 
 
-def check_stamp(stamp: float) -> None:
-    """Refuse what cannot be a capture time in seconds: whole numbers, which count images or ticks, and far too many.
+def check_stamp(stamp: float, earlier: Sequence[float] = ()) -> None:
+    """Refuse what cannot be a capture time in seconds.
+
+    A single gap is a pause; two gaps in a row are another unit.
+
+    Args:
+        stamp: image capture time [s].
+        earlier: stamps of the images before [s], the newest last.
 
     Raises:
-        ObservationError: the stamp is such a number, or not finite.
+        ObservationError: the stamp counts images or ticks, is not finite, does not rise, or is closer to or further
+            from those before than a camera's images are.
     """
     if isinstance(stamp, Integral) or not abs(stamp) < _LATEST:
         raise ObservationError(
             f"stamp {stamp}, expected seconds as a float: divide frame numbers by the frame rate, milliseconds by 1e3, "
             "nanoseconds by 1e9"
+        )
+    if not earlier:
+        return
+    period = stamp - earlier[-1]
+    if period <= 0.0:
+        raise ObservationError(
+            f"stamp {stamp:.6f} s after {earlier[-1]:.6f} s, expected rising stamps; reset for a new recording"
+        )
+    if period < _SAME_IMAGE:
+        raise ObservationError(
+            f"stamp {period:.3g} s after the last, expected at least {_SAME_IMAGE:g} s: one image came twice"
+        )
+    if len(earlier) > 1:
+        _check_unit(earlier[-2], earlier[-1], float(stamp))
+
+
+def _check_unit(first: float, second: float, third: float) -> None:
+    """Refuse rising stamps of three images in a row that are not in seconds."""
+    if first.is_integer() and second.is_integer() and third.is_integer():
+        raise ObservationError(
+            f"stamps {first:g}, {second:g}, {third:g}, expected seconds: if these are frame numbers, divide them by "
+            "the frame rate"
+        )
+    shorter, longer = sorted((second - first, third - second))
+    if longer < _SHORTEST_PERIOD or shorter > _LONGEST_PERIOD:
+        unit = min(_UNITS, key=lambda name: abs(np.log(_UNITS[name] * shorter / _USUAL_PERIOD)))
+        likely = f"; the stamps look like {unit}" if shorter > _LONGEST_PERIOD else ""
+        raise ObservationError(
+            f"images {shorter:.4g} s apart, expected {_SHORTEST_PERIOD:g} to {_LONGEST_PERIOD:g} s{likely}"
         )
 
 
