@@ -68,7 +68,6 @@ from finforce.ros.topics import (  # noqa: F401 - for those with topics
     Stage,
     describe_rivals,
     is_wanted,
-    listen,
     send_cloud,
 )
 from finforce.ros.tracing import write_trace
