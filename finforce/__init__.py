@@ -8,7 +8,8 @@
 - the contact: `load_object_mesh`, `ContactEstimator`, and `ForceLoop`, contact and force together;
 - the images: `KeypointDetector`, `build_detector`, `RgbdImage`;
 - the gripper: `Gripper`, `build_bus`; `GripperClient`, for a driver node that runs elsewhere;
-- recordings: `read_recording`, `iter_frames`, `find_mesh`, `DEMO`, the one that comes with finforce.
+- recordings: `evaluate`, which returns a table of forces; `read_recording`, `iter_frames`, `find_mesh`; `DEMO`, the one
+  that comes with finforce.
 """
 
 import ast

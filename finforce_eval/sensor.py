@@ -76,7 +76,7 @@ class ForceSensor:
         calibration: of the finger; None for the material of the jaw file.
         sides: jaws in the images.
         detector: parameters of the detector that differ from their defaults, as `--detector` names them.
-        settings: of the estimator, likewise, as `--set` names them.
+        settings: of the estimator, whole or those that differ, as `--set` names them.
         is_video: whether images went through a video encoder, after which a scene at rest repeats itself to the bit.
 
     Raises:
@@ -95,7 +95,7 @@ class ForceSensor:
         calibration: str | Path | Calibration | None = None,
         sides: Sequence[str] = SIDES,
         detector: Mapping[str, Any] | None = None,
-        settings: Mapping[str, Any] | None = None,
+        settings: EstimatorSettings | Mapping[str, Any] | None = None,
         is_video: bool = False,
     ) -> None:
         if (contact_height is None) == (object_mesh is None):
@@ -112,7 +112,8 @@ class ForceSensor:
         jaws = {side: load_jaw(jaw or "bench", side) for side in sides}
         records = build_records({**parameters, **(detector or {})})
         self._detector = build_detector(jaws, *records, watched=not is_video)
-        settings = EstimatorSettings(**(settings or {})).resolve_held(both=len(sides) == len(SIDES))
+        whole = settings if isinstance(settings, EstimatorSettings) else EstimatorSettings(**(settings or {}))
+        settings = whole.resolve_held(both=len(sides) == len(SIDES))
         mesh = None if object_mesh is None else load_object_mesh(object_mesh)
         self._loops: dict[str, ForceLoop] = {}
         for side, own in jaws.items():

@@ -76,7 +76,7 @@ def test_detector_and_solver_are_one_process_unless_it_is_said_otherwise(recorde
     assert {a.args[0]: a.kwargs["default_value"] for a in arguments}["composed"] == "true"
     apart = [action.kwargs["executable"] for action in act(path, images="true") if "executable" in action.kwargs]
     (pipeline, *others) = [a.kwargs for a in act(path, images="true", composed="true") if "executable" in a.kwargs]
-    assert pipeline["executable"] == "pipeline" and pipeline["name"] is None  # which would be all nodes' name
+    assert pipeline["executable"] == "finforce_pipeline" and pipeline["name"] is None  # which would be all nodes' name
     parts = [read_part(word) for word in pipeline["arguments"]]
     together = [part.executable for part in parts]
     assert together[0] == "keypoint_detector" and "ifea_solver" in together
