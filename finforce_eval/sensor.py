@@ -1,4 +1,4 @@
-"""Images in, forces of the gripper out: the whole chain for a program without nodes and without a recording."""
+"""Turn images into the forces on a gripper: the whole chain for a program without nodes and recordings."""
 
 from __future__ import annotations
 
@@ -37,15 +37,16 @@ Camera = CameraIntrinsics | str | Path | ArrayLike
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GripperForces:
-    """The forces in one image; vectors of the gripper are in `gripper_base`.
+    """Forces on the gripper in one image.
 
     Attributes:
-        stamp: of the image [s].
-        jaws: side -> force, torque, deviations and status of that jaw, in its frame; one that was not seen is absent.
-        status: "ok", else what keeps the force of which jaw from being trusted; there is no grasp force then.
-        grasp: how hard the object is held [N], NaN unless `status` is "ok".
+        stamp: image capture time [s].
+        jaws: side -> force, torque, standard deviations and status of that jaw, in the frame of the jaw. A jaw that was
+            not found is absent.
+        status: "ok", else the reason why the force of a jaw cannot be trusted; then there is no grasp force.
+        grasp: grasp force [N], the smaller of the two jaw forces; NaN unless `status` is "ok".
         grasp_stddev: standard deviation of the grasp force [N].
-        manipulation: (3,) net force that the object applies to the gripper [N].
+        manipulation: (3,) net force that the object applies to the gripper [N], in `gripper_base`.
         manipulation_stddev: (3,) its standard deviation [N].
     """
 
@@ -59,25 +60,25 @@ class GripperForces:
 
 
 class ForceSensor:
-    """Finds the forces on a gripper in the images of its wrist camera, one after the other.
+    """Estimates the forces on a gripper from the images of its wrist camera, one image after the other.
 
     Attributes:
-        camera: intrinsics, or what they are to be read from once the size of the images is known.
+        camera: intrinsics, or their source until the size of the images is known.
 
     Args:
-        jaw: name of a shipped jaw, jaw file, or a left jaw; None for that of the rig, else "bench".
-        camera: intrinsics, a file of them, a (3, 3) matrix [px], or the numbers fx, fy, cx, cy [px] and perhaps k1, k2,
-            p1, p2, k3.
-        extrinsics: the camera in `gripper_base`: (4, 4), the seven numbers x, y, z [m], qx, qy, qz, qw, or "robot" or
-            "bench" for those of the simulator.
-        rig: file by `finforce camera`, which takes the place of these three.
-        contact_height: of first touch above the clamped base [m].
-        object_mesh: mesh of the object in metres, or its file; `update` then needs its poses. Give one of these two.
-        calibration: of the finger; None for the material of the jaw file.
+        jaw: name of an included jaw, a jaw file, or a left jaw; None for the jaw of the rig, else "bench".
+        camera: intrinsics, a file with them, a (3, 3) matrix [px], or the numbers fx, fy, cx, cy [px], optionally
+            followed by k1, k2, p1, p2, k3.
+        extrinsics: camera pose in `gripper_base`: a (4, 4) matrix, the seven numbers x, y, z [m], qx, qy, qz, qw, or
+            "robot" or "bench", the cameras of the simulator.
+        rig: file written by `finforce camera`, instead of jaw, camera and extrinsics.
+        contact_height: height of first touch above the clamped base [m].
+        object_mesh: mesh of the object [m], or its file, instead of the height; `update` then needs the object's pose.
+        calibration: calibration of the finger, its file or an included name; None for the material of the jaw file.
         sides: jaws in the images.
-        detector: parameters of the detector that differ from their defaults, as `--detector` names them.
-        settings: of the estimator, whole or those that differ, as `--set` names them.
-        is_video: whether images went through a video encoder, after which a scene at rest repeats itself to the bit.
+        detector: parameters of the detector that differ from the defaults, by the names that `--detector` takes.
+        settings: settings of the estimator, or only those that differ from the defaults, by name.
+        is_video: whether the images come from a video, where a scene at rest may repeat itself bit by bit.
 
     Raises:
         FinforceError: one of these cannot be used.
@@ -126,18 +127,20 @@ class ForceSensor:
     ) -> GripperForces:
         """Return the forces in an image.
 
-        The first images, 45 unless the settings say otherwise, have to show the jaws unloaded.
+        The jaws must be unloaded in the first images, 45 by default, which give no force.
 
         Args:
             rgb: (h, w, 3) uint8.
-            depth: (h, w) aligned to the colours, in metres, or whole numbers in millimetres; None without.
-            stamp: image capture time [s], a rising float; frame numbers are divided by the frame rate.
-            T_camera_object: (4, 4) pose of the object's mesh in this image, where it is known.
+            depth: (h, w) depth aligned to the colour image: floats in metres or integers in millimetres; None if there
+                is none.
+            stamp: image capture time [s], a float that rises from image to image. Divide frame numbers by the frame
+                rate.
+            T_camera_object: (4, 4) pose of the object's mesh in this image, if it is known.
 
         Raises:
             ImageError: the image has another shape, shows nothing, or its stamp does not rise.
             ObservationError: the stamps are not in seconds.
-            PoseError: the pose makes no sense.
+            PoseError: the matrix is no pose.
         """
         check_stamp(stamp)
         if not isinstance(self.camera, CameraIntrinsics):
@@ -150,21 +153,21 @@ class ForceSensor:
         return combine_solutions(stamp, {side: found[side] if side in seen else None for side in found})
 
     def skip(self, stamp: float, reason: str) -> GripperForces:
-        """Return the forces in an image [s] that `update` has rejected: none. Time passes for the estimators."""
+        """Let time pass for an image at `stamp` [s] that `update` has rejected, and return a result without forces."""
         for loop in self._loops.values():
             with suppress(ObservationError):  # of a jaw that has taken the image before the other one rejected it
                 self._solve(loop, None, stamp, None)
         return GripperForces(stamp=stamp, jaws={}, status=reason)
 
     def reset(self) -> None:
-        """Forget everything that images have shown, the tare included; for a new recording or episode."""
+        """Forget all images, including the tare, before a new recording or episode."""
         self._detector.reset()
         for loop in self._loops.values():
             loop.force.forget()
             loop.contact.reset()
 
     def warm_up(self) -> None:
-        """Compile and load all that images need, so that the first one waits for nothing; forget what was seen."""
+        """Compile and load everything ahead of the first image, and forget all images."""
         self._detector.warm_up()
         for loop in self._loops.values():
             loop.force.warm_up()

@@ -18,6 +18,11 @@ def test_every_name_of_the_door_is_there_and_named_in_its_docstring(name):
     assert name in finforce.__doc__
 
 
+@pytest.mark.parametrize("name", finforce.__all__)
+def test_every_name_of_the_door_is_in_the_reference(name):
+    assert f"`{name}`" in (PAGE.parent / "api" / "finforce.md").read_text(encoding="utf-8")
+
+
 def test_the_door_itself_loads_no_library():
     code = "import sys; before = set(sys.modules); import finforce; print(*set(sys.modules) - before)"
     loaded = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.split()
