@@ -327,7 +327,7 @@ class SolverOptions:
     pose_source: str = setting("", "Source of object poses: topic, detections or tracker")
     pose_topic: str = setting("", "Topic of object poses from another program; none: object_pose, object_detections")
     images: bool = setting(False, "Detection of key points in camera images; false: key points come by topic")
-    detection_method: str = setting("", "network, frame (DeepLabCut) or dots", alias="finder")
+    detection_method: str = setting("", "network, frame (DeepLabCut) or dots")
     model: str = setting("", "Folder of a network")
     depth: str = setting(
         "auto",

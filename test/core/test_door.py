@@ -35,12 +35,6 @@ def test_an_unknown_name_is_refused_with_the_known_ones():
         finforce.load_jaws  # noqa: B018 - the look-up is the claim
 
 
-def test_former_names_still_work_and_say_the_new_one():
-    for former, name in (("JawEstimator", "ForceEstimator"), ("play", "iter_frames")):
-        with pytest.warns(DeprecationWarning, match=f"finforce.{former} is now finforce.{name}"):
-            assert getattr(finforce, former) is getattr(finforce, name)
-
-
 def test_names_of_files_do_where_objects_are_expected():
     jaw, calibration = finforce.load_jaw("bench"), finforce.load_calibration("bench")
     assert finforce.load_jaw(jaw) is jaw and finforce.load_jaw(jaw, "right").side == "right"

@@ -4,13 +4,14 @@ import re
 import runpy
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 from eval_fakes import cut
-from rgbd_fakes import FakeDetector, make_footage
+from rgbd_fakes import make_footage
 
 import finforce as ff
 from finforce_eval.cli.main import main
@@ -53,12 +54,19 @@ def test_a_folder_of_recordings_gives_all_of_them(folder):
     assert not found.isna()["status"].any()
 
 
-def test_forces_come_from_images(tmp_path, monkeypatch):
-    path = write_footage(make_footage(), tmp_path / "twin")
-    monkeypatch.setattr(KeypointSource, "build", lambda source, recording: FakeDetector(recording))
-    found = ff.evaluate(path, source="images", contact_height=0.040)
-    assert sorted(found["side"].unique()) == ["left", "right"]
-    assert len(found) == 24 and np.isfinite(found["detector_ms"]).all()
+def test_forces_come_from_images(folder, tmp_path, monkeypatch):
+    path, looked = write_footage(make_footage(), tmp_path / "twin"), []
+    keypoints = ff.read_recording(folder / "first").jaws
+
+    def detect(source, recording):
+        looked.append((len(recording.images), source.parameters))
+        return replace(recording, jaws=keypoints)
+
+    monkeypatch.setattr(KeypointSource, "_detect", detect)
+    found = ff.evaluate(path, source="images", contact_height=0.040, extrinsics="robot", detector={"depth": "none"})
+    ((images, parameters),) = looked
+    assert images == 12 and parameters["depth"] == "none" and len(parameters["T_gripper_camera"]) == 7
+    assert len(found) == 150 and np.isfinite(found[FORCE]).all(axis=1).any()
 
 
 @pytest.mark.parametrize(
@@ -84,7 +92,7 @@ def test_the_example_prints_the_largest_force_of_each_recording(folder, tmp_path
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["evaluate_recordings.py"])
     runpy.run_path(str(EXAMPLES / "evaluate_recordings.py"))
-    assert re.search(r"\n\S+ +left +7\.\d+ ", capsys.readouterr().out)
+    assert re.search(r"\nbench_cyl25_middle +left +4\.1 ", capsys.readouterr().out)
     assert len(pd.read_csv("forces.csv")) == len(ff.read_recording(ff.DEMO).jaw("left").keypoints.stamps)
 
 
