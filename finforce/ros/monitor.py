@@ -130,8 +130,8 @@ def iter_messages(topic: str, note: Callable[[str], Any], *, domain: int | None 
                 note(f"no message on {topic} for {PATIENCE:g} s; published by {' and '.join(sorted(names))}")
 
 
-def _await_publisher(node: Node, executor: SingleThreadedExecutor, topic: str) -> str:
-    """Return the full name of a topic once somebody publishes it."""
+def _await_publisher(node: Node, executor: SingleThreadedExecutor, topic: str, hint: str = "") -> str:
+    """Return the full name of a topic once somebody publishes it; the hint is for a system that does not."""
     try:
         validate_topic_name(topic)
     except (NameValidationException, ValueError) as error:
@@ -140,7 +140,7 @@ def _await_publisher(node: Node, executor: SingleThreadedExecutor, topic: str) -
     while not node.count_publishers(topic):
         if monotonic() > end:
             there = published_topics(node).keys() - {"/rosout", "/parameter_events"}
-            told = suggest(topic, sorted(there)) if there else f"nor any other topic; {_ask_system(node)}"
+            told = hint or suggest(topic, sorted(there)) if there else f"nor any other topic; {_ask_system(node)}"
             raise SilentTopicError(f"nobody publishes {topic}; {told}")
         executor.spin_once(timeout_sec=0.1)
     return topic
@@ -206,7 +206,7 @@ def iter_statuses(period: float, *, domain: int | None = None) -> Iterator[Mappi
                 came[status.name] = monotonic(), report
 
         node.create_subscription(DiagnosticArray, "/diagnostics", take, RESULT)
-        _await_publisher(node, executor, "/diagnostics")
+        _await_publisher(node, executor, "/diagnostics", "nodes that are starting publish none yet: try again")
         while True:
             end = monotonic() + period
             while (left := end - monotonic()) > 0.0:
