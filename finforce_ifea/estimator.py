@@ -16,6 +16,7 @@ from finforce.errors import ObservationError
 from finforce_ifea.contact_mechanics.friction import Coefficient
 from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics
 from finforce_ifea.errors import ContactError, NotEnoughDataError, UnobservableError
+from finforce_ifea.filter.lateral_load import measure_torsion
 from finforce_ifea.filter.tracker import ContactTracker
 from finforce_ifea.jaw.calibration import Calibration, load_calibration
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
@@ -43,7 +44,6 @@ from finforce_ifea.tracking.contact_state import (
 )
 from finforce_ifea.tracking.given_contact import GivenContactTracker
 from finforce_ifea.tracking.influence import OffsetChange, ReachWatch, split_change
-from finforce_ifea.tracking.lateral_load import measure_torsion
 
 _LONGEST_GAP = 1.0
 _FEWEST_COMPARED = 3

@@ -284,6 +284,10 @@ def _are_possible(points, likelihood):
     return True
 
 
+# Farthest that a stated contact point may be from the undeformed inner face along x [m].
+_OFF_FACE = 1e-3
+
+
 def check_contact(contact: Contact, jaw: Jaw) -> None:
     """Refuse what cannot be a contact.
 
@@ -293,10 +297,28 @@ def check_contact(contact: Contact, jaw: Jaw) -> None:
     points, weights = np.asarray(contact.points), np.asarray(contact.weights)
     if points.ndim != 2 or points.shape[1:] != (3,) or weights.shape != (len(points),):
         raise ContactError(f"contact points {points.shape} with weights {weights.shape}, expected (n, 3) and (n,)")
-    if not np.isfinite(points).all() or np.abs(points[:, 0] - jaw.face.read(points[:, 2])).max(initial=0.0) > 1e-3:
+    if not _are_near(np.asarray(points, float), np.asarray(jaw.face.read(points[:, 2]), float)):
         raise ContactError(f"contact points off the undeformed inner surface x = {jaw.inner_face_x:g} m")
-    if len(weights) and not (np.isfinite(weights).all() and (weights >= 0).all() and weights.sum() > 0):
+    if len(weights) and not _are_weights(np.asarray(weights, float)):
         raise ContactError(f"contact weights {weights}, expected non-negative numbers that are not all zero")
+
+
+@njit(cache=True)
+def _are_near(points, face):
+    """Whether points (n, 3) [m] are finite and at x of the inner face (n,) [m]."""
+    off = 0
+    for i in range(len(points)):
+        off += not (np.isfinite(points[i].sum()) and abs(points[i, 0] - face[i]) <= _OFF_FACE)
+    return off == 0
+
+
+@njit(cache=True)
+def _are_weights(weights):
+    """Whether weights (n,) are finite, none negative, and not all zero."""
+    for weight in weights:
+        if not 0.0 <= weight < np.inf:
+            return False
+    return weights.sum() > 0.0
 
 
 def sketch_contact(jaw: Jaw) -> Contact:

@@ -353,6 +353,16 @@ def _find_first_touch(pressed, face, state):
     return least + pressed.front if np.isfinite(least) else 0.0
 
 
+@njit(**_OPTIONS)
+def find_clearance(pressed, x, height):
+    """Return the distance [m] of an outline in a state (3,) from a plane undeformed surface below a height [m].
+
+    It is negative behind the surface, and infinite where the outline is not at these heights.
+    """
+    least = _find_leading(pressed.segments, np.cos(x[1]), np.sin(x[1]), -x[2], height - x[2])
+    return least + pressed.front - x[0] if least < _OUTSIDE else np.inf
+
+
 def flat_profile(low: float, high: float, x: float = 0.0) -> FaceProfile:
     """Return a plane inner surface x = const between two heights [m]."""
     return FaceProfile(np.array([[x, low], [x, high]]), True, x)
@@ -426,17 +436,6 @@ class Indenter:
     def find_gap(self, points: NDArray, face_x: float, x: NDArray) -> float:
         """Return the least distance [m] of points (p, 3) [m] from the object in a state (3,), negative inside."""
         return float(measure_gap(self.pressed, pose_object(self.pressed, face_x, x), np.ascontiguousarray(points)))
-
-    def find_clearance(self, x: NDArray, low: float, high: float) -> float:
-        """Return the distance [m] from a plane undeformed surface between two heights [m], negative behind it.
-
-        It is infinite where the object is not at these heights, and for a cylinder, which is small and round.
-        """
-        if self.pressed.is_round:
-            return np.inf
-        c, s = np.cos(x[SHAPE]), np.sin(x[SHAPE])
-        least = _find_leading(self.pressed.segments, c, s, low - x[HEIGHT], high - x[HEIGHT])
-        return least + self.pressed.front - x[DEPTH] if least < _OUTSIDE else np.inf
 
     def find_touch(self, x: NDArray, face: FaceProfile) -> float:
         """Return the depth [m] of first touch with an undeformed surface, at the shape and height of a state (3,).

@@ -34,7 +34,7 @@ class Posterior(NamedTuple):
         mean: of the state over the hypotheses (n,).
         A: with P <- P - A^T A (2 m, n).
         L: Cholesky factor of S (2 m, 2 m).
-        nu: mean innovation (2 m,) [m].
+        white: mean innovation, L^-1 nu (2 m,).
         own: covariance of the first four entries by the noise of this image alone, K R K^T (4, 4).
         left: residuals of the key points (m, 2) [m].
         distances: their squares, normalised (m,).
@@ -46,7 +46,7 @@ class Posterior(NamedTuple):
     mean: NDArray
     A: NDArray
     L: NDArray
-    nu: NDArray
+    white: NDArray
     own: NDArray
     left: NDArray
     distances: NDArray
@@ -133,7 +133,7 @@ def divide_noise(R, weight):
 
 
 @njit(**_OPTIONS)
-def update(measured, weight, ratios, x, log_weights, P):
+def update(measured, weight, ratios, x, log_weights, HP, S):
     """Return the posterior of one image.
 
     Args:
@@ -142,11 +142,11 @@ def update(measured, weight, ratios, x, log_weights, P):
         ratios: traction ratio of each hypothesis (N,).
         x: predicted means (N, n).
         log_weights: (N,).
-        P: predicted covariance (n, n).
+        HP: see `innovate` (2 m, n).
+        S: the same, for key points without weights (2 m, 2 m).
     """
     R, nu = divide_noise(measured.R, weight), expect_innovations(measured, ratios, x)
-    HP, S = innovate(measured.H, measured.rows, measured.u, P, R)
-    L = np.linalg.cholesky(S)
+    L = np.linalg.cholesky(widen(S, R, measured.R))
     A, white = solve_lower(L, HP), solve_lower(L, np.ascontiguousarray(nu.T))
     updated, before = x + np.dot(np.ascontiguousarray(white.T), A), np.exp(log_weights)
     log_weights = normalize(log_weights - 0.5 * (white**2).sum(axis=0))
@@ -159,12 +159,23 @@ def update(measured, weight, ratios, x, log_weights, P):
         np.dot(w, updated),
         A,
         L,
-        np.dot(before, nu),
+        np.dot(white, before),
         _spread_noise(A, L, R),
         left,
         distances,
         weigh(distances),
     )
+
+
+@njit(**_OPTIONS)
+def widen(S, R, before):
+    """Return S (2 m, 2 m) with noise R in place of that before (m, 2, 2)."""
+    out = S.copy()
+    for k in range(len(R)):
+        for a in range(2):
+            for b in range(2):
+                out[2 * k + a, 2 * k + b] += R[k, a, b] - before[k, a, b]
+    return out
 
 
 @njit(**_OPTIONS)
@@ -179,7 +190,10 @@ def normalize(log_weights):
 def reduce_covariance(P, A):
     """Return P - A^T A, symmetric."""
     out = P - np.dot(np.ascontiguousarray(A.T), A)
-    return 0.5 * (out + out.T)
+    for i in range(len(out)):
+        for j in range(i):
+            out[i, j] = out[j, i] = 0.5 * (out[i, j] + out[j, i])
+    return out
 
 
 @njit(**_OPTIONS)

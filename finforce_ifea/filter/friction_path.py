@@ -122,6 +122,8 @@ class TractionHypotheses:
         """Return the coefficient of friction for the weights of the hypotheses (N,)."""
         if not self.follows_path:
             return Coefficient(0.0, np.inf)
+        if len(self.mu) == 1:
+            return Coefficient(float(self.mu[0]), self.unweighed)
         own = self._share(weights)
         mean = float(own @ self.mu)
         between = max(float(own @ self.mu**2) - mean**2, 0.0)

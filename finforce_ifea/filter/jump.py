@@ -22,6 +22,8 @@ from finforce_ifea.filter.filter import (
     innovate,
     project_columns,
     solve_lower,
+    update,
+    widen,
 )
 from finforce_ifea.filter.measurement import Measurement, find_depth_jump, measure_distances, weigh
 from finforce_ifea.filter.state import CAMERA_TURN, CAMERA_X, CAMERA_Z, DEPTH, HEIGHT, TRACTION
@@ -87,29 +89,48 @@ def weigh_jump(jump, information, score):
 
 
 @njit(**_OPTIONS)
-def detect_jump(measured, ratios, x, log_weights, P, jumps, possible):
-    """Widen P where part of the state has jumped; return weights of the key points (m,) and which jump, or `NO_JUMP`.
-
-    A motion of the object, which is no jump, is taken out first to weigh the key points.
+def correct(measured, weight, ratios, x, log_weights, P, jumps, possible):
+    """Return the posterior of one image, and which jump it shows, or `NO_JUMP`.
 
     Args:
         measured: see `update`.
+        weight: of the key points (m,); none at first (0,), when they are found and jumps are looked for.
         ratios: see `update`.
         x: see `update`.
         log_weights: see `update`.
-        P: see `update`; changed.
+        P: predicted covariance (n, n); widened where part of the state has jumped.
         jumps: that may be (J,).
         possible: which of them are possible now (J,).
     """
-    H, rows, u, R = measured.H, measured.rows, measured.u, measured.R
-    nu = np.dot(np.exp(log_weights), expect_innovations(measured, ratios, x))
-    _, S = innovate(H, rows, u, P, R)
-    weight = _weigh_innovations(measured, nu, S, P[DEPTH, DEPTH])
-    extra = divide_noise(R, weight) - R
-    for i in range(len(R)):
-        S[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] += extra[i]
-    L = np.linalg.cholesky(S)
-    white_H, white = solve_lower(L, H), solve_lower(L, nu.reshape(-1, 1))
+    HP, S = innovate(measured.H, measured.rows, measured.u, P, measured.R)
+    found = NO_JUMP
+    if len(weight) == 0:
+        nu = np.dot(np.exp(log_weights), expect_innovations(measured, ratios, x))
+        weight = _weigh_innovations(measured, nu, S, P[DEPTH, DEPTH])
+        found = detect_jump(measured, weight, nu, S, jumps, possible)
+        if found != NO_JUMP:
+            for index, jump in enumerate(jumps):
+                if index == found:
+                    for i in range(len(jump.entries)):
+                        P[jump.entries[i], jump.entries[i]] += jump.stddev[i] ** 2
+            HP, S = innovate(measured.H, measured.rows, measured.u, P, measured.R)
+    return update(measured, weight, ratios, x, log_weights, HP, S), found
+
+
+@njit(**_OPTIONS)
+def detect_jump(measured, weight, nu, S, jumps, possible):
+    """Return which part of the state has jumped, or `NO_JUMP`.
+
+    Args:
+        measured: see `update`.
+        weight: of the key points (m,).
+        nu: mean innovation (2 m,) [m].
+        S: its covariance for key points without weights (2 m, 2 m).
+        jumps: that may be (J,).
+        possible: which of them are possible now (J,).
+    """
+    L = np.linalg.cholesky(widen(S, divide_noise(measured.R, weight), measured.R))
+    white_H, white = solve_lower(L, measured.H), solve_lower(L, nu.reshape(-1, 1))
     rows_H = np.ascontiguousarray(white_H.T)
     information, score = np.dot(rows_H, white_H), np.dot(rows_H, white)[:, 0].copy()
     found, most = NO_JUMP, 0.0
@@ -119,18 +140,14 @@ def detect_jump(measured, ratios, x, log_weights, P, jumps, possible):
             odds = weigh_jump(jump, own, part)
             if odds > most:
                 found, most = index, odds
-    for index, jump in enumerate(jumps):
-        if index == found:
-            for i in range(len(jump.entries)):
-                P[jump.entries[i], jump.entries[i]] += jump.stddev[i] ** 2
-    return weight, found
+    return found
 
 
 @njit(**_OPTIONS)
 def _weigh_innovations(measured, nu, S, depth_variance):
     """Return weights of the key points (m,) by their innovation (2 m,), the motion of the object taken out.
 
-    S has a depth of which nothing is known; here it is known as well as the median of the key points has it.
+    That is no jump. S has a depth of which nothing is known; here the median of the key points tells it.
     """
     H, R = measured.H, measured.R
     deeper, variance = find_depth_jump(H, R, nu)
@@ -169,7 +186,8 @@ class JumpWatch:
     def update(self, measured: Measurement, posterior: Posterior) -> tuple[NDArray, NDArray] | None:
         """Take an image; once it has jumped, return the change of the mean (n,) and of P (n, n)."""
         jump = self._jump
-        odds = _watch(measured, posterior, jump, self._F, self._information, self._score)
+        given = measured.H, measured.rows, measured.u, posterior.L, posterior.A, posterior.white
+        odds = _watch(given, jump, self._F, self._information, self._score)
         if odds <= 0.0:
             if odds - np.log(jump.probability) < _UNLIKELY:
                 self.reset()
@@ -184,14 +202,27 @@ class JumpWatch:
 
 
 @njit(**_OPTIONS)
-def _watch(measured, posterior, jump, F, information, score):
-    """Return the log odds of a jump by one more image; F (n, j), information (j, j) and score (j,) are updated."""
-    G = -project_columns(measured.H, measured.rows, measured.u, np.ascontiguousarray(F.T)).T.copy()
-    for j in range(len(jump.entries)):
-        G[:, j] += measured.H[:, jump.entries[j]]
-    G = solve_lower(posterior.L, G)
-    GT = np.ascontiguousarray(G.T)
-    information += np.dot(GT, G)
-    score += np.dot(GT, solve_lower(posterior.L, posterior.nu.reshape(-1, 1)))[:, 0]
-    F += np.dot(np.ascontiguousarray(posterior.A.T), G)
+def _watch(given, jump, F, information, score):
+    """Return the log odds of a jump by one more image; F (n, j), information (j, j) and score (j,) are updated.
+
+    Args:
+        given: H, rows and u of the `Measurement`; L, A and white of the `Posterior`.
+        jump: that is watched for.
+        F: see `JumpWatch`.
+        information: I of the module.
+        score: y of the module.
+    """
+    H, rows, u, L, A, white = given
+    count = F.shape[1]
+    G = -project_columns(H, rows, u, np.ascontiguousarray(F.T)).T.copy()
+    for j in range(count):
+        G[:, j] += H[:, jump.entries[j]]
+    G = solve_lower(L, G)
+    for i in range(len(G)):
+        for j in range(count):
+            score[j] += G[i, j] * white[i]
+            for k in range(count):
+                information[j, k] += G[i, j] * G[i, k]
+            for k in range(len(F)):
+                F[k, j] += A[i, k] * G[i, j]
     return weigh_jump(jump, information, score)

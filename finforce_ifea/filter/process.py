@@ -132,6 +132,48 @@ def find_growth(before, after, keypoints):
 
 
 @njit(**_OPTIONS)
+def start(expected, points, x):
+    """Return mean (n,) and stationary variance (n,) before the first image.
+
+    Args:
+        expected: see `Expectation`.
+        points: see `KEYPOINT` (K,).
+        x: depth, shape and height to begin with (3,).
+    """
+    m, V = expect_state(expected, points.offset_variance, np.zeros(len(points)))
+    m[DEPTH], m[SHAPE], m[HEIGHT] = x
+    return m, V
+
+
+@njit(**_OPTIONS)
+def advance(x, P, V, expected, points, positions, passed):
+    """Predict the state of an image in place; return its transition, a factor for each entry (n,).
+
+    Args:
+        x: means of the hypotheses (N, n).
+        P: covariance (n, n).
+        V: stationary variance in the last image (n,); becomes that in this one.
+        expected: see `Expectation`.
+        points: see `KEYPOINT` (K,).
+        positions: of the key points in the model (K, 3) [m].
+        passed: time [s] and motion of the object [m] since the last image.
+    """
+    dt, motion = passed
+    count = len(points)
+    displacement, sight = np.empty(count), np.empty(count)
+    for k in range(count):
+        displacement[k] = np.hypot(positions[k, 0] - points[k].rest[0], positions[k, 2] - points[k].rest[2])
+    m, after = expect_state(expected, points.offset_variance, displacement)
+    growth = find_growth(V, after, count)
+    for k in range(count):
+        sight[k] = points[k].sight / after[SHARED + 2 * k]
+    a = find_decay(sight, dt, motion, expected.camera_time)
+    predict(x, P, a, m, after, growth)
+    V[:] = after
+    return a * growth
+
+
+@njit(**_OPTIONS)
 def predict(x, P, a, m, V, growth):
     """Predict means (N, n) and covariance (n, n) in place.
 

@@ -20,7 +20,7 @@ AGREES = 0.25
 
 
 @njit(**_OPTIONS)
-def read_out(state, force, modes, x, log_weights, P, shift, reduction, at, ratios, ratio, spread):
+def read_out(state, force, modes, x, log_weights, P, shift, smoothing, at, ratios, ratio, spread):
     """Fill in force and covariance of the hypotheses.
 
     Args:
@@ -31,7 +31,8 @@ def read_out(state, force, modes, x, log_weights, P, shift, reduction, at, ratio
         log_weights: of the hypotheses (N,).
         P: covariance (n, n).
         shift: from the depth in x to that of the mechanics [m].
-        reduction: of the covariance of the first four entries by smoothing (4, 4).
+        smoothing: covariance of the first four entries by the noise of this image alone (4, 4), and the factor by which
+            smoothing lessens the standard deviation of the depth.
         at: depth, shape and height of the linearisation (3,).
         ratios: traction ratio of each hypothesis (N,).
         ratio: that of the linearisation.
@@ -46,7 +47,12 @@ def read_out(state, force, modes, x, log_weights, P, shift, reduction, at, ratio
             for c in range(4):
                 forces[i, a] += modes[a, c] * offset[c]
             found[a] += w[i] * forces[i, a]
-    covariance = np.dot(modes, np.dot(P[:4, :4] + reduction, np.ascontiguousarray(modes.T)))
+    (own, lessened), inner = smoothing, P[:4, :4].copy()
+    for c in range(4):
+        inner[0, c] += (lessened - 1.0) * own[0, c]
+        inner[c, 0] += (lessened - 1.0) * own[c, 0]
+    inner[0, 0] += (lessened - 1.0) ** 2 * own[0, 0]
+    covariance = np.dot(modes, np.dot(inner, np.ascontiguousarray(modes.T)))
     for a in range(3):
         for b in range(3):
             covariance[a, b] += (spread + _MISDIRECTED**2) * modes[a, 3] * modes[b, 3]

@@ -6,6 +6,7 @@ state until nothing changes that matters (iterated Kalman filter). What comes ou
 
 from __future__ import annotations
 
+from math import sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,9 +16,9 @@ from numpy.typing import NDArray
 from finforce.kalman import MotionNoise, Track
 from finforce_ifea.contact_mechanics.friction import Coefficient, constant_traction
 from finforce_ifea.contact_mechanics.pressed_jaw import PressedState, RigidContact, limit_step
-from finforce_ifea.filter.filter import Posterior, reduce_covariance, update
+from finforce_ifea.filter.filter import Posterior, reduce_covariance
 from finforce_ifea.filter.friction_path import TractionHypotheses
-from finforce_ifea.filter.jump import BUMPED, LIFTED, MISPLACED, NO_JUMP, NUDGED, OFFSET, JumpWatch, detect_jump
+from finforce_ifea.filter.jump import BUMPED, LIFTED, MISPLACED, NO_JUMP, NUDGED, OFFSET, JumpWatch, correct
 from finforce_ifea.filter.measurement import Measurement, find_seen, observe
 from finforce_ifea.filter.process import (
     BUMPED_SHIFT,
@@ -32,13 +33,11 @@ from finforce_ifea.filter.process import (
     TRACTION_FLOOR,
     TRACTION_SHARE,
     Expectation,
-    expect_state,
-    find_decay,
-    find_growth,
-    predict,
+    advance,
+    start,
 )
-from finforce_ifea.filter.readout import AGREES, LARGEST_RATIO, find_upright_ratio, judge_points, read_out
-from finforce_ifea.filter.state import CONTACT, DEPTH, HEIGHT, SHAPE, SHARED, TRACTION, state_size
+from finforce_ifea.filter.readout import AGREES, find_upright_ratio, judge_points, read_out
+from finforce_ifea.filter.state import CONTACT, DEPTH, HEIGHT, SHAPE, TRACTION, state_size
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tracking.contact_state import KEYPOINT, LEAST_DEPTH, LOADED_DEPTH, blank_contact_state
 
@@ -230,41 +229,33 @@ class ContactSearch:
     @property
     def ratio(self) -> float:
         """Expected traction ratio [-]."""
-        return float(np.clip(self.weights @ self.hypotheses.ratios, -LARGEST_RATIO, LARGEST_RATIO))
+        return float(self.weights @ self.hypotheses.ratios)
 
     def _expect(self) -> Expectation:
         """Return what the state returns to."""
-        mu, height_stddev = self.friction.mean, float(MISPLACED.stddev[0]) if self._misplaced else 0.0
+        mu, variance = self.friction.mean, self.expectation["variance"].copy()
+        variance[1] += float(MISPLACED.stddev[0]) ** 2 if self._misplaced else 0.0
         traction = TRACTION_FLOOR**2 + (TRACTION_SHARE * mu) ** 2 + min(self.hypotheses.stddev, mu) ** 2
         shared = float(self.expectation["shared"])
         camera, time = (_BUMPED, BUMPED_TIME) if self._bumped else (_STILL, CAMERA_TIME)
         if shared > 0.0:
             camera, time = camera + np.array([shared, shared, PLACE_TURN, PLACE_STRETCH]) ** 2, PLACE_TIME
-        return Expectation(
-            self.expectation["mean"].copy(),
-            self.expectation["variance"] + np.array([0.0, height_stddev**2]),
-            traction + self.hypotheses.unweighed**2,
-            camera,
-            time,
-        )
+        mean, traction = self.expectation["mean"].copy(), traction + self.hypotheses.unweighed**2
+        return Expectation(mean, variance, traction, camera, time)
 
     def _predict(self, dt: float) -> None:
         """Predict the state of an image dt [s] after the last one."""
-        expected, motion = self._expect(), self.hypotheses.take_motion()
-        bent = _find_displacements(self.points, self.positions, self.x is not None)
-        m, V = expect_state(expected, self.points["offset_variance"], bent)
+        expected, positions, passed = self._expect(), self.positions, (dt, self.hypotheses.take_motion())
         if self.x is None:
-            m[CONTACT] = self.state["x"]
-            self.x, self.P, self._V = np.tile(m, (len(self.log_weights), 1)), np.diag(V), V
+            m, self._V = start(expected, self.points, self.state["x"])
+            self.x, self.P = np.tile(m, (len(self.log_weights), 1)), np.diag(self._V)
             self.track = Track(_DEPTH_NOISE, float(m[DEPTH]), _FIRST_DEPTH**2)
-        growth, self._V = find_growth(self._V, V, self._count), V
-        sight = self.points["sight"] / V[SHARED : SHARED + 2 * self._count : 2]
-        a = find_decay(sight, dt, motion, expected.camera_time)
+            positions, passed = np.ascontiguousarray(self.points["rest"]), (0.0, 0.0)
         self.track.predict(dt, _FREE_TIME if self.state["depth"] < LOADED_DEPTH else None)
         self.x[:, DEPTH] += self.track.x - self.weights @ self.x[:, DEPTH]
-        predict(self.x, self.P, a, m, V, growth)
+        transition = advance(self.x, self.P, self._V, expected, self.points, positions, passed)
         for watch in self._watches:
-            watch.predict(a * growth)
+            watch.predict(transition)
 
     def find(self, contact: RigidContact, probe: Any, dt: float, *, iterations: int) -> bool:
         """Find the contact in the image of `points`; False, all as it was, where too few key points agree.
@@ -285,7 +276,8 @@ class ContactSearch:
         x[0], x[1] = self.track.x, min(max(x[1], expectation["lowest"]), expectation["highest"])
         q = self.q + self._modes @ (find_x_model(contact, x)[0] - self.state["x_model"])
         settled, iteration, share, last = False, 0, 1.0, np.zeros(3)
-        at, weight, moved, jump, P = None, None, np.zeros(3), NO_JUMP, self.P.copy()
+        at, weight, moved, jump, P = None, np.empty(0), np.zeros(3), NO_JUMP, self.P.copy()
+        possible = self._find_possible_jumps()
         while iteration < iterations and not settled:
             iteration += 1
             q, made = self._linearize(contact, probe, q, x, ratio)
@@ -293,10 +285,8 @@ class ContactSearch:
                 continue
             at = made
             measured = observe(points, seen, at.positions, at.motions, at.x, ratio, self._level)
-            if weight is None:
-                possible = self._find_possible_jumps()
-                weight, jump = detect_jump(measured, ratios, self.x, self.log_weights, P, _JUMPS, possible)
-            posterior = update(measured, weight, ratios, self.x, self.log_weights, P)
+            posterior, found = correct(measured, weight, ratios, self.x, self.log_weights, P, _JUMPS, possible)
+            jump = max(jump, found)
             weight, aim = posterior.weight, posterior.mean[CONTACT] - x
             aim[0] = self.track.expect(posterior.mean[DEPTH], max(posterior.own[0, 0], _LEAST_VARIANCE)) - x[0]
             last, share = _bound_step(aim, last, share, expectation)
@@ -354,14 +344,12 @@ class ContactSearch:
                 self._forget_innovations()
                 return
 
-    def _smooth_depth(self, posterior: Posterior) -> NDArray:
-        """Smooth the depth; return by how much that lessens the covariance of the first four entries (4, 4)."""
-        own = posterior.own
-        raw, variance = float(self.mean[DEPTH]), max(own[0, 0], _LEAST_VARIANCE)
+    def _smooth_depth(self, raw: float, variance: float) -> float:
+        """Smooth a depth [m] of some variance [m^2]; return by which factor that lessens its standard deviation."""
+        variance = max(variance, _LEAST_VARIANCE)
         self.track.update(raw, variance)
-        self._smooth, scale = self.track.x - raw, np.ones(4)
-        scale[0] = np.sqrt(min(self.track.variance / variance, 1.0))
-        return scale[:, None] * own * scale - own
+        self._smooth = self.track.x - raw
+        return sqrt(min(self.track.variance / variance, 1.0))
 
     def _read_out(
         self,
@@ -380,7 +368,8 @@ class ContactSearch:
             posterior: of the image.
             traction: ratio of each hypothesis (N,), and that of the linearisation.
         """
-        s, pressed, smoothing = blank_contact_state(), at.pressed, self._smooth_depth(posterior)
+        s, pressed = blank_contact_state(), at.pressed
+        lessened = self._smooth_depth(float(self.weights @ self.x[:, DEPTH]), float(posterior.own[0, 0]))
         x_model, s["depth"] = find_x_model(contact, x)
         s["x"], s["x_model"] = x, x_model
         s["pressure_point"], s["pressure_location"] = pressed.pressure_point, pressed.pressure_location
@@ -388,6 +377,7 @@ class ContactSearch:
         s["mistaken"] = self._misplaced
         force, modes, (ratios, ratio) = pressed.force, np.ascontiguousarray(pressed.force_modes), traction
         shift, spread = self._smooth + x_model[0] - x[0], self.hypotheses.spread_cells(self.weights)
+        smoothing = posterior.own, lessened
         read_out(s, force, modes, self.x, self.log_weights, self.P, shift, smoothing, at.x, ratios, ratio, spread)
         self.state = s
         if s["magnitude"] > _LEAST_FORCE:
@@ -405,7 +395,7 @@ class ContactSearch:
 
     def contact_covariance(self) -> NDArray:
         """Return the covariance of depth, shape and height (3, 3)."""
-        return self.P[np.ix_(CONTACT, CONTACT)]
+        return self.P[: HEIGHT + 1, : HEIGHT + 1]
 
 
 def find_x_model(contact: RigidContact, x: NDArray) -> tuple[NDArray, float]:
@@ -413,16 +403,6 @@ def find_x_model(contact: RigidContact, x: NDArray) -> tuple[NDArray, float]:
     x_model, touch = x.copy(), contact.find_touch(x)
     x_model[DEPTH] = max(x[DEPTH], touch + LEAST_DEPTH)
     return x_model, x[DEPTH] - touch
-
-
-@njit(**_OPTIONS)
-def _find_displacements(points, positions, is_known):
-    """Return by how much the key points are displaced in the plane (K,) [m], zero before anything is known."""
-    out = np.zeros(len(points))
-    for k in range(len(points)):
-        if is_known:
-            out[k] = np.hypot(positions[k, 0] - points[k].rest[0], positions[k, 2] - points[k].rest[2])
-    return out
 
 
 @njit(**_OPTIONS)
@@ -458,7 +438,11 @@ def _is_settled(moved, missing, share, expectation):
     return True
 
 
-def _is_believed(posterior: Posterior, V: NDArray) -> bool:
+@njit(**_OPTIONS)
+def _is_believed(posterior, V):
     """Whether most key points agree, and the camera has moved no farther than a bump, or V (n,), allows."""
-    moved = np.abs(posterior.mean[BUMPED.entries]) / np.maximum(BUMPED.stddev, np.sqrt(V[BUMPED.entries]))
-    return bool((posterior.weight > AGREES).mean() > _MAJORITY and (moved < _LARGEST_BUMP).all())
+    for i in range(len(BUMPED.entries)):
+        entry = BUMPED.entries[i]
+        if not abs(posterior.mean[entry]) < _LARGEST_BUMP * max(BUMPED.stddev[i], np.sqrt(V[entry])):
+            return False
+    return (posterior.weight > AGREES).mean() > _MAJORITY

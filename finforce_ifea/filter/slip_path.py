@@ -60,6 +60,8 @@ class SlipPath:
             x: state of the contact (3,).
             motion: in depth and height for each coefficient (N, 2) [m].
         """
+        if not self.coefficients.any():
+            return
         place = x[[0, 2]]
         if self._turns is None or np.abs(place - self._at).max() > _FRESH:
             self._turns, self._at = measure_turns(contact, q, x), place

@@ -5,15 +5,17 @@ The shape of an unknown object is its radius, that of a known outline its tilt.
 
 from __future__ import annotations
 
-from math import hypot, inf, nan, sqrt
+from math import hypot, nan
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from finforce_ifea.contact_mechanics.friction import Coefficient, constant_traction
-from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, SHAPE, OutlineIndenter, RoundIndenter, expect_object
+from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, OutlineIndenter, RoundIndenter, expect_object
 from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics, RigidContact, limit_step
+from finforce_ifea.filter.hidden import APART_SIGMAS, HiddenForce, list_clamped_heights
+from finforce_ifea.filter.lateral_load import LateralLoad, Torsion, expect_weight
 from finforce_ifea.filter.search import ContactSearch, find_x_model
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE
 from finforce_ifea.observation import Contact, Observation
@@ -21,7 +23,6 @@ from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tare import PointNoise, Tare
 from finforce_ifea.tracking.contact_state import MIDDLE_STDDEV, TOUCH_DEPTH, UNSEEN_TRACTION, ContactState
 from finforce_ifea.tracking.influence import explain_offsets, measure_influence, press_lightly
-from finforce_ifea.tracking.lateral_load import LateralLoad, Torsion, expect_weight
 
 # Images without touch after which the next object may be any.
 _IMAGES_RELEASED = 15
@@ -37,14 +38,6 @@ _BEYOND_STORED, _BACK = 1.0, 0.8
 _FULL_ITERATIONS = 3
 # Those that find the equilibrium of the full mechanics in the state at which they take over, and their last correction.
 _SETTLING, _SETTLED = 8, 2e-3
-# An object is apart from the jaw where its pose says so by this many standard deviations.
-_APART_SIGMAS = 3.0
-# So far from the pressure centre is elsewhere along the finger [m], of whose heights every third is asked.
-_ELSEWHERE, _EVERY = 5e-3, 3
-# Heights next to the clamp, as shares of the lowest at which key points show a force; objects farther off than this,
-# or deeper in, are surely so [m].
-_NEXT_TO_CLAMP, _WELL_CLEAR = np.array([0.2, 0.4, 0.6, 0.8, 1.0]), 3e-3
-_LEAST_VARIANCE = 1e-12
 # Share of the expected deviation of a coefficient of friction below which something was learnt of it.
 _LEARNT = 0.75
 
@@ -97,10 +90,7 @@ class ContactTracker:
         self.response = measure_influence(self._contact, self._probe, len(keypoints))
         self._outline: OutlineIndenter | None = None
         self._is_apart = False
-        # height [m], stiffness [N/m], and standard deviation of what key points tell of a force there [N]
-        self._base = [(height, self._measure_stiffness(height), inf) for height in contact_range[0] * _NEXT_TO_CLAMP]
-        _, vague = self.response.fit_forces(np.ones(len(keypoints), bool))
-        self._along = list(zip(self.response.heights, self.response.stiffness, vague, strict=True))[::_EVERY]
+        self._hidden = self._build_hidden(contact_range[0])
         self._lateral = LateralLoad(torsion, len(keypoints), UNSEEN_TRACTION * settings.friction)
         self._tare: Tare | None = None
         self.expect_friction(None)
@@ -314,9 +304,10 @@ class ContactTracker:
         self._expect(expected.mean, expected.variance)
         self._lead(contact.outline.stddev[[2, 1]])
         self._outline = after = expected.indenter
-        self._press(after)
+        if after is not before:
+            self._press(after)
         pressed_by_pose = self._contact.face_x + after.pressed.front - contact.outline.origin[0]
-        self._is_apart = bool(pressed_by_pose < -_APART_SIGMAS * contact.outline.stddev[0])
+        self._is_apart = bool(pressed_by_pose < -APART_SIGMAS * contact.outline.stddev[0])
         height = float(expected.mean[1])
         self._given = None
         is_off = abs(self._search.state["x"][HEIGHT] - height) > _FARTHEST_HEIGHT * self.settings.height_stddev
@@ -341,48 +332,33 @@ class ContactTracker:
         traction = UNSEEN_TRACTION * self.settings.friction
         load = self._lateral.load if self._is_known else (0.0, MIDDLE_STDDEV, nan, traction)
         state["y"], state["y_stddev"], state["lateral_force"], state["lateral_stddev"] = load
-        state["hidden"] = self._find_hidden(state, hypot(state["force"][0], state["force"][2]))
+        state["hidden"] = self._find_hidden(state)
         state["bearable"] = self._fidelities[0].contact.bearable
 
-    def _find_hidden(self, state: ContactState, normal: float) -> float:
-        """Return the standard deviation of a force [N] elsewhere than the key points have it, which they hardly show.
-
-        Within the uncertainty of its state, as by rocking, an object that is clear of the base may press there, and one
-        that seems to press there may be clear of it; so may a flat one anywhere along a stiff finger. A force whose
-        centre is next to the clamp is not known at all.
-        """
+    def _find_hidden(self, state: ContactState) -> float:
+        """Return the standard deviation of a force [N] elsewhere than the key points have it, see `HiddenForce`."""
+        force, centre = state["force"], float(state["pressure_location"][2])
         if self._is_apart:
             return 0.0
-        centre = state["pressure_location"][2]
-        if centre < self._base[-1][0]:
-            return normal
-        places = self._base + [place for place in self._along if abs(place[0] - centre) > _ELSEWHERE]
-        x, indenter, surface = state["x"], self._contact.indenter, self._contact.surface
-        near = [(place, c) for place in places if abs(c := indenter.find_clearance(x, 0.0, place[0])) < _WELL_CLEAR]
-        if not near:
-            return 0.0
-        moved, hidden = self._contact.place_points(self.q)[:, 0] - surface.points[:, 0], 0.0
-        for (height, stiffness, vague), clearance in near:
-            row = max(0, int(np.searchsorted(surface.heights, height)) - 1) * surface.across
-            beyond = self._find_clearance_stddev(state["x"], height) - abs(clearance - moved[row]) / _APART_SIGMAS
-            hidden = max(hidden, min(stiffness * beyond, vague))
-        return hidden
+        if self._hidden.is_next_to_clamp(centre):
+            return hypot(force[0], force[2])
+        pressed, covariance = self._contact.indenter.pressed, self._search.contact_covariance()
+        return self._hidden.bound(pressed, state["x"], covariance, centre, self._move_surface)
 
-    def _find_clearance_stddev(self, x: NDArray, height: float) -> float:
-        """Return the standard deviation of the object's clearance at a height in a state (3,) [m]."""
-        indenter = self._contact.indenter
-        slope, covariance = np.array([-1.0, 0.0, 0.0]), self._search.contact_covariance()
-        for i in (SHAPE, HEIGHT):
-            step = np.zeros(3)
-            step[i] = sqrt(max(covariance[i, i], _LEAST_VARIANCE))
-            change = [indenter.find_clearance(x + sign * step, 0.0, height) for sign in (-1.0, 1.0)]
-            slope[i] = 0.5 * (change[1] - change[0]) / step[i] if np.isfinite(change).all() else 0.0
-        return sqrt(max(float(slope @ covariance @ slope), 0.0))
+    def _move_surface(self) -> NDArray:
+        """Return the motion along x of the inner face at its heights (h,) [m]."""
+        surface = self._contact.surface
+        return (self._contact.place_points(self.q)[:, 0] - surface.points[:, 0])[:: surface.across]
 
-    def _measure_stiffness(self, height: float) -> float:
-        """Return the stiffness of the unloaded jaw at a height [m] against a round object [N/m]."""
-        _, pressed = press_lightly(self._contact, self.settings.radius, height)
-        return abs(float(pressed.force_modes[0, DEPTH]))
+    def _build_hidden(self, lowest: float) -> HiddenForce:
+        """Return where key points hardly show a force, on a finger that shows one from a height [m] on."""
+        _, vague = self.response.fit_forces(np.ones(len(self._rest), bool))
+        contact, along = self._contact, zip(self.response.heights, self.response.stiffness, vague, strict=True)
+        clamped = [
+            (height, abs(float(press_lightly(contact, self.settings.radius, height)[1].force_modes[0, DEPTH])))
+            for height in list_clamped_heights(lowest)
+        ]
+        return HiddenForce(clamped, list(along), contact.surface)
 
 
 def _attach(contact: RigidContact, keypoints: NDArray) -> _Fidelity:

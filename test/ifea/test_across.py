@@ -17,12 +17,12 @@ from scipy.interpolate import interp1d
 from finforce_ifea.contact_mechanics.friction import constant_traction
 from finforce_ifea.errors import ContactError
 from finforce_ifea.estimator import ForceEstimator
+from finforce_ifea.filter.lateral_load import measure_torsion, turn_bent
 from finforce_ifea.filter.tracker import ContactTracker
 from finforce_ifea.jaw.calibration import Calibration, load_calibration
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.observation import Contact, ObjectOutline, Observation
 from finforce_ifea.settings import EstimatorSettings
-from finforce_ifea.tracking.lateral_load import measure_torsion, turn_bent
 
 _DATA = Path(__file__).parents[1] / "data"
 TRUTH = {**np.load(_DATA / "shaped_bench.npz"), **np.load(_DATA / "sphere_off_middle.npz")}

@@ -15,6 +15,7 @@ y_c is expected where the object's mesh is nearest.
 """
 
 from dataclasses import dataclass
+from math import hypot, inf, isfinite, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +23,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from finforce_ifea.fem.solid import SolidModel
+from finforce_ifea.filter.filter import solve_lower
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE, Jaw
 from finforce_ifea.jaw.mesh import VolumeMesh
 from finforce_ifea.tracking.contact_state import MIDDLE_STDDEV, ContactState
@@ -243,61 +245,47 @@ class LateralLoad:
             weight: 1 sigma of the lateral traction ratio by a weight that may have been lifted; None where none may.
         """
         torsion, force, height = self._torsion, state["force"], float(state["pressure_location"][2])
-        normal = float(np.hypot(force[0], force[2]))
-        if torsion is None or not normal > _LEAST_FORCE or not np.isfinite(height):
+        normal = hypot(force[0], force[2])
+        if torsion is None or not normal > _LEAST_FORCE or not isfinite(height):
             self.reset()
             return
         by_moment, by_force, roll = torsion.at(height)
-        turns = turn_bent(by_moment[:, 0], points["rest"], bend)
-        moment, across = by_moment[:, 1] + turns, by_force[:, 1] + turn_bent(by_force[:, 0], points["rest"], bend)
-        rolled = force[0] ** 2 * roll * self.load[0]  # -F_x r, with r = roll (-y F_x)
-        seen = np.flatnonzero(np.isfinite(motions) & (points["weight"] > 0.0))
-        noise = points["width_variance"] / (points["trust"] * np.maximum(points["weight"], 1e-9))
-        noise += (_TURN_ERROR * turns * self.load[0] * normal) ** 2
-        rows = np.ascontiguousarray(normal * np.stack([moment, across], axis=1)[seen])
-        measured = rows, (motions - across * rolled)[seen], noise[seen]
-        offsets, moved = points["offset_variance"] + _FLOOR**2, abs(float(state["depth"]) - self._depth)
-        self._depth = float(state["depth"])
-        self._follow(seen, measured, offsets, moved, dt, weight)
+        rolled = float(force[0] ** 2 * roll * self.load[0])  # -F_x r, with r = roll (-y F_x)
+        place = normal, rolled, self.load[0]
+        measured = _observe(points, motions, bend, by_moment, by_force, place)
+        moved, self._depth = abs(float(state["depth"]) - self._depth), float(state["depth"])
+        self._follow(measured, points["offset_variance"], (moved, dt), weight)
         x, P, half = *self._known, torsion.half_width
-        location, stddev = min(max(x[0], -half), half), float(np.hypot(np.sqrt(P[1, 1]), _NONLINEAR))
+        location, stddev = min(max(float(x[0]), -half), half), hypot(sqrt(P[1, 1]), _NONLINEAR)
         # unless a weight was lifted, chance and what the linear jaw errs by are no force
-        clear = np.inf if self._is_lifted else (x[1] / (_CLEAR * stddev)) ** 4
-        total = rolled + x[1] * normal / (1.0 + 1.0 / max(clear, 1e-300))
-        self.load[:] = location, np.sqrt(P[0, 0]), total, stddev
+        clear = inf if self._is_lifted else (float(x[1]) / (_CLEAR * stddev)) ** 4
+        total = rolled + float(x[1]) * normal / (1.0 + 1.0 / max(clear, 1e-300))
+        self.load[:] = location, sqrt(P[0, 0]), total, stddev
         self.motions = by_moment * (-location * force[0]) + by_force * total
 
     def _follow(
-        self, seen: NDArray, measured: tuple, offsets: NDArray, moved: float, dt: float, weight: float | None
+        self, measured: tuple[NDArray, ...], offsets: NDArray, passed: tuple[float, float], weight: float | None
     ) -> None:
         """Take an image into both hypotheses, and decide between them.
 
         Args:
-            seen: numbers of the key points (m,).
-            measured: derivatives by location and ratio (m, 2), motions (m,) [m], and variances (m,) [m^2].
+            measured: see `_observe`.
             offsets: stationary variance of each key point's offset (K,) [m^2].
-            moved: of the object in depth since the last image [m].
-            dt: time since then [s].
+            passed: motion of the object in depth [m] and time [s] since the last image.
             weight: see `update`.
         """
-        mean, V = np.zeros(2 + self._count), np.r_[self._expected[1] ** 2, _TRACTION**2, offsets]
-        mean[0] = self._expected[0]
-        a = np.full(2 + self._count, np.exp(-moved / _OFFSET_LENGTH - dt / _OFFSET_TIME))
-        a[:2] = np.exp(-dt / _LOCATION_TIME), np.exp(-dt / _TRACTION_TIME)
         if self._known is None:
-            self._known = self._candidate = _Estimate(mean.copy(), np.diag(V))
+            self._known = self._candidate = _begin(self._expected, offsets)
             self._odds = 0.0
-        held, rate = V.copy(), a.copy()
-        if weight is not None:
-            held[1], rate[1] = weight**2 + _TRACTION**2, np.exp(-dt / _WEIGHT_TIME)
+        expected = (*self._expected, 0.0 if weight is None else weight)
         if self._is_lifted:
-            self._known = _step(*self._known, rate, mean, held, seen, *measured)[0]
+            self._known = _step(self._known, expected, offsets, passed, measured)[0]
             return
-        before = self._known
-        self._known, likely = _step(*before, a, mean, V, seen, *measured)
+        before, light = self._known, (*self._expected, 0.0)
+        self._known, likely = _step(before, light, offsets, passed, measured)
         if weight is None:
             return
-        self._candidate, other = _step(*self._candidate, rate, mean, held, seen, *measured)
+        self._candidate, other = _step(self._candidate, expected, offsets, passed, measured)
         self._odds += other - likely
         if self._odds < _UNLIKELY:
             self._candidate, self._odds = self._known, 0.0
@@ -306,14 +294,72 @@ class LateralLoad:
 
 
 @njit(**_OPTIONS)
-def _step(x, P, a, mean, V, seen, H, z, R):
-    """Return the estimate after an image, and the logarithm of its likelihood; see `LateralLoad`."""
-    n, m = len(x), len(seen)
-    x, P = mean + a * (x - mean), P.copy()
+def _observe(points, motions, bend, by_moment, by_force, place):
+    """Return what the key points show across the finger.
+
+    Args:
+        points: see `KEYPOINT` (K,).
+        motions: measured along y (K,) [m], NaN where unused.
+        bend: of the model along x (K,) [m].
+        by_moment: see `Torsion`, at the height of the pressure (K, 3).
+        by_force: the same.
+        place: normal force [N], the force along y by the roll of the face [N], and the location so far [m].
+
+    Returns:
+        Numbers of the key points that are seen (m,), derivatives by location and ratio (m, 2), motions less that by the
+        roll (m,) [m], and their variances (m,) [m^2].
+    """
+    normal, rolled, location = place
+    turns = turn_bent(by_moment[:, 0], points.rest, bend)
+    aside = turn_bent(by_force[:, 0], points.rest, bend)
+    count, m = len(points), 0
+    seen, H, z, R = np.empty(count, np.int64), np.empty((count, 2)), np.empty(count), np.empty(count)
+    for k in range(count):
+        if np.isfinite(motions[k]) and points[k].weight > 0.0:
+            across = by_force[k, 1] + aside[k]
+            seen[m], z[m] = k, motions[k] - across * rolled
+            H[m, 0], H[m, 1] = normal * (by_moment[k, 1] + turns[k]), normal * across
+            R[m] = points[k].width_variance / (points[k].trust * max(points[k].weight, 1e-9))
+            R[m] += (_TURN_ERROR * turns[k] * location * normal) ** 2
+            m += 1
+    return seen[:m], H[:m], z[:m], R[:m]
+
+
+@njit(**_OPTIONS)
+def _begin(expected, offsets):
+    """Return the estimate before the first image; see `_step` for the arguments."""
+    x, V = np.zeros(2 + len(offsets)), np.empty(2 + len(offsets))
+    x[0] = expected[0]
+    V[0], V[1], V[2:] = expected[1] ** 2, _TRACTION**2, offsets + _FLOOR**2
+    return _Estimate(x, np.diag(V))
+
+
+@njit(**_OPTIONS)
+def _step(estimate, expected, offsets, passed, measured):
+    """Return the estimate after an image, and the logarithm of its likelihood; see `LateralLoad`.
+
+    Args:
+        estimate: before it.
+        expected: location [m], its standard deviation [m], and 1 sigma of the ratio by a weight, 0 for none.
+        offsets: stationary variance of each key point's offset (K,) [m^2].
+        passed: motion [m] and time [s] since the last image.
+        measured: see `_observe`.
+    """
+    moved, dt = passed
+    seen, H, z, R = measured
+    location, stddev, weight = expected
+    n, m, kept = len(estimate.x), len(seen), np.exp(-moved / _OFFSET_LENGTH - dt / _OFFSET_TIME)
+    rates = np.exp(-dt / _LOCATION_TIME), np.exp(-dt / (_WEIGHT_TIME if weight > 0.0 else _TRACTION_TIME))
+    x, P, a = estimate.x.copy(), estimate.P.copy(), np.empty(n)
+    for i in range(n):
+        a[i] = rates[i] if i < 2 else kept
+        mean = location if i == 0 else 0.0
+        x[i] = mean + a[i] * (x[i] - mean)
     for i in range(n):
         for j in range(n):
             P[i, j] *= a[i] * a[j]
-        P[i, i] += (1.0 - a[i] ** 2) * V[i]
+        V = offsets[i - 2] + _FLOOR**2 if i > 1 else (stddev**2 if i == 0 else weight**2 + _TRACTION**2)
+        P[i, i] += (1.0 - a[i] ** 2) * V
     HP, nu, S = np.empty((m, n)), np.empty((m, 1)), np.empty((m, m))
     for i in range(m):
         k = 2 + seen[i]
@@ -325,7 +371,7 @@ def _step(x, P, a, mean, V, seen, H, z, R):
             S[i, j] = HP[i, 0] * H[j, 0] + HP[i, 1] * H[j, 1] + HP[i, 2 + seen[j]]
         S[i, i] += R[i]
     L = np.linalg.cholesky(S)
-    A, white = np.linalg.solve(L, HP), np.linalg.solve(L, nu)
+    A, white = solve_lower(L, HP), solve_lower(L, nu)
     A_T = np.ascontiguousarray(A.T)
     likely = -0.5 * (white**2).sum() - np.log(np.diag(L)).sum()
     return _Estimate(x + np.dot(A_T, white)[:, 0], P - np.dot(A_T, A)), likely

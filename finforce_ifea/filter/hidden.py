@@ -1,0 +1,113 @@
+"""Force that an object may exert where key points hardly show it: next to the clamp, or along a flat face.
+
+An object whose clearance c from the deformed jaw has the standard deviation s at a height may press there, and one that
+seems to press there may be clear of it. With the stiffness k of the jaw, the force has the standard deviation
+k (s - |c| / 3), but no more than what key points leave of a force at that height.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, SHAPE, PressedObject, find_clearance
+from finforce_ifea.contact_mechanics.pressed_jaw import ContactSurface
+
+_OPTIONS = {"cache": True, "error_model": "numpy"}
+# Heights next to the clamp, as shares of the lowest at which key points show a force [-].
+_NEXT_TO_CLAMP = np.array([0.2, 0.4, 0.6, 0.8, 1.0])
+# Of the heights along the finger, one in so many is asked.
+_EVERY = 3
+# Distance along the finger from the pressure centre beyond which a force is elsewhere [m].
+_ELSEWHERE = 5e-3
+# Objects farther off than this, or deeper in, are surely so [m].
+_WELL_CLEAR = 3e-3
+# An object is apart from the jaw by so many standard deviations.
+APART_SIGMAS = 3.0
+_LEAST_VARIANCE = 1e-12
+
+
+def list_clamped_heights(lowest: float) -> NDArray:
+    """Return heights (b,) [m] next to the clamp, for the lowest at which key points show a force [m]."""
+    return lowest * _NEXT_TO_CLAMP
+
+
+class HiddenForce:
+    """Bounds the force elsewhere than the key points have it, within the uncertainty of the object's state."""
+
+    def __init__(
+        self,
+        clamped: Sequence[tuple[float, float]],
+        along: Sequence[tuple[float, float, float]],
+        surface: ContactSurface,
+    ) -> None:
+        """Keep where such a force may act.
+
+        Args:
+            clamped: heights [m] next to the clamp, rising, and the stiffness of the jaw there [N/m].
+            along: heights along the finger [m], stiffness [N/m], and the standard deviation of what all key points tell
+                of a force there [N].
+            surface: of the jaw.
+        """
+        self._places = np.array([*((*place, np.inf) for place in clamped), *along[::_EVERY]])
+        self._clamped, self._lowest = len(clamped), clamped[-1][0]
+        self._rows = np.maximum(0, np.searchsorted(surface.heights, self._places[:, 0]) - 1)
+
+    def is_next_to_clamp(self, centre: float) -> bool:
+        """Return whether key points tell nothing of a force about a height [m]."""
+        return centre < self._lowest
+
+    def bound(
+        self,
+        pressed: PressedObject,
+        x: NDArray,
+        covariance: NDArray,
+        centre: float,
+        move_surface: Callable[[], NDArray],
+    ) -> float:
+        """Return the standard deviation of a hidden force [N].
+
+        Args:
+            pressed: the object.
+            x: state of the contact (3,).
+            covariance: of x (3, 3).
+            centre: height of the pressure [m].
+            move_surface: returns the motion along x of the jaw's surface at its heights (h,) [m].
+        """
+        if pressed.is_round:  # a cylinder, which is small and round
+            return 0.0
+        clearance, stddev = _measure_clearances(pressed, x, covariance, self._places, self._clamped, centre)
+        near = np.flatnonzero(np.abs(clearance) < _WELL_CLEAR)
+        if not len(near):
+            return 0.0
+        beyond = stddev[near] - np.abs(clearance[near] - move_surface()[self._rows[near]]) / APART_SIGMAS
+        return max(0.0, float(np.minimum(self._places[near, 1] * beyond, self._places[near, 2]).max()))
+
+
+@njit(**_OPTIONS)
+def _measure_clearances(pressed, x, covariance, places, clamped, centre):
+    """Return clearance and its standard deviation (m,) [m] at each place, infinite where it is not elsewhere."""
+    count, slope, step = len(places), np.empty(3), np.zeros(3)
+    clearance, stddev = np.full(count, np.inf), np.zeros(count)
+    for p in range(count):
+        height = places[p, 0]
+        if p >= clamped and abs(height - centre) <= _ELSEWHERE:
+            continue
+        clearance[p] = find_clearance(pressed, x, height)
+        if not abs(clearance[p]) < _WELL_CLEAR:
+            continue
+        slope[DEPTH] = -1.0
+        for i in (SHAPE, HEIGHT):
+            step[:] = 0.0
+            step[i] = np.sqrt(max(covariance[i, i], _LEAST_VARIANCE))
+            change = find_clearance(pressed, x + step, height) - find_clearance(pressed, x - step, height)
+            slope[i] = 0.5 * change / step[i] if np.isfinite(change) else 0.0
+        variance = 0.0
+        for i in range(3):
+            for j in range(3):
+                variance += slope[i] * covariance[i, j] * slope[j]
+        stddev[p] = np.sqrt(max(variance, 0.0))
+    return clearance, stddev
