@@ -28,6 +28,7 @@ from finforce_ifea.observation import (
     blank_solution,
     check_contact,
     check_observation,
+    check_periods,
     sketch_contact,
 )
 from finforce_ifea.relaxation import Relaxation
@@ -116,7 +117,7 @@ class ForceEstimator:
 
     def reset(self) -> None:
         """Forget everything but the jaw: offsets, place, relaxation, stamps."""
-        self._stamps: deque[float] = deque(maxlen=2)  # of the last images [s]
+        self._stamps: deque[float] = deque(maxlen=3)  # of the last images [s]
         self._bits, self._changed = b"", 0.0
         self._followed: float | None = None  # stamp of the last image that a tracker took
         self._contact: Contact | None = None
@@ -217,12 +218,13 @@ class ForceEstimator:
             ContactError: The contact is not on the jaw.
         """
         self.learn()
-        check_observation(observation, len(self.jaw.keypoints), self._stamps)
+        check_observation(observation, len(self.jaw.keypoints), self._stamps[-1] if self._stamps else None)
         if contact is not None and contact is not self._contact:
             check_contact(contact, self.jaw)
             self._follow(contact)
         self._contact, self._pressed = contact, None
         self._stamps.append(float(observation.stamp))
+        check_periods(self._stamps)
         bits = np.asarray(observation.points).tobytes()
         if bits != self._bits:
             self._bits, self._changed = bits, self._stamp

@@ -183,17 +183,12 @@ def blank_solution(stamp: float, status: str, message: str, used: NDArray, itera
     )
 
 
-def check_observation(observation: Observation, count: int, earlier: Sequence[float] = ()) -> None:
+def check_observation(observation: Observation, count: int, last_stamp: float | None = None) -> None:
     """Refuse what cannot be an image's key points.
-
-    Args:
-        observation: the key points of the image.
-        count: number of key points of the jaw.
-        earlier: stamps of the images before [s], the newest last.
 
     Raises:
         ObservationError: Wrong shapes, infinite values, a likelihood outside [0, 1], a standard deviation that is none,
-            a direction of gravity of another length than 1, stamps that do not rise by a camera's period in seconds.
+            a direction of gravity of another length than 1, stamps that do not rise.
     """
     points, likelihood = np.asarray(observation.points, float), np.asarray(observation.likelihood, float)
     if points.shape != (count, 3) or likelihood.shape != (count,):
@@ -220,44 +215,41 @@ def check_observation(observation: Observation, count: int, earlier: Sequence[fl
     gravity = observation.gravity
     if gravity is not None and not (np.shape(gravity) == (3,) and abs(np.linalg.norm(gravity) - 1.0) < _UNIT):
         raise ObservationError(f"gravity {np.asarray(gravity).tolist()}, expected a unit vector of three numbers")
-    check_stamp(observation.stamp, earlier)
+    check_stamp(observation.stamp)
+    if last_stamp is not None and observation.stamp <= last_stamp:
+        raise ObservationError(
+            f"stamp {observation.stamp:.6f} s after {last_stamp:.6f} s, expected rising stamps; "
+            "reset for a new recording"
+        )
+    if last_stamp is not None and observation.stamp < last_stamp + _SAME_IMAGE:
+        raise ObservationError(
+            f"stamp {observation.stamp - last_stamp:.3g} s after the last, expected at least {_SAME_IMAGE:g} s: "
+            "one image came twice"
+        )
 
 
-def check_stamp(stamp: float, earlier: Sequence[float] = ()) -> None:
-    """Refuse what cannot be a capture time in seconds.
-
-    A single gap is a pause; two gaps in a row are another unit.
-
-    Args:
-        stamp: image capture time [s].
-        earlier: stamps of the images before [s], the newest last.
+def check_stamp(stamp: float) -> None:
+    """Refuse what cannot be a capture time in seconds: whole numbers, which count images or ticks, and far too many.
 
     Raises:
-        ObservationError: the stamp counts images or ticks, is not finite, does not rise, or is closer to or further
-            from those before than a camera's images are.
+        ObservationError: the stamp is such a number, or not finite.
     """
     if isinstance(stamp, Integral) or not abs(stamp) < _LATEST:
         raise ObservationError(
             f"stamp {stamp}, expected seconds as a float: divide frame numbers by the frame rate, milliseconds by 1e3, "
             "nanoseconds by 1e9"
         )
-    if not earlier:
+
+
+def check_periods(stamps: Sequence[float]) -> None:
+    """Refuse rising stamps of three images in a row that are not in seconds; a single gap is a pause.
+
+    Raises:
+        ObservationError: they are whole numbers, or closer or further apart than a camera's images.
+    """
+    if len(stamps) < 3:
         return
-    period = stamp - earlier[-1]
-    if period <= 0.0:
-        raise ObservationError(
-            f"stamp {stamp:.6f} s after {earlier[-1]:.6f} s, expected rising stamps; reset for a new recording"
-        )
-    if period < _SAME_IMAGE:
-        raise ObservationError(
-            f"stamp {period:.3g} s after the last, expected at least {_SAME_IMAGE:g} s: one image came twice"
-        )
-    if len(earlier) > 1:
-        _check_unit(earlier[-2], earlier[-1], float(stamp))
-
-
-def _check_unit(first: float, second: float, third: float) -> None:
-    """Refuse rising stamps of three images in a row that are not in seconds."""
+    first, second, third = stamps
     if first.is_integer() and second.is_integer() and third.is_integer():
         raise ObservationError(
             f"stamps {first:g}, {second:g}, {third:g}, expected seconds: if these are frame numbers, divide them by "

@@ -24,7 +24,8 @@ from finforce.health import Level, Report
 from finforce.messages import decode_columns
 from finforce.ros.topics import RESULT, SENSOR
 
-PATIENCE = 5.0  # [s] in which a publisher is found, and in which its first message should come
+DISCOVERY = 5.0  # [s] in which a publisher is found
+PATIENCE = 5.0  # [s] of silence after which it is noted
 LONGEST = 32  # elements of a sequence that are shown
 DIGITS = 7  # of a number, as single precision has
 Heard = Mapping[str, list[bytes]]
@@ -136,7 +137,7 @@ def _await_publisher(node: Node, executor: SingleThreadedExecutor, topic: str, h
         validate_topic_name(topic)
     except (NameValidationException, ValueError) as error:
         raise SilentTopicError(f"{topic!r} cannot be a topic, expected a name such as /grasp_wrench") from error
-    topic, end = node.resolve_topic_name(topic), monotonic() + PATIENCE
+    topic, end = node.resolve_topic_name(topic), monotonic() + DISCOVERY
     while not node.count_publishers(topic):
         if monotonic() > end:
             there = published_topics(node).keys() - {"/rosout", "/parameter_events"}

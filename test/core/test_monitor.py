@@ -24,6 +24,7 @@ from finforce_eval.cli.main import main
 def system(monkeypatch):
     """A solver in a domain of its own that is given key points, and spins in a thread until the test ends."""
     with ros_domain() as probe:
+        monkeypatch.setattr(monitor, "DISCOVERY", 60.0)  # on a busy machine; it ends when a publisher is found
         monkeypatch.setenv("ROS_DOMAIN_ID", str(probe.context.get_domain_id()))
         start_solver(probe)
         keypoints, ended = probe.speak("/left/keypoints"), Event()
@@ -67,7 +68,7 @@ def test_a_latched_message_is_shown_after_it_was_sent(system, capsys):
 
 
 def test_a_topic_that_nobody_publishes_is_named_with_the_one_that_was_meant(system, capsys, monkeypatch):
-    monkeypatch.setattr(monitor, "PATIENCE", 1.0)
+    monkeypatch.setattr(monitor, "DISCOVERY", 10.0)
     assert main(["echo", "/left/wrensh"]) == 2
     assert "nobody publishes /left/wrensh; did you mean /left/wrench" in capsys.readouterr().err
     assert main(["echo", "left wrench"]) == 2
@@ -87,14 +88,14 @@ def test_silence_on_a_topic_is_said_with_its_publisher(system, monkeypatch):
 
 
 def test_without_a_system_its_domain_is_named(monkeypatch):
-    monkeypatch.setattr(monitor, "PATIENCE", 0.5)
+    monkeypatch.setattr(monitor, "DISCOVERY", 0.5)
     domain = free_domain()
     with pytest.raises(SilentTopicError, match=rf"nobody publishes /diagnostics; .*ROS_DOMAIN_ID={domain}\? finforce"):
         next(monitor.iter_statuses(0.1, domain=domain))
 
 
 def test_the_state_of_a_running_solver_is_a_table(system, monkeypatch, capsys):
-    monkeypatch.setattr(status, "COLLECTED", 1.5)
+    monkeypatch.setattr(status, "COLLECTED", 3.0)
     assert main(["status", "--once"]) == 0
     head, *rows = capsys.readouterr().out.splitlines()
     assert head.split() == ["part", "state", "Hz", "ms", "p95"]

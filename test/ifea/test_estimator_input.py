@@ -215,6 +215,16 @@ def test_a_period_in_another_unit_than_seconds_is_refused_with_that_unit(period,
         estimator.update(spoil(stamp=period * 2), None)
 
 
+def test_a_camera_that_pauses_twice_goes_on():
+    estimator = make_estimator(solver="frame")
+    for stamp in (1.01, 11.02):
+        estimator.update(spoil(stamp=stamp), None)
+    with pytest.raises(ObservationError, match="look like milliseconds"):
+        estimator.update(spoil(stamp=31.03), None)
+    for stamp in (31.06, 31.09):
+        estimator.update(spoil(stamp=stamp), None)
+
+
 def test_refused_observations_leave_no_trace():
     recording, estimator = pressed(), make_estimator(solver="frame")
     solutions = []
