@@ -25,7 +25,7 @@ _HEAD = ("part", "state", "Hz", "ms p95", "")
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
-    text = "print one table and exit, with 1 if a part is in error or silent; always so without a terminal"
+    text = "print one table and exit, with 1 if a part is in error or silent, or there is none; always so without a terminal"
     parser.add_argument("--once", action="store_true", help=text)
 
 
@@ -38,7 +38,7 @@ def run(options: argparse.Namespace) -> CommandResult:
     if options.once or options.json or not sys.stdout.isatty():
         statuses = next(iter_statuses(COLLECTED))
         print(format_statuses(statuses))
-        failed = any(level_of(status) >= Level.ERROR for status in statuses.values())
+        failed = not statuses or any(level_of(status) >= Level.ERROR for status in statuses.values())
         return CommandResult({name: asdict(status) for name, status in statuses.items()}, status=int(failed))
     for statuses in iter_statuses(PERIOD):
         print(f"{_CLEAR}{format_statuses(statuses, get_terminal_size().columns)}", flush=True)
@@ -52,6 +52,8 @@ def level_of(status: NodeStatus) -> Level:
 
 def format_statuses(statuses: Mapping[str, NodeStatus], width: int | None = None) -> str:
     """Return a table with a row per part, cut to a width in characters."""
+    if not statuses:
+        return "no diagnostics yet: nodes that are starting publish none"
     rows = [_HEAD, *(_row(name, status) for name, status in statuses.items())]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ("  ".join(cell.ljust(wide) for cell, wide in zip(row, widths, strict=True)).rstrip() for row in rows)

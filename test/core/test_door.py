@@ -1,6 +1,5 @@
 """Claims about the door: what most programs need comes from `finforce`, and only what is asked for is loaded."""
 
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -56,7 +55,8 @@ def test_a_shape_is_no_jaw_file(tmp_path):
 
 
 def test_the_example_of_getting_started_runs_and_says_what_it_prints(capsys):
-    code, printed = re.search(r"```python\n(.*?)```\n.*?```text\n(.*?)```", PAGE.read_text("utf-8"), re.S).groups()
+    before, _, after = PAGE.read_text("utf-8").partition("\n\nprints\n\n```text\n")
+    code, printed = before.rpartition("```python\n")[2].removesuffix("```"), after.partition("```")[0]
     assert len(code.splitlines()) <= 12
     assert code.count("import ") == 1
     exec(compile(code, PAGE.name, "exec"), {})

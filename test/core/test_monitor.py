@@ -114,6 +114,8 @@ def test_a_part_in_error_or_silent_ends_the_command_with_1(monkeypatch, capsys):
     assert "gripper   STALE              no diagnostics for 9 s; before: holds" in capsys.readouterr().out
     del states["gripper"]
     assert main(["status", "--once"]) == 0
+    states.clear()
+    assert main(["status", "--once"]) == 1 and "nodes that are starting" in capsys.readouterr().out
 
 
 def test_a_row_is_cut_to_the_terminal():
