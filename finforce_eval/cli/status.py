@@ -25,7 +25,7 @@ _HEAD = ("part", "state", "Hz", "ms p95", "")
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
-    text = "print one table and exit, with 1 if a part is in error or silent, or there is none; always so without a terminal"
+    text = "print one table and exit, with 1 if a part is in error or silent; always so without a terminal"
     parser.add_argument("--once", action="store_true", help=text)
 
 
