@@ -14,7 +14,7 @@ from finforce_eval.cli.parser import CommandResult, whole_number
 EXAMPLES = """examples:
   finforce echo grasp_wrench
   finforce echo /left/keypoints --count 1
-  finforce echo joint_states --line | head"""
+  finforce echo joint_states --line              # one line per message"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
