@@ -18,7 +18,7 @@ RUN apt-get update \
 FROM base AS run
 COPY . /src
 RUN python3 -m venv /opt/finforce \
- && /opt/finforce/bin/pip install --no-cache-dir "/src[ros,can]" \
+ && /opt/finforce/bin/pip install --no-cache-dir "/src[ros,mesh,can]" \
  && rm -rf /src
 ENV PATH=/opt/finforce/bin:$PATH
 # a user whose group owns the serial ports

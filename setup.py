@@ -1,17 +1,21 @@
 """Packages, executables and installed files; name and version stand in package.xml, too."""
 
+import re
 from glob import glob
 from pathlib import Path
 
 from setuptools import find_packages, setup
 
 NAME = "finforce"
+# README outside the repository: without its pictures, and with the text alone of links to other files
+README = re.sub(r"^!\[.*\n", "", Path("README.md").read_text(encoding="utf-8"), flags=re.M)
+README = re.sub(r"(?<!!)\[([^\]\[]+)\]\((?!https?:|#)[^)]*\)", r"\1", README)
 
 setup(
     name=NAME,
     version="0.1.0",
     description="Grasp force from the key points of fin-ray jaws, by a mechanical model of the jaw.",
-    long_description=Path("README.md").read_text(encoding="utf-8"),
+    long_description=README,
     long_description_content_type="text/markdown",
     author="finforce developers",
     license="Apache-2.0",
@@ -61,9 +65,6 @@ setup(
         "manifold3d",  # Boolean intersections and outlines of object meshes
         "trimesh",  # object mesh files, surfaces of fingers
         "shapely",  # polygons: sections of fingers, what lies in them, whether they are sound
-        # ray casting, registration with scale, Poisson surfaces; the build without CUDA is a quarter of the size
-        "open3d-cpu; platform_machine == 'x86_64' and sys_platform == 'linux'",
-        "open3d; platform_machine != 'x86_64' or sys_platform != 'linux'",
         "onnxruntime",  # runs key point networks, without their makers' frameworks
         "opencv-contrib-python-headless",  # warps, resizes and decodes images; finds dots
         "pyserial",  # the serial port of the CAN adapter
@@ -80,6 +81,12 @@ setup(
             "ros-jazzy-rmw-fastrtps-cpp",
             "ros-jazzy-common-interfaces",
             "ros-jazzy-ament-index-python",
+        ],
+        # ray casting, registration with scale, Poisson surfaces: the simulator, and meshes of objects that are tracked,
+        # checked, reconstructed or decimated; 312 MB, and the build without CUDA is a quarter of the whole size
+        "mesh": [
+            "open3d-cpu; platform_machine == 'x86_64' and sys_platform == 'linux'",
+            "open3d; platform_machine != 'x86_64' or sys_platform != 'linux'",
         ],
         "cad": ["cascadio", "ezdxf", "svgelements"],  # fingers from STEP, DXF and SVG files
         "can": ["python-can>=4.3"],  # other CAN adapters than SLCAN ones: SocketCAN and more
@@ -106,8 +113,8 @@ setup(
             "gripper_driver = finforce.ros.start:main",
             "ifea_solver = finforce.ros.start:main",
             "keypoint_detector = finforce.ros.start:main",
-            "pipeline = finforce.ros.start:main",
-            "recording_player = finforce.ros.start:main",
+            "finforce_pipeline = finforce.ros.start:main",
+            "finforce_recording_player = finforce.ros.start:main",
             "twin_camera = finforce.ros.start:main",
         ],
     },

@@ -8,11 +8,11 @@
 - the contact: `load_object_mesh`, `ContactEstimator`, and `ForceLoop`, contact and force together;
 - the images: `KeypointDetector`, `build_detector`, `RgbdImage`;
 - the gripper: `Gripper`, `build_bus`; `GripperClient`, for a driver node that runs elsewhere;
-- recordings: `read_recording`, `iter_frames`, `find_mesh`, `DEMO`, the one that comes with finforce.
+- recordings: `evaluate`, which returns a table of forces; `read_recording`, `iter_frames`, `find_mesh`; `DEMO`, the one
+  that comes with finforce.
 """
 
 import ast
-import warnings
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -20,16 +20,12 @@ from typing import Any
 # the stub, which editors read, says where every name is
 _STUB = ast.parse(Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8"))
 _HOMES = {entry.names[0].name: entry.module for entry in _STUB.body if isinstance(entry, ast.ImportFrom)}
-_FORMER = {"JawEstimator": "ForceEstimator", "play": "iter_frames"}  # for one release
 
 __all__ = sorted(_HOMES)
 
 
 def __getattr__(name: str) -> Any:
     """Load what was asked for from its package; it stays."""
-    if name in _FORMER:
-        warnings.warn(f"finforce.{name} is now finforce.{_FORMER[name]}", DeprecationWarning, stacklevel=2)
-        return __getattr__(_FORMER[name])
     if name not in _HOMES:
         raise AttributeError(f"module 'finforce' has no attribute {name!r}; it has {', '.join(__all__)}")
     value = globals()[name] = getattr(import_module(_HOMES[name]), name)

@@ -24,6 +24,10 @@ class ServiceError(FinforceError, RuntimeError):
     """A service of a node is not there, does not answer, or could not do what was asked; the message says which."""
 
 
+class SilentTopicError(FinforceError, RuntimeError):
+    """Nobody publishes a topic that is listened to; the message says what is published."""
+
+
 def one_line(error: BaseException, longest: int = 1000) -> str:
     """Return what an error says as one line of so many characters, or its class where it says nothing."""
     return " ".join(str(error).split())[:longest] or type(error).__name__

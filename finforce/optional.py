@@ -30,7 +30,7 @@ def import_manifold3d() -> ModuleType:
 
 def import_open3d() -> ModuleType:
     """Return open3d, repair and registration; raises MissingDependencyError where it is not installed."""
-    return import_library("open3d", "repair and registration of meshes")
+    return import_library("open3d", "the simulator, or registration or decimation of a mesh,", "'finforce[mesh]'")
 
 
 def import_trimesh() -> ModuleType:

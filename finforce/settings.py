@@ -32,7 +32,7 @@ def setting(
         low: least value.
         high: largest value.
         flags: `choices` (one of several words), `topic` (names one, or several), `settable` (while a node runs),
-            `alias` (former name of the ROS parameter, still read), `parameter` (False: no ROS parameter).
+            `parameter` (False: no ROS parameter).
     """
     bounds = {"min": low, "max": high}
     return field(default=default, metadata={"description": description, "unit": unit, **bounds, **flags})

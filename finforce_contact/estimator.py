@@ -59,7 +59,7 @@ _REASONS = ("solved", "no_object", "no_pose", CONTRADICTED, "surrounded", "out_o
 
 
 class ContactEstimator:
-    """Finds what an object shows to one jaw; deterministic, one thread.
+    """Estimates where an object touches one jaw, from its mesh and pose; deterministic, one thread.
 
     Attributes:
         jaw: with the calibration applied that the solver has.

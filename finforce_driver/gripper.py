@@ -117,15 +117,15 @@ class StateSource:
 
 
 class Gripper(GripperMachine, StateSource):
-    """An SSG-48 behind a bus: one request at a time, and the bus opened again and again.
+    """Drives an SSG-48 over a CAN bus, which is reopened whenever it fails.
 
-    Whatever is sent is chosen and sent under one lock, so that after an emergency stop, which takes it too, no message
-    that was chosen before can leave.
+    One lock covers the choice and the sending of every message. An emergency stop takes it too, so no message that was
+    chosen before the stop is sent after it.
 
     Args:
-        bus: what carries the messages; the gripper opens and closes it.
-        settings: of the gripper.
-        clock: what it lives by; the machine's own where none is given.
+        bus: bus that carries the messages; the gripper opens and closes it.
+        settings: settings of the gripper.
+        clock: source of time; None for the clock of this machine.
     """
 
     def __init__(self, bus: Bus, settings: GripperSettings | None = None, clock: Clock | None = None) -> None:

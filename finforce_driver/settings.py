@@ -233,7 +233,6 @@ class GraspSettings(_Bounded):
         "s",
         0.1,
         10.0,
-        alias="touch_timeout",
     )
     motor_friction: float = setting(
         0.4,

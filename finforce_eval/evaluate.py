@@ -3,21 +3,136 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike
+
 from finforce.errors import FinforceError
+from finforce.gripper_frames import read_extrinsics
+from finforce.messages import SECOND
+from finforce.transforms import pose_numbers
 from finforce_eval.errors import RecordingError
-from finforce_eval.evaluation.forces import describe_contradictions, evaluate_jaws, truth_sides
-from finforce_eval.evaluation.keypoint_source import parse_source
+from finforce_eval.evaluation.contact_source import choose_contact
+from finforce_eval.evaluation.forces import describe_contradictions, estimate_forces, evaluate_jaws, truth_sides
+from finforce_eval.evaluation.keypoint_source import KeypointSource, parse_source, pose_of
 from finforce_eval.evaluation.scoring import Evaluation, score_results, score_series, true_range
-from finforce_eval.evaluation.setup import EvaluationSetup, describe_options, print_notes, share_setup
+from finforce_eval.evaluation.setup import (
+    EvaluationSetup,
+    announce_compilation,
+    describe_options,
+    print_notes,
+    share_setup,
+)
 from finforce_eval.recordings.bags import list_files, name_recordings
+from finforce_eval.recordings.images import ImageChoice
+from finforce_eval.recordings.recording import find_recordings, stated_jaw
 from finforce_eval.recordings.tracks import Recording
-from finforce_eval.table import ForceSeries, read_table, write_table
-from finforce_eval.tasks import OK, EngineOptions, Manifest, Task, hash_settings, run_tasks
+from finforce_eval.table import ForceSeries, read_table, unit_of, write_table
+from finforce_eval.tasks import OK, EngineOptions, Manifest, Task, hash_settings, progress_bar, run_tasks
+from finforce_ifea.jaw.calibration import Calibration, load_calibration
+from finforce_ifea.jaw.jaw import load_jaw
+from finforce_ifea.settings import EstimatorSettings
+from finforce_keypoints.rig import read_rig
+
+
+def evaluate(
+    recordings: str | Path | Sequence[str | Path],
+    *,
+    jaw: str | Path | None = None,
+    rig: str | Path | None = None,
+    camera: str | Path | ArrayLike | None = None,
+    extrinsics: str | ArrayLike | None = None,
+    contact_height: float | None = None,
+    object_mesh: str | Path | None = None,
+    calibration: str | Path | Calibration | None = None,
+    source: str = "",
+    sides: Sequence[str] = (),
+    stills: bool = False,
+    episode: int = 0,
+    detector: Mapping[str, Any] | None = None,
+    settings: EstimatorSettings | Mapping[str, Any] | None = None,
+) -> pd.DataFrame:
+    """Estimate the forces in recordings and return them as a table with a row for each image and jaw.
+
+    The same estimators as `finforce evaluate` uses. The columns, all in SI units, are those of its Parquet files;
+    `attrs["units"]` of the table has their units. An image without a force has NaN there, and says why in `message`.
+
+    Args:
+        recordings: rosbag2 folders, .mcap or .db3 files, LeRobot datasets, UMI's .zarr, videos, folders of pictures, or
+            folders that hold some of these; one or several.
+        jaw: jaw file, or name of an included jaw; None for that of the rig or of the `case.json`, else "bench".
+        rig: file by `finforce camera`, in place of jaw, camera and extrinsics.
+        camera: intrinsics for images without camera_info, as of `ForceSensor`.
+        extrinsics: the camera in `gripper_base`, as of `ForceSensor`; None for that of the `case.json`, else "robot".
+        contact_height: of first touch above the clamped base [m].
+        object_mesh: file of the object's mesh [m], whose recorded poses then give the contact. Without these two, the
+            mesh or the height in the `case.json` counts.
+        calibration: of the finger, its file or an included name; None for the material of the jaw file.
+        source: of the key points: "images", "keypoints" as recorded, or "truth" of a simulation; "" for recorded ones
+            where there are some, else images.
+        sides: jaws in the images, where no topic tells.
+        stills: whether every image is a photograph by itself, without a tare.
+        episode: of a dataset.
+        detector: parameters of the detector that differ from their defaults.
+        settings: of the estimator, whole or those that differ from their defaults.
+
+    Raises:
+        FinforceError: a recording cannot be read or evaluated, or an argument cannot be used.
+    """
+    found = None if rig is None else read_rig(rig)
+    paths = [recordings] if isinstance(recordings, str | Path) else recordings
+    named = name_recordings([each for path in paths for each in find_recordings(Path(path))], "/")
+    jaw = str(jaw or (found.jaw if found else stated_jaw([path for _, path in named], "bench")))
+    parameters = {**(found.detector_parameters() if found else {}), **(detector or {})}
+    if extrinsics is not None:
+        parameters["T_gripper_camera"] = list(pose_numbers(read_extrinsics(extrinsics)))
+    choice = ImageChoice(
+        intrinsics=() if camera is None else _words_of(camera),
+        camera=found.intrinsics if found else None,
+        T_gripper_camera=pose_of(parameters),
+        episode=episode,
+    )
+    keypoints = KeypointSource(
+        source=source, jaw_file=jaw, parameters=parameters, stills=stills, choice=choice, sides=tuple(sides)
+    )
+    announce_compilation()
+    settings = settings if isinstance(settings, EstimatorSettings) else EstimatorSettings(**(settings or {}))
+    setup = EvaluationSetup(
+        jaw=load_jaw(jaw),
+        settings=replace(settings, automatic_tare=False) if stills else settings,
+        calibration=None if calibration is None else load_calibration(calibration),
+        contacts=choose_contact(contact_height, object_mesh),
+        about={},
+        stills=stills,
+    )
+    table = pd.concat([_tabulate(name, path, keypoints, setup) for name, path in named], ignore_index=True)
+    table["stamp"] = SECOND * table["stamp"]
+    table.attrs = {"units": {column: unit_of(column) for column in table} | {"stamp": "s"}}
+    return table
+
+
+def _words_of(camera: str | Path | ArrayLike) -> tuple[str, ...]:
+    """Return intrinsics, a file or numbers, as words of `--intrinsics`."""
+    if isinstance(camera, str | Path):
+        return (str(camera),)
+    return tuple(str(number) for number in np.asarray(camera, dtype=float).ravel())
+
+
+def _tabulate(name: str, path: Path, keypoints: KeypointSource, setup: EvaluationSetup) -> pd.DataFrame:
+    """Return the forces on all jaws of a recording, under a progress bar."""
+    read = replace(keypoints.read(path), name=name)
+    setup.contacts.check(read)
+    recording = keypoints.apply(read)
+    print_notes(name, recording.notes)
+    frames = sum(len(track.keypoints.stamps_ns) for track in recording.jaws.values())
+    with progress_bar(frames, "frame", name) as bar:
+        found = estimate_forces(recording, setup, progress=bar.update)
+    return pd.concat([each.table for each in found.values()])
 
 
 def evaluate_all(recordings: Sequence[Recording], setup: EvaluationSetup) -> Evaluation:

@@ -1,8 +1,7 @@
-"""Images in, forces of the gripper out: the whole chain for a program without nodes and without a recording."""
+"""Turn images into the forces on a gripper: the whole chain for a program without nodes and recordings."""
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -34,23 +33,20 @@ from finforce_keypoints.images import RgbdImage
 from finforce_keypoints.rig import read_rig
 
 Camera = CameraIntrinsics | str | Path | ArrayLike
-_SHORTEST_PERIOD = 1e-3  # [s] between images: no RGB-D camera takes 1000 a second
-_LONGEST_PERIOD = 5.0  # [s] between images: rarer ones show no grasp
-_USUAL_PERIOD = 1 / 30  # [s] between images, by which the unit of other stamps is guessed
-_UNITS = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}  # [s]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GripperForces:
-    """The forces in one image; vectors of the gripper are in `gripper_base`.
+    """Forces on the gripper in one image.
 
     Attributes:
-        stamp: of the image [s].
-        jaws: side -> force, torque, deviations and status of that jaw, in its frame; one that was not seen is absent.
-        status: "ok", else what keeps the force of which jaw from being trusted; there is no grasp force then.
-        grasp: how hard the object is held [N], NaN unless `status` is "ok".
+        stamp: image capture time [s].
+        jaws: side -> force, torque, standard deviations and status of that jaw, in the frame of the jaw. A jaw that was
+            not found is absent.
+        status: "ok", else the reason why the force of a jaw cannot be trusted; then there is no grasp force.
+        grasp: grasp force [N], the smaller of the two jaw forces; NaN unless `status` is "ok".
         grasp_stddev: standard deviation of the grasp force [N].
-        manipulation: (3,) net force that the object applies to the gripper [N].
+        manipulation: (3,) net force that the object applies to the gripper [N], in `gripper_base`.
         manipulation_stddev: (3,) its standard deviation [N].
     """
 
@@ -64,25 +60,25 @@ class GripperForces:
 
 
 class ForceSensor:
-    """Finds the forces on a gripper in the images of its wrist camera, one after the other.
+    """Estimates the forces on a gripper from the images of its wrist camera, one image after the other.
 
     Attributes:
-        camera: intrinsics, or what they are to be read from once the size of the images is known.
+        camera: intrinsics, or their source until the size of the images is known.
 
     Args:
-        jaw: name of a shipped jaw, jaw file, or a left jaw; None for that of the rig, else "bench".
-        camera: intrinsics, a file of them, a (3, 3) matrix [px], or the numbers fx, fy, cx, cy [px] and perhaps k1, k2,
-            p1, p2, k3.
-        extrinsics: the camera in `gripper_base`: (4, 4), the seven numbers x, y, z [m], qx, qy, qz, qw, or "robot" or
-            "bench" for those of the simulator.
-        rig: file by `finforce camera`, which takes the place of these three.
-        contact_height: of first touch above the clamped base [m].
-        object_mesh: mesh of the object in metres, or its file; `update` then needs its poses. Give one of these two.
-        calibration: of the finger; None for the material of the jaw file.
+        jaw: name of an included jaw, a jaw file, or a left jaw; None for the jaw of the rig, else "bench".
+        camera: intrinsics, a file with them, a (3, 3) matrix [px], or the numbers fx, fy, cx, cy [px], optionally
+            followed by k1, k2, p1, p2, k3.
+        extrinsics: camera pose in `gripper_base`: a (4, 4) matrix, the seven numbers x, y, z [m], qx, qy, qz, qw, or
+            "robot" or "bench", the cameras of the simulator.
+        rig: file written by `finforce camera`, instead of jaw, camera and extrinsics.
+        contact_height: height of first touch above the clamped base [m].
+        object_mesh: mesh of the object [m], or its file, instead of the height; `update` then needs the object's pose.
+        calibration: calibration of the finger, its file or an included name; None for the material of the jaw file.
         sides: jaws in the images.
-        detector: parameters of the detector that differ from their defaults, as `--detector` names them.
-        settings: of the estimator, likewise, as `--set` names them.
-        is_video: whether images went through a video encoder, after which a scene at rest repeats itself to the bit.
+        detector: parameters of the detector that differ from the defaults, by the names that `--detector` takes.
+        settings: settings of the estimator, or only those that differ from the defaults, by name.
+        is_video: whether the images come from a video, where a scene at rest may repeat itself bit by bit.
 
     Raises:
         FinforceError: one of these cannot be used.
@@ -100,7 +96,7 @@ class ForceSensor:
         calibration: str | Path | Calibration | None = None,
         sides: Sequence[str] = SIDES,
         detector: Mapping[str, Any] | None = None,
-        settings: Mapping[str, Any] | None = None,
+        settings: EstimatorSettings | Mapping[str, Any] | None = None,
         is_video: bool = False,
     ) -> None:
         if (contact_height is None) == (object_mesh is None):
@@ -114,11 +110,11 @@ class ForceSensor:
         else:
             parameters = {"T_gripper_camera": pose_numbers(read_extrinsics(extrinsics))}
         self.camera = camera
-        self._stamps: deque[float] = deque(maxlen=3)
         jaws = {side: load_jaw(jaw or "bench", side) for side in sides}
         records = build_records({**parameters, **(detector or {})})
         self._detector = build_detector(jaws, *records, watched=not is_video)
-        settings = EstimatorSettings(**(settings or {})).resolve_held(both=len(sides) == len(SIDES))
+        whole = settings if isinstance(settings, EstimatorSettings) else EstimatorSettings(**(settings or {}))
+        settings = whole.resolve_held(both=len(sides) == len(SIDES))
         mesh = None if object_mesh is None else load_object_mesh(object_mesh)
         self._loops: dict[str, ForceLoop] = {}
         for side, own in jaws.items():
@@ -131,18 +127,20 @@ class ForceSensor:
     ) -> GripperForces:
         """Return the forces in an image.
 
-        The first images, 45 unless the settings say otherwise, have to show the jaws unloaded.
+        The jaws must be unloaded in the first images, 45 by default, which give no force.
 
         Args:
             rgb: (h, w, 3) uint8.
-            depth: (h, w) aligned to the colours, in metres, or whole numbers in millimetres; None without.
-            stamp: image capture time [s], a rising float; frame numbers are divided by the frame rate.
-            T_camera_object: (4, 4) pose of the object's mesh in this image, where it is known.
+            depth: (h, w) depth aligned to the colour image: floats in metres or integers in millimetres; None if there
+                is none.
+            stamp: image capture time [s], a float that rises from image to image. Divide frame numbers by the frame
+                rate.
+            T_camera_object: (4, 4) pose of the object's mesh in this image, if it is known.
 
         Raises:
             ImageError: the image has another shape, shows nothing, or its stamp does not rise.
             ObservationError: the stamps are not in seconds.
-            PoseError: the pose makes no sense.
+            PoseError: the matrix is no pose.
         """
         check_stamp(stamp)
         if not isinstance(self.camera, CameraIntrinsics):
@@ -150,29 +148,26 @@ class ForceSensor:
         if depth is not None:
             depth = decode_depth(depth, "16UC1" if np.asarray(depth).dtype.kind in "iu" else "32FC1")
         seen = self._detector.detect(RgbdImage(stamp=stamp, color=rgb, depth=depth, camera=self.camera))
-        self._stamps.append(stamp)
-        check_periods(self._stamps)
         T = None if T_camera_object is None else check_pose(T_camera_object, "T_camera_object")
         found = {side: self._solve(loop, seen.get(side), stamp, T) for side, loop in self._loops.items()}
         return combine_solutions(stamp, {side: found[side] if side in seen else None for side in found})
 
     def skip(self, stamp: float, reason: str) -> GripperForces:
-        """Return the forces in an image [s] that `update` has rejected: none. Time passes for the estimators."""
+        """Let time pass for an image at `stamp` [s] that `update` has rejected, and return a result without forces."""
         for loop in self._loops.values():
             with suppress(ObservationError):  # of a jaw that has taken the image before the other one rejected it
                 self._solve(loop, None, stamp, None)
         return GripperForces(stamp=stamp, jaws={}, status=reason)
 
     def reset(self) -> None:
-        """Forget everything that images have shown, the tare included; for a new recording or episode."""
+        """Forget all images, including the tare, before a new recording or episode."""
         self._detector.reset()
-        self._stamps.clear()
         for loop in self._loops.values():
             loop.force.forget()
             loop.contact.reset()
 
     def warm_up(self) -> None:
-        """Compile and load all that images need, so that the first one waits for nothing; forget what was seen."""
+        """Compile and load everything ahead of the first image, and forget all images."""
         self._detector.warm_up()
         for loop in self._loops.values():
             loop.force.warm_up()
@@ -186,28 +181,6 @@ class ForceSensor:
         if seen is None or T_camera_object is None:
             return loop.update(observation)
         return loop.update(observation, [(stamp, invert_pose(seen.T_camera_jaw) @ T_camera_object)])
-
-
-def check_periods(stamps: Sequence[float]) -> None:
-    """Refuse rising stamps of three images in a row that are not in seconds; a single gap is a pause.
-
-    Raises:
-        ObservationError: they are whole numbers, or closer or further apart than a camera's images.
-    """
-    if len(stamps) < 3:
-        return
-    periods = np.diff(np.asarray(stamps, dtype=float))
-    if all(float(stamp).is_integer() for stamp in stamps):
-        raise ObservationError(
-            f"stamps {', '.join(f'{stamp:g}' for stamp in stamps)}, expected seconds: if these are frame numbers, "
-            "divide them by the frame rate"
-        )
-    if periods.max() < _SHORTEST_PERIOD or periods.min() > _LONGEST_PERIOD:
-        unit = min(_UNITS, key=lambda name: abs(np.log(_UNITS[name] * periods.min() / _USUAL_PERIOD)))
-        likely = f"; the stamps look like {unit}" if periods.min() > _LONGEST_PERIOD else ""
-        raise ObservationError(
-            f"images {periods.min():.4g} s apart, expected {_SHORTEST_PERIOD:g} to {_LONGEST_PERIOD:g} s{likely}"
-        )
 
 
 def observe_jaw(seen: JawKeypoints | None, stamp: float, count: int) -> Observation:

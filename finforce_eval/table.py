@@ -219,6 +219,11 @@ def stddev_along(force: NDArray[np.float64], stddev: NDArray[np.float64]) -> NDA
     return np.linalg.norm(along * stddev, axis=1)
 
 
+def unit_of(column: str) -> str:
+    """Return the unit of a column."""
+    return UNITS.get(column, VECTORS.get(column[:-2], ""))
+
+
 def write_table(path: Path, series: Sequence[ForceSeries], about: Mapping[str, Any]) -> None:
     """Write the rows of all jaws of a recording as one Parquet file that is whole or not there.
 
@@ -231,8 +236,7 @@ def write_table(path: Path, series: Sequence[ForceSeries], about: Mapping[str, A
         OSError: it cannot be written.
     """
     table = pa.Table.from_pandas(pd.concat([each.table for each in series], ignore_index=True), preserve_index=False)
-    units = {name: UNITS.get(name, VECTORS.get(name[:-2], "")) for name in table.schema.names}
-    fields = [field.with_metadata({"unit": units[field.name]}) for field in table.schema]
+    fields = [field.with_metadata({"unit": unit_of(field.name)}) for field in table.schema]
     metadata = {**(table.schema.metadata or {}), _ABOUT: json.dumps(dict(about)).encode()}
     part = path.with_name(f".{path.name}.{uuid4().hex}.part")
     try:

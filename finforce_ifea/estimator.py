@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from math import hypot
@@ -27,6 +28,7 @@ from finforce_ifea.observation import (
     blank_solution,
     check_contact,
     check_observation,
+    check_periods,
     sketch_contact,
 )
 from finforce_ifea.relaxation import Relaxation
@@ -115,7 +117,7 @@ class ForceEstimator:
 
     def reset(self) -> None:
         """Forget everything but the jaw: offsets, place, relaxation, stamps."""
-        self._stamp: float | None = None
+        self._stamps: deque[float] = deque(maxlen=3)  # of the last images [s]
         self._bits, self._changed = b"", 0.0
         self._followed: float | None = None  # stamp of the last image that a tracker took
         self._contact: Contact | None = None
@@ -164,6 +166,11 @@ class ForceEstimator:
             _WARM.add(kind)
 
     @property
+    def _stamp(self) -> float:
+        """Stamp of the last image [s]."""
+        return self._stamps[-1]
+
+    @property
     def tared(self) -> bool:
         """Whether the key points' offsets are known."""
         return self._taring.tared
@@ -207,16 +214,17 @@ class ForceEstimator:
             contact: where the object touches; None or no rows when there is no object.
 
         Raises:
-            ObservationError: Key points of wrong shape, infinite, or stamps that do not rise by a camera's period.
+            ObservationError: Key points of wrong shape, infinite, or stamps that are not seconds or do not rise.
             ContactError: The contact is not on the jaw.
         """
         self.learn()
-        check_observation(observation, len(self.jaw.keypoints), self._stamp)
+        check_observation(observation, len(self.jaw.keypoints), self._stamps[-1] if self._stamps else None)
         if contact is not None and contact is not self._contact:
             check_contact(contact, self.jaw)
             self._follow(contact)
         self._contact, self._pressed = contact, None
-        self._stamp = observation.stamp
+        self._stamps.append(float(observation.stamp))
+        check_periods(self._stamps)
         bits = np.asarray(observation.points).tobytes()
         if bits != self._bits:
             self._bits, self._changed = bits, self._stamp

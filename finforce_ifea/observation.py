@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from numbers import Integral
 from typing import NamedTuple
@@ -20,8 +21,11 @@ TRUSTED = ("ok", "unloaded")
 # the images of an unloaded jaw.
 _TOUCHING = 0.5
 _UNIT = 1e-3  # by which the length of a unit vector may be off
-# Images are at least so long apart [s]; what comes sooner is the same one, stamped again.
-_SHORTEST_PERIOD = 0.5e-3
+_SAME_IMAGE = 0.5e-3  # [s] between two stamps within which one image came twice
+_SHORTEST_PERIOD = 1e-3  # [s] between three images in a row: no RGB-D camera takes 1000 a second
+_LONGEST_PERIOD = 5.0  # [s] between three images in a row: rarer ones show no grasp
+_USUAL_PERIOD = 1 / 30  # [s] between images, by which the unit of other stamps is guessed
+_UNITS = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}  # [s]
 # Maximum coordinate of a key point [m]: fingers are 0.25 m long at most.
 _FARTHEST = 1.0
 # Maximum capture time [s] since 1970: the year 5138. Milliseconds since 1970 are ten times as many.
@@ -37,13 +41,13 @@ class Observation:
     Attributes:
         stamp: image capture time [s].
         points: (K, 3) [m], jaw frame; NaN where there is no depth.
-        likelihood: (K,) in [0, 1]; None: 1 of every point that is there, 0 of those that are NaN.
-        stddev: (K, 3) [m] of each point along the axes of the jaw frame, above zero where there is a point; None when
-            the detector states none.
-        shared: standard deviation [m] of a shift, beyond `stddev`, that all points of the image share because the jaw's
-            place is not known better; they may then turn together by a few degrees, too.
-        gravity: unit vector (3,) along which things fall, jaw frame; None where unknown. Who gives it says that
-            next to nothing but its weight, 0.1 N, acts along and across the fingers on what they hold.
+        likelihood: (K,) in [0, 1]; None for 1 where there is a point and 0 where it is NaN.
+        stddev: (K, 3) standard deviation of each point [m] along the axes of the jaw frame, above zero where there is a
+            point; None if the detector states none.
+        shared: standard deviation [m] of an additional shift that all points of the image have in common, because the
+            position of the jaw is uncertain. The points may then also rotate together by a few degrees.
+        gravity: (3,) unit vector in the direction of gravity, jaw frame; None if unknown. With it, the object is
+            expected to be held against its weight alone, up to 0.1 N of other forces along and across the fingers.
     """
 
     stamp: float
@@ -65,10 +69,11 @@ class Contact:
 
     Attributes:
         points: (n, 3) [m], on the undeformed inner surface.
-        weights: (n,), shares of the force.
-        touching: whether object and jaw intersect; None when unknown.
-        free: the points say where the object touched first, and the solver follows it from there.
-        outline: of the object, whose place the solver finds together with the force; it goes before the points.
+        weights: (n,) fractions of the force.
+        touching: whether object and jaw intersect; None if unknown.
+        free: whether the points are those of first touch, from which the solver tracks the contact.
+        outline: outline of the object, whose position the solver estimates together with the force. It has priority
+            over the points.
     """
 
     points: NDArray
@@ -79,7 +84,7 @@ class Contact:
 
     @classmethod
     def fixed(cls, jaw: Jaw, z: float) -> Contact:
-        """Return the contact of an object that first touches at height z [m].
+        """Return the contact of an object that first touches the jaw at height z [m].
 
         Raises:
             ContactError: The height is not among those at which the jaw can be touched, see `Jaw.contact_range`.
@@ -101,25 +106,25 @@ def is_out_of_reach(contact: Contact, face_x: float) -> bool:
 
 
 class Solution(NamedTuple):
-    """One estimate and how good it is; only a trusted one may be published.
+    """One estimate and its quality. Only a trusted one may be published.
 
     Attributes:
-        stamp: of the image [s].
+        stamp: image capture time [s].
         status: "ok", "unloaded", "waiting", "no_contact", "not_enough_points", "unobservable" or "diverged".
-        message: what to tell the user.
-        force: (3,) [N], jaw frame, what the object applies to the jaw; zero unless trusted.
-        torque: (3,) [N m] about the jaw frame's origin.
-        force_stddev: (3,) [N].
-        torque_stddev: (3,) [N m].
-        magnitude_stddev: of the force's magnitude [N].
+        message: explanation for the user.
+        force: (3,) force that the object applies to the jaw [N], jaw frame; zero unless trusted.
+        torque: (3,) torque about the origin of the jaw frame [N m].
+        force_stddev: (3,) standard deviation of the force [N].
+        torque_stddev: (3,) standard deviation of the torque [N m].
+        magnitude_stddev: standard deviation of the force's magnitude [N].
         contact_point: (3,) [m], pressure centre on the deformed surface; NaN without contact.
         contact_location: (3,) [m], the same point on the undeformed surface; NaN without contact.
-        normal: (3,), direction of the force; NaN without contact.
-        residual: weighted root mean square of the used key points' residuals [m].
-        kkt: how far the returned force is from satisfying its optimality conditions, scaled.
+        normal: (3,) direction of the force; NaN without contact.
+        residual: weighted root mean square of the residuals of the used key points [m].
+        kkt: scaled violation of the optimality conditions by the returned force.
         keypoints_used: (K,) bool.
-        iterations: Newton iterations of this frame.
-        converged: whether the last iteration changed nothing that matters.
+        iterations: Newton iterations for this image.
+        converged: whether the last iteration changed the result by less than the tolerance.
     """
 
     stamp: float
@@ -178,12 +183,12 @@ def blank_solution(stamp: float, status: str, message: str, used: NDArray, itera
     )
 
 
-def check_observation(observation: Observation, count: int, last_stamp: float | None) -> None:
+def check_observation(observation: Observation, count: int, last_stamp: float | None = None) -> None:
     """Refuse what cannot be an image's key points.
 
     Raises:
         ObservationError: Wrong shapes, infinite values, a likelihood outside [0, 1], a standard deviation that is none,
-            a direction of gravity of another length than 1, stamps that do not rise by a camera's period.
+            a direction of gravity of another length than 1, stamps that do not rise.
     """
     points, likelihood = np.asarray(observation.points, float), np.asarray(observation.likelihood, float)
     if points.shape != (count, 3) or likelihood.shape != (count,):
@@ -216,9 +221,9 @@ def check_observation(observation: Observation, count: int, last_stamp: float | 
             f"stamp {observation.stamp:.6f} s after {last_stamp:.6f} s, expected rising stamps; "
             "reset for a new recording"
         )
-    if last_stamp is not None and observation.stamp < last_stamp + _SHORTEST_PERIOD:
+    if last_stamp is not None and observation.stamp < last_stamp + _SAME_IMAGE:
         raise ObservationError(
-            f"stamp {observation.stamp - last_stamp:.3g} s after the last, expected at least {_SHORTEST_PERIOD:g} s: "
+            f"stamp {observation.stamp - last_stamp:.3g} s after the last, expected at least {_SAME_IMAGE:g} s: "
             "one image came twice"
         )
 
@@ -233,6 +238,29 @@ def check_stamp(stamp: float) -> None:
         raise ObservationError(
             f"stamp {stamp}, expected seconds as a float: divide frame numbers by the frame rate, milliseconds by 1e3, "
             "nanoseconds by 1e9"
+        )
+
+
+def check_periods(stamps: Sequence[float]) -> None:
+    """Refuse rising stamps of three images in a row that are not in seconds; a single gap is a pause.
+
+    Raises:
+        ObservationError: they are whole numbers, or closer or further apart than a camera's images.
+    """
+    if len(stamps) < 3:
+        return
+    first, second, third = stamps
+    if first.is_integer() and second.is_integer() and third.is_integer():
+        raise ObservationError(
+            f"stamps {first:g}, {second:g}, {third:g}, expected seconds: if these are frame numbers, divide them by "
+            "the frame rate"
+        )
+    shorter, longer = sorted((second - first, third - second))
+    if longer < _SHORTEST_PERIOD or shorter > _LONGEST_PERIOD:
+        unit = min(_UNITS, key=lambda name: abs(np.log(_UNITS[name] * shorter / _USUAL_PERIOD)))
+        likely = f"; the stamps look like {unit}" if shorter > _LONGEST_PERIOD else ""
+        raise ObservationError(
+            f"images {shorter:.4g} s apart, expected {_SHORTEST_PERIOD:g} to {_LONGEST_PERIOD:g} s{likely}"
         )
 
 

@@ -36,7 +36,6 @@ class NodeParameters(GripperParameters):
         "s",
         0.0,
         1.0,
-        alias="contact_patience",
     )
     peer: str = setting(
         "",

@@ -50,18 +50,18 @@ class _Sight:
 class KeypointDetector:
     """Finds the key points of one jaw or two in the images of one camera.
 
-    A pixel detector gives their pixels; the jaws' places, depths, and what is believed, are found here.
+    A pixel detector finds their pixels. This class finds the poses of the jaws and the depths, and rejects outliers.
 
     Attributes:
-        was_still: whether nothing had moved in the last image, so that its key points are the means of those before.
-        mounts: how the jaws, by side, stand in the gripper.
+        was_still: whether nothing moved in the last image, so that its key points are means over the images before.
+        mounts: side -> how the jaw is mounted in the gripper.
         counts: "images", "still", "<side>" found, "<side>/<reason>" refused key points, "off centre".
 
     Raises:
         GeometryError: there is no jaw, a jaw is not the one of its side, or its reference point is not on the side of
             its key points.
-        PoseError: the camera's pose is none.
-        MeshError: a jaw's mesh is bad.
+        PoseError: the camera pose is not valid.
+        MeshError: the mesh of a jaw is not valid.
     """
 
     def __init__(
@@ -190,8 +190,8 @@ class KeypointDetector:
     def detect(self, image: RgbdImage) -> Mapping[str, JawKeypoints]:
         """Return the key points of the jaws in an image; a jaw that is not found is absent.
 
-        None is there while their middle is off the gripper's by more than the settings allow; see `warnings`. Where
-        nothing has moved they are the means of the images since when nothing has.
+        No jaw is returned while the jaws are further off the centre of the gripper than the settings allow; see
+        `warnings`. While nothing moves, the key points are means over the images since the last motion.
 
         Raises:
             ImageError: the image's parts do not fit each other, it shows nothing, or the camera is frozen.

@@ -76,7 +76,6 @@ class DetectorParameters(GripperParameters):
         "Pixel detector: network (on rectified side planes), frame (a DeepLabCut network on the whole image), dots "
         "(printed dots, no network)",
         choices=("network", "frame", "dots"),
-        alias="finder",
     )
     model: str = setting("", "Folder of the network; empty: the included one for the finger")
     names: tuple[str, ...] = setting(
@@ -209,7 +208,6 @@ class DetectorSettings:
         "m",
         1e-3,
         1.0,
-        alias="largest_beside",
     )
     rest_tolerance: float = setting(
         1.1e-3,

@@ -7,7 +7,7 @@ folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 "$python" -m venv "$folder/venv"
 bin=$folder/venv/bin
-"$bin/pip" install --quiet --disable-pip-version-check "$wheel[ros]"
+"$bin/pip" install --quiet --disable-pip-version-check "$wheel[ros,mesh]"
 cd "$folder"
 unset PYTHONPATH
 export OMP_NUM_THREADS=1

@@ -8,7 +8,7 @@ from typing import Any
 from latex2mathml.converter import convert
 
 ROOT = Path(__file__).resolve().parents[1]
-_LINK = re.compile(r"\[([^\]\[]+)\]\(\.\./([^)#\s]+)\)")
+_LINK = re.compile(r"\[([^\]\[]+)\]\((?:\.\./)+([^)#\s]+)\)")
 _EQUATION = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 
 

@@ -111,10 +111,10 @@ install_browser() {
 }
 
 install_product() {
-  local extras=$1
-  if [ "$ros" = wheels ]; then extras="ros${extras:+,$extras}"; fi
+  local extras=mesh${1:+,$1}
+  if [ "$ros" = wheels ]; then extras="ros,$extras"; fi
   install setuptools wheel
-  install --no-build-isolation --editable ".${extras:+[$extras]}"
+  install --no-build-isolation --editable ".[$extras]"
 }
 
 # What the first start would have to wait for.

@@ -68,7 +68,6 @@ from finforce.ros.topics import (  # noqa: F401 - for those with topics
     Stage,
     describe_rivals,
     is_wanted,
-    listen,
     send_cloud,
 )
 from finforce.ros.tracing import write_trace
@@ -97,7 +96,7 @@ def declare_record(node: Node, record: type[RecordT], prefix: str = "") -> Recor
     values = {}
     for entry in filter(is_parameter, fields(record)):
         name = f"{prefix}.{entry.name}" if prefix else entry.name
-        value = _read_value(node, name, entry, prefix)
+        value = _read_value(node, name, entry)
         check_value(entry, value, name=name)
         if entry.metadata.get("topic"):
             found = [_full_topic(node, name, topic) for topic in ((value,) if isinstance(value, str) else value)]
@@ -106,16 +105,8 @@ def declare_record(node: Node, record: type[RecordT], prefix: str = "") -> Recor
     return record(**values)
 
 
-def _read_value(node: Node, name: str, entry: Field, prefix: str) -> Any:
-    """Declare a parameter and return its value; an empty list, which has no type in ROS, is one of the field's.
-
-    A value that was given under the parameter's former name counts, with a warning.
-    """
-    former = ".".join(filter(None, (prefix, entry.metadata.get("alias"))))
-    if entry.metadata.get("alias") and former in node._parameter_overrides:
-        node.get_logger().warning(f"parameter {former} is deprecated; use {name}")
-        given = node._parameter_overrides.pop(former)
-        node._parameter_overrides.setdefault(name, Parameter(name, given.type_, given.value))
+def _read_value(node: Node, name: str, entry: Field) -> Any:
+    """Declare a parameter and return its value; an empty list, which has no type in ROS, is one of the field's."""
     try:
         value = node.declare_parameter(name, entry.default, describe_field(entry)).value
     except ParameterException as error:

@@ -15,10 +15,10 @@ NODES = {
     "ifea_solver": "finforce_ifea.node",
     "contact_estimator": "finforce_contact.node",
     "keypoint_detector": "finforce_keypoints.node",
-    "pipeline": "finforce.ros.composition",
+    "finforce_pipeline": "finforce.ros.composition",
     "gripper_driver": "finforce_driver.node",
     "emulated_gripper": "finforce_sim.emulator.__main__",
-    "recording_player": "finforce_eval.replay.node",
+    "finforce_recording_player": "finforce_eval.replay.node",
     "twin_camera": "finforce_sim.node",
 }
 CLASSES = {  # of the nodes that may share a process

@@ -9,16 +9,13 @@ from collections.abc import Callable, Iterator, Mapping
 from copy import copy
 from dataclasses import dataclass, field
 from functools import partial
-from importlib import import_module
 from statistics import median
-from time import monotonic, perf_counter
-from typing import Any, NamedTuple
+from time import perf_counter
+from typing import Any
 
-import rclpy
 from numpy.typing import NDArray
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
@@ -482,46 +479,3 @@ class ImageInput:
         if topic:
             kind = CompressedImage if topic.endswith(ENDS) else Image
             self._close = self._stage.large_subscription(kind, topic, partial(self._take, topic), **self._options)
-
-
-Heard = Mapping[str, list[bytes]]
-
-
-class Listening(NamedTuple):
-    """Serialised messages by topic, and the types of all topics that somebody published meanwhile."""
-
-    heard: Heard
-    published: Mapping[str, tuple[str, ...]]
-
-
-def listen(
-    types: Mapping[str, str], enough: Callable[[Heard], bool], timeout: float, domain: int | None = None
-) -> Listening:
-    """Listen to topics until enough has come, or for some time.
-
-    Args:
-        types: of the topics, as `sensor_msgs/msg/Image`.
-        enough: says whether what came is enough.
-        timeout: the longest time [s].
-        domain: ROS_DOMAIN_ID; None for that of the environment.
-    """
-    heard: dict[str, list[bytes]] = {topic: [] for topic in types}
-    context = rclpy.Context()
-    rclpy.init(context=context, domain_id=domain)
-    try:
-        node, executor = rclpy.create_node("listening", context=context), SingleThreadedExecutor(context=context)
-        executor.add_node(node)
-        for topic, name in types.items():
-            package, _, kind = name.split("/")
-            node.create_subscription(
-                getattr(import_module(f"{package}.msg"), kind), topic, heard[topic].append, SENSOR, raw=True
-            )
-        deadline = monotonic() + timeout
-        while not enough(heard) and monotonic() < deadline:
-            executor.spin_once(timeout_sec=0.1)
-        there = {name: tuple(kinds) for name, kinds in node.get_topic_names_and_types() if node.count_publishers(name)}
-        executor.shutdown()
-        node.destroy_node()
-    finally:
-        rclpy.try_shutdown(context=context)
-    return Listening(heard, there)

@@ -39,26 +39,18 @@ def describe_system(
         options = options_from_texts(record, context.launch_configurations)
         return [launch_action(part) for part in processes(options, share)]
 
-    arguments = [argument for entry in fields(record) for argument in _arguments_of(entry, own.get(entry.name))]
+    arguments = [_argument_of(entry, own.get(entry.name)) for entry in fields(record)]
     return LaunchDescription([*arguments, OpaqueFunction(function=start)])
 
 
-def _arguments_of(entry: Field, default: str | None) -> list[Any]:
-    """Return the launch argument of an option, after the one by its former name, where it has one."""
+def _argument_of(entry: Field, default: str | None) -> Any:
+    """Return the launch argument of an option."""
     from launch.actions import DeclareLaunchArgument
-    from launch.substitutions import LaunchConfiguration
 
     choices = SWITCH if isinstance(entry.default, bool) else entry.metadata.get("choices")
     some = {"choices": [str(word) or NONE for word in choices]} if choices else {}
     default = default or default_text(entry)
-    former = entry.metadata.get("alias")
-    if former is None:
-        return [DeclareLaunchArgument(entry.name, default_value=default, description=describe(entry), **some)]
-    text = f"Former name of {entry.name}, for one release"
-    return [
-        DeclareLaunchArgument(former, default_value=default, description=text),
-        DeclareLaunchArgument(entry.name, default_value=LaunchConfiguration(former), description=describe(entry)),
-    ]
+    return DeclareLaunchArgument(entry.name, default_value=default, description=describe(entry), **some)
 
 
 def default_text(entry: Field) -> str:
@@ -78,11 +70,9 @@ def options_from_words(record: type[OptionsT], words: Sequence[str], without: Se
         ValueError: a word names no option, or its value is none.
     """
     known = {entry.name: entry for entry in fields(record) if entry.name not in without}
-    former = {entry.metadata["alias"]: name for name, entry in known.items() if "alias" in entry.metadata}
     texts = {entry.name: default_text(entry) for entry in fields(record)}
     for word in words:
         name, given, text = word.partition(":=")
-        name = former.get(name, name)
         if name not in known:
             raise ValueError(f"{name!r} is not an option: {suggest(name, known)}")
         if not given:

@@ -22,7 +22,7 @@ SINGLE_THREAD = {
     name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 }
 POSE_TOPICS = ("object_pose", "object_detections")  # where a contact estimator listens for poses of other programs
-PIPELINE = "pipeline"
+PIPELINE = "finforce_pipeline"
 STAGES = ("keypoint_detector", "contact_estimator", "ifea_solver")  # in the order in which an image passes them
 RESPAWNED = (*STAGES, PIPELINE, "robot_state_publisher", "static_transform_publisher")  # none of them holds anything
 RESPAWN_DELAY = 2.0  # [s]
@@ -257,7 +257,7 @@ def replay_processes(options: ReplayOptions, share: Path) -> list[Process]:
     awaited = {"awaits_poses": True} if options.object_mesh else {}
     awaited |= {"awaits_images": True, "composed": options.composed} if options.images else {}
     player = Process(
-        executable="recording_player",
+        executable="finforce_recording_player",
         name="recording_player",
         parameters={"bag": options.bag, "rate": options.rate, **awaited},
         ends_all=True,
@@ -327,7 +327,7 @@ class SolverOptions:
     pose_source: str = setting("", "Source of object poses: topic, detections or tracker")
     pose_topic: str = setting("", "Topic of object poses from another program; none: object_pose, object_detections")
     images: bool = setting(False, "Detection of key points in camera images; false: key points come by topic")
-    detection_method: str = setting("", "network, frame (DeepLabCut) or dots", alias="finder")
+    detection_method: str = setting("", "network, frame (DeepLabCut) or dots")
     model: str = setting("", "Folder of a network")
     depth: str = setting(
         "auto",

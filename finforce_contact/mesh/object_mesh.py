@@ -78,12 +78,12 @@ def surrounds(mesh: ObjectMesh, point: NDArray) -> bool:
 
 
 def load_object_mesh(path: Path | str | ObjectMesh, *, unit: str = "m", triangle_limit: int = 20000) -> ObjectMesh:
-    """Read an object's mesh, refuse what is no graspable object, repair and decimate the rest.
+    """Read the mesh of an object, repair and decimate it; reject what cannot be a graspable object.
 
     Args:
         path: a file of `FORMATS`; the parts of a scene are put together by their transforms. Or a mesh, which is kept.
         unit: of the file's coordinates, one of `UNITS`; GLB is in metres by its standard, STL mostly in millimetres.
-        triangle_limit: the most triangles that are kept.
+        triangle_limit: maximum number of triangles after decimation.
 
     Returns:
         The mesh in metres, in the frame of the file.

@@ -9,8 +9,8 @@ def build_bus(port: str, interface: str = "slcan", *, baud_rate: int = 115_200) 
     """Return a bus of 1 Mbit/s that is not yet open.
 
     Args:
-        port: path of the adapter's serial port for "slcan", else python-can's name of the channel, "can0" for one.
-        interface: "slcan", or a name of python-can's: "socketcan", "gs_usb", "virtual", ...
+        port: path of the serial port of the adapter for "slcan", else the channel of python-can, such as "can0".
+        interface: "slcan", or an interface of python-can: "socketcan", "gs_usb", "virtual", ...
         baud_rate: of the serial port [baud].
     """
     return SerialBus(port, baud_rate) if interface == "slcan" else PythonCanBus(interface, port)

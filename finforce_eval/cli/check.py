@@ -74,7 +74,7 @@ def record_camera(topics: Sequence[str], count: int, folder: Path, domain: int |
         MissingDependencyError: ROS is not there.
     """
     try:
-        from finforce.ros.node import listen
+        from finforce.ros.monitor import listen
     except ImportError as error:
         raise MissingDependencyError(f"listening to topics needs ROS 2: {error}") from error
     color, info = topics[:2]

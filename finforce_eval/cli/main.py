@@ -28,6 +28,8 @@ COMMANDS = {
     "prepare": "compile code and build stored equilibria ahead of time",
     "launch": "start a whole system, such as the simulated robot, without `ros2`",
     "pipeline": "run all stages from camera images to grasp force in one process",
+    "status": "show the state of every part of a running system as a table",
+    "echo": "print the messages of a topic",
     "trace": "show how long the images of a recording take in each stage",
     "jaw": "make the jaw file of a finger from its STL, STEP, DXF or SVG file",
     "calibrate": "calibrate a finger from recordings with measured forces",

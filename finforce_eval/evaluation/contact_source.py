@@ -317,6 +317,19 @@ class ContactChoice:
         return float(z) * 1e-3
 
 
+def choose_contact(height: float | None, object_file: str | Path | None) -> ContactChoice:
+    """Return a contact at a height [m], by a mesh and its recorded poses, or with neither as each recording states it.
+
+    Raises:
+        OptionError: both were given.
+    """
+    if height is not None and object_file is not None:
+        raise OptionError("contact_height and object_mesh: expected one of the two")
+    if height is not None:
+        return ContactChoice(mode=FIXED, height_mm=1e3 * height)
+    return ContactChoice(object_file=None if object_file is None else str(object_file))
+
+
 def parse_contacts(texts: Sequence[str], *, object_file: str | None = None, object_unit: str = "m") -> ContactChoice:
     """Read `--contact` values: an estimator, `fixed:Z_MM`, `fixed:case`, or `NAME=Z_MM`, the last repeatable.
 

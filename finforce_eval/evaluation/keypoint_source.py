@@ -238,19 +238,25 @@ def parse_source(options: argparse.Namespace) -> KeypointSource:
     if extrinsics:
         parameters["T_gripper_camera"] = _parse_extrinsics(extrinsics)
     switches = {name: bool(getattr(options, name, False)) for name in ("strict", "as_live", "stills")}
-    seconds, pose = parameters.get("sync_tolerance"), parameters.get("T_gripper_camera")
+    seconds = parameters.get("sync_tolerance")
     given = {name: getattr(options, option, None) for name, option in _CHOICES.items()}
     choice = ImageChoice(
         **{name: value for name, value in given.items() if value},
         intrinsics=tuple(getattr(options, "intrinsics", None) or ()),
         camera=rig.intrinsics if rig is not None else None,
-        T_gripper_camera=None if pose is None else pose_from_quaternion(pose[:3], pose[3:]),
+        T_gripper_camera=pose_of(parameters),
         pairing=None if seconds is None or math.isnan(seconds) else round(seconds * NANOSECONDS),
     )
     sides = sides_of(options)
     return KeypointSource(
         source=source, jaw_file=options.jaw, parameters=parameters, choice=choice, sides=sides, **switches
     )
+
+
+def pose_of(parameters: Mapping[str, Any]) -> NDArray[np.float64] | None:
+    """Return the camera's pose (4, 4) [m] in the gripper's frame among a detector's parameters; None without."""
+    pose = parameters.get("T_gripper_camera")
+    return None if pose is None else pose_from_quaternion(pose[:3], pose[3:])
 
 
 def _parse_parameters(texts: Sequence[str]) -> dict[str, Any]:

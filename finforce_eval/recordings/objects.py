@@ -174,7 +174,7 @@ class RecordedImage(NamedTuple):
 
 
 def iter_frames(recording: Recording | str | Path, side: str = "left") -> Iterator[RecordedImage]:
-    """Yield the images of one jaw with the poses of the object between them, as they came.
+    """Yield the key points of one jaw image by image, each with the object poses since the image before.
 
     Args:
         recording: with key points, or its path.

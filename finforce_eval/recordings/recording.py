@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -251,6 +252,22 @@ def _pose_track(samples: Sequence[Any], topic: str, name: str) -> PoseTrack:
         quaternion=np.array([[getattr(p.orientation, axis) for axis in "xyzw"] for p in poses]),
         frame_id=frames[0],
     )
+
+
+def find_recordings(path: Path) -> list[Path]:
+    """Return the recordings in a folder that is none itself, by their names; any other path as it is."""
+    if not path.is_dir() or _is_recording(path):
+        return [path]
+    bags = (".mcap", ".db3")  # of which several in one folder are the parts of a bag without its metadata
+    inside = [each for each in sorted(path.iterdir()) if each.suffix not in bags and _is_recording(each)]
+    return inside or [path]
+
+
+def _is_recording(path: Path) -> bool:
+    """Say whether a path is what `read_recording` reads."""
+    with suppress(RecordingError):
+        return is_dataset(path) or is_frames(path) or bag_source(path).exists()
+    return False
 
 
 def stated_jaw(paths: Sequence[str | Path], default: str) -> str:

@@ -155,7 +155,7 @@ def _thicken(band: Band, factor: float, drawing: Drawing) -> Band:
 
 
 def load_calibration(name_or_path: str | Path | Calibration) -> Calibration:
-    """Load a calibration from its YAML file or a shipped one by its name; a calibration is returned as it is.
+    """Load a calibration from its YAML file, or an included one by its name; a calibration is returned unchanged.
 
     Raises:
         CalibrationError: The file is missing, is no calibration, or has unknown keys.

@@ -34,7 +34,8 @@ NEEDS = {
     r"/dev/|--topics|live --camera": "a gripper or a camera",
     r"^(lerobot-train|dask)|tcp://": "another program: see test_cluster.py",
     r"DATASET|RECORDINGS": "a dataset of LeRobot: see test_annotate_lerobot.py",
-    r"demo\.mp4|rig\.yaml": "a video of a gripper: see test_placement.py and test_video.py",
+    r"^finforce camera": "a video of a gripper in its holders: see test_placement.py",
+    r"^finforce (echo|status)": "a system that runs: see test_monitor.py",
     r"generated\.": "the mesh of a generator: see test_reconstruction.py",
     r"launch bench": "a camera that runs",
     r"weigh weighing": "a kitchen scale: see test_weighing.py",
@@ -103,6 +104,8 @@ def give(name, page, folder, shared):
         give_finger(path, json.loads((jaws / "umi.section.json").read_text(encoding="utf-8"))["loops"])
     elif name in ("depth.png", "mask.png"):
         give_ball(path)
+    elif name in ("demo.mp4", "rig.yaml"):
+        give_video(folder, shared)
 
 
 def give_recording(path, has_keypoints, shared):
@@ -119,6 +122,27 @@ def give_recording(path, has_keypoints, shared):
     begin = int(whole.jaw("left").keypoints.stamps_ns[0])
     write_recording(cut(whole, begin, begin + 19 * 10**9), path)
     (path.parent / "objects").exists() or (path.parent / "objects").symlink_to(ff.DEMO.parent / "objects")
+
+
+def give_video(folder, shared):
+    """Write the images of a grasp as a video, and the rig file of its camera."""
+    import av
+
+    import finforce as ff
+    from finforce_keypoints.rig import Rig, RigCamera, RigJaw, write_rig
+
+    recording = ff.read_recording(images_of(shared))
+    with av.open(str(folder / "demo.mp4"), "w") as container:
+        stream = container.add_stream("libx264", rate=30, options={"crf": "10"})
+        camera = recording.images.camera
+        stream.width, stream.height, stream.pix_fmt = camera.width, camera.height, "yuv420p"
+        for _, image in recording.images:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image.color, format="rgb24")))
+        container.mux(stream.encode())
+    numbers = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy", "model")}
+    lens = RigCamera(**numbers, distortion=tuple(camera.distortion))
+    pose, jaw = tuple(recording.case["T_gripper_camera"]), RigJaw()
+    write_rig(Rig(jaw="bench", camera=lens, T_gripper_camera=pose, left=jaw, right=jaw), folder / "rig.yaml")
 
 
 def give_finger(path, loops):
@@ -154,7 +178,7 @@ def give_ball(path):
 
 
 GIVEN = ("BAG", "OTHER_BAG", "FOLDER", "rest", "my_finger.yaml", "my_finger_calibration.yaml", "can.stl", "part.stl")
-GIVEN += ("FINGER.stl", "finger.jpg", "depth.png", "mask.png")
+GIVEN += ("FINGER.stl", "finger.jpg", "depth.png", "mask.png", "demo.mp4", "rig.yaml")
 
 
 def give_all(command, page, folder, shared):
@@ -185,6 +209,18 @@ def run(command, folder):
         except subprocess.TimeoutExpired:
             os.killpg(process.pid, signal.SIGINT)
             return 0 if process.wait(60.0) in (0, 130, -signal.SIGINT) else 1
+
+
+def run_programs(page, folder):
+    """Run the programs of a page that need what its commands were given; those that failed."""
+    from test_pages import PYTHON
+
+    failed = []
+    for block in PYTHON:
+        if (block.page, block.wanted) == (page.name, "make pages runs it"):
+            (folder / "program.py").write_text(block.text, encoding="utf-8")
+            failed += [str(block)] if run("python program.py", folder) else []
+    return failed
 
 
 def run_sensor(shared):
@@ -234,6 +270,7 @@ def main(pages):
                 if run(command, folder):
                     failed.append(f"{page.name}: {command}")
                 print(f"  {perf_counter() - began:.1f} s", flush=True)
+            failed += run_programs(page, folder)
             if page.name == "getting_started.md" and run_sensor(Path(shared)):
                 failed.append(f"{page.name}: ForceSensor")
     print(f"{count} commands run, {len(failed)} failed", *failed, sep="\n")

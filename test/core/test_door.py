@@ -1,6 +1,5 @@
 """Claims about the door: what most programs need comes from `finforce`, and only what is asked for is loaded."""
 
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -18,6 +17,11 @@ def test_every_name_of_the_door_is_there_and_named_in_its_docstring(name):
     assert name in finforce.__doc__
 
 
+@pytest.mark.parametrize("name", finforce.__all__)
+def test_every_name_of_the_door_is_in_the_reference(name):
+    assert f"`{name}`" in (PAGE.parent / "api" / "finforce.md").read_text(encoding="utf-8")
+
+
 def test_the_door_itself_loads_no_library():
     code = "import sys; before = set(sys.modules); import finforce; print(*set(sys.modules) - before)"
     loaded = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.split()
@@ -28,12 +32,6 @@ def test_the_door_itself_loads_no_library():
 def test_an_unknown_name_is_refused_with_the_known_ones():
     with pytest.raises(AttributeError, match=r"no attribute 'load_jaws'; it has .*load_jaw,"):
         finforce.load_jaws  # noqa: B018 - the look-up is the claim
-
-
-def test_former_names_still_work_and_say_the_new_one():
-    for former, name in (("JawEstimator", "ForceEstimator"), ("play", "iter_frames")):
-        with pytest.warns(DeprecationWarning, match=f"finforce.{former} is now finforce.{name}"):
-            assert getattr(finforce, former) is getattr(finforce, name)
 
 
 def test_names_of_files_do_where_objects_are_expected():
@@ -57,7 +55,8 @@ def test_a_shape_is_no_jaw_file(tmp_path):
 
 
 def test_the_example_of_getting_started_runs_and_says_what_it_prints(capsys):
-    code, printed = re.search(r"```python\n(.*?)```\n.*?```text\n(.*?)```", PAGE.read_text("utf-8"), re.S).groups()
+    before, _, after = PAGE.read_text("utf-8").partition("\n\nprints\n\n```text\n")
+    code, printed = before.rpartition("```python\n")[2].removesuffix("```"), after.partition("```")[0]
     assert len(code.splitlines()) <= 12
     assert code.count("import ") == 1
     exec(compile(code, PAGE.name, "exec"), {})

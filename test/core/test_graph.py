@@ -94,7 +94,7 @@ def test_every_parameter_of_the_graph_is_one_of_the_node():
         "ifea_solver": SOLVER_PARAMETERS,
         "contact_estimator": CONTACT_PARAMETERS,
         "keypoint_detector": DETECTOR_PARAMETERS,
-        "recording_player": PLAYER_PARAMETERS,
+        "finforce_recording_player": PLAYER_PARAMETERS,
     }
     processes = replay_processes(ReplayOptions(composed=False, jaws="both", bag="x", **given), ROOT)
     assert {process.executable for process in processes} == set(known)

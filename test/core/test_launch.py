@@ -76,7 +76,7 @@ def test_detector_and_solver_are_one_process_unless_it_is_said_otherwise(recorde
     assert {a.args[0]: a.kwargs["default_value"] for a in arguments}["composed"] == "true"
     apart = [action.kwargs["executable"] for action in act(path, images="true") if "executable" in action.kwargs]
     (pipeline, *others) = [a.kwargs for a in act(path, images="true", composed="true") if "executable" in a.kwargs]
-    assert pipeline["executable"] == "pipeline" and pipeline["name"] is None  # which would be all nodes' name
+    assert pipeline["executable"] == "finforce_pipeline" and pipeline["name"] is None  # which would be all nodes' name
     parts = [read_part(word) for word in pipeline["arguments"]]
     together = [part.executable for part in parts]
     assert together[0] == "keypoint_detector" and "ifea_solver" in together
@@ -105,11 +105,6 @@ def test_friction_of_the_object_is_an_argument(recorded_launch):
     (solver,) = start(ROOT / "launch" / "bench.launch.py", friction="0.3", friction_stddev="0.05").values()
     assert solver["parameters"][1]["estimator.friction"] == 0.3
     assert solver["parameters"][1]["estimator.friction_stddev"] == 0.05
-
-
-def test_an_argument_is_read_under_its_former_name(recorded_launch):
-    nodes = start(ROOT / "launch" / "bench.launch.py", images="true", finder="dots")
-    assert nodes["keypoint_detector"]["parameters"][1]["detection_method"] == "dots"
 
 
 def test_an_object_mesh_starts_the_contact_estimator(recorded_launch):
@@ -154,9 +149,7 @@ def test_the_declared_arguments_are_the_options_with_their_defaults(recorded_lau
     record = RECORDS[path.name.split(".")[0]]
     texts = {action.args[0]: action.kwargs["default_value"] for action in arguments}
     assert len(texts) == len(arguments)
-    aliases = {name: text.args[0] for name, text in texts.items() if isinstance(text, Recorder)}
-    texts |= {name: texts[alias] for name, alias in aliases.items()}
-    assert set(texts) - set(aliases.values()) == {entry.name for entry in fields(record)}
+    assert set(texts) == {entry.name for entry in fields(record)}
     options = launch_module.options_from_texts(record, texts)
     expected = record(parameter_file=options.parameter_file)
     assert repr(options) == repr(expected)  # nan is not nan

@@ -82,7 +82,8 @@ def test_every_library_that_is_imported_is_required_and_no_other(described):
     ours = {path.stem for path in ROOT.glob("finforce*")}
     names = set().union(*(imported(path) for path in SOURCES))
     libraries = names - set(sys.stdlib_module_names) - ours - ROS - LAUNCH - set(ADAPTERS)
-    required = {re.split(r"[<>=\[; ]", text)[0] for text in described["install_requires"]} - {"open3d-cpu"}
+    listed = [*described["install_requires"], *described["extras_require"]["mesh"]]
+    required = {re.split(r"[<>=\[; ]", text)[0] for text in listed} - {"open3d-cpu"}
     assert {MODULES.get(name, name) for name in libraries} == required
 
 
@@ -99,6 +100,14 @@ def test_every_ros_package_that_is_imported_is_in_the_manifest(manifest):
 def test_every_module_is_installed(described):
     folders = {".".join(path.parent.relative_to(ROOT).parts) for path in SOURCES}
     assert set(described["packages"]) == folders
+
+
+def test_the_description_of_the_wheel_has_no_link_into_the_repository(described):
+    targets = re.findall(r"\]\(([^)]*)\)", described["long_description"])
+    assert all(target.startswith(("https://", "#")) for target in targets)
+    assert (
+        "[calibrated]" not in described["long_description"] and "calibrated, the force" in described["long_description"]
+    )
 
 
 def test_every_package_says_that_it_is_typed(described):

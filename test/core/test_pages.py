@@ -66,7 +66,7 @@ HELPS = {name: build_parser(name).epilog for name in COMMANDS}
 BLOCKS += [
     Block(f"finforce {name} --help", "", "", "", text.replace("\n  ", "\n")) for name, text in HELPS.items() if text
 ]
-PYTHON = [block for block in BLOCKS if block.language == "python" and "ff.DEMO" not in block.text]  # see test_door.py
+PYTHON = [block for block in BLOCKS if block.language == "python" and "iter_frames" not in block.text]  # test_door.py
 
 
 def commands_of(block):

@@ -235,7 +235,7 @@ def test_a_word_that_asks_for_no_stage_is_refused(word):
 
 
 def run_pipeline(*parts):
-    words = [sys.executable, "-m", "finforce.ros.start", "pipeline", *map(json.dumps, parts), "--ros-args"]
+    words = [sys.executable, "-m", "finforce.ros.start", "finforce_pipeline", *map(json.dumps, parts), "--ros-args"]
     return subprocess.run(words, capture_output=True, text=True, timeout=120, env=environment())
 
 

@@ -103,7 +103,7 @@ class Example:
 
     limit: float = field(default=0.5, metadata={"description": "a limit", "unit": "s", "min": 0.0, "max": 1.0})
     height: float = field(default=math.nan, metadata={"description": "a height", "unit": "m", "min": 0.0})
-    count: int = field(default=3, metadata={"description": "a count", "min": 1, "alias": "number"})
+    count: int = field(default=3, metadata={"description": "a count", "min": 1})
     mode: str = field(default="a", metadata={"description": "a mode", "choices": ("a", "b")})
     flag: bool = field(default=False, metadata={"description": "a flag"})
     scale: float = field(
@@ -148,13 +148,6 @@ def test_descriptors_carry_description_unit_range_and_choices(declare):
 def test_a_value_that_does_not_fit_is_refused_by_name(declare, name, value):
     with pytest.raises(ros.ParameterError, match=f"group.{name}"):
         declare(**{name: value})
-
-
-def test_a_parameter_is_read_under_its_former_name_and_its_own_wins(declare):
-    assert declare(number=7).record.count == 7
-    assert declare(number=7, count=5).record.count == 5
-    with pytest.raises(ros.ParameterError, match=r"group\.count"):
-        declare(number="seven")
 
 
 @pytest.mark.parametrize("record", RECORDS)

@@ -38,8 +38,8 @@ class TestRules:
         assert (said["skipped: nothing moved"], said["skipped: idle image"]) == ("3", "off")
 
     def test_the_page_lists_exactly_the_rules_that_nodes_count(self):
-        page = (Path(__file__).parents[2] / "docs" / "skipping.md").read_text(encoding="utf-8")
-        table = page.partition("\n## The rules")[2].partition("\n## ")[0]
+        page = (Path(__file__).parents[2] / "docs" / "evidence.md").read_text(encoding="utf-8")
+        table = page.partition("\n## Skipped work")[2].partition("\n## ")[0]
         listed = re.findall(r"^\| `([^`]+)` \|", table, flags=re.MULTILINE)
         assert sorted(listed) == sorted(RULES)
 

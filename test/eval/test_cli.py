@@ -350,11 +350,11 @@ def test_the_demo_of_a_busy_machine_is_played_once_more_and_slower(monkeypatch, 
         rates.append(options.rate)
         if len(rates) < 2:
             raise SilentReplayError("no wrench came")
-        return CommandResult({"rate": options.rate})
+        return CommandResult({"grasp": {"n": 10 * len(rates)}, "grasp_frames": 50})
 
     monkeypatch.setattr(replay, "run", play)
     assert main(["demo", "--from", "keypoints", "--rate", "2"]) == 0
-    assert rates == [2.0, 0.5] and "Once more at 0.5 x real time" in capsys.readouterr().out
+    assert rates == [2.0, 0.5, 0.125] and "Once more at 0.125 x real time" in capsys.readouterr().out
 
 
 def test_the_options_of_evaluate_stand_in_groups_with_examples():

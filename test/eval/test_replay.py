@@ -40,7 +40,7 @@ def solvers_of(domain):
             variables = (folder / "environ").read_bytes()
         except OSError:
             continue
-        is_ours = any(b"finforce.ros.start\0" + name in words for name in (b"ifea_solver", b"pipeline"))
+        is_ours = any(b"finforce.ros.start\0" + name in words for name in (b"ifea_solver", b"finforce_pipeline"))
         if is_ours and f"ROS_DOMAIN_ID={domain}\0".encode() in variables:
             found.append(int(folder.name))
     return found

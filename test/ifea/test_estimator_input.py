@@ -197,6 +197,34 @@ def test_stamps_have_to_rise(stamp):
     estimator.update(spoil(stamp=stamp), None)
 
 
+@pytest.mark.parametrize(
+    ("period", "reason"),
+    [
+        (1e3 / 30, "look like milliseconds"),
+        (1e6 / 30 + 0.5, "look like microseconds"),
+        (1e9 / 30 + 0.5, "look like nanoseconds"),
+        (1.0, "divide them by the frame rate"),
+        (0.8e-3, r"0\.001 to 5 s"),
+    ],
+)
+def test_a_period_in_another_unit_than_seconds_is_refused_with_that_unit(period, reason):
+    estimator = make_estimator(solver="frame")
+    for number in range(2):  # a single gap is a pause
+        estimator.update(spoil(stamp=period * number), None)
+    with pytest.raises(ObservationError, match=reason):
+        estimator.update(spoil(stamp=period * 2), None)
+
+
+def test_a_camera_that_pauses_twice_goes_on():
+    estimator = make_estimator(solver="frame")
+    for stamp in (1.01, 11.02):
+        estimator.update(spoil(stamp=stamp), None)
+    with pytest.raises(ObservationError, match="look like milliseconds"):
+        estimator.update(spoil(stamp=31.03), None)
+    for stamp in (31.06, 31.09):
+        estimator.update(spoil(stamp=stamp), None)
+
+
 def test_refused_observations_leave_no_trace():
     recording, estimator = pressed(), make_estimator(solver="frame")
     solutions = []
@@ -289,18 +317,18 @@ def test_steel_finger_works_with_the_same_estimator():
 @pytest.mark.parametrize("gravity", [np.array([0.0, 0.0, 9.81]), np.array([0.0, 1.0]), np.full(3, np.nan)])
 def test_a_direction_of_gravity_is_a_unit_vector(gravity):
     one = Observation(stamp=0.0, points=np.zeros((2, 3)), likelihood=np.ones(2), gravity=np.array([0.0, 0.6, 0.8]))
-    check_observation(one, 2, None)
+    check_observation(one, 2)
     with pytest.raises(ObservationError, match="expected a unit vector"):
-        check_observation(replace(one, gravity=gravity), 2, None)
+        check_observation(replace(one, gravity=gravity), 2)
 
 
 def test_key_points_in_millimetres_are_refused_with_their_unit_and_a_gross_error_is_not():
     millimetres = Observation(stamp=1.0, points=1e3 * BENCH.keypoints)
     with pytest.raises(ObservationError, match=r"key points up to \d+.* expected metres .* divided by 1000"):
-        check_observation(millimetres, len(BENCH.keypoints), None)
+        check_observation(millimetres, len(BENCH.keypoints))
     gross = BENCH.keypoints.copy()
     gross[:3] = [0.0, 0.0, 2.5]
-    check_observation(Observation(stamp=1.0, points=gross), len(BENCH.keypoints), None)
+    check_observation(Observation(stamp=1.0, points=gross), len(BENCH.keypoints))
 
 
 def test_points_without_likelihood_that_are_not_there_count_as_unseen():
@@ -312,4 +340,4 @@ def test_points_without_likelihood_that_are_not_there_count_as_unseen():
 @pytest.mark.parametrize("stamp", [3, np.int64(3), 1.7e12, 1.7e18, np.nan])
 def test_stamps_that_are_no_seconds_are_refused(stamp):
     with pytest.raises(ObservationError, match="expected seconds as a float: divide frame numbers"):
-        check_observation(Observation(stamp=stamp, points=BENCH.keypoints), len(BENCH.keypoints), None)
+        check_observation(Observation(stamp=stamp, points=BENCH.keypoints), len(BENCH.keypoints))

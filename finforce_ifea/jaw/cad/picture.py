@@ -37,7 +37,9 @@ def draw_finger(finger: RecognizedFinger, jaw: Jaw, path: Path) -> None:
     _draw_points(flat, finger, jaw)
     flat.set(xlabel="x / mm, towards the object", ylabel="z / mm, base to tip", aspect="equal")
     widths = [finger.width] if finger.layers else finger.read_width(finger.rings[0])
-    flat.set_title(f"{jaw.name}: {1e3 * size[0]:.1f} x {say_range(widths)} x {1e3 * size[1]:.1f} mm")
+    low, high = (f"{1e3 * width:.1f}" for width in (np.min(widths), np.max(widths)))
+    across = high if low == high else f"{low} to {high}"
+    flat.set_title(f"{jaw.name}: {1e3 * size[0]:.1f} x {across} x {1e3 * size[1]:.1f} mm")
     flat.legend(loc="upper left", fontsize=8, framealpha=0.9)
     _draw_solid(solid, jaw.build_mesh("coarse"))
     figure.savefig(path, dpi=110)

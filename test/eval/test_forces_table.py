@@ -1,0 +1,103 @@
+"""Claims about `finforce.evaluate`: the forces of the command as a table, of recordings, images and folders."""
+
+import re
+import runpy
+import shutil
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from eval_fakes import cut
+from rgbd_fakes import make_footage
+
+import finforce as ff
+from finforce_eval.cli.main import main
+from finforce_eval.cli.twin import write_footage
+from finforce_eval.evaluation.keypoint_source import KeypointSource
+from finforce_eval.recordings.writer import write_recording
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+FORCE = ["force_x", "force_y", "force_z"]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A folder with the first seconds of the included recording, twice."""
+    folder = tmp_path_factory.mktemp("bags")
+    whole = ff.read_recording(ff.DEMO)
+    begin = int(whole.jaw("left").keypoints.stamps_ns[0])
+    write_recording(cut(whole, begin, begin + 5 * 10**9), folder / "first")
+    shutil.copytree(folder / "first", folder / "second")
+    (folder / "notes.txt").write_text("none")
+    return folder
+
+
+def test_the_forces_are_those_of_the_command_with_stamps_in_seconds(folder, tmp_path):
+    options = ["--contact", "fixed:40", "--calibration", "bench", "--set", "friction=0.1"]
+    assert main(["evaluate", str(folder / "first"), *options, "--out", str(tmp_path), "-q"]) == 0
+    kept = pd.read_parquet(tmp_path / "first.parquet")
+    found = ff.evaluate(
+        folder / "first", contact_height=0.040, calibration="bench", settings=ff.EstimatorSettings(friction=0.1)
+    )
+    np.testing.assert_array_equal(found[FORCE], kept[FORCE])
+    assert np.isfinite(found[FORCE]).all(axis=1).any()
+    np.testing.assert_allclose(found["stamp"], 1e-9 * kept["stamp"], rtol=1e-15)
+    assert found.attrs["units"] | {"stamp": "s", "force_x": "N"} == found.attrs["units"]
+
+
+def test_a_folder_of_recordings_gives_all_of_them(folder):
+    found = ff.evaluate(str(folder), contact_height=0.040, stills=True)
+    assert found.groupby("case").size().to_dict() == {"first": 150, "second": 150}
+    assert not found.isna()["status"].any()
+
+
+def test_forces_come_from_images(folder, tmp_path, monkeypatch):
+    path, looked = write_footage(make_footage(), tmp_path / "twin"), []
+    keypoints = ff.read_recording(folder / "first").jaws
+
+    def detect(source, recording):
+        looked.append((len(recording.images), source.parameters))
+        return replace(recording, jaws=keypoints)
+
+    monkeypatch.setattr(KeypointSource, "_detect", detect)
+    found = ff.evaluate(path, source="images", contact_height=0.040, extrinsics="robot", detector={"depth": "none"})
+    ((images, parameters),) = looked
+    assert images == 12 and parameters["depth"] == "none" and len(parameters["T_gripper_camera"]) == 7
+    assert len(found) == 150 and np.isfinite(found[FORCE]).all(axis=1).any()
+
+
+@pytest.mark.parametrize(
+    ("given", "reason"),
+    [
+        ({"contact_height": 0.04, "object_mesh": "can.stl"}, "expected one of the two"),
+        ({"contact_height": 40.0}, "contact height 40000 mm, expected"),
+        ({"jaw": "bnch"}, "did you mean bench"),
+        ({"settings": {"frction": 0.1}}, "frction"),
+    ],
+)
+def test_what_cannot_be_used_is_said(folder, given, reason):
+    with pytest.raises((ValueError, TypeError), match=reason):
+        ff.evaluate(folder / "first", **given)
+
+
+def test_a_path_that_is_no_recording_is_named(tmp_path):
+    with pytest.raises(ValueError, match="nowhere: no such recording"):
+        ff.evaluate(tmp_path / "nowhere", contact_height=0.04)
+
+
+def test_the_example_prints_the_largest_force_of_each_recording(folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["evaluate_recordings.py"])
+    runpy.run_path(str(EXAMPLES / "evaluate_recordings.py"))
+    assert re.search(r"\nbench_cyl25_middle +left +4\.1 ", capsys.readouterr().out)
+    assert len(pd.read_csv("forces.csv")) == len(ff.read_recording(ff.DEMO).jaw("left").keypoints.stamps)
+
+
+def test_the_example_prints_a_line_per_image(tmp_path, monkeypatch, capsys):
+    path = write_footage(make_footage(), tmp_path / "twin")
+    monkeypatch.setattr(sys, "argv", ["images_to_forces.py", str(path)])
+    runpy.run_path(str(EXAMPLES / "images_to_forces.py"))
+    assert capsys.readouterr().out.count(" s  ") == 12
