@@ -27,7 +27,7 @@ from lab.stress.session import LIKELIHOOD, OFFSET, PERIOD, Bench, noise_of
 from lab.stress.stress import Plan
 
 # Steps of a press, of depth and height [m]; the last Newton step, as a share of the model's reach, and their number.
-_STEP, _SETTLED, _ITERATIONS = 0.1e-3, 1e-6, 100
+_STEP, _SETTLED, _ITERATIONS = 0.1e-3, 1e-5, 100
 # Images of the tare and of rest before a press; speed of the press [m/s].
 _TARE, _REST, _SPEED = 45, 15, 2e-3
 # Standard deviation of a tracked pose: x, z [m] and turn [rad].
@@ -118,7 +118,7 @@ def press(
                 q, force, traction = rest, np.zeros(3), FRICTIONLESS
                 continue
             traction = traction._replace(moved=moved)
-            q, force, traction = _settle(contact, q, at, traction, None if along is None else float(along[i]))
+            q, force, traction = settle(contact, q, at, traction, None if along is None else float(along[i]))
             if along is None and friction > 0.0:
                 traction = _keep_shear(contact, q, at, traction, friction)
         found.append((contact.model.positions(probe, q), force))
@@ -126,8 +126,9 @@ def press(
     return Press(states=states, points=points, forces=forces, indenter=indenter)
 
 
-def _settle(
-    contact: RigidContact, q: NDArray, x: NDArray, traction: Traction, along: float | None
+def settle(
+    contact: RigidContact, q: NDArray, x: NDArray, traction: Traction, along: float | None = None, *,
+    tolerance: float = _SETTLED,
 ) -> tuple[NDArray, NDArray, Traction]:
     """Return unknowns (size,), force (3,) [N] and traction in equilibrium with an object in a state (3,)."""
     for _ in range(_ITERATIONS):
@@ -139,7 +140,7 @@ def _settle(
         change = 0.0 if along is None else (along - pressed.force[2]) / pressed.force_modes[2, 3]
         if along is not None:
             traction = constant_traction(traction.ratio + min(max(change, -0.2), 0.2))
-        if pressed.size < _SETTLED and abs(change) < _SETTLED:
+        if pressed.size < tolerance and abs(change) < tolerance:
             break
     return q, pressed.force, traction
 
