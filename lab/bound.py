@@ -310,15 +310,17 @@ def compare(recordings: Iterable[Recording], setup: EvaluationSetup) -> Figures:
                 images, counted = read_truth(recording, side, setup), series.counted
                 error = (series.column("force") - series.column("true_force"))[counted]
                 exact = images if read_friction(recording) is None else replace(images, friction=Coefficient(0.0, 0.0))
-                bounds = [
-                    _measure(bound_forces(*each)[counted]) for each in ((images, Stated()), (exact, NOISE_ALONE))
-                ]
-                rms = float(np.sqrt((error**2).sum(axis=1).mean()))
-                rows.append({"recording": series.name, "error/N": rms, "bound/N": bounds[0], "ratio": rms / bounds[0],
-                             "noise alone/N": bounds[1], "ratio to noise": rms / bounds[1]})  # fmt: skip
+                row = {"recording": series.name, "error/N": float(np.sqrt((error**2).sum(axis=1).mean()))}
+                for name, own, stated in (
+                    ("as stated", images, Stated()), ("friction known", exact, Stated()), ("noise alone", exact, NOISE_ALONE)
+                ):  # fmt: skip
+                    bound = _measure(bound_forces(own, stated)[counted])
+                    row |= {f"{name}/N": bound, f"over {name}": row["error/N"] / bound}
+                rows.append(row)
             bar.update(1)
     table = pd.DataFrame(rows)
-    return Figures(tables={"bound": table}, notes=[f"Median ratio {table.ratio.median():.2f}."])
+    medians = ", ".join(f"{table[name].median():.2f} ({name})" for name in table if name.startswith("over "))
+    return Figures(tables={"bound": table}, notes=[f"Median of the error over the bound: {medians}."])
 
 
 def _measure(covariance: NDArray) -> float:

@@ -1,7 +1,7 @@
-"""Runs scenes with one rule switched off: each in a process of its own, whose compiled code knows the other values.
+"""Runs scenes with one rule switched off, in a process whose compiled code knows the other values.
 
-Numba keeps the values of module attributes in the code that it compiles. So a process begins with all compiled code but
-that which a rule is compiled into, replaces the attributes, and compiles the rest anew.
+Numba keeps the values of module attributes in the code that it compiles. So the process of a rule that is compiled in
+begins with all compiled code but that, replaces the attributes, and compiles the rest anew. The others share a process.
 """
 
 from __future__ import annotations
@@ -11,7 +11,8 @@ import os
 import pickle
 import subprocess
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from functools import reduce
 from importlib import import_module
 from pathlib import Path
@@ -64,13 +65,22 @@ def link_compiled(rule: Rule, folder: Path) -> None:
             (folder / path.parent.name / path.name).symlink_to(path)
 
 
-def switch_off(rule: Rule) -> None:
-    """Replace the attributes of a rule, before anything that uses them is compiled."""
+@contextmanager
+def switch_off(rule: Rule) -> Iterator[None]:
+    """Replace the attributes of a rule; what is compiled in has to be replaced before it is compiled.
+
+    Raises:
+        AttributeError: a place is gone.
+    """
+    before = []
     for place, value in rule.off.items():
         name, _, path = place.partition(":")
         *owners, attribute = path.split(".")
         owner = reduce(getattr, owners, import_module(name))
-        getattr(owner, attribute)  # a place that is gone must not go unnoticed
+        before.append((owner, attribute, getattr(owner, attribute)))
+        setattr(owner, attribute, value)
+    yield
+    for owner, attribute, value in before:
         setattr(owner, attribute, value)
 
 
@@ -113,38 +123,51 @@ def play_recordings(bags: Iterable[str], options: Mapping[str, Any]) -> dict[str
     return figures
 
 
-def run_child(rule: Rule | None, scenes: Path, names: Iterable[str], bags: Iterable[str], calibration: str) -> Any:
-    """Return the figures of scenes and recordings, by name, of a process in which a rule is off.
+def run_child(
+    rules: Sequence[Rule], scenes: Path, bags: Iterable[str] = (), calibration: str = "bench", names: Iterable[str] = ()
+) -> Iterator[dict[str, dict[str, float]]]:
+    """Yield the figures of scenes or recordings, by name, for one rule after the other that is off in a process.
+
+    Args:
+        rules: of which only a lone one may be compiled in; none for the estimator as it is.
+        scenes: folder of the scenes.
+        bags: recordings, which are evaluated instead.
+        calibration: of the finger of the recordings.
+        names: scenes for all rules; those that reach each without.
 
     Raises:
         RecordingError: the process fails.
     """
+    asked = {"folder": str(scenes), "bags": list(bags), "calibration": calibration,
+             "rules": [[each.name, list(names or each.scenes)] for each in rules] or [["", list(names)]]}  # fmt: skip
     with TemporaryDirectory(prefix="finforce_ablation_") as folder:
-        if rule is not None:
+        for rule in rules[:1]:
             link_compiled(rule, Path(folder))
-        asked = {"rule": rule.name if rule else "", "folder": str(scenes), "scenes": list(names), "bags": list(bags),
-                 "calibration": calibration}  # fmt: skip
-        environment = {**os.environ, "NUMBA_CACHE_DIR": folder} if rule else dict(os.environ)
-        done = subprocess.run(
-            [sys.executable, "-m", __spec__.name, json.dumps(asked)], env=environment, capture_output=True, text=True
-        )
-    if done.returncode:
-        raise RecordingError(f"{asked['rule'] or AS_IT_IS}: {done.stderr.strip().splitlines()[-1]}")
-    return json.loads(done.stdout.splitlines()[-1])
+        environment = {**os.environ, "NUMBA_CACHE_DIR": folder if rules else os.environ["NUMBA_CACHE_DIR"]}
+        command = [sys.executable, "-m", __spec__.name, json.dumps(asked)]
+        with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as child:
+            yield from map(json.loads, child.stdout)
+    if child.returncode:
+        raise RecordingError(f"{', '.join(name for name, _ in asked['rules'])}: status {child.returncode}, see above")
 
 
 def main() -> None:
-    """Print the figures that `run_child` asks for."""
-    asked = json.loads(sys.argv[1])
-    for rule in RULES:
-        if rule.name == asked["rule"]:
-            switch_off(rule)
-    figures = {}
-    for name in asked["scenes"]:
-        figures[name] = play(pickle.loads((Path(asked["folder"]) / name).read_bytes()))
-    if asked["bags"]:
-        figures |= play_recordings(asked["bags"], {"calibration": asked["calibration"]})
-    print(json.dumps(figures))
+    """Print the figures that `run_child` asks for, a line for each rule."""
+    asked, known = json.loads(sys.argv[1]), {rule.name: rule for rule in RULES}
+    folder = Path(asked["folder"])
+    for name, scenes in asked["rules"]:
+        with switch_off(known[name]) if name else nullcontext():
+            if asked["bags"]:
+                figures = play_recordings(asked["bags"], {"calibration": asked["calibration"]})
+            else:
+                figures = {scene: play(pickle.loads((folder / scene).read_bytes())) for scene in scenes}
+        print(json.dumps(figures), flush=True)
+
+
+def list_runs(rules: Iterable[Rule]) -> list[list[Rule]]:
+    """Return the rules by process: all that are nowhere compiled in together, each other one by itself."""
+    plain = [rule for rule in rules if not find_compiled(rule)]
+    return [*([plain] if plain else []), *([rule] for rule in rules if rule not in plain)]
 
 
 def ablate(rules: Iterable[Rule], bags: Iterable[str] = (), calibration: str = "bench") -> Figures:
@@ -164,14 +187,18 @@ def ablate(rules: Iterable[Rule], bags: Iterable[str] = (), calibration: str = "
         bench = Bench(Plan())
         for name in names:
             (Path(folder) / name).write_bytes(pickle.dumps(build_scene(bench, name)))
-        usual = run_child(None, Path(folder), names, bags, calibration)
+        usual = next(run_child((), Path(folder), bags, calibration, names))
         bar.update(1)
-        rows = []
-        for rule in rules:
-            found = run_child(rule, Path(folder), () if bags else rule.scenes, bags, calibration)
-            rows += [{"rule": rule.name, "scene": scene, **describe(usual[scene], figures)}
-                     for scene, figures in found.items()]  # fmt: skip
-            bar.update(1)
+        found = {}
+        for each in list_runs(rules):
+            for rule, figures in zip(each, run_child(each, Path(folder), bags, calibration), strict=True):
+                found[rule.name] = figures
+                bar.update(1)
+    rows = [
+        {"rule": rule.name, "scene": scene, **describe(usual[scene], figures)}
+        for rule in rules
+        for scene, figures in found[rule.name].items()
+    ]
     table = pd.DataFrame(rows)
     best = table.loc[table.groupby("rule", sort=False)["moves"].idxmax()].drop(columns="moves")
     told = {rule.name: rule for rule in rules}
