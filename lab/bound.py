@@ -1,7 +1,7 @@
 """Posterior Cramér-Rao bound of the force in recordings: what no estimator that knows no more can fall below.
 
-The state is linear about the true one, x <- F x + w, z = H x + n, force = J x, so that the bound of Tichavsky, Muravchik
-and Nehorai (Posterior Cramér-Rao bounds for discrete-time nonlinear filtering, 1998) is the covariance recursion
+The state is linear about the true one, x <- F x + w, z = H x + n, force = J x, so that the bound of Tichavsky,
+Muravchik and Nehorai (Posterior Cramér-Rao bounds for discrete-time nonlinear filtering, 1998) is the covariance recursion
 
     P <- F P F^T + Q,    P <- P - P H^T (H P H^T + R)^-1 H P,    Var force = J P J^T,
 
@@ -125,10 +125,7 @@ def bound_forces(images: TrueImages, stated: Stated | None = None) -> NDArray:
     P, before, bounds = np.zeros((size, size)), None, np.zeros((len(dts), 3, 3))
     for i, (dt, step) in enumerate(zip(dts, steps, strict=True)):
         V = _expect(images, stated, images.displacement[i])
-        if before is None:
-            P = np.diag(V)
-        else:
-            P = _predict(P, V, before, float(dt), abs(float(step)), stated)
+        P = np.diag(V) if before is None else _predict(P, V, before, float(dt), abs(float(step)), stated)
         if not touches[i]:
             P[[_D, _V], :] = P[:, [_D, _V]] = 0.0
             P[_D, _D], P[_V, _V] = V[_D], V[_V]
@@ -222,7 +219,7 @@ def read_truth(recording: Recording, side: str, setup: EvaluationSetup) -> TrueI
     depths, table, forces = tabulate(mechanics, jaw.keypoints, OutlineIndenter(outline.polygons), height, size.max())
     smooth = forces[:, 1]
     depth = np.where(size > _TOUCH, np.interp(size, np.linalg.norm(smooth, axis=1), depths), 0.0)
-    flat = np.stack([np.interp(depth, depths, np.arctan2(smooth[:, 2], -smooth[:, 0]))])[0]
+    flat = np.interp(depth, depths, np.arctan2(smooth[:, 2], -smooth[:, 0]))
     ratio = np.where(size > 5 * _TOUCH, np.tan(np.arctan2(force[:, 2], -force[:, 0]) - flat), 0.0)
     friction = read_friction(recording)
     if friction is None:
@@ -311,9 +308,8 @@ def compare(recordings: Iterable[Recording], setup: EvaluationSetup) -> Figures:
                 error = (series.column("force") - series.column("true_force"))[counted]
                 exact = images if read_friction(recording) is None else replace(images, friction=Coefficient(0.0, 0.0))
                 row = {"recording": series.name, "error/N": float(np.sqrt((error**2).sum(axis=1).mean()))}
-                for name, own, stated in (
-                    ("as stated", images, Stated()), ("friction known", exact, Stated()), ("noise alone", exact, NOISE_ALONE)
-                ):  # fmt: skip
+                limits = {"as stated": (images, Stated()), "friction known": (exact, Stated())}
+                for name, (own, stated) in (limits | {"noise alone": (exact, NOISE_ALONE)}).items():
                     bound = _measure(bound_forces(own, stated)[counted])
                     row |= {f"{name}/N": bound, f"over {name}": row["error/N"] / bound}
                 rows.append(row)

@@ -183,13 +183,14 @@ def ablate(rules: Iterable[Rule], bags: Iterable[str] = (), calibration: str = "
     """
     rules, bags = list(rules), list(bags)
     names = [] if bags else list(dict.fromkeys(name for rule in rules for name in rule.scenes))
-    with TemporaryDirectory(prefix="finforce_scenes_") as folder, progress_bar(len(rules) + 1, "rule", "ablation") as bar:
-        bench = Bench(Plan())
+    steps, found = len(names) + len(rules) + 1, {}
+    with TemporaryDirectory(prefix="finforce_scenes_") as folder, progress_bar(steps, "step", "ablation") as bar:
+        bench = Bench(Plan()) if names else None
         for name in names:
             (Path(folder) / name).write_bytes(pickle.dumps(build_scene(bench, name)))
+            bar.update(1)
         usual = next(run_child((), Path(folder), bags, calibration, names))
         bar.update(1)
-        found = {}
         for each in list_runs(rules):
             for rule, figures in zip(each, run_child(each, Path(folder), bags, calibration), strict=True):
                 found[rule.name] = figures

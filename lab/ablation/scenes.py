@@ -127,7 +127,12 @@ def press(
 
 
 def settle(
-    contact: RigidContact, q: NDArray, x: NDArray, traction: Traction, along: float | None = None, *,
+    contact: RigidContact,
+    q: NDArray,
+    x: NDArray,
+    traction: Traction,
+    along: float | None = None,
+    *,
     tolerance: float = _SETTLED,
 ) -> tuple[NDArray, NDArray, Traction]:
     """Return unknowns (size,), force (3,) [N] and traction in equilibrium with an object in a state (3,)."""
@@ -176,9 +181,13 @@ def tell_outline(bench: Bench, pressed: Press, random: np.random.Generator, poly
 
 
 def film(
-    bench: Bench, pressed: Press, contacts: Sequence[Contact], random: np.random.Generator, scale: float | NDArray = 1.0,
+    bench: Bench,
+    pressed: Press,
+    contacts: Sequence[Contact],
+    random: np.random.Generator,
+    scale: float | NDArray = 1.0,
     **settings: Any,
-) -> Scene:  # fmt: skip
+) -> Scene:
     """Return the scene of a press with `scale` times a camera's noise, and its settings; friction 0 is stated."""
     count = pressed.points.shape[:2]
     noise = np.reshape(scale, (-1, 1, 1)) * noise_of(random, count)
@@ -228,7 +237,7 @@ def build_gross(bench: Bench, random: np.random.Generator) -> Scene:
 
 
 def build_tailed(bench: Bench, random: np.random.Generator) -> Scene:
-    """Let one key point in five be off by a millimetre or so, others in each image: far for chance, near for an error."""
+    """Let one key point in five be off by 1.2 mm, others in each image: far for chance, near for an error."""
     scene = build_press(bench, random)
     count = len(scene.images), len(scene.images[0].points)
     off = (random.random(count) < 0.2) & (np.arange(count[0])[:, None] >= _TARE)
