@@ -1,7 +1,8 @@
 """Posterior Cramér-Rao bound of the force in recordings: what no estimator that knows no more can fall below.
 
 The state is linear about the true one, x <- F x + w, z = H x + n, force = J x, so that the bound of Tichavsky,
-Muravchik and Nehorai (Posterior Cramér-Rao bounds for discrete-time nonlinear filtering, 1998) is the covariance recursion
+Muravchik and Nehorai (Posterior Cramér-Rao bounds for discrete-time nonlinear filtering, 1998) is the covariance
+recursion
 
     P <- F P F^T + Q,    P <- P - P H^T (H P H^T + R)^-1 H P,    Var force = J P J^T,
 
@@ -37,7 +38,9 @@ from lab.ablation.scenes import settle
 from lab.harness import Figures
 
 _D, _V, _TILT, _HEIGHT, _MU, _DK, _E, _CX, _CZ, _CPHI, _SHARED = range(11)
-_LEAST_DEPTH, _DEEPEST, _EVERY = 0.05e-3, 12e-3, 0.8e-3
+_LEAST_DEPTH, _DEEPEST, _EVERY = 0.05e-3, 12e-3, 0.4e-3
+# Traction ratios up to which objects of stated and of unknown friction are linearised [-].
+_SMOOTH, _RUBS = 0.05, 0.5
 # A true force from which on the object touches [N], and a change of the depth from which on it moves [m/s].
 _TOUCH, _MOVES = 0.02, 0.2e-3
 _SEEN, _WINDOW = 0.6, 31  # likelihood of a visible key point, and images in half of which it is seen
@@ -216,18 +219,19 @@ def read_truth(recording: Recording, side: str, setup: EvaluationSetup) -> TrueI
         outline = contact.outline if contact is not None and contact.outline is not None else outline
     mechanics = build_mechanics(jaw, replace(own.settings, solver=jaw.model))
     height = 1e-3 * float(recording.case["object"]["z"])
-    depths, table, forces = tabulate(mechanics, jaw.keypoints, OutlineIndenter(outline.polygons), height, size.max())
+    friction, indenter = read_friction(recording), OutlineIndenter(outline.polygons)
+    largest = float(size.max()), _SMOOTH if friction is not None else _RUBS
+    depths, table, forces = tabulate(mechanics, jaw.keypoints, indenter, height, largest)
     smooth = forces[:, 1]
     depth = np.where(size > _TOUCH, np.interp(size, np.linalg.norm(smooth, axis=1), depths), 0.0)
     flat = np.interp(depth, depths, np.arctan2(smooth[:, 2], -smooth[:, 0]))
     ratio = np.where(size > 5 * _TOUCH, np.tan(np.arctan2(force[:, 2], -force[:, 0]) - flat), 0.0)
-    friction = read_friction(recording)
     if friction is None:
         friction = Coefficient(own.settings.friction, own.settings.friction_stddev)
         mobilised = np.clip(ratio / np.quantile(np.abs(ratio[size > 5 * _TOUCH]), 0.9), -1.0, 1.0)
     else:
         ratio, mobilised = np.zeros_like(ratio), np.ones_like(ratio)
-    at = np.stack([np.maximum(depth, _LEAST_DEPTH), np.clip(-ratio, -0.5, 0.5)], axis=1)
+    at = np.stack([np.maximum(depth, _LEAST_DEPTH), np.clip(-ratio, -_RUBS, _RUBS)], axis=1)
     values = table(at)
     count = len(jaw.keypoints)
     motions, places = np.split(values[:, : 10 * count].reshape(-1, count, 10), [8], axis=2)
@@ -258,7 +262,7 @@ def read_truth(recording: Recording, side: str, setup: EvaluationSetup) -> TrueI
 
 
 def tabulate(
-    mechanics: Mechanics, keypoints: NDArray, indenter: OutlineIndenter, height: float, largest: float
+    mechanics: Mechanics, keypoints: NDArray, indenter: OutlineIndenter, height: float, largest: tuple[float, float]
 ) -> tuple[NDArray, RegularGridInterpolator, NDArray]:
     """Return depths (m,) [m], what is linearised there, and forces (m, 3, 3) [N] at three traction ratios.
 
@@ -269,25 +273,26 @@ def tabulate(
         keypoints: (K, 3) [m].
         indenter: the object.
         height: of its origin [m].
-        largest: force up to which it is pressed [N].
+        largest: force [N] up to which it is pressed, and traction ratio.
     """
-    contact, ratios = mechanics.contact, np.array([-0.5, 0.0, 0.5])
+    contact, ratios = mechanics.contact, np.array([-1.0, 0.0, 1.0]) * largest[1]
     contact.set_indenter(indenter)
     probe = contact.model.attach(keypoints, KEYPOINT_DISTANCE)
     touch = contact.find_touch(np.array([0.0, 0.0, height]))
-    q, rows, forces, depths = np.zeros((3, contact.model.size)), [], [], []
-    for depth in np.concatenate([[_LEAST_DEPTH], np.arange(_EVERY / 2, _DEEPEST, _EVERY)]):
-        x, row = np.array([depth + touch, 0.0, height]), []
+    shapes, rows, forces, depths = [np.zeros(contact.model.size)] * 3, [], [], []
+    for depth in np.concatenate([[_LEAST_DEPTH], np.arange(_EVERY, _DEEPEST, _EVERY)]):
+        x, row, found = np.array([depth + touch, 0.0, height]), [], []
         for i, ratio in enumerate(ratios):
-            q[i], _, _ = settle(contact, q[i], x, constant_traction(ratio), tolerance=1e-4)
-            pressed = contact.linearize(q[i], x, constant_traction(ratio))
-            motions = contact.model.project(probe, q[i], pressed.modes)[:, [0, 2]].reshape(len(keypoints), 8)
-            places = contact.model.positions(probe, q[i])[:, [0, 2]]
-            row.append((np.r_[np.hstack([motions, places]).ravel(), pressed.force_modes.ravel()], pressed.force))
-        rows.append([each for each, _ in row])
-        forces.append([each for _, each in row])
-        depths.append(depth)
-        if np.linalg.norm(forces[-1][1]) > 1.1 * largest:
+            traction = constant_traction(ratio)
+            q, _, _ = settle(contact, shapes[i], x, traction, tolerance=1e-4)
+            pressed = contact.linearize(q, x, traction)
+            motions = contact.model.project(probe, q, pressed.modes)[:, [0, 2]].reshape(len(keypoints), 8)
+            places = contact.model.positions(probe, q)[:, [0, 2]]
+            row.append(np.r_[np.hstack([motions, places]).ravel(), pressed.force_modes.ravel()])
+            found.append(pressed.force)
+            shapes[i] = q + _EVERY * pressed.modes[:, 0]  # ahead, where the next one is
+        rows, forces, depths = [*rows, row], [*forces, found], [*depths, depth]
+        if np.linalg.norm(found[1]) > largest[0]:
             break
     table = RegularGridInterpolator((np.array(depths), ratios), np.array(rows), bounds_error=False, fill_value=None)
     return np.array(depths), table, np.array(forces)
