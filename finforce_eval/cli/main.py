@@ -39,13 +39,15 @@ COMMANDS = {
     "extrinsics": "calibrate the camera pose from images of open, still, unloaded jaws",
     "twin": "make RGB-D recordings of a simulated gripper with ground truth",
     "demo": "run a simulated grasp through the nodes and write a report",
+    "ablation": "switch off the estimator's rules one at a time",
     "bench": "measure run time and error of every stage",
+    "bound": "compare the force error in recordings with the Cramér-Rao bound",
     "experiment": "repeat an experiment of the paper on the twin or on recordings",
     "stress": "test the estimators with difficult input",
     "report": "show forces over time on an HTML page",
     "reconstruct": "make an object mesh and its pose from a masked depth image",
 }
-LAB = ("bench", "experiment", "stress")  # these judge the product, and are in its checkout alone
+LAB = ("ablation", "bench", "bound", "experiment", "stress")  # these judge the product, and are in its checkout alone
 CHECKOUT = Path(__file__).parents[2]
 
 
