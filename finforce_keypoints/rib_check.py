@@ -1,0 +1,200 @@
+"""Whether the ribs in pictures of open jaws are where a rig has them, or explain the pictures as well elsewhere."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce.camera import CameraIntrinsics
+from finforce.gripper_frames import OpeningRange, jaw_in_camera
+from finforce_keypoints.geometry.rib_pattern import SLANTS, STRETCHES, RibPattern, RibScan
+from finforce_keypoints.parameters import JawMount
+
+if TYPE_CHECKING:
+    from finforce_ifea.jaw.jaw import Jaw
+
+OPENING_STEP = 1.5e-3  # [m] between the openings at which jaws are looked for
+PLACES = 8  # of a finger that are compared
+APART = 0.35  # [pitches] between two of them, root mean square of the ribs to be seen
+HERE = 0.5  # [pitches] within which a place is the one that a rig has
+HIDDEN = 0.35  # share of the face, from the base, whose ribs holders usually hide
+# Evidence, see `RibPlace`, by which a place has to be likelier than others, and least correlation of a jaw that tells.
+LEAST_MARGIN, LEAST_RIBS = 0.1, 0.4
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RibPlace:
+    """A place of a finger on its own side, in all pictures of a rig.
+
+    Attributes:
+        evidence: minus the logarithms of what ribs and tip leave unexplained of the pictures, in the mean.
+        ribs: correlation of ribs and cells with the pictures, in the mean.
+        shift: mean shift of the ribs towards the tip from where the rig has them [m].
+        distance: root mean square of that, in pitches.
+        warps: affine maps (n, 2, 3) of x and z [m] from where the rig has the finger to there, in each picture.
+    """
+
+    evidence: float
+    ribs: float
+    shift: float
+    distance: float
+    warps: NDArray
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RibComparison:
+    """Where the ribs of a jaw may be.
+
+    Attributes:
+        here: the best place within half a rib of the rig's.
+        other: the best of all others.
+    """
+
+    here: RibPlace
+    other: RibPlace
+
+    @property
+    def margin(self) -> float:
+        """Evidence for the rig's place over that for any other."""
+        return self.here.evidence - self.other.evidence
+
+    def describe(self, side: str) -> str:
+        """Return in words what speaks against the rig's place; empty if nothing does."""
+        shift = f"{1e3 * abs(self.other.shift):.1f} mm towards the {'tip' if self.other.shift > 0.0 else 'base'}"
+        fits = f"(ribs {self.other.ribs:.2f}, here {self.here.ribs:.2f}; evidence {self.margin:+.2f})"
+        if self.margin < 0.0:
+            return f"{side} jaw: the ribs are rather {shift} {fits}"
+        if self.margin < LEAST_MARGIN:
+            return f"two places explain the pictures alike: {side} jaw here, and {shift} {fits}"
+        return ""
+
+
+def compare_ribs(
+    jaw: Jaw, images: Sequence[NDArray], poses: Sequence[NDArray], camera: CameraIntrinsics
+) -> RibComparison:
+    """Return where the ribs of a jaw may be in pictures of one rig.
+
+    Args:
+        jaw: which.
+        images: (h, w, 3) uint8 RGB, of open and unloaded jaws.
+        poses: T_camera_jaw (4, 4) in each.
+        camera: intrinsics.
+    """
+    places = find_places(jaw, RibPattern(jaw), images, poses, camera)
+    nothing = RibPlace(evidence=0.0, ribs=0.0, shift=0.0, distance=0.0, warps=np.zeros((0, 2, 3)))
+    best = [
+        max(
+            (each for each in places if (each.distance < HERE) == is_here),
+            key=lambda each: each.evidence,
+            default=nothing,
+        )
+        for is_here in (True, False)
+    ]
+    return RibComparison(here=best[0], other=best[1])
+
+
+def compare_rig(
+    jaws: Mapping[str, Jaw],
+    images: Sequence[NDArray],
+    camera: CameraIntrinsics,
+    T_gripper_camera: NDArray,
+    mounts: Mapping[str, JawMount],
+    opening: OpeningRange,
+) -> dict[str, RibComparison]:
+    """Return by side where the ribs may be in pictures of a known rig, whose jaws are as far open as tips show best.
+
+    Args:
+        jaws: by side.
+        images: (h, w, 3) uint8 RGB, of open and unloaded jaws.
+        camera: intrinsics.
+        T_gripper_camera: (4, 4).
+        mounts: how the jaws are mounted, by side.
+        opening: where the jaws can be.
+    """
+    compared = {}
+    for side, jaw in jaws.items():
+        pattern, sign = RibPattern(jaw), -1.0 if side == "left" else 1.0
+        halves = sign * np.arange(opening.nearest, opening.farthest, OPENING_STEP)
+        tried = [jaw_in_camera(T_gripper_camera, side, x, mounts[side].turn) for x in halves]
+        rest = pattern.warp(0.0, 0.0, 0.0, 0.0)
+        poses = [max(tried, key=lambda T, color=color: pattern.contrast(color, T, camera, rest)) for color in images]
+        compared[side] = compare_ribs(jaw, images, poses, camera)
+    return compared
+
+
+def describe_ribs(compared: dict[str, RibComparison]) -> list[str]:
+    """Return in words what speaks against the places of jaws, by side; empty if nothing does."""
+    here = max(each.here.ribs for each in compared.values())
+    other = max(each.other.ribs for each in compared.values())
+    said = [words for side, each in compared.items() if (words := each.describe(side))]
+    if here < LEAST_RIBS and (not said or other < LEAST_RIBS):
+        return [f"no ribs show where the jaws are (correlation {here:.2f}, expected {LEAST_RIBS:g})"]
+    return said
+
+
+def find_places(
+    jaw: Jaw, pattern: RibPattern, images: Sequence[NDArray], poses: Sequence[NDArray], camera: CameraIntrinsics
+) -> list[RibPlace]:
+    """Return places of a jaw beside given ones, the likeliest by their ribs, and at least one within half a rib.
+
+    Args:
+        jaw: which.
+        pattern: of its side.
+        images: (h, w, 3) uint8 RGB.
+        poses: T_camera_jaw (4, 4) in each.
+        camera: intrinsics.
+    """
+    scans = [pattern.scan(color, T, camera) for color, T in zip(images, poses, strict=True)]
+    along = scans[0].along
+    face = np.sort(jaw.keypoints[[name.startswith("inner") for name in jaw.keypoint_names], 2])
+    heights = face[face >= face[0] + HIDDEN * (face[-1] - face[0])] - pattern.middle[1]
+    shifts = along[None, :, None] + STRETCHES[:, None, None] * heights
+    evidence = np.mean([-np.log1p(-(scan.ribs.max(axis=3) ** 2)) for scan in scans], axis=0)
+    is_here = np.sqrt((shifts**2).mean(axis=2)) < HERE * pattern.pitch
+    found: list[RibPlace] = []
+    for is_wanted in (np.ones_like(is_here), is_here):
+        left = np.where(is_wanted[:, None, :], evidence, -1.0)
+        for _ in range(PLACES if is_wanted.all() else PLACES // 2):
+            i, k, n = np.unravel_index(int(np.argmax(left)), left.shape)
+            if left[i, k, n] <= 0.0:
+                break
+            warps, fits = zip(
+                *(_fit(pattern, *each, (i, k, n), camera) for each in zip(scans, images, poses, strict=True)),
+                strict=True,
+            )
+            found.append(
+                RibPlace(
+                    evidence=float(np.mean([_sum_evidence(*fit) for fit in fits])),
+                    ribs=float(np.mean([ribs for ribs, _ in fits])),
+                    shift=float(shifts[i, n].mean()),
+                    distance=float(np.sqrt((shifts[i, n] ** 2).mean()) / pattern.pitch),
+                    warps=np.array(warps),
+                )
+            )
+            near = np.sqrt(((shifts - shifts[i, n]) ** 2).mean(axis=2)) < APART * pattern.pitch
+            left = np.where(near[:, None, :], -1.0, left)
+    return found
+
+
+def _sum_evidence(ribs: float, tip: float) -> float:
+    return -float(np.log1p(-(ribs**2)) + np.log1p(-min(tip, 0.99)))
+
+
+def _fit(
+    pattern: RibPattern, scan: RibScan, color: NDArray, T: NDArray, place: tuple, camera: CameraIntrinsics
+) -> tuple[NDArray, tuple[float, float]]:
+    """Return the warp (2, 3) of a place, across the finger where ribs and tip fit best, and how well they do."""
+    i, k, n = place
+    best = (pattern.warp(STRETCHES[i], SLANTS[k], 0.0, scan.along[n]), (0.0, 0.0))
+    for m in range(0, len(scan.across), 2):
+        ribs = float(scan.ribs[i, k, n, m])
+        if ribs > 0.0:
+            warp = pattern.warp(STRETCHES[i], SLANTS[k], scan.across[m], scan.along[n])
+            fit = ribs, pattern.contrast(color, T, camera, warp)
+            if _sum_evidence(*fit) > _sum_evidence(*best[1]):
+                best = (warp, fit)
+    return best
