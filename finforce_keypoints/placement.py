@@ -60,6 +60,7 @@ ALIKE = 8.0  # independent points that all the points of a jaw in a picture are 
 PIXEL = 1.0  # [px] standard deviation of one of those
 # How far outlines may be off the camera's place: three in m, three in rad; and how far jaws are mounted askew [rad].
 OUTLINE_STDDEV = np.array([0.015, 0.015, 0.015, 0.06, 0.06, 0.06])
+GUESS_STDDEV = np.repeat((0.005, np.radians(2.0)), 3)  # the same of a guess of which nothing is said
 TURN_STDDEV = 0.05
 MIDDLE_STDDEV = 1e-3  # [m] of the middle between the jaws, which says where the gripper's middle is
 CUTS = 48  # directions in which a holder may cover a jaw up to a straight edge
@@ -240,6 +241,7 @@ def find_placement(
     jaws: Mapping[str, Jaw],
     locator: AnyFinger,
     guess: NDArray | None = None,
+    guess_stddev: NDArray = GUESS_STDDEV,
     half: float = 0.045,
     progress: Callable[[int], Any] = lambda steps: None,
 ) -> CameraPlacement:
@@ -251,6 +253,7 @@ def find_placement(
         jaws: by side.
         locator: finds the points in pictures of their sides.
         guess: T_gripper_camera (4, 4); None: it is searched for.
+        guess_stddev: its standard deviations, three in m and three in rad (6,).
         half: guess of half the distance of the jaws' origins [m].
         progress: called with the number of steps done since its last call.
 
@@ -258,11 +261,10 @@ def find_placement(
         GeometryError: there are no such jaws in the pictures.
     """
     starts = [(guess, half, WHOLE)] if guess is not None else search_camera(images, camera, jaws, progress)
-    least = LEAST_FOUND if guess is None else LEAST_GUESSED
     found: list[CameraPlacement] = []
     failures: dict[float, GeometryError] = {}
     for T, opening, edge in starts:
-        fit = _Refinement(images, camera, jaws, locator, T, opening, least)
+        fit = _Refinement(images, camera, jaws, locator, T, opening, None if guess is None else guess_stddev)
         fit.polish(edge)
         for rounds, is_far in PLAN:
             for _ in range(rounds):
@@ -284,7 +286,7 @@ def _add_ribs(
 ) -> CameraPlacement:
     """Return a placement with where its ribs may be."""
     poses = {side: [found.pose(side, number) for number in range(len(images))] for side in jaws}
-    return replace(found, ribs={side: compare_ribs(jaw, images, poses[side], camera) for side, jaw in jaws.items()})
+    return replace(found, ribs=compare_ribs({s: RibPattern(jaw) for s, jaw in jaws.items()}, images, poses, camera))
 
 
 def find_points(
@@ -344,9 +346,11 @@ class _Refinement:
         locator: AnyFinger,
         T: NDArray,
         half: float,
-        least_contrast: float,
+        guess_stddev: NDArray | None,
     ) -> None:
-        self._least_contrast = least_contrast
+        self._least_contrast = LEAST_FOUND if guess_stddev is None else LEAST_GUESSED
+        self._is_guess = guess_stddev is not None
+        self._stddev = OUTLINE_STDDEV if guess_stddev is None else guess_stddev
         self._images, self._camera, self._jaws, self._locator = images, camera, jaws, locator
         self._points = {side: np.vstack((jaw.keypoints, jaw.reference_point)) for side, jaw in jaws.items()}
         self._planes = {side: find_side(jaw) for side, jaw in jaws.items()}
@@ -383,18 +387,21 @@ class _Refinement:
         return float(each.max())
 
     def polish(self, edge: int | None = None) -> None:
-        """Move camera and jaws until the outlines show best up to an edge, without one up to the best."""
-        start = self._x / self._scale
+        """Move jaws, and a camera that is no guess, until outlines show best up to an edge; None: up to the best."""
+        first = 6 if self._is_guess else 0
+        still, start = self._x[:first] / self._scale[:first], self._x[first:] / self._scale[first:]
         if edge is None:
             self.contrast()
             edge = self._edge
 
-        def judge(x: NDArray) -> float:
+        def judge(moving: NDArray) -> float:
+            x = np.concatenate((still, moving))
             turns = x[6 : 6 + 3 * len(self._jaws)] * 0.03 / TURN_STDDEV
             return 0.01 * float(turns @ turns) - self.contrast(x * self._scale, edge)
 
         fit = minimize(judge, start, method="L-BFGS-B", options={"maxiter": POLISH, "eps": 0.02})
-        self._start, self._x = self._split(fit.x * self._scale)[0], fit.x * self._scale
+        self._x = np.concatenate((still, fit.x)) * self._scale
+        self._start = self._split(self._x)[0]
         self._x[:6] = 0.0
 
     def _look(self) -> None:
@@ -413,7 +420,7 @@ class _Refinement:
     def _misses(self, x: NDArray) -> NDArray:
         """Return what is off, in standard deviations."""
         T, turns, origins = self._split(x)
-        parts = [x[:6] / OUTLINE_STDDEV, np.concatenate([*turns.values()]) / TURN_STDDEV]
+        parts = [x[:6] / self._stddev, np.concatenate([*turns.values()]) / TURN_STDDEV]
         for side in self._jaws:
             away = self._away(side, T, turns[side], origins[side])
             share = np.minimum(1.0, ALIKE / np.maximum(self._likelihood[side].sum(axis=1), 1e-9))
@@ -440,17 +447,20 @@ class _Refinement:
         """Move camera, turns and origins until jaws lie where their ribs and tips are likeliest, perhaps far off."""
         for number in range(RIB_ROUNDS):
             T, turns, origins = self._split(self._x)
+            poses = {side: [jaw_in_camera(T, side, x, turns[side]) for x in origins[side]] for side in self._jaws}
+            found = find_places(self._patterns, self._images, poses, self._camera)
             self._seen, self._likelihood = {}, {}
             for side, jaw in self._jaws.items():
-                poses = [jaw_in_camera(T, side, x, turns[side]) for x in origins[side]]
-                places = find_places(jaw, self._patterns[side], self._images, poses, self._camera)
+                places = found[side]
                 near = [each for each in places if (is_far and number == 0) or each.distance < HERE] or places
+                if not near:
+                    return
                 warps = max(near, key=lambda each: each.evidence).warps
                 points = self._points[side][:, ::2]
                 self._seen[side] = np.array(
                     [
                         project_plane(points @ warp[:, :2].T + warp[:, 2], self._planes[side], pose, self._camera)
-                        for warp, pose in zip(warps, poses, strict=True)
+                        for warp, pose in zip(warps, poses[side], strict=True)
                     ]
                 )
                 on_face = np.array([name.startswith("inner") for name in (*jaw.keypoint_names, REFERENCE)])

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,10 +18,9 @@ if TYPE_CHECKING:
     from finforce_ifea.jaw.jaw import Jaw
 
 OPENING_STEP = 1.5e-3  # [m] between the openings at which jaws are looked for
-PLACES = 8  # of a finger that are compared
+PLACES, PLACES_HERE = 8, 4  # of a finger that are compared, and more of them within half a rib
 APART = 0.35  # [pitches] between two of them, root mean square of the ribs to be seen
 HERE = 0.5  # [pitches] within which a place is the one that a rig has
-HIDDEN = 0.35  # share of the face, from the base, whose ribs holders usually hide
 # Evidence, see `RibPlace`, by which a place has to be likelier than others, and least correlation of a jaw that tells.
 LEAST_MARGIN, LEAST_RIBS = 0.1, 0.4
 
@@ -74,27 +73,27 @@ class RibComparison:
 
 
 def compare_ribs(
-    jaw: Jaw, images: Sequence[NDArray], poses: Sequence[NDArray], camera: CameraIntrinsics
-) -> RibComparison:
-    """Return where the ribs of a jaw may be in pictures of one rig.
+    patterns: Mapping[str, RibPattern],
+    images: Sequence[NDArray],
+    poses: Mapping[str, Sequence[NDArray]],
+    camera: CameraIntrinsics,
+) -> dict[str, RibComparison]:
+    """Return by side where the ribs of jaws may be in pictures of one rig.
 
     Args:
-        jaw: which.
+        patterns: of the jaws' sides.
         images: (h, w, 3) uint8 RGB, of open and unloaded jaws.
-        poses: T_camera_jaw (4, 4) in each.
+        poses: side -> T_camera_jaw (4, 4) in each.
         camera: intrinsics.
     """
-    places = find_places(jaw, RibPattern(jaw), images, poses, camera)
     nothing = RibPlace(evidence=0.0, ribs=0.0, shift=0.0, distance=0.0, warps=np.zeros((0, 2, 3)))
-    best = [
-        max(
-            (each for each in places if (each.distance < HERE) == is_here),
-            key=lambda each: each.evidence,
-            default=nothing,
-        )
-        for is_here in (True, False)
-    ]
-    return RibComparison(here=best[0], other=best[1])
+
+    def choose(places: Sequence[RibPlace], is_here: bool) -> RibPlace:
+        chosen = [each for each in places if (each.distance < HERE) == is_here]
+        return max(chosen, key=lambda each: each.evidence, default=nothing)
+
+    found = find_places(patterns, images, poses, camera)
+    return {side: RibComparison(here=choose(each, True), other=choose(each, False)) for side, each in found.items()}
 
 
 def compare_rig(
@@ -115,15 +114,17 @@ def compare_rig(
         mounts: how the jaws are mounted, by side.
         opening: where the jaws can be.
     """
-    compared = {}
-    for side, jaw in jaws.items():
-        pattern, sign = RibPattern(jaw), -1.0 if side == "left" else 1.0
+    patterns, poses = {side: RibPattern(jaw) for side, jaw in jaws.items()}, {}
+    for side, pattern in patterns.items():
+        sign = -1.0 if side == "left" else 1.0
         halves = sign * np.arange(opening.nearest, opening.farthest, OPENING_STEP)
         tried = [jaw_in_camera(T_gripper_camera, side, x, mounts[side].turn) for x in halves]
         rest = pattern.warp(0.0, 0.0, 0.0, 0.0)
-        poses = [max(tried, key=lambda T, color=color: pattern.contrast(color, T, camera, rest)) for color in images]
-        compared[side] = compare_ribs(jaw, images, poses, camera)
-    return compared
+        poses[side] = [
+            max(tried, key=lambda T, color=color, pattern=pattern: pattern.contrast(color, T, camera, rest))
+            for color in images
+        ]
+    return compare_ribs(patterns, images, poses, camera)
 
 
 def describe_ribs(compared: dict[str, RibComparison]) -> list[str]:
@@ -137,47 +138,72 @@ def describe_ribs(compared: dict[str, RibComparison]) -> list[str]:
 
 
 def find_places(
-    jaw: Jaw, pattern: RibPattern, images: Sequence[NDArray], poses: Sequence[NDArray], camera: CameraIntrinsics
-) -> list[RibPlace]:
-    """Return places of a jaw beside given ones, the likeliest by their ribs, and at least one within half a rib.
+    patterns: Mapping[str, RibPattern],
+    images: Sequence[NDArray],
+    poses: Mapping[str, Sequence[NDArray]],
+    camera: CameraIntrinsics,
+) -> dict[str, list[RibPlace]]:
+    """Return by side the likeliest places of jaws beside given ones, some of them within half a rib.
 
-    Args:
-        jaw: which.
-        pattern: of its side.
-        images: (h, w, 3) uint8 RGB.
-        poses: T_camera_jaw (4, 4) in each.
-        camera: intrinsics.
+    Ribs may be brighter than cells or darker, but alike on all jaws in all pictures: half a rib further they are not.
+    The arguments are those of `compare_ribs`.
     """
-    scans = [pattern.scan(color, T, camera) for color, T in zip(images, poses, strict=True)]
-    along = scans[0].along
-    face = np.sort(jaw.keypoints[[name.startswith("inner") for name in jaw.keypoint_names], 2])
-    heights = face[face >= face[0] + HIDDEN * (face[-1] - face[0])] - pattern.middle[1]
-    shifts = along[None, :, None] + STRETCHES[:, None, None] * heights
-    evidence = np.mean([-np.log1p(-(scan.ribs.max(axis=3) ** 2)) for scan in scans], axis=0)
+    scans = {
+        side: [pattern.scan(color, T, camera) for color, T in zip(images, poses[side], strict=True)]
+        for side, pattern in patterns.items()
+    }
+    found = [
+        {
+            side: _find_places(
+                pattern, [replace(each, ribs=sign * each.ribs) for each in scans[side]], images, poses[side], camera
+            )
+            for side, pattern in patterns.items()
+        }
+        for sign in (1.0, -1.0)
+    ]
+    return max(found, key=lambda places: sum(max((p.evidence for p in each), default=0.0) for each in places.values()))
+
+
+def _find_places(
+    pattern: RibPattern,
+    scans: Sequence[RibScan],
+    images: Sequence[NDArray],
+    poses: Sequence[NDArray],
+    camera: CameraIntrinsics,
+) -> list[RibPlace]:
+    """Return the likeliest places of a jaw whose ribs are brighter than its cells."""
+    shifts = scans[0].along[None, :, None] + STRETCHES[:, None, None] * pattern.heights
+    evidence = np.mean([-np.log1p(-(np.maximum(scan.ribs, 0.0).max(axis=3) ** 2)) for scan in scans], axis=0)
     is_here = np.sqrt((shifts**2).mean(axis=2)) < HERE * pattern.pitch
     found: list[RibPlace] = []
-    for is_wanted in (np.ones_like(is_here), is_here):
-        left = np.where(is_wanted[:, None, :], evidence, -1.0)
-        for _ in range(PLACES if is_wanted.all() else PLACES // 2):
-            i, k, n = np.unravel_index(int(np.argmax(left)), left.shape)
-            if left[i, k, n] <= 0.0:
+    for is_wanted, count in ((np.ones_like(is_here), PLACES), (is_here, PLACES_HERE)):
+        left = np.where(is_wanted[:, None, :], evidence, 0.0)
+        for _ in range(count):
+            place = np.unravel_index(int(np.argmax(left)), left.shape)
+            if left[place] <= 0.0:
                 break
-            warps, fits = zip(
-                *(_fit(pattern, *each, (i, k, n), camera) for each in zip(scans, images, poses, strict=True)),
-                strict=True,
-            )
+            moved = shifts[place[0], place[2]]
+            fits = [_fit(pattern, *each, place, camera) for each in zip(scans, images, poses, strict=True)]
             found.append(
                 RibPlace(
-                    evidence=float(np.mean([_sum_evidence(*fit) for fit in fits])),
-                    ribs=float(np.mean([ribs for ribs, _ in fits])),
-                    shift=float(shifts[i, n].mean()),
-                    distance=float(np.sqrt((shifts[i, n] ** 2).mean()) / pattern.pitch),
-                    warps=np.array(warps),
+                    evidence=float(np.mean([_sum_evidence(fit.ribs, fit.tip) for fit in fits])),
+                    ribs=float(np.mean([fit.ribs for fit in fits])),
+                    shift=float(moved.mean()),
+                    distance=float(np.sqrt((moved**2).mean()) / pattern.pitch),
+                    warps=np.array([fit.warp for fit in fits]),
                 )
             )
-            near = np.sqrt(((shifts - shifts[i, n]) ** 2).mean(axis=2)) < APART * pattern.pitch
-            left = np.where(near[:, None, :], -1.0, left)
+            near = np.sqrt(((shifts - moved) ** 2).mean(axis=2)) < APART * pattern.pitch
+            left = np.where(near[:, None, :], 0.0, left)
     return found
+
+
+class _Fit(NamedTuple):
+    """How well a picture fits a place: its warp (2, 3), the correlation of the ribs, and the contrast of the tip."""
+
+    warp: NDArray
+    ribs: float
+    tip: float
 
 
 def _sum_evidence(ribs: float, tip: float) -> float:
@@ -185,16 +211,15 @@ def _sum_evidence(ribs: float, tip: float) -> float:
 
 
 def _fit(
-    pattern: RibPattern, scan: RibScan, color: NDArray, T: NDArray, place: tuple, camera: CameraIntrinsics
-) -> tuple[NDArray, tuple[float, float]]:
-    """Return the warp (2, 3) of a place, across the finger where ribs and tip fit best, and how well they do."""
+    pattern: RibPattern, scan: RibScan, color: NDArray, T: NDArray, place: Sequence[int], camera: CameraIntrinsics
+) -> _Fit:
+    """Return the fit of a place, across the finger where ribs and tip together fit best."""
     i, k, n = place
-    best = (pattern.warp(STRETCHES[i], SLANTS[k], 0.0, scan.along[n]), (0.0, 0.0))
+    best = _Fit(pattern.warp(STRETCHES[i], SLANTS[k], 0.0, scan.along[n]), 0.0, 0.0)
     for m in range(0, len(scan.across), 2):
         ribs = float(scan.ribs[i, k, n, m])
         if ribs > 0.0:
             warp = pattern.warp(STRETCHES[i], SLANTS[k], scan.across[m], scan.along[n])
-            fit = ribs, pattern.contrast(color, T, camera, warp)
-            if _sum_evidence(*fit) > _sum_evidence(*best[1]):
-                best = (warp, fit)
+            fit = _Fit(warp, ribs, pattern.contrast(color, T, camera, warp))
+            best = max(best, fit, key=lambda each: _sum_evidence(each.ribs, each.tip))
     return best

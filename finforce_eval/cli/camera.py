@@ -53,9 +53,21 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     text = "length of an edge of these tags' black square [mm] (16)"
     parser.add_argument("--tag-size", type=length_mm, default=0.016, metavar="MM", help=text)
     parser.add_argument("--tag-family", default=FAMILIES[0], choices=FAMILIES, help="family of the tags (4x4_50)")
+    text = "standard deviations of --extrinsics: position [mm] and direction [degrees] (5 2)"
+    parser.add_argument(
+        "--extrinsics-stddev", nargs=2, type=positive, default=(5.0, 2.0), metavar=("MM", "DEG"), help=text
+    )
     text = "write the rig even if its ribs are not where they should be, or may be elsewhere"
     parser.add_argument("--force", action="store_true", help=text)
     add_rest_options(parser, images=45)
+
+
+def positive(text: str) -> float:
+    """Return an option that is a positive number."""
+    value = float(text)
+    if not 0.0 < value < np.inf:
+        raise argparse.ArgumentTypeError(f"{text}: expected a positive number")
+    return value
 
 
 def run(options: argparse.Namespace) -> CommandResult:
@@ -73,7 +85,15 @@ def run(options: argparse.Namespace) -> CommandResult:
     guess = source.node_parameters(recording).get("T_gripper_camera")
     guess = None if guess is None else read_extrinsics(guess)
     with progress_bar(STARTS + 2 * (KEPT * STEPS + POLISHED * ROUNDS * len(colors)), "step") as bar:
-        found = find_placement(colors, recording.images.camera, jaws, locator, guess, progress=bar.update)
+        found = find_placement(
+            colors,
+            recording.images.camera,
+            jaws,
+            locator,
+            guess,
+            np.repeat((1e-3, np.radians(1.0)) * np.array(options.extrinsics_stddev), 3),
+            progress=bar.update,
+        )
     found = add_tags(found, seen, recording.images.camera, options)
     output = Path(options.output)
     picture = output.with_suffix(".png")

@@ -28,6 +28,7 @@ HUE = 0.13  # difference of the shares of red, green and blue of the finger and 
 DARK = 30.0  # of 255: what is added to the brightness by which colours are divided
 USUAL = 2.5  # standard deviations of brightness beyond which it is taken for something else than ribs
 UPPER = 0.4  # share of the side, from the base, that holders may cover: what is above has the finger's colour
+HIDDEN = 0.35  # share of the face, from the base, whose ribs holders usually hide
 LEAST_SHOWN = 0.35  # share of the side that has to have the finger's colour
 # Other places of a finger: stretched along itself, slanted by so much along its width, shifted along it [pitches] and
 # across [lengths].
@@ -42,7 +43,8 @@ class RibScan:
     """How well ribs and cells fit a picture at many places of a finger.
 
     Attributes:
-        ribs: correlation, whatever its sign, by stretch, slant and shifts along and across the finger (s, k, n, m).
+        ribs: correlation by stretch, slant and shifts along and across the finger (s, k, n, m), positive where ribs are
+            brighter than cells.
         along: shifts along the finger (n,) [m].
         across: shifts across it (m,) [m].
     """
@@ -58,6 +60,7 @@ class RibPattern:
     Attributes:
         pitch: median distance of the ribs along the face [m].
         middle: x and z of the point about which the finger is stretched and slanted (2,) [m].
+        heights: z above it of the ribs on the face that no holder hides (r,) [m].
 
     Args:
         jaw: whose side it is.
@@ -65,14 +68,15 @@ class RibPattern:
 
     def __init__(self, jaw: Jaw) -> None:
         cv2, shape = import_cv2(), find_shape(jaw)
-        names = np.array(jaw.keypoint_names)
-        self.pitch = float(np.median(np.diff(np.sort(jaw.keypoints[np.char.startswith(names, "inner"), 2]))))
+        face = np.sort(jaw.keypoints[[name.startswith("inner") for name in jaw.keypoint_names], 2])
+        self.pitch = float(np.median(np.diff(face)))
         self.side = find_side(jaw)
         points = np.vstack(shape.rings)
         low, high = points.min(axis=0), points.max(axis=0)
         length, scale = float(high[1] - low[1]), self.pitch / PER_PITCH
         base = np.array([low[0], max(low[1], shape.clamped_z)])
         self.middle = np.array([high[0], 0.35 * base[1] + 0.65 * high[1]])
+        self.heights = face[face >= face[0] + HIDDEN * (face[-1] - face[0])] - self.middle[1]
         self._margin = np.array([round(ACROSS * length / scale), round(ALONG * PER_PITCH)])
         self._grid = _cover(base, high, scale)
         self._filled = _fill(shape, self._grid)
@@ -120,6 +124,7 @@ class RibPattern:
         sharp = _sharpen(picture, mask)
         there = sharp[(mask > 0.0) & self._upper]
         colour = np.linalg.eigh(there.T @ there)[1][:, -1]
+        colour = np.copysign(1.0, colour.sum()) * colour
         values = sharp @ colour.astype(np.float32)
         reach = USUAL * float(np.sqrt(np.mean((there @ colour) ** 2) + 1.0))
         return np.clip(values, -reach, reach), mask
@@ -140,8 +145,8 @@ class RibPattern:
             seen = cv2.matchTemplate(squares, filled, cv2.TM_CCORR)
             drawn = cv2.matchTemplate(mask, pattern**2, cv2.TM_CCORR)
             share = cv2.matchTemplate(mask, filled, cv2.TM_CCORR) / max(float(self._filled.sum()), 1.0)
-            ribs = np.abs(both) / np.sqrt(np.maximum(seen * drawn, 1e-3))
-            found.append(np.where(share > LEAST_SHOWN, np.minimum(ribs, 0.99), 0.0))
+            ribs = both / np.sqrt(np.maximum(seen * drawn, 1e-3))
+            found.append(np.where(share > LEAST_SHOWN, np.clip(ribs, -0.99, 0.99), 0.0))
         ribs = np.reshape(found, (len(STRETCHES), len(SLANTS), *found[0].shape))
         across, along = ((np.arange(2 * each + 1) - each) * grid.scale for each in self._margin)
         return RibScan(ribs=ribs, along=along, across=across)

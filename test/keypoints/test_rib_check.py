@@ -47,9 +47,8 @@ def test_ribs_tell_a_rig_that_is_some_ribs_off_from_one_that_is_right(name, ribs
     jaws = {side: load_jaw(name, side) for side in ("left", "right")}
     poses = {side: jaw_in_camera(ROBOT_CAMERA, side, x) for side, x in (("left", -0.045), ("right", 0.045))}
     color, pitch = paint(poses, jaws, cells=cells), RibPattern(jaws["left"]).pitch
-    compared = {
-        side: compare_ribs(jaw, [color], [shift_along(poses[side], ribs * pitch)], CAMERA) for side, jaw in jaws.items()
-    }
+    moved = {side: [shift_along(T, ribs * pitch)] for side, T in poses.items()}
+    compared = compare_ribs({side: RibPattern(jaw) for side, jaw in jaws.items()}, [color], moved, CAMERA)
     said = describe_ribs(compared)
     if ribs == 0:
         assert not said and all(each.margin > LEAST_MARGIN for each in compared.values())
@@ -64,9 +63,10 @@ def test_ribs_tell_a_rig_that_is_some_ribs_off_from_one_that_is_right(name, ribs
 def test_ribs_that_cannot_be_seen_are_no_reason_to_trust_a_rig():
     jaw, T = load_jaw("umi", "left"), jaw_in_camera(ROBOT_CAMERA, "left", -0.045)
     plain = paint({"left": T}, {"left": jaw}, cells=(240, 120, 20))
-    assert describe_ribs({"left": compare_ribs(jaw, [plain], [T], CAMERA)})
-    empty = compare_ribs(jaw, [np.zeros_like(plain)], [T], CAMERA)
-    assert "no ribs show" in describe_ribs({"left": empty})[0]
+    pattern = {"left": RibPattern(jaw)}
+    assert describe_ribs(compare_ribs(pattern, [plain], {"left": [T]}, CAMERA))
+    empty = compare_ribs(pattern, [np.zeros_like(plain)], {"left": [T]}, CAMERA)
+    assert "no ribs show" in describe_ribs(empty)[0]
 
 
 def test_a_rig_is_judged_by_pictures_at_openings_that_nobody_states():
