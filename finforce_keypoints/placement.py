@@ -71,7 +71,7 @@ TYPICAL, LEAST_TYPICAL, MOST_ODDS = 0.75, 0.15, 17.0
 # [px] Root mean square of points seen off their places, over their likelihood: 0.9 to 2.6 of real fingers in holders,
 # 3.1 and more of other fingers, of these one rib off, and of pictures without any.
 MOST_LEFT = 2.8
-RIB_ROUNDS = 3  # of laying the jaws on their ribs
+RIB_ROUNDS = 4  # of laying the jaws on their ribs
 # Rounds of finding key points with the place found before; whether jaws are then laid on ribs, of all or near places.
 PLAN = ((12, None), (0, True), (4, False))
 ROUNDS = sum(rounds for rounds, _ in PLAN)
@@ -445,14 +445,14 @@ class _Refinement:
 
     def follow_ribs(self, is_far: bool) -> None:
         """Move camera, turns and origins until jaws lie where their ribs and tips are likeliest, perhaps far off."""
-        for number in range(RIB_ROUNDS):
+        for _ in range(RIB_ROUNDS):
             T, turns, origins = self._split(self._x)
             poses = {side: [jaw_in_camera(T, side, x, turns[side]) for x in origins[side]] for side in self._jaws}
             found = find_places(self._patterns, self._images, poses, self._camera)
             self._seen, self._likelihood = {}, {}
             for side, jaw in self._jaws.items():
                 places = found[side]
-                near = [each for each in places if (is_far and number == 0) or each.distance < HERE] or places
+                near = [each for each in places if is_far or each.distance < HERE] or places
                 if not near:
                     return
                 warps = max(near, key=lambda each: each.evidence).warps

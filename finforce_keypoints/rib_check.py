@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -23,6 +24,7 @@ APART = 0.35  # [pitches] between two of them, root mean square of the ribs to b
 HERE = 0.5  # [pitches] within which a place is the one that a rig has
 # Evidence, see `RibPlace`, by which a place has to be likelier than others, and least correlation of a jaw that tells.
 LEAST_MARGIN, LEAST_RIBS = 0.1, 0.4
+LEAST_EVIDENCE = 0.7  # of a jaw that shows at all: 2.0 to 3.4 of those that are right
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -63,6 +65,8 @@ class RibComparison:
 
     def describe(self, side: str) -> str:
         """Return in words what speaks against the rig's place; empty if nothing does."""
+        if max(self.here.evidence, self.other.evidence) < LEAST_EVIDENCE:
+            return f"{side} jaw: neither ribs nor tip show where it should be"
         shift = f"{1e3 * abs(self.other.shift):.1f} mm towards the {'tip' if self.other.shift > 0.0 else 'base'}"
         fits = f"(ribs {self.other.ribs:.2f}, here {self.here.ribs:.2f}; evidence {self.margin:+.2f})"
         if self.margin < 0.0:
@@ -130,9 +134,8 @@ def compare_rig(
 def describe_ribs(compared: dict[str, RibComparison]) -> list[str]:
     """Return in words what speaks against the places of jaws, by side; empty if nothing does."""
     here = max(each.here.ribs for each in compared.values())
-    other = max(each.other.ribs for each in compared.values())
     said = [words for side, each in compared.items() if (words := each.describe(side))]
-    if here < LEAST_RIBS and (not said or other < LEAST_RIBS):
+    if not said and here < LEAST_RIBS:
         return [f"no ribs show where the jaws are (correlation {here:.2f}, expected {LEAST_RIBS:g})"]
     return said
 
@@ -213,10 +216,11 @@ def _sum_evidence(ribs: float, tip: float) -> float:
 def _fit(
     pattern: RibPattern, scan: RibScan, color: NDArray, T: NDArray, place: Sequence[int], camera: CameraIntrinsics
 ) -> _Fit:
-    """Return the fit of a place, across the finger where ribs and tip together fit best."""
-    i, k, n = place
-    best = _Fit(pattern.warp(STRETCHES[i], SLANTS[k], 0.0, scan.along[n]), 0.0, 0.0)
-    for m in range(0, len(scan.across), 2):
+    """Return the fit of a place, across the finger and within a pixel along it where ribs and tip together fit best."""
+    i, k, centre = place
+    best = _Fit(pattern.warp(STRETCHES[i], SLANTS[k], 0.0, scan.along[centre]), 0.0, 0.0)
+    rows = range(max(centre - 1, 0), min(centre + 2, len(scan.along)))
+    for n, m in product(rows, range(len(scan.across))):
         ribs = float(scan.ribs[i, k, n, m])
         if ribs > 0.0:
             warp = pattern.warp(STRETCHES[i], SLANTS[k], scan.across[m], scan.along[n])
