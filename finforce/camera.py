@@ -323,20 +323,26 @@ _SENT = ("JPEG", "PNG")  # formats of a compressed image
 LARGEST_PICTURE = 50_000_000  # px, of a picture that is unpacked: no camera here makes more
 
 
+HEIC = (b"ftypheic", b"ftypheix", b"ftyphevc", b"ftypmif1", b"ftypmsf1")  # how files of phones begin, from byte 4 on
+
+
 def open_picture(data: bytes, what: str, formats: tuple[str, ...] | None = _SENT) -> Any:
-    """Return a picture of Pillow, unpacked; of any format that Pillow reads where `formats` is None.
+    """Return a picture of Pillow, unpacked and upright; of any format that Pillow reads where `formats` is None.
 
     Raises:
         ImageError: the bytes are none, are damaged, or unpack to more than 50 million pixels; `what` names them.
     """
-    from PIL import Image, UnidentifiedImageError
+    from PIL import Image, ImageOps, UnidentifiedImageError
 
+    if data[4:12] in HEIC:
+        raise ImageError(f"{what}: an HEIC picture; expected JPEG or PNG: export it as one of these")
     expected = f"at most {LARGEST_PICTURE} pixels"
     try:
         picture = Image.open(io.BytesIO(data), formats=formats)
         if picture.width * picture.height > LARGEST_PICTURE:
             raise ImageError(f"{what}: {picture.width} x {picture.height}; expected {expected}")
         picture.load()
+        ImageOps.exif_transpose(picture, in_place=True)
     except ImageError:
         raise
     except UnidentifiedImageError as error:

@@ -3,13 +3,14 @@
 A network that is shown the wrong place finds a finger there, too. What a picture shows of the finger's outline does not
 depend on it: by how much colours tell the inside of the drawn outline from what surrounds it. The outline finds the
 camera; the network's key points then say how each jaw is turned, where it stands in each picture, and which of its
-points are never seen.
+points are never seen. Neither tells one rib from the next: the pattern of the ribs moves what was found along the
+fingers, and of all places the one is taken that this pattern and the tips make likeliest.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from finforce.optional import import_cv2
 from finforce.transforms import move_pose
 from finforce_keypoints.detectors.side_plane import AnyFinger
 from finforce_keypoints.errors import GeometryError
+from finforce_keypoints.geometry.rib_pattern import RibPattern
 from finforce_keypoints.geometry.side_picture import (
     PlaneGrid,
     SidePlane,
@@ -33,6 +35,7 @@ from finforce_keypoints.geometry.side_picture import (
 )
 from finforce_keypoints.geometry.template import find_shape, fit_grid
 from finforce_keypoints.parameters import REFERENCE, JawMount
+from finforce_keypoints.rib_check import HERE, RibComparison, compare_ribs, find_places
 
 if TYPE_CHECKING:
     from finforce_ifea.jaw.jaw import Jaw
@@ -53,11 +56,11 @@ SIMPLEX = np.array([0.008, 0.008, 0.05, 0.008, 0.006, 0.02, 0.05])  # [m, m, rad
 # Least contrast of outlines that are there, in the mean; a part of them taken for held, the best of thousands of places
 # explains pictures of no jaw better. With a guess, a grey finger before a textured ground shows with 0.44.
 LEAST_FOUND, LEAST_GUESSED = 0.75, 0.3
-ROUNDS = 12  # of finding key points with the place found before
 ALIKE = 8.0  # independent points that all the points of a jaw in a picture are worth: what they err by is shared
 PIXEL = 1.0  # [px] standard deviation of one of those
 # How far outlines may be off the camera's place: three in m, three in rad; and how far jaws are mounted askew [rad].
 OUTLINE_STDDEV = np.array([0.015, 0.015, 0.015, 0.06, 0.06, 0.06])
+GUESS_STDDEV = np.repeat((0.005, np.radians(2.0)), 3)  # the same of a guess of which nothing is said
 TURN_STDDEV = 0.05
 MIDDLE_STDDEV = 1e-3  # [m] of the middle between the jaws, which says where the gripper's middle is
 CUTS = 48  # directions in which a holder may cover a jaw up to a straight edge
@@ -68,7 +71,11 @@ TYPICAL, LEAST_TYPICAL, MOST_ODDS = 0.75, 0.15, 17.0
 # [px] Root mean square of points seen off their places, over their likelihood: 0.9 to 2.6 of real fingers in holders,
 # 3.1 and more of other fingers, of these one rib off, and of pictures without any.
 MOST_LEFT = 2.8
-AS_GOOD = 0.05  # by which the outlines' contrast differs between a finger and itself one rib off
+RIB_ROUNDS = 4  # of laying the jaws on their ribs
+# Rounds of finding key points with the place found before; whether jaws are then laid on ribs, of all or near places.
+PLAN = ((12, None), (0, True), (4, False))
+ROUNDS = sum(rounds for rounds, _ in PLAN)
+OUTER_WEIGHT = 0.25  # of points off the face: how ribs slant differs more between fingers than where they meet the face
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -82,7 +89,7 @@ class CameraPlacement:
         contrast: of the outlines, 0 to 1.
         residual: root mean square distance of the points seen from where they should be [px].
         seen: side -> pixels of the points in each picture (n, K + 1, 2), NaN where one was not seen.
-        rival: how far the points are in another placement that outlines hardly tell from it [px]; 0 without one.
+        ribs: side -> where the ribs may be.
     """
 
     T_gripper_camera: NDArray
@@ -91,11 +98,16 @@ class CameraPlacement:
     contrast: float
     residual: float
     seen: Mapping[str, NDArray]
-    rival: float = 0.0
+    ribs: Mapping[str, RibComparison] = field(default_factory=dict)
 
     def pose(self, side: str, number: int) -> NDArray:
         """Return T_camera_jaw (4, 4) in a picture."""
         return jaw_in_camera(self.T_gripper_camera, side, self.origins[side][number], self.mounts[side].turn)
+
+    @property
+    def evidence(self) -> float:
+        """Evidence of ribs and tips for this place, see `RibPlace`."""
+        return float(np.mean([each.here.evidence for each in self.ribs.values()]))
 
 
 class OutlineContrast:
@@ -229,6 +241,7 @@ def find_placement(
     jaws: Mapping[str, Jaw],
     locator: AnyFinger,
     guess: NDArray | None = None,
+    guess_stddev: NDArray = GUESS_STDDEV,
     half: float = 0.045,
     progress: Callable[[int], Any] = lambda steps: None,
 ) -> CameraPlacement:
@@ -240,6 +253,7 @@ def find_placement(
         jaws: by side.
         locator: finds the points in pictures of their sides.
         guess: T_gripper_camera (4, 4); None: it is searched for.
+        guess_stddev: its standard deviations, three in m and three in rad (6,).
         half: guess of half the distance of the jaws' origins [m].
         progress: called with the number of steps done since its last call.
 
@@ -247,36 +261,32 @@ def find_placement(
         GeometryError: there are no such jaws in the pictures.
     """
     starts = [(guess, half, WHOLE)] if guess is not None else search_camera(images, camera, jaws, progress)
-    least = LEAST_FOUND if guess is None else LEAST_GUESSED
     found: list[CameraPlacement] = []
     failures: dict[float, GeometryError] = {}
     for T, opening, edge in starts:
-        fit = _Refinement(images, camera, jaws, locator, T, opening, least)
+        fit = _Refinement(images, camera, jaws, locator, T, opening, None if guess is None else guess_stddev)
         fit.polish(edge)
-        for _ in range(ROUNDS):
-            fit.improve()
-            progress(len(images))
-        try:
-            found.append(fit.describe())
-        except GeometryError as error:
-            failures[fit.likeliest] = error
+        for rounds, is_far in PLAN:
+            for _ in range(rounds):
+                fit.improve()
+                progress(len(images))
+            if is_far is not None:
+                fit.follow_ribs(is_far)
+            try:
+                found.append(_add_ribs(fit.describe(), images, camera, jaws))
+            except GeometryError as error:
+                failures[fit.likeliest] = error
     if not found:
         raise failures[max(failures)]
-    # ribs look alike: one further along the finger is as likely, but the outline is elsewhere
-    best = max(found, key=lambda each: each.contrast)
-    return replace(best, rival=max(measure_rival(best, each, jaws, camera) for each in found))
+    return max(found, key=lambda each: each.evidence)
 
 
-def measure_rival(best: CameraPlacement, other: CameraPlacement, jaws: Mapping[str, Jaw], camera) -> float:
-    """Return the mean distance [px] of the points seen in one placement and in another that is as good, else 0."""
-    if other.contrast < best.contrast - AS_GOOD:
-        return 0.0
-    away = []
-    for side, jaw in jaws.items():
-        points = jaw.keypoints[best.mounts[side].seen_points(jaw)[:-1]]
-        pixels = [project(points @ T[:3, :3].T + T[:3, 3], camera) for T in (best.pose(side, 0), other.pose(side, 0))]
-        away.append(np.linalg.norm(pixels[0] - pixels[1], axis=1))
-    return float(np.mean(np.concatenate(away)))
+def _add_ribs(
+    found: CameraPlacement, images: Sequence[NDArray], camera: CameraIntrinsics, jaws: Mapping[str, Jaw]
+) -> CameraPlacement:
+    """Return a placement with where its ribs may be."""
+    poses = {side: [found.pose(side, number) for number in range(len(images))] for side in jaws}
+    return replace(found, ribs=compare_ribs({s: RibPattern(jaw) for s, jaw in jaws.items()}, images, poses, camera))
 
 
 def find_points(
@@ -336,13 +346,16 @@ class _Refinement:
         locator: AnyFinger,
         T: NDArray,
         half: float,
-        least_contrast: float,
+        guess_stddev: NDArray | None,
     ) -> None:
-        self._least_contrast = least_contrast
+        self._least_contrast = LEAST_FOUND if guess_stddev is None else LEAST_GUESSED
+        self._is_guess = guess_stddev is not None
+        self._stddev = OUTLINE_STDDEV if guess_stddev is None else guess_stddev
         self._images, self._camera, self._jaws, self._locator = images, camera, jaws, locator
         self._points = {side: np.vstack((jaw.keypoints, jaw.reference_point)) for side, jaw in jaws.items()}
         self._planes = {side: find_side(jaw) for side, jaw in jaws.items()}
         self._outlines = {side: OutlineContrast(jaw, FINER) for side, jaw in jaws.items()}
+        self._patterns = {side: RibPattern(jaw) for side, jaw in jaws.items()}
         self._start, count, sides = T, len(images), len(jaws)
         origins = [np.full(count, _origin(side, half)) for side in jaws]
         # step of the camera, turns of the jaws, origins by jaw and picture
@@ -374,18 +387,21 @@ class _Refinement:
         return float(each.max())
 
     def polish(self, edge: int | None = None) -> None:
-        """Move camera and jaws until the outlines show best up to an edge, without one up to the best."""
-        start = self._x / self._scale
+        """Move jaws, and a camera that is no guess, until outlines show best up to an edge; None: up to the best."""
+        first = 6 if self._is_guess else 0
+        still, start = self._x[:first] / self._scale[:first], self._x[first:] / self._scale[first:]
         if edge is None:
             self.contrast()
             edge = self._edge
 
-        def judge(x: NDArray) -> float:
+        def judge(moving: NDArray) -> float:
+            x = np.concatenate((still, moving))
             turns = x[6 : 6 + 3 * len(self._jaws)] * 0.03 / TURN_STDDEV
             return 0.01 * float(turns @ turns) - self.contrast(x * self._scale, edge)
 
         fit = minimize(judge, start, method="L-BFGS-B", options={"maxiter": POLISH, "eps": 0.02})
-        self._start, self._x = self._split(fit.x * self._scale)[0], fit.x * self._scale
+        self._x = np.concatenate((still, fit.x)) * self._scale
+        self._start = self._split(self._x)[0]
         self._x[:6] = 0.0
 
     def _look(self) -> None:
@@ -404,7 +420,7 @@ class _Refinement:
     def _misses(self, x: NDArray) -> NDArray:
         """Return what is off, in standard deviations."""
         T, turns, origins = self._split(x)
-        parts = [x[:6] / OUTLINE_STDDEV, np.concatenate([*turns.values()]) / TURN_STDDEV]
+        parts = [x[:6] / self._stddev, np.concatenate([*turns.values()]) / TURN_STDDEV]
         for side in self._jaws:
             away = self._away(side, T, turns[side], origins[side])
             share = np.minimum(1.0, ALIKE / np.maximum(self._likelihood[side].sum(axis=1), 1e-9))
@@ -426,6 +442,32 @@ class _Refinement:
         self._look()
         self._keep_best()
         self._x = least_squares(self._misses, self._x, x_scale=self._scale, loss="soft_l1").x
+
+    def follow_ribs(self, is_far: bool) -> None:
+        """Move camera, turns and origins until jaws lie where their ribs and tips are likeliest, perhaps far off."""
+        for _ in range(RIB_ROUNDS):
+            T, turns, origins = self._split(self._x)
+            poses = {side: [jaw_in_camera(T, side, x, turns[side]) for x in origins[side]] for side in self._jaws}
+            found = find_places(self._patterns, self._images, poses, self._camera)
+            self._seen, self._likelihood = {}, {}
+            for side, jaw in self._jaws.items():
+                places = found[side]
+                near = [each for each in places if is_far or each.distance < HERE] or places
+                if not near:
+                    return
+                warps = max(near, key=lambda each: each.evidence).warps
+                points = self._points[side][:, ::2]
+                self._seen[side] = np.array(
+                    [
+                        project_plane(points @ warp[:, :2].T + warp[:, 2], self._planes[side], pose, self._camera)
+                        for warp, pose in zip(warps, poses[side], strict=True)
+                    ]
+                )
+                on_face = np.array([name.startswith("inner") for name in (*jaw.keypoint_names, REFERENCE)])
+                weight = np.where(on_face, 1.0, OUTER_WEIGHT) * np.isfinite(self._seen[side]).all(axis=2)
+                self._likelihood[side] = weight
+            self._x = least_squares(self._misses, self._x, x_scale=self._scale, loss="soft_l1").x
+        self._best = (-1.0, self._x)
 
     @property
     def likeliest(self) -> float:

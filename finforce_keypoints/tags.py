@@ -18,7 +18,8 @@ FAMILIES = ("4x4_50", "5x5_50", "6x6_50", "apriltag_16h5", "apriltag_25h9", "apr
 CORNERS = 4
 CORNER_STDDEV = 0.3  # [px] of a corner
 _MARGIN = 1.0  # widths of a tag around the last ones, within which they are looked for first
-_UNSEEN = 30  # images without a tag: of the first of so many the mirrored picture is looked at, too
+_UNSEEN = 30  # images without one of the tags: the first of so many is also looked at enlarged and mirrored
+_LARGER, _LEGIBLE = 4, 60  # times as large small tags are looked for; length of an edge [px] from which this is in vain
 _SCATTER = 2e-3  # [m] by which a corner may move in the frame of a jaw: more of it, and the tag is not on its holder
 # A calibrated camera's pictures of a tag fit it to this [px].
 _MISFIT = 2.0
@@ -44,12 +45,14 @@ class TagFinder:
         mirrored: corners (4, 2) [px] by number of those in the mirrored image, looked for while no tag is seen.
     """
 
-    def __init__(self, family: str, ids: Sequence[int]) -> None:
+    def __init__(self, family: str, ids: Sequence[int] | None = None) -> None:
+        """Look for tags of a family, of some numbers or of all."""
         cv2 = import_cv2()
         parameters = cv2.aruco.DetectorParameters()
         parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{family.upper()}"))
-        self._detector, self._ids = cv2.aruco.ArucoDetector(dictionary, parameters), tuple(ids)
+        self._ids = range(len(dictionary.bytesList)) if ids is None else ids
+        self._detector = cv2.aruco.ArucoDetector(dictionary, parameters)
         self.reset()
 
     def reset(self) -> None:
@@ -64,10 +67,14 @@ class TagFinder:
         found = self._detect_near(grey) if len(self._last) == len(self._ids) else {}
         if len(found) < len(self._ids):
             found = self._detect(grey)
-        self._last, self._unseen = found, 0 if found else self._unseen + 1
+        is_missing = len(found) < len(self._ids)
+        is_first = is_missing and self._unseen % _UNSEEN == 0
+        if is_first:
+            found = self._detect(grey, _LARGER) | found
+        self._last, self._unseen = found, self._unseen + 1 if is_missing else 0
         if found:
             self.mirrored = {}
-        elif self._unseen % _UNSEEN == 1:
+        elif is_first:
             self.mirrored = self._detect(cv2.flip(grey, 1))
         return found
 
@@ -79,15 +86,19 @@ class TagFinder:
             first = np.maximum((corners.mean(axis=0) - margin).astype(int), 0)
             last = (corners.mean(axis=0) + margin).astype(int)
             part = np.ascontiguousarray(grey[first[1] : last[1], first[0] : last[0]])
-            found |= {number: there + first for number, there in self._detect(part).items()}
+            larger = int(np.clip(_LEGIBLE * (2.0 + 2.0 * _MARGIN) / max(*part.shape, 1), 1, _LARGER))
+            found |= {number: there + first for number, there in self._detect(part, larger).items()}
         return found
 
-    def _detect(self, grey: NDArray) -> dict[int, NDArray]:
-        """Return the corners (4, 2) of the wanted tags in a picture, of none whose number is seen twice."""
+    def _detect(self, grey: NDArray, larger: int = 1) -> dict[int, NDArray]:
+        """Return the corners (4, 2) of the wanted tags in a picture, enlarged, of none whose number is seen twice."""
+        cv2 = import_cv2()
+        if larger > 1:
+            grey = cv2.resize(grey, None, fx=larger, fy=larger, interpolation=cv2.INTER_CUBIC)
         corners, numbers, _ = self._detector.detectMarkers(grey)
         seen = [] if numbers is None else numbers.ravel().tolist()
         return {
-            number: there[0].astype(float)
+            number: (there[0].astype(float) + 0.5) / larger - 0.5
             for number, there in zip(seen, corners, strict=True)
             if number in self._ids and seen.count(number) == 1
         }

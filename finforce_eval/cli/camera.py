@@ -22,6 +22,7 @@ from finforce_eval.tasks import progress_bar
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints.build import ANY_FINGER
 from finforce_keypoints.detectors.side_plane import AnyFinger
+from finforce_keypoints.errors import GeometryError
 from finforce_keypoints.networks.side_network import SideNetwork
 from finforce_keypoints.parameters import NO_DEPTH
 from finforce_keypoints.placement import (
@@ -34,11 +35,11 @@ from finforce_keypoints.placement import (
     CameraPlacement,
     find_placement,
 )
+from finforce_keypoints.rib_check import describe_ribs
 from finforce_keypoints.rig import Rig, RigCamera, describe_mount, write_rig
 from finforce_keypoints.tags import FAMILIES, TagFinder, find_tag
 
 PICTURES = 4  # of the images, which are compared
-RIVAL = 3.0  # [px] between two places of the key points, of which one has to be wrong
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -52,7 +53,21 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     text = "length of an edge of these tags' black square [mm] (16)"
     parser.add_argument("--tag-size", type=length_mm, default=0.016, metavar="MM", help=text)
     parser.add_argument("--tag-family", default=FAMILIES[0], choices=FAMILIES, help="family of the tags (4x4_50)")
+    text = "standard deviations of --extrinsics: position [mm] and direction [degrees] (5 2)"
+    parser.add_argument(
+        "--extrinsics-stddev", nargs=2, type=positive, default=(5.0, 2.0), metavar=("MM", "DEG"), help=text
+    )
+    text = "write the rig even if its ribs are not where they should be, or may be elsewhere"
+    parser.add_argument("--force", action="store_true", help=text)
     add_rest_options(parser, images=45)
+
+
+def positive(text: str) -> float:
+    """Return an option that is a positive number."""
+    value = float(text)
+    if not 0.0 < value < np.inf:
+        raise argparse.ArgumentTypeError(f"{text}: expected a positive number")
+    return value
 
 
 def run(options: argparse.Namespace) -> CommandResult:
@@ -70,18 +85,50 @@ def run(options: argparse.Namespace) -> CommandResult:
     guess = source.node_parameters(recording).get("T_gripper_camera")
     guess = None if guess is None else read_extrinsics(guess)
     with progress_bar(STARTS + 2 * (KEPT * STEPS + POLISHED * ROUNDS * len(colors)), "step") as bar:
-        found = find_placement(colors, recording.images.camera, jaws, locator, guess, progress=bar.update)
+        found = find_placement(
+            colors,
+            recording.images.camera,
+            jaws,
+            locator,
+            guess,
+            np.repeat((1e-3, np.radians(1.0)) * np.array(options.extrinsics_stddev), 3),
+            progress=bar.update,
+        )
     found = add_tags(found, seen, recording.images.camera, options)
     output = Path(options.output)
-    rig = build_rig(found, recording, options.jaw, options.tag_family)
-    write_rig(rig, output)
     picture = output.with_suffix(".png")
     import_cv2().imwrite(str(picture), draw_placement(found, colors[0], recording, jaws)[..., ::-1])
     print(describe_placement(found, jaws))
+    doubts = refuse_doubts(found, options, picture)
+    rig = build_rig(found, recording, options.jaw, options.tag_family)
+    write_rig(rig, output)
+    for doubt in doubts:
+        print(f"WARNING: {doubt}")
     print(f"Rig: {output}; {picture}: jaws as found in orange, key points seen in green")
     return CommandResult(
-        {"rig": rig.model_dump(mode="json"), "contrast": found.contrast, "residual_px": found.residual}
+        {
+            "rig": rig.model_dump(mode="json"),
+            "contrast": found.contrast,
+            "residual_px": found.residual,
+            "ribs": {side: each.here.ribs for side, each in found.ribs.items()},
+            "margin": {side: each.margin for side, each in found.ribs.items()},
+        }
     )
+
+
+def refuse_doubts(found: CameraPlacement, options: argparse.Namespace, picture: Path) -> list[str]:
+    """Return in words what speaks against a placement that is to be written all the same.
+
+    Raises:
+        GeometryError: something does, and the options do not force it.
+    """
+    doubts = describe_ribs(found.ribs)
+    if doubts and not options.force:
+        raise GeometryError(
+            f"{'; '.join(doubts)}. No rig is written, see {picture}: give sharper pictures, at several openings, a "
+            "better --extrinsics, or --force"
+        )
+    return doubts
 
 
 def choose_pictures(recording: Recording, count: int) -> list[NDArray]:
@@ -103,7 +150,7 @@ def find_tags(colors: list[NDArray], options: argparse.Namespace) -> list[dict[i
     """Return the corners (4, 2) [px] by number of the tags that the options name, in each of some pictures.
 
     Raises:
-        OptionError: the pictures are mirrored.
+        OptionError: the pictures are mirrored, or a tag is in none of them.
     """
     if not options.tags:
         return []
@@ -114,6 +161,15 @@ def find_tags(colors: list[NDArray], options: argparse.Namespace) -> list[dict[i
         mirrored |= bool(finder.mirrored)
     if mirrored and not any(seen):
         raise OptionError("the pictures are mirrored: their tags decode only when they are flipped")
+    there = {number for tags in seen for number in tags}
+    if missing := sorted(set(options.tags) - there):
+        anything = TagFinder(options.tag_family)
+        others = sorted({number for color in colors for number in anything.find(color)} - set(options.tags))
+        raise OptionError(
+            f"tag {', '.join(map(str, missing))} is in none of the {len(colors)} pictures; of {options.tag_family} "
+            f"they show {', '.join(map(str, sorted(there) + others)) or 'none'}: give these numbers, another "
+            "--tag-family, or sharper pictures"
+        )
     return seen
 
 
@@ -168,6 +224,8 @@ def describe_placement(found: CameraPlacement, jaws) -> str:
         turned = ", ".join(f"{angle:.1f}" for angle in np.degrees(mount.turn))
         places = ", ".join(f"{1e3 * origin:.1f}" for origin in found.origins[side])
         tag = "" if mount.tag is None else f", tag {mount.tag.id}"
+        if side in found.ribs:
+            tag += f"; ribs {found.ribs[side].here.ribs:.2f}, evidence {found.ribs[side].margin:+.2f} over other places"
         lines.append(
             f"{side} jaw: {seen} of {count} key points to be seen, turned by {turned} degrees, at {places} mm{tag}"
         )
@@ -181,11 +239,6 @@ def describe_placement(found: CameraPlacement, jaws) -> str:
         lines.append(
             f"WARNING: {' and '.join(askew)} jaw turned by more than {np.degrees(2.0 * TURN_STDDEV):.1f} degrees, "
             "which few mounts are: check the picture, and give images at several openings or in other light"
-        )
-    if found.rival > RIVAL:
-        lines.append(
-            f"WARNING: key points {found.rival:.1f} px beside explain the pictures nearly as well (one rib further?): "
-            "check the picture, and give images at several openings"
         )
     return "\n".join(lines)
 

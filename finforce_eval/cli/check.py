@@ -15,7 +15,7 @@ from finforce_eval.cli.extrinsics import read_at_rest
 from finforce_eval.cli.parser import BAG_HELP, CommandResult, add_rest_options
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.at_rest import ROUNDS
-from finforce_eval.evaluation.check import FAULT, check_object, check_recording
+from finforce_eval.evaluation.check import FAULT, check_object, check_recording, check_rig
 from finforce_eval.recordings.images import CAMERA_INFO, COMPRESSED, IMAGE
 from finforce_eval.recordings.writer import Entry, typestore, write_entries
 from finforce_eval.tasks import progress_bar
@@ -104,6 +104,8 @@ def _check(options: argparse.Namespace) -> CommandResult:
     with progress_bar(ROUNDS * len(recording.images), "image") as bar:
         found, picture = check_recording(recording, source, bar.update)
     found += check_object(recording, options.object, options.object_unit)
+    if options.rig is not None:
+        found += check_rig(recording, source)
     for line in found:
         print(f"{line.severity:<8}{line.text}")
     folder = Path(options.report)

@@ -31,7 +31,8 @@ from finforce_keypoints.geometry.jaw_localizer import DEPTH_OFF, describe_depth
 from finforce_keypoints.geometry.side_picture import find_side, project_plane
 from finforce_keypoints.geometry.template import find_shape
 from finforce_keypoints.images import RgbdImage
-from finforce_keypoints.parameters import NO_DEPTH
+from finforce_keypoints.parameters import NO_DEPTH, find_mounts
+from finforce_keypoints.rib_check import compare_rig, describe_ribs
 
 OK, WARNING, FAULT = "ok", "warning", "fault"
 DARK, BRIGHT = 25.0, 235.0  # of 255: mean brightness beyond which a picture shows little
@@ -43,6 +44,7 @@ FAR, TURNED = 3e-3, np.radians(1.5)  # [m], [rad] by which the camera may be els
 # Share of a jaw's key points that have to be seen for another reading to be named: pictures of fingers that are none of
 # the known ones show at most 0.75 of a wrong one's.
 ENOUGH = 0.8
+RIG_PICTURES = 4  # of the images, in which the ribs are compared with a rig
 
 
 class Finding(NamedTuple):
@@ -107,6 +109,32 @@ def check_object(recording: Recording, object_file: str | None, unit: str) -> li
         return [Finding(WARNING, text)]
     said = check.at(int(recording.images.stamps_ns[-1]))
     return [Finding(FAULT, said) if said else Finding(OK, f"{mesh.name} is where the camera sees it")]
+
+
+def check_rig(recording: Recording, source: KeypointSource) -> list[Finding]:
+    """Return whether the ribs in a few images are where a rig has them.
+
+    Args:
+        recording: with images of jaws that are open and unloaded, best others than those that the rig was made from.
+        source: the detector's parameters, those of the rig among them.
+    """
+    records = build_records(source.node_parameters(recording))
+    images = choose_images(recording, NO_DEPTH)
+    chosen = np.unique(np.linspace(0, len(images) - 1, RIG_PICTURES).round().astype(int))
+    jaws = {side: load_jaw(source.jaw_file, side) for side in recording.jaws}
+    compared = compare_rig(
+        jaws,
+        [image.color for _, image in images.at(images.stamps_ns[chosen])],
+        images.camera,
+        records.parameters.camera_pose,
+        find_mounts(records.parameters, jaws),
+        OpeningRange(nearest=records.settings.opening_min, farthest=records.settings.opening_max),
+    )
+    shown = ", ".join(f"{side} {each.here.ribs:.2f}" for side, each in compared.items())
+    if said := describe_ribs(compared):
+        again = "make the rig anew with finforce camera, or give sharp pictures of open, unloaded jaws"
+        return [Finding(FAULT, f"{words}: {again}") for words in said]
+    return [Finding(OK, f"the ribs are where the rig has them: correlation {shown}")]
 
 
 def judge_picture(color: NDArray) -> list[Finding]:

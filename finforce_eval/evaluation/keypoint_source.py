@@ -371,6 +371,8 @@ def detect_keypoints(
         raise UnseenError(f"{recording.name}: no key points in {len(images)} images: {why}")
     notes = [f"{count} images rejected: {text}" for text, count in reasons.items()] + warnings
     notes += [f"the {side} jaw is in none of the images" for side, seen in found.items() if not seen]
+    if missing := len(images) - len(step_ms):
+        notes.append(f"{missing} of {len(images)} images are damaged or follow a damaged one, and are left out")
     recording = replace(recording, notes=(*recording.notes, *notes))
     return with_detections(recording, found, dict.fromkeys(found, step_ms), passed)
 

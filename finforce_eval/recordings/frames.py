@@ -19,7 +19,7 @@ from finforce.gripper_frames import SIDES
 from finforce.messages import NANOSECONDS
 from finforce.optional import import_library
 from finforce.typed_yaml import Number
-from finforce_eval.errors import OptionError, RecordingError
+from finforce_eval.errors import DamagedError, OptionError, RecordingError
 from finforce_eval.recordings.bags import list_pictures
 from finforce_eval.recordings.image_files import read_intrinsics
 from finforce_eval.recordings.images import ImageChoice, StampedImage
@@ -46,6 +46,7 @@ class FrameImages(Timed):
         read: begins anew to yield all frames, (h, w, 3) RGB.
         times: (count,) of the frames [ns]; None where they follow each other at `fps` from zero on.
         is_video: whether they are those of a camera that ran, compressed, whose still pictures are alike.
+        ends_at_damage: whether the frames before the first damaged one are read, if there are any.
         frames: (n,) numbers of those to be read, rising; None for all.
         depth_scale: without meaning.
     """
@@ -57,6 +58,7 @@ class FrameImages(Timed):
     read: Callable[[], Iterable[NDArray[np.uint8]]]
     times: NDArray[np.int64] | None = None
     is_video: bool = True
+    ends_at_damage: bool = False
     frames: NDArray[np.int64] | None = None
     depth_scale: float = MILLIMETRE
     frame_id: str = "camera_color_optical_frame"
@@ -104,17 +106,22 @@ class FrameImages(Timed):
         """
         frames = range(len(self)) if self.frames is None else self.frames.tolist()
         wanted, count = dict(zip(frames, self.stamps_ns.tolist(), strict=True)), 0
-        for frame, color in enumerate(self.read()):
-            if frame in wanted:
-                stamp, count = wanted[frame], count + 1
-                image = RgbdImage(stamp=stamp / NANOSECONDS, color=color, depth=None, camera=self.camera)
-                try:
-                    check_image(image)
-                except ImageError as error:
-                    raise RecordingError(f"{self.name}: frame {frame}: {error}") from error
-                yield StampedImage(stamp, image)
-            if count == len(wanted):
-                return
+        try:
+            for frame, color in enumerate(self.read()):
+                if frame in wanted:
+                    stamp, count = wanted[frame], count + 1
+                    image = RgbdImage(stamp=stamp / NANOSECONDS, color=color, depth=None, camera=self.camera)
+                    try:
+                        check_image(image)
+                    except ImageError as error:
+                        raise RecordingError(f"{self.name}: frame {frame}: {error}") from error
+                    yield StampedImage(stamp, image)
+                if count == len(wanted):
+                    return
+        except DamagedError:
+            if not (count and self.ends_at_damage):
+                raise
+            return
         raise RecordingError(f"{self.name}: {count} pictures; expected {len(wanted)}")
 
 
@@ -123,20 +130,29 @@ def _open_video(path: Path, name: str) -> Iterator[tuple[Any, Any]]:
     """Open a video, container and stream of PyAV, for the length of a `with` block.
 
     Raises:
-        RecordingError: it is no video, or damaged.
+        RecordingError: it is no video.
+        DamagedError: it is damaged.
         MissingDependencyError: PyAV is not installed.
     """
     av = import_library("av", "reading videos", "'finforce[video]'")
+    where = f"{name}: {path.parent.name}/{path.name}"
     try:
         check_plain(path)
-        with av.open(str(path), options=_ALONE) as container:
-            yield container, container.streams.video[0]
+        container = av.open(str(path), options=_ALONE)
+        stream = container.streams.video[0]
     except (FileError, av.FFmpegError, IndexError) as error:
-        raise RecordingError(f"{name}: {path.parent.name}/{path.name}: {error}; expected a video") from error
+        raise RecordingError(f"{where}: {error}; expected a video") from error
+    with container:
+        # decoders else paint over what is damaged
+        stream.codec_context.options = {"err_detect": "explode"}
+        try:
+            yield container, stream
+        except av.FFmpegError as error:
+            raise DamagedError(f"{where}: damaged: {error}") from error
 
 
 def decode_video(path: Path, name: str, begin: float = 0.0, count: int | None = None) -> Iterator[NDArray[np.uint8]]:
-    """Yield the frames (h, w, 3) RGB of a video from a time [s] on; see `_open_video`.
+    """Yield the frames (h, w, 3) RGB of a video from a time [s] on, upright; see `_open_video`.
 
     A video that says of itself that it has another number of frames than `count` is refused, too.
     """
@@ -147,7 +163,19 @@ def decode_video(path: Path, name: str, begin: float = 0.0, count: int | None = 
             container.seek(int(begin / stream.time_base), stream=stream)
         for frame in container.decode(stream):
             if frame.time is None or frame.time >= begin:
-                yield frame.to_ndarray(format="rgb24")
+                color = frame.to_ndarray(format="rgb24")
+                turns = round(frame.rotation / 90.0) % 4
+                yield np.ascontiguousarray(np.rot90(color, turns)) if turns else color
+
+
+def _list_times(container: Any, stream: Any) -> NDArray[np.int64] | None:
+    """Return when the frames of a video are shown, from the first one on (n,) [ns]; None where it does not say so."""
+    packets = [each for each in container.demux(stream) if each.size and not each.is_discard and not each.is_corrupt]
+    if not packets or any(each.pts is None for each in packets):
+        return None
+    shown = np.sort([each.pts for each in packets])
+    times = np.rint((shown - shown[0]) * float(stream.time_base) * NANOSECONDS).astype(np.int64)
+    return times if (np.diff(times) > 0).all() else None
 
 
 def read_picture(path: Path) -> NDArray[np.uint8]:
@@ -166,20 +194,24 @@ def read_frames(path: Path, choice: ImageChoice, sides: Sequence[str] = ()) -> R
         OptionError: nothing says what its camera is.
         RigError: the rig is of another camera.
     """
-    name = path.name if path.is_dir() else path.stem
+    name, times = path.name if path.is_dir() else path.stem, None
     if path.is_dir():
         paths = list_pictures(path)
         fps, count, shape = STILL_RATE, len(paths), read_picture(paths[0]).shape[:2]
         read = partial(map, read_picture, paths)
     else:
         with _open_video(path, name) as (container, stream):
-            count = stream.frames or sum(bool(packet.size) for packet in container.demux(stream))
-            fps, shape = float(stream.average_rate or 0.0), (stream.height, stream.width)
+            fps, times = float(stream.average_rate or 0.0), _list_times(container, stream)
+            count = stream.frames if times is None else len(times)
         if not (count and LEAST_RATE <= fps <= MOST_RATE):
             raise RecordingError(f"{name}: {path.name}: {count} frames at {fps:g} Hz; expected a video")
         read = partial(decode_video, path, name)
+        shape = next(read()).shape[:2]
     camera = choose_camera(choice, shape, name)
-    return FrameImages(name=name, fps=fps, camera=camera, count=count, read=read).make_recording(path, sides)
+    images = FrameImages(
+        name=name, fps=fps, camera=camera, count=count, read=read, times=times, ends_at_damage=not path.is_dir()
+    )
+    return images.make_recording(path, sides)
 
 
 def choose_camera(choice: ImageChoice, shape: tuple[int, int], name: str) -> CameraIntrinsics:

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_ifea.contact_mechanics.friction import FRICTIONLESS, Traction, constant_traction
+from finforce_ifea.contact_mechanics.friction import FRICTIONLESS, Traction, constant_traction, measure_shear
 from finforce_ifea.contact_mechanics.indenter import Indenter, OutlineIndenter, RoundIndenter
 from finforce_ifea.contact_mechanics.pressed_jaw import RigidContact
+from finforce_ifea.filter.lateral_load import measure_torsion
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE
 from finforce_ifea.observation import Contact, ObjectOutline, Observation
 from finforce_ifea.relaxation import RelaxationTerm
-from finforce_ifea.tracking.lateral_load import measure_torsion
 from lab.presses import circle
 from lab.stress.objects import rectangle
 from lab.stress.session import FRICTIONLESS as SMOOTH
@@ -154,9 +154,7 @@ def _keep_shear(contact: RigidContact, q: NDArray, x: NDArray, traction: Tractio
     """Return what the next step has to know of the tangential forces of this one."""
     points = contact.place_points(q)
     normal, total = (contact.press(points, x, each).forces for each in (FRICTIONLESS, traction))
-    size = np.maximum(np.hypot(normal[:, 0], normal[:, 2]), 1e-300)
-    shear = (total[:, 0] * normal[:, 2] - total[:, 2] * normal[:, 0]) / size
-    return Traction(0.0, friction, shear, points, np.zeros(2))
+    return Traction(0.0, friction, measure_shear(total, normal), points, np.zeros(2))
 
 
 def tell_height(bench: Bench, pressed: Press, error: float = 0.0) -> list[Contact]:

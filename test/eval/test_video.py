@@ -1,6 +1,8 @@
 """Claims about pictures without messages: a video and a folder of them are recordings like others."""
 
 from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,14 +15,17 @@ from finforce.transforms import pose_numbers
 from finforce_contact.loop import GivenContact
 from finforce_eval.annotation import video
 from finforce_eval.cli.main import main
-from finforce_eval.errors import OptionError, RecordingError
+from finforce_eval.errors import DamagedError, OptionError, RecordingError
 from finforce_eval.evaluation import unseen
 from finforce_eval.evaluation.forces import STILL_UPDATES, find_forces, share_reached
 from finforce_eval.evaluation.keypoint_source import detect_keypoints
+from finforce_eval.evaluation.setup import EvaluationSetup
+from finforce_eval.recordings.frames import FrameImages, read_picture
 from finforce_eval.recordings.images import ImageChoice
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.tracks import DetectionTrack, PoseTrack
 from finforce_eval.table import ForceSeries
+from finforce_ifea.settings import EstimatorSettings
 from finforce_keypoints.rig import Rig, RigCamera, write_rig
 
 CAMERA = RigCamera(width=64, height=48, fx=50.0, fy=50.0, cx=32.0, cy=24.0, model="plumb_bob")
@@ -215,3 +220,76 @@ def test_why_key_points_were_of_no_use_for_long_is_said_with_the_time(monkeypatc
     np.testing.assert_array_equal(asked[0], stamps[5:21])
     for fine in ((long, "unloaded"), (long, "waiting"), (stamps < 9e8, "unobservable"), (long, "unobservable", None)):
         assert describe(*fine) == []
+
+
+def test_frames_of_a_variable_rate_have_the_times_of_the_file(tmp_path):
+    av = pytest.importorskip("av")
+    shown = [0, 40, 200, 240, 1000]  # [ms]
+    with av.open(str(tmp_path / "phone.mp4"), "w") as container:
+        stream = container.add_stream("mpeg4", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        stream.codec_context.time_base = Fraction(1, 1000)
+        for time, level in zip(shown, LEVELS, strict=True):
+            frame = av.VideoFrame.from_ndarray(np.full((48, 64, 3), level, np.uint8), format="rgb24")
+            frame.pts, frame.time_base = time, Fraction(1, 1000)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    images = read_recording(tmp_path / "phone.mp4", CHOICE).images
+    np.testing.assert_allclose(1e-6 * images.stamps_ns, shown, atol=1.0)
+
+
+def test_a_cut_video_is_read_up_to_the_cut(tmp_path):
+    whole = write_video(tmp_path / "whole.mkv").read_bytes()
+    (tmp_path / "cut.mkv").write_bytes(whole[: int(0.8 * len(whole))])
+    levels = [image.color.mean() for _, image in read_recording(tmp_path / "cut.mkv", CHOICE).images]
+    assert 0 < len(levels) < 5
+    np.testing.assert_allclose(levels, LEVELS[: len(levels)], atol=6)
+
+
+def test_a_video_that_a_decoder_finds_damaged_ends_before_the_damage():
+    def read():
+        yield from (np.full((48, 64, 3), level, np.uint8) for level in LEVELS[:3])
+        raise DamagedError("demo: damaged")
+
+    images = FrameImages(name="demo", fps=20.0, camera=RIG.intrinsics, count=5, read=read, ends_at_damage=True)
+    assert [int(image.color.mean()) for _, image in images] == list(LEVELS[:3])
+    with pytest.raises(DamagedError):
+        list(replace(images, ends_at_damage=False))
+
+
+def test_turns_in_the_metadata_of_a_video_are_applied(tmp_path):
+    content = bytearray(write_video(tmp_path / "turned.mp4").read_bytes())
+    matrix = content.index(b"tkhd") + 4 + 40
+    quarter = np.array([0, 1 << 16, 0, -1 << 16, 0, 0, 0, 0, 1 << 30], dtype=">i4")
+    content[matrix : matrix + 36] = quarter.tobytes()
+    (tmp_path / "turned.mp4").write_bytes(content)
+    upright = RIG.camera.model_copy(update={"width": 48, "height": 64, "cx": 24.0, "cy": 32.0})
+    images = read_recording(tmp_path / "turned.mp4", ImageChoice(camera=replace_camera(upright))).images
+    assert {image.color.shape for _, image in images} == {(64, 48, 3)}
+
+
+def replace_camera(camera):
+    return RIG.model_copy(update={"camera": camera}).intrinsics
+
+
+def test_turns_in_pictures_are_applied_and_heic_is_named(tmp_path):
+    folder = tmp_path / "stills"
+    folder.mkdir()
+    picture = Image.fromarray(np.tile(np.arange(48, dtype=np.uint8)[:, None, None], (1, 64, 3)))
+    exif = Image.Exif()
+    exif[0x0112] = 6  # to be turned clockwise
+    picture.save(folder / "a.png", exif=exif)
+    assert (read_picture(folder / "a.png")[0, [0, -1], 0] == (47, 0)).all()
+    (folder / "b.jpg").write_bytes(b"\0\0\0\x24ftypheic" + bytes(40))
+    with pytest.raises(RecordingError, match="HEIC picture; expected JPEG or PNG"):
+        read_picture(folder / "b.jpg")
+
+
+@pytest.mark.parametrize(("fps", "count"), [(7.5, 15), (20.0, 30), (30.0, 45), (60.0, 45)])
+def test_the_tare_of_a_slow_video_is_a_time(fps, count):
+    images = FrameImages(name="demo", fps=fps, camera=RIG.intrinsics, count=100, read=list)
+    recording, settings = images.make_recording(Path("demo.mp4"), ()), EstimatorSettings()
+    setup = EvaluationSetup(jaw=FakeJaw, settings=settings, calibration=None, contacts=None, about={})
+    assert setup.at_rate(recording).settings.tare_frames == count
+    given = replace(setup, settings=replace(settings, tare_frames=60))
+    assert given.at_rate(recording) is given

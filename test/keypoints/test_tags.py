@@ -189,3 +189,12 @@ def test_tags_on_the_wrong_sides_and_mirrored_images_are_named_and_give_no_key_p
 def test_a_parameter_that_is_no_tag_is_refused(numbers):
     with pytest.raises(DetectorSettingsError, match="left_tag: got .* expected a tag's number"):
         find_mounts(DetectorParameters(left_tag=numbers), {"left": load_jaw("bench")})
+
+
+def test_small_tags_are_found_in_the_enlarged_picture_and_missing_ones_are_named():
+    corners = [see(tag_of(side).corners, pose(side)) for side in PLACES]
+    small = cv2.resize(picture(*corners), None, fx=0.27, fy=0.27, interpolation=cv2.INTER_AREA)
+    edge = 0.27 * np.linalg.norm(corners[0][1] - corners[0][0])
+    assert edge < 20.0 and sorted(TagFinder(FAMILY, (0, 1)).find(small)) == [0, 1]
+    with pytest.raises(OptionError, match="tag 5 is in none of the 1 pictures; .*show 0, 1"):
+        find_tags([small], Namespace(tags=[0, 5], tag_family=FAMILY))
