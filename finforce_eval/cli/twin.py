@@ -151,6 +151,8 @@ def scenario_from_options(options: argparse.Namespace) -> Scenario:
     return build_scenario(options.scene, **changes)
 
 
+# What a `case.json` says of objects that a hand or the bench guides: the simulator presses them in without friction.
+FRICTIONLESS = {"mean": 0.0, "stddev": 0.03}
 FRAME = "camera_color_optical_frame"
 MESH = "object.stl"
 
@@ -265,5 +267,7 @@ def record_footage(
         "jaw": str(Path(scenario.jaw).resolve()) if Path(scenario.jaw).is_file() else scenario.jaw,
         "object": {"kind": scenario.object},
     }
+    if scenario.is_guided:
+        case["friction"] = FRICTIONLESS
     with progress_bar(len(footage), "image", scenario.name) as bar:
         write_footage(footage, folder, compressed=compressed, case=case, seen=lambda _: bar.update())

@@ -14,6 +14,7 @@ from finforce_eval.cli.twin import write_footage
 from finforce_eval.evaluation.keypoint_source import detect_keypoints
 from finforce_eval.evaluation.scoring import score_results
 from finforce_eval.evaluation.tables import evaluation_json, format_tables, sight_table
+from finforce_eval.recordings.objects import read_friction
 from finforce_eval.recordings.recording import read_recording
 from finforce_sim.scenarios import SCENARIOS
 
@@ -64,8 +65,15 @@ def test_a_scene_is_recorded_with_its_changes(asked, tmp_path, capsys):
     case = json.loads((bag / "case.json").read_text())
     named = [case[name] for name in ("scene", "seed", "finger", "light", "mesh")]
     assert named == ["grasp_cylinder", 7, 3, "dim", "twin/object.stl"]
+    assert "friction" not in case  # the jaws alone hold it
     assert len(read_recording(bag).images) == 12
     assert str(bag) in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("asked")
+def test_a_recording_states_the_friction_of_an_object_that_is_guided(tmp_path):
+    assert main(["twin", "record", "bench_cylinder", "-o", str(tmp_path / "bag")]) == 0
+    assert read_friction(read_recording(tmp_path / "bag")) == (0.0, 0.03)
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from estimator_fakes import BENCH, PERIOD, circle, contact_with
 
+from finforce.kalman import MotionNoise, Track
 from finforce_ifea.contact_mechanics.friction import Coefficient, constant_traction
 from finforce_ifea.contact_mechanics.indenter import RoundIndenter
 from finforce_ifea.contact_mechanics.pressed_jaw import limit_step
@@ -26,6 +27,7 @@ from finforce_ifea.jaw.calibration import Calibration, load_calibration
 from finforce_ifea.mechanics import build_chosen
 from finforce_ifea.observation import Observation
 from finforce_ifea.settings import EstimatorSettings
+from lab.presses import rub_jaw
 
 RUBBED = np.load(Path(__file__).parents[1] / "data" / "rubbed_bench.npz")
 HEIGHTS = {"lower": 0.020, "middle": 0.040, "upper": 0.060}
@@ -166,6 +168,35 @@ class TestSlipPath:
         assert np.sqrt(np.mean(np.square(errors))) < 4.0  # of a cone of 33 degrees
         contact.set_indenter(RoundIndenter())
 
+    @pytest.mark.parametrize("name", HEIGHTS)
+    def test_a_contact_begins_by_sticking_wherever_it_is_seen_first(self, name):
+        contact, height = mechanics().contact, HEIGHTS[name]
+        contact.set_indenter(RoundIndenter())
+        states = [np.array([depth, 12.5e-3, height]) for depth in np.linspace(0.02e-3, 0.2e-3, 6)]
+        for coefficient in (0.3, 0.9):
+            q, pressed = rub_jaw(contact, states, coefficient)[-1]
+            smooth = contact.linearize(q, states[-1]).force
+            leans = np.tan(np.radians(incline(smooth) - incline(pressed.force)))
+            seen = SlipPath(np.array([coefficient]))
+            seen.begin(contact, q, states[-1])
+            assert seen.ratios[0] == pytest.approx(leans, abs=0.1)
+
+    def test_a_look_ahead_is_where_the_path_will_be(self):
+        contact, path = mechanics().contact, SlipPath(np.array([0.3, 0.9]))
+        contact.set_indenter(RoundIndenter())
+        q = contact.begin(0.040)
+        for depth in (0.5e-3, 1e-3, 1.5e-3, 2e-3):
+            x = np.array([depth, 12.5e-3, 0.040])
+            q, _ = press(contact, x, 0.0, q)
+        path.ratios[:] = -0.2
+        path.move(contact, q, x, np.zeros((2, 2)))  # measures the turns
+        motion = np.full((2, 2), [0.2e-3, 0.0])
+        ahead, before = path.preview(motion), path.ratios.copy()
+        np.testing.assert_array_equal(path.ratios, before)
+        path.move(contact, q, x, motion)
+        np.testing.assert_allclose(path.ratios, ahead)
+        assert (ahead > before).any()
+
     def test_the_ratio_never_leaves_the_cone(self):
         contact, path = mechanics().contact, SlipPath(np.array([0.1, 0.3, 0.5]))
         contact.set_indenter(RoundIndenter())
@@ -181,6 +212,22 @@ class TestSlipPath:
 
 
 class TestHypotheses:
+    def test_a_way_back_that_may_be_chance_is_doubted_by_what_it_would_turn(self):
+        contact, unknown = mechanics().contact, TractionHypotheses(Coefficient(0.45, 0.25), "no")
+        contact.set_indenter(RoundIndenter())
+        q, x = contact.begin(0.040), np.array([2e-3, 12.5e-3, 0.040])
+        q, _ = press(contact, x, 0.0, q)
+        track, weights = Track(MotionNoise(1e-12, 1e-6, 1e-6, 3.0, 1.0), 2e-3, (0.1e-3) ** 2), np.exp(unknown.prior)
+        places = np.tile([2e-3, 0.040], (NODES, 1))
+        unknown.preview(places, track, weights)
+        assert unknown.doubt == pytest.approx(0.45, abs=0.05)  # nobody knows which way it sticks
+        unknown.follow(contact, q, x, places, track, weights)
+        back = places - [0.05e-3, 0.0]
+        np.testing.assert_array_equal(unknown.preview(back, track, weights), unknown.ratios)
+        small = unknown.doubt
+        unknown.preview(places - [0.1e-3, 0.0], track, weights)
+        assert 0.0 < small < unknown.doubt
+
     def test_friction_is_known_as_it_was_stated(self):
         stated = TractionHypotheses(Coefficient(0.5, 0.1), "no")
         mean, stddev = stated.estimate(np.exp(stated.prior))
