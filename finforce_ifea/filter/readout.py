@@ -13,6 +13,8 @@ from finforce_ifea.tracking.contact_state import LEAST_DEPTH, LOADED_DEPTH, TOUC
 _OPTIONS = {"cache": True, "error_model": "numpy"}
 # Error of the force's direction [-]: it is considered and never estimated.
 _MISDIRECTED = 0.03
+# The largest force that is read out, over that of the linearisation [-].
+_LARGEST_GROWTH = 10.0
 # The largest traction ratio that the mechanics is asked for [-].
 LARGEST_RATIO = 0.9
 # Weight at which a key point still agrees.
@@ -54,7 +56,7 @@ def read_out(state, force, modes, x, log_weights, P, shift, smoothing, at, ratio
     inner[0, 0] += (lessened - 1.0) ** 2 * own[0, 0]
     covariance = np.dot(modes, np.dot(inner, np.ascontiguousarray(modes.T)))
     # where the linearisation has found less of a force, it turns less by the traction ratio, too
-    grown = max(np.sqrt((found**2).sum() / max((force**2).sum(), 1e-300)), 1.0) ** 2
+    grown = min(max((found**2).sum() / max((force**2).sum(), 1e-300), 1.0), _LARGEST_GROWTH**2)
     for a in range(3):
         for b in range(3):
             covariance[a, b] += (spread + _MISDIRECTED**2) * grown * modes[a, 3] * modes[b, 3]
