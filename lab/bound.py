@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import uniform_filter1d
 
+from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.forces import evaluate_jaws, truth_sides
 from finforce_eval.evaluation.scoring import match_truth
 from finforce_eval.evaluation.setup import EvaluationSetup
@@ -39,8 +40,8 @@ from lab.harness import Figures
 
 _D, _V, _TILT, _HEIGHT, _MU, _DK, _E, _CX, _CZ, _CPHI, _SHARED = range(11)
 _LEAST_DEPTH, _DEEPEST, _EVERY = 0.05e-3, 12e-3, 0.4e-3
-# Traction ratios up to which objects of stated and of unknown friction are linearised [-].
-_SMOOTH, _RUBS = 0.05, 0.5
+# Traction ratio up to which the mechanics is linearised [-]: of objects that slide freely.
+_SMOOTH = 0.05
 # A true force from which on the object touches [N], and a change of the depth from which on it moves [m/s].
 _TOUCH, _MOVES = 0.02, 0.2e-3
 _SEEN, _WINDOW = 0.6, 31  # likelihood of a visible key point, and images in half of which it is seen
@@ -220,18 +221,11 @@ def read_truth(recording: Recording, side: str, setup: EvaluationSetup) -> TrueI
     mechanics = build_mechanics(jaw, replace(own.settings, solver=jaw.model))
     height = 1e-3 * float(recording.case["object"]["z"])
     friction, indenter = read_friction(recording), OutlineIndenter(outline.polygons)
-    largest = float(size.max()), _SMOOTH if friction is not None else _RUBS
+    largest = float(size.max()), _SMOOTH
     depths, table, forces = tabulate(mechanics, jaw.keypoints, indenter, height, largest)
     smooth = forces[:, 1]
     depth = np.where(size > _TOUCH, np.interp(size, np.linalg.norm(smooth, axis=1), depths), 0.0)
-    flat = np.interp(depth, depths, np.arctan2(smooth[:, 2], -smooth[:, 0]))
-    ratio = np.where(size > 5 * _TOUCH, np.tan(np.arctan2(force[:, 2], -force[:, 0]) - flat), 0.0)
-    if friction is None:
-        friction = Coefficient(own.settings.friction, own.settings.friction_stddev)
-        mobilised = np.clip(ratio / np.quantile(np.abs(ratio[size > 5 * _TOUCH]), 0.9), -1.0, 1.0)
-    else:
-        ratio, mobilised = np.zeros_like(ratio), np.ones_like(ratio)
-    at = np.stack([np.maximum(depth, _LEAST_DEPTH), np.clip(-ratio, -_RUBS, _RUBS)], axis=1)
+    at = np.stack([np.maximum(depth, _LEAST_DEPTH), np.zeros_like(depth)], axis=1)
     values = table(at)
     count = len(jaw.keypoints)
     motions, places = np.split(values[:, : 10 * count].reshape(-1, count, 10), [8], axis=2)
@@ -248,7 +242,7 @@ def read_truth(recording: Recording, side: str, setup: EvaluationSetup) -> TrueI
     return TrueImages(
         stamps=track.stamps,
         depth=depth,
-        mobilised=mobilised,
+        mobilised=np.ones_like(depth),
         motions=motions,
         displacement=np.linalg.norm(places - rest, axis=2),
         places=places,
@@ -302,16 +296,19 @@ def compare(recordings: Iterable[Recording], setup: EvaluationSetup) -> Figures:
     """Return the force error of the estimator over the bound, for each jaw of recordings with truth.
 
     Raises:
-        FinforceError: a recording has no truth, or cannot be evaluated.
+        FinforceError: a recording has no truth, does not state its friction, or cannot be evaluated.
     """
-    rows, recordings = [], list(recordings)
+    recordings = list(recordings)
+    rows, unknown = [], [each.name for each in recordings if read_friction(each) is None]
+    if unknown:  # where a contact sticks or slides, nothing is linear in a coefficient that nobody knows
+        raise RecordingError(f"{', '.join(unknown)}: no friction in case.json, expected recordings that state it")
     with progress_bar(len(recordings), "recording", "bound") as bar:
         for recording in recordings:
             sides = truth_sides(recording)
             for side, series in zip(sides, evaluate_jaws(recording, setup), strict=True):
                 images, counted = read_truth(recording, side, setup), series.counted
                 error = (series.column("force") - series.column("true_force"))[counted]
-                exact = images if read_friction(recording) is None else replace(images, friction=Coefficient(0.0, 0.0))
+                exact = replace(images, friction=Coefficient(0.0, 0.0))
                 row = {"recording": series.name, "error/N": float(np.sqrt((error**2).sum(axis=1).mean()))}
                 limits = {"as stated": (images, Stated()), "friction known": (exact, Stated())}
                 for name, (own, stated) in (limits | {"noise alone": (exact, NOISE_ALONE)}).items():
