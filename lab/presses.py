@@ -205,11 +205,12 @@ def rub_jaw(contact: RigidContact, states: Sequence[NDArray], coefficient: float
     Raises:
         ContactError: No equilibrium is found; the message says at which depth.
     """
-    q, shear, before = contact.begin(float(states[0][2])), np.zeros(len(contact.surface.points)), contact.surface.points
+    q, rest = contact.begin(float(states[0][2])), contact.surface.points
+    traction = Traction(0.0, coefficient, np.zeros(len(rest)), rest, np.zeros(2))
     last, results = np.asarray(states[0], float), []
     for x in states:
         # towards the jaw is along -x, and the height along z
-        traction = Traction(0.0, coefficient, shear, before, np.array([last[0] - x[0], x[2] - last[2]]))
+        traction = traction._replace(moved=np.array([last[0] - x[0], x[2] - last[2]]))
         for iteration in range(_ITERATIONS):
             pressed = contact.linearize(q, x, traction)
             if not pressed.touches:
@@ -224,10 +225,16 @@ def rub_jaw(contact: RigidContact, states: Sequence[NDArray], coefficient: float
                 break
         else:
             raise ContactError(f"no equilibrium with friction at a depth of {1e3 * x[0]:.3f} mm")
-        before, last = contact.place_points(q), x
-        shear = measure_shear(contact.press(before, x, traction).forces, contact.press(before, x, FRICTIONLESS).forces)
+        traction, last = keep_shear(contact, q, x, traction, coefficient), x
         results.append((q, pressed))
     return results
+
+
+def keep_shear(contact: RigidContact, q: NDArray, x: NDArray, traction: Traction, coefficient: float) -> Traction:
+    """Return what the next step has to know of the tangential forces at unknowns q (size,) and state x (3,)."""
+    points = contact.place_points(q)
+    pressure, total = (contact.press(points, x, each).forces for each in (FRICTIONLESS, traction))
+    return Traction(0.0, coefficient, measure_shear(total, pressure), points, np.zeros(2))
 
 
 def _snaps(before: PressState, after: PressState) -> bool:

@@ -291,9 +291,7 @@ class ContactSearch:
             jump = max(jump, found)
             weight, aim = posterior.weight, posterior.mean[CONTACT] - x
             aim[0] = self.track.expect(posterior.mean[DEPTH], max(posterior.own[0, 0], _LEAST_VARIANCE)) - x[0]
-            last, share = _bound_step(aim, last, share, expectation)
-            x = x + last
-            x[1] = min(max(x[1], expectation["lowest"]), expectation["highest"])
+            x, last, share = _take_step(x, aim, last, share, expectation)
             moved = find_x_model(contact, x)[0] - at.x
             q = q + limit_step(contact.model, at.pressed.modes[:, :3] @ moved)
             settled = at.pressed.size < _SETTLED_CORRECTION and _is_settled(moved, aim - last, share, expectation)
@@ -418,8 +416,8 @@ def find_x_model(contact: RigidContact, x: NDArray) -> tuple[NDArray, float]:
 
 
 @njit(**_OPTIONS)
-def _bound_step(aim, last, share, expectation):
-    """Return a step (3,) within a share of where the linearisation holds, and the share of the next one.
+def _take_step(x, aim, last, share, expectation):
+    """Return x (3,) after a step (3,) within a share of where the linearisation holds, the step, and the next share.
 
     Between two corners of an object the linearisation changes its mind: meet in the middle.
     """
@@ -430,7 +428,9 @@ def _bound_step(aim, last, share, expectation):
     if expectation.has_corners and step[1] * last[1] + step[2] * last[2] < 0.0:
         step[1:] *= 0.5
         share *= 0.5
-    return step, share
+    moved = x + step
+    moved[1] = min(max(moved[1], expectation.lowest), expectation.highest)
+    return moved, step, share
 
 
 @njit(**_OPTIONS)

@@ -66,26 +66,23 @@ class SlipPath:
             x: state of the contact (3,).
             motion: in depth and height for each coefficient (N, 2) [m].
         """
-        if not self.coefficients.any():
-            return
         self._measure(contact, q, x)
         self.ratios = self.preview(motion)
 
     def begin(self, contact: RigidContact, q: NDArray, x: NDArray) -> None:
         """Begin with an object that has just touched; see `move` for the arguments."""
-        stuck = self._measure(contact, q, x) if self.coefficients.any() else 0.0
-        self.ratios = np.clip(np.full(len(self.coefficients), stuck), -self.coefficients, self.coefficients)
+        self._measure(contact, q, x)
+        self.ratios = np.clip(np.full(len(self.coefficients), self._stuck), -self.coefficients, self.coefficients)
 
-    def _measure(self, contact: RigidContact, q: NDArray, x: NDArray) -> float:
-        """Measure the turns anew where the object has moved; return the ratio of a contact that began by sticking."""
+    def _measure(self, contact: RigidContact, q: NDArray, x: NDArray) -> None:
+        """Measure the turns anew where an object that may stick has moved."""
         place = x[[0, 2]]
-        if self._turns is None or np.abs(place - self._at).max() > _FRESH:
+        if self.coefficients.any() and (self._turns is None or np.abs(place - self._at).max() > _FRESH):
             self._turns, self._stuck, self._at = *measure_turns(contact, q, x), place
-        return self._stuck
 
     def preview(self, motion: NDArray) -> NDArray:
         """Return the traction ratios (N,) after a motion in depth and height (N, 2) [m], by the last turn."""
-        if self._turns is None or not self.coefficients.any():
+        if self._turns is None:
             return self.ratios
         return _turn_path(self.ratios, self.coefficients, self._turns, motion)
 

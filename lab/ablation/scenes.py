@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_ifea.contact_mechanics.friction import FRICTIONLESS, Traction, constant_traction, measure_shear
+from finforce_ifea.contact_mechanics.friction import FRICTIONLESS, Traction, constant_traction
 from finforce_ifea.contact_mechanics.indenter import Indenter, OutlineIndenter, RoundIndenter
 from finforce_ifea.contact_mechanics.pressed_jaw import RigidContact
 from finforce_ifea.filter.lateral_load import measure_torsion
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE
 from finforce_ifea.observation import Contact, ObjectOutline, Observation
 from finforce_ifea.relaxation import RelaxationTerm
-from lab.presses import circle
+from lab.presses import circle, keep_shear
 from lab.stress.objects import rectangle
 from lab.stress.session import FRICTIONLESS as SMOOTH
 from lab.stress.session import LIKELIHOOD, OFFSET, PERIOD, Bench, noise_of
@@ -120,7 +120,7 @@ def press(
             traction = traction._replace(moved=moved)
             q, force, traction = settle(contact, q, at, traction, None if along is None else float(along[i]))
             if along is None and friction > 0.0:
-                traction = _keep_shear(contact, q, at, traction, friction)
+                traction = keep_shear(contact, q, at, traction, friction)
         found.append((contact.model.positions(probe, q), force))
     points, forces = (np.stack(each) for each in zip(*found, strict=True))
     return Press(states=states, points=points, forces=forces, indenter=indenter)
@@ -148,13 +148,6 @@ def settle(
         if pressed.size < tolerance and abs(change) < tolerance:
             break
     return q, pressed.force, traction
-
-
-def _keep_shear(contact: RigidContact, q: NDArray, x: NDArray, traction: Traction, friction: float) -> Traction:
-    """Return what the next step has to know of the tangential forces of this one."""
-    points = contact.place_points(q)
-    normal, total = (contact.press(points, x, each).forces for each in (FRICTIONLESS, traction))
-    return Traction(0.0, friction, measure_shear(total, normal), points, np.zeros(2))
 
 
 def tell_height(bench: Bench, pressed: Press, error: float = 0.0) -> list[Contact]:
