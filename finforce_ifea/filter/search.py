@@ -190,13 +190,18 @@ class ContactSearch:
             self.hypotheses.reset()
 
     def lead(self, change: NDArray) -> None:
-        """Take shape and height along by a change (2,)."""
+        """Take shape and height along by a change (2,), which lessens what is known beyond the object's pose."""
         self.state["x"][1:] += change
         if self.x is None:
             return
-        for i, each in zip((SHAPE, HEIGHT), change, strict=True):
-            self.x[:, i] += each
-            self.P[i, i] += (_SLIDE * each) ** 2
+        expected = self._expect()
+        for i, each, mean, variance in zip((SHAPE, HEIGHT), change, expected.mean, expected.variance, strict=True):
+            lost = min((_SLIDE * each) ** 2 / variance, 1.0)
+            kept = sqrt(1.0 - lost)
+            self.x[:, i] = mean + kept * (self.x[:, i] + each - mean)
+            self.P[i, :] *= kept
+            self.P[:, i] *= kept
+            self.P[i, i] += lost * variance
 
     def shift(self, change: float) -> None:
         """Count the depth `change` [m] more, as of an object that was cut anew."""
