@@ -139,15 +139,15 @@ class ContactTracker:
             self._left = (self.q.copy(), pressed)
             q = self._contact.model.expand(self.q)
             self._use(1)
-            q = self._settle(q, state["x_model"])
+            self._search.resume(self._settle(q, state["x_model"]))
         elif self._fidelity == 1 and pressed < _BACK * self._left[1]:
-            self._use(0)
-            # of the shape that was left and the unloaded jaw, the nearer one
-            is_near = pressed > 0.5 * self._left[1]
-            q = self._left[0] if is_near else self._contact.begin(float(state["x"][HEIGHT]))
-        else:
-            return
-        self._search.resume(q)
+            self._leave_full(state)
+
+    def _leave_full(self, state: ContactState) -> None:
+        """Go back to the stored shapes, from the one that was left or from the unloaded jaw, whichever is nearer."""
+        self._use(0)
+        is_near = state["x"][DEPTH] > 0.5 * self._left[1]
+        self._search.resume(self._left[0] if is_near else self._contact.begin(float(state["x"][HEIGHT])))
 
     def _settle(self, q: NDArray, x: NDArray) -> NDArray:
         """Return the shape (size,) of the jaw that is pressed in a state (3,), from one nearby."""
@@ -209,6 +209,8 @@ class ContactTracker:
         most = _FULL_ITERATIONS if self._fidelity else self.settings.iterations
         if not search.find(self._contact, self._probe, dt, iterations=most):
             search.lose(_LOST_STDDEV)
+            if self._fidelity:
+                self._leave_full(search.state)
             return None
         state = search.state
         self._released = self._released + 1 if state["depth"] < TOUCH_DEPTH else 0
