@@ -38,6 +38,8 @@ _BEYOND_STORED, _BACK = 1.0, 0.8
 _FULL_ITERATIONS = 3
 # Those that find the equilibrium of the full mechanics in the state at which they take over, and their last correction.
 _SETTLING, _SETTLED = 8, 2e-3
+# Steps of the depth in which the full mechanics is pressed anew [m].
+_PRESSING = 0.5e-3
 # Share of the expected deviation of a coefficient of friction below which something was learnt of it.
 _LEARNT = 0.75
 
@@ -139,25 +141,32 @@ class ContactTracker:
             self._left = (self.q.copy(), pressed)
             q = self._contact.model.expand(self.q)
             self._use(1)
-            self._search.resume(self._settle(q, state["x_model"]))
+            self._search.resume(self._settle(q, state["x_model"])[0])
         elif self._fidelity == 1 and pressed < _BACK * self._left[1]:
-            self._leave_full(state)
+            self._use(0)
+            # of the shape that was left and the unloaded jaw, the nearer one
+            is_near = pressed > 0.5 * self._left[1]
+            self._search.resume(self._left[0] if is_near else self._contact.begin(float(state["x"][HEIGHT])))
 
-    def _leave_full(self, state: ContactState) -> None:
-        """Go back to the stored shapes, from the one that was left or from the unloaded jaw, whichever is nearer."""
-        self._use(0)
-        is_near = state["x"][DEPTH] > 0.5 * self._left[1]
-        self._search.resume(self._left[0] if is_near else self._contact.begin(float(state["x"][HEIGHT])))
-
-    def _settle(self, q: NDArray, x: NDArray) -> NDArray:
-        """Return the shape (size,) of the jaw that is pressed in a state (3,), from one nearby."""
+    def _settle(self, q: NDArray, x: NDArray) -> tuple[NDArray, bool]:
+        """Return the shape (size,) of the jaw pressed in a state (3,), from one nearby, and whether it was found."""
         traction = constant_traction(self._search.ratio)
         for _ in range(_SETTLING):
             pressed = self._contact.linearize(q, x, traction)
             if not pressed.touches or pressed.size < _SETTLED:
-                break
+                return q, pressed.touches
             q = q + limit_step(self._contact.model, pressed.correction)
-        return q
+        return q, False
+
+    def _restore_shape(self) -> None:
+        """Find the equilibrium of the full mechanics anew where an image has led it astray, from the unloaded jaw."""
+        x = self._search.state["x_model"]
+        if self._settle(self.q, x)[1]:
+            return
+        q = np.zeros(self._contact.model.size)
+        for depth in np.append(np.arange(self._contact.find_touch(x), x[DEPTH], _PRESSING)[1:], x[DEPTH]):
+            q, _ = self._settle(q, np.r_[depth, x[1:]])
+        self._search.resume(q)
 
     def vertices(self) -> NDArray:
         """Return the deformed mesh vertices (n, 3) [m], in mesh order."""
@@ -210,7 +219,7 @@ class ContactTracker:
         if not search.find(self._contact, self._probe, dt, iterations=most):
             search.lose(_LOST_STDDEV)
             if self._fidelity:
-                self._leave_full(search.state)
+                self._restore_shape()
             return None
         state = search.state
         self._released = self._released + 1 if state["depth"] < TOUCH_DEPTH else 0
@@ -223,6 +232,8 @@ class ContactTracker:
             bend = search.positions[:, 0] - self._rest[:, 0]
             weight = expect_weight(observation.gravity) if self.settings.may_be_held else None
             self._lateral.update((measured - search.positions)[:, 1], bend, search.points, state, dt, weight)
+        if self._fidelity and not state["converged"]:
+            self._restore_shape()
         self._change_fidelity(state)
         self._has_moved = True
         return state

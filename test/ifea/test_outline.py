@@ -21,6 +21,7 @@ from estimator_fakes import (
 from mechanics_fakes import BENCH, bench_mechanics
 from test_tracking import settle
 
+from finforce_ifea.contact_mechanics.friction import constant_traction
 from finforce_ifea.contact_mechanics.indenter import (
     CELL,
     DEPTH,
@@ -154,6 +155,45 @@ def test_modes_are_the_derivatives_of_the_equilibrium_by_depth_tilt_and_height(n
         np.testing.assert_allclose(state.force_modes[:, which], change, atol=2e-2 * np.linalg.norm(change) + 1e-6)
     finally:
         contact.indenter = RoundIndenter()
+
+
+WIDE = box(0.0125, 0.025)
+
+
+@pytest.mark.parametrize("depth", [5e-3, 6.2e-3])
+def test_force_follows_the_tilt_alike_while_corners_slide_over_the_face(depth):
+    """Contact points stand so close that a corner always touches several."""
+    contact = bench_mechanics("default", "solid").contact
+    contact.indenter = OutlineIndenter(WIDE)
+    try:
+        q, by_tilt = np.zeros(contact.model.size), []
+        for each in np.linspace(0.0, depth, 21)[1:]:
+            q, _ = settle(contact, q, np.array([each, 0.0, 0.042]))
+        for tilt in np.linspace(-0.01, 0.01, 21):
+            q, state = settle(contact, q, np.array([depth, tilt, 0.042]))
+            by_tilt.append(state.force_modes[2, SHAPE])
+    finally:
+        contact.indenter = RoundIndenter()
+    assert min(by_tilt) > 0.1 * np.mean(by_tilt) and max(by_tilt) < 3.0 * np.mean(by_tilt)
+
+
+@pytest.mark.parametrize("ratio", [0.5, -0.5])
+def test_equilibrium_with_friction_is_found_as_fast_as_without(ratio):
+    contact = bench_mechanics("default", "solid").contact
+    contact.indenter = OutlineIndenter(WIDE)
+    try:
+        q, sizes = np.zeros(contact.model.size), []
+        for depth in np.linspace(0.0, 4e-3, 17)[1:]:
+            q, _ = settle(contact, q, np.array([depth, 0.0, 0.042]))
+        for _ in range(12):
+            state = contact.linearize(q, np.array([4e-3, 0.0, 0.042]), constant_traction(ratio))
+            q = q + state.correction
+            sizes.append(state.size)
+    finally:
+        contact.indenter = RoundIndenter()
+    steps = np.array(sizes)
+    settled = np.flatnonzero(steps < 2e-3)[0]
+    assert settled < 8 and steps[settled + 2] < 1e-5
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.05, -0.2])
