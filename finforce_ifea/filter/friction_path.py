@@ -178,13 +178,6 @@ class TractionHypotheses:
         own = weights[: len(self.mu)]
         return own / max(own.sum(), 1e-300)
 
-    def spread_cells(self, weights: NDArray) -> float:
-        """Return the variance of kappa within the cells of the grid, for the weights of the hypotheses (N,)."""
-        if not self.follows_path or len(self.mu) < 2:
-            return 0.0
-        slopes = np.gradient(np.clip(self._path.ratios, -LARGEST_RATIO, LARGEST_RATIO), self.mu)
-        return float(weights[: len(self.mu)] @ slopes**2) * self._cell**2 / 12.0
-
     def bound_held(self, log_weights: NDArray) -> NDArray:
         """Return the weights (N,), that of "held" less what friction does not bear: P(mu > |kappa|)."""
         if not 0.0 < self._held < 1.0:

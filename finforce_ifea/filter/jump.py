@@ -26,7 +26,7 @@ from finforce_ifea.filter.filter import (
     widen,
 )
 from finforce_ifea.filter.measurement import Measurement, find_depth_jump, measure_distances, weigh
-from finforce_ifea.filter.state import CAMERA_TURN, CAMERA_X, CAMERA_Z, DEPTH, HEIGHT, TRACTION
+from finforce_ifea.filter.state import CAMERA_TURN, CAMERA_X, CAMERA_Z, DEPTH, HEIGHT
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
 
@@ -50,16 +50,12 @@ _SHIFT = np.array([CAMERA_X, CAMERA_Z, CAMERA_TURN])
 BUMPED = Jump(_SHIFT, np.array([1e-3, 1e-3, 10e-3]), 1e-5)
 # The object touches elsewhere than stated, anywhere within 30 mm.
 MISPLACED = Jump(np.array([HEIGHT]), np.array([30e-3]), 1e-4)
-# An object that only the jaws hold was lifted or set down.
-LIFTED = Jump(np.array([TRACTION]), np.array([0.3]), 1e-4)
 # The camera was bumped by less, and the object touches elsewhere, as they show over some images only.
 NUDGED = Jump(_SHIFT, np.array([0.4e-3, 0.4e-3, 4e-3]), 1e-4)
 OFFSET = Jump(np.array([HEIGHT]), np.array([15e-3]), 1e-4)
 # Log odds against a jump since the first image, its prior left out, after which the test begins anew.
 _UNLIKELY = -3.0
 NO_JUMP = -1
-# Error of the linearisation about the last state, as a share of the object's motion since.
-_NONLINEAR = 0.2
 
 
 @njit(**_OPTIONS)
@@ -151,7 +147,7 @@ def _weigh_innovations(measured, nu, S, depth_variance):
     """
     H, R = measured.H, measured.R
     deeper, variance = find_depth_jump(H, R, nu)
-    moved, spread = nu - H[:, DEPTH] * deeper, variance + (_NONLINEAR * deeper) ** 2 - depth_variance
+    moved, spread = nu - H[:, DEPTH] * deeper, variance - depth_variance
     blocks = np.empty_like(R)
     for i in range(len(R)):
         h = H[2 * i : 2 * i + 2, DEPTH]

@@ -18,7 +18,7 @@ from finforce_ifea.contact_mechanics.friction import Coefficient, constant_tract
 from finforce_ifea.contact_mechanics.pressed_jaw import PressedState, RigidContact, limit_step
 from finforce_ifea.filter.filter import Posterior, reduce_covariance
 from finforce_ifea.filter.friction_path import TractionHypotheses
-from finforce_ifea.filter.jump import BUMPED, LIFTED, MISPLACED, NO_JUMP, NUDGED, OFFSET, JumpWatch, correct
+from finforce_ifea.filter.jump import BUMPED, MISPLACED, NO_JUMP, NUDGED, OFFSET, JumpWatch, correct
 from finforce_ifea.filter.measurement import Measurement, find_seen, observe
 from finforce_ifea.filter.process import (
     BUMPED_SHIFT,
@@ -94,7 +94,7 @@ _SAME_RATIO = 0.02
 _LEAST_FORCE = 0.1
 _LEAST_VARIANCE = 1e-14
 # Jumps that one image may show.
-_JUMPS = (BUMPED, MISPLACED, LIFTED)
+_JUMPS = (BUMPED, MISPLACED)
 # Share of the key points that has to agree, and the largest bump of a camera that is believed [sigma].
 _MAJORITY = 0.5
 _LARGEST_BUMP = 5.0
@@ -335,10 +335,9 @@ class ContactSearch:
         motions = contact.model.project(probe, q, pressed.modes)
         return q, _Linearized(x_model, pressed, contact.model.positions(probe, q), motions)
 
-    def _find_possible_jumps(self) -> tuple[bool, bool, bool]:
+    def _find_possible_jumps(self) -> tuple[bool, bool]:
         """Return which of `_JUMPS` are possible now."""
-        loaded = bool(self.state["depth"] > LOADED_DEPTH)
-        return True, loaded and not self._misplaced, loaded and self.settings.may_be_held
+        return True, bool(self.state["depth"] > LOADED_DEPTH) and not self._misplaced
 
     def _take_jump(self, index: int) -> None:
         """Remember which of `_JUMPS` was seen, or `NO_JUMP`."""
@@ -391,7 +390,7 @@ class ContactSearch:
         s["mistaken"] = self._misplaced
         force, modes, (ratios, ratio) = pressed.force, np.ascontiguousarray(pressed.force_modes), traction
         shift = self._smooth + x_model[0] - x[0]
-        spread = self.hypotheses.spread_cells(self.weights) + self.hypotheses.doubt**2
+        spread = self.hypotheses.doubt**2
         smoothing = posterior.own, lessened
         read_out(s, force, modes, self.x, self.log_weights, self.P, shift, smoothing, at.x, ratios, ratio, spread)
         self.state = s

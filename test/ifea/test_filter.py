@@ -18,7 +18,7 @@ from finforce_ifea.contact_mechanics.pressed_jaw import limit_step
 from finforce_ifea.estimator import ForceEstimator
 from finforce_ifea.filter.filter import expect_innovations, innovate, reduce_covariance, update
 from finforce_ifea.filter.friction_path import NODES, TractionHypotheses
-from finforce_ifea.filter.jump import BUMPED, LIFTED, MISPLACED, weigh_jump
+from finforce_ifea.filter.jump import BUMPED, MISPLACED, weigh_jump
 from finforce_ifea.filter.measurement import FREEDOM, NO_WEIGHT, Measurement, measure_distances, weigh
 from finforce_ifea.filter.process import CAMERA_TIME, FREE_DEPTH, Expectation, expect_state, find_decay, predict
 from finforce_ifea.filter.slip_path import SlipPath
@@ -110,7 +110,7 @@ class TestProcess:
 
 
 class TestJump:
-    @pytest.mark.parametrize("jump", [BUMPED, MISPLACED, LIFTED], ids=["bumped", "misplaced", "lifted"])
+    @pytest.mark.parametrize("jump", [BUMPED, MISPLACED], ids=["bumped", "misplaced"])
     def test_it_is_told_where_the_innovation_is_beyond_chance_alone(self, jump):
         information = np.diag(100.0 / jump.stddev**2)
         score = information @ (0.1 * jump.stddev)
