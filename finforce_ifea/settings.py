@@ -5,10 +5,10 @@ from dataclasses import dataclass, replace
 from finforce.errors import ObservationError
 from finforce.settings import check_bounds, setting
 
-SOLVERS = ("default", "reduced", "solid", "frame", "plane", "linear", "paper")
+SOLVERS = ("default", "reduced", "solid", "frame", "plane", "paper")
 _SOLVER_MEANING = (
     "mechanics: reduced (default), stored equilibria of the model that the jaw file recommends; solid, plane or frame, "
-    "a full model; linear, the compliance of the unloaded jaw; paper, the published setting"
+    "a full model; paper, the published setting"
 )
 
 

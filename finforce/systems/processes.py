@@ -335,7 +335,7 @@ class SolverOptions:
         choices=("aligned", "auto", "none"),
     )
     T_gripper_camera: str = setting("", "Pose of the camera in the gripper frame: x y z [m] qx qy qz qw")
-    solver: str = setting("", "Mechanics: reduced, solid, frame, linear or paper (Eq. 1)")
+    solver: str = setting("", "Mechanics: reduced, solid, frame, plane or paper (Eq. 1)")
     parameter_file: str = setting("", "YAML file with node parameters; none: that of the system")
     use_sim_time: bool = setting(False, "Time from /clock")
     composed: bool = setting(True, "Detector, contact estimator and solvers in one process; false: one process each")

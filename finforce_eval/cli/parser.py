@@ -14,7 +14,7 @@ from finforce.errors import suggest
 if TYPE_CHECKING:
     from finforce_eval.tasks import EngineOptions
 
-SOLVERS = ("default", "reduced", "solid", "frame", "plane", "linear", "paper")
+SOLVERS = ("default", "reduced", "solid", "frame", "plane", "paper")
 MESHES = ("default", "coarse", "fine")
 UNITS = ("m", "cm", "mm", "inch")
 SOURCES = ("images", "keypoints", "truth")

@@ -258,7 +258,6 @@ class Tier:
 
 
 TIERS = (
-    Tier(name="linear", solver="linear"),
     Tier(name="reduced", solver="reduced"),
     Tier(name="frame", solver="frame"),
     Tier(name="solid, 522 vertices", solver="solid", mesh="coarse"),
