@@ -108,7 +108,7 @@ def read_yaml(path: str | Path, *, text_keys: bool = True) -> Any:
 
     Args:
         path: of the file.
-        text_keys: whether keys that are no texts are refused.
+        text_keys: True if keys that are no texts are refused.
 
     Raises:
         FileError: it cannot be read, is no YAML, or is out of bounds; a key stands twice, or is no text.
@@ -145,7 +145,7 @@ class _BoundedLoader(yaml.SafeLoader):
     """The safe loader, which counts what it builds and refuses a key that stands twice.
 
     Attributes:
-        text_keys: whether keys have to be texts.
+        text_keys: True if keys have to be texts.
     """
 
     text_keys = True

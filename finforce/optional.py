@@ -11,8 +11,8 @@ def import_library(name: str, purpose: str, package: str = "") -> ModuleType:
 
     Args:
         name: of the module.
-        purpose: what needs it, for the message.
-        package: what `pip install` calls it; empty: the module's name.
+        purpose: its user, for the message.
+        package: its name for `pip install`; empty: the module's name.
 
     Raises:
         MissingDependencyError: it is not installed.

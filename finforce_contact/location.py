@@ -71,7 +71,7 @@ class ContactLocation:
 
     Attributes:
         height: on the undeformed inner surface [m].
-        touching: whether the meshes of object and jaw intersect.
+        touching: True if the meshes of object and jaw intersect.
     """
 
     height: float

@@ -123,7 +123,7 @@ class ContactParameters(TimeParameters):
 
     @property
     def tracks(self) -> bool:
-        """Whether the object's pose is found here, from depth images."""
+        """True if the object's pose is found here, from depth images."""
         return self.pose_source == "tracker"
 
 

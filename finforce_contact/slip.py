@@ -35,13 +35,13 @@ _LONGEST_GAP = 0.5
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Slip:
-    """How an object moves over a jaw.
+    """The motion of an object over a jaw.
 
     Attributes:
         stamp: of the newest pose [s].
         velocity: of the object over the jaw, along the undeformed face where they touch (3,) [m/s], jaw frame.
         stddev: of its tangential parts [m/s].
-        sliding: whether a held object slides beyond chance.
+        sliding: True if a held object slides beyond chance.
     """
 
     stamp: float
@@ -110,7 +110,7 @@ class SlipWatch:
             T: T_jaw_object (4, 4), as measured.
             face: at the followed height.
             closing: speed of the object along x, filtered [m/s].
-            odd: whether the pose is not that of an object that goes on as it did.
+            odd: True if the pose is not that of an object that goes on as it did.
         """
         if odd and not self._samples:
             return self.slip

@@ -50,11 +50,11 @@ class Clock:
 
 
 class StateSource:
-    """What has a state that others listen to and wait for.
+    """A source of states that others listen to and wait for.
 
     Attributes:
         state: the present one; reading it never blocks.
-        clock: what it lives by.
+        clock: its time.
     """
 
     state: GripperState

@@ -54,7 +54,7 @@ class JointGripper(StateSource):
             at once.
         settings: stroke, offset and default speed.
         joint: relates the joint's value to the opening.
-        clock: what it lives by; the machine's own where none is given.
+        clock: its time; the machine's own where none is given.
 
     Attributes:
         settings: the same.

@@ -230,7 +230,7 @@ def write_table(path: Path, series: Sequence[ForceSeries], about: Mapping[str, A
     Args:
         path: of the file.
         series: of the jaws.
-        about: what JSON can hold: what was run, and on what; in the metadata of the file.
+        about: settings and machine of the run, as JSON in the metadata of the file.
 
     Raises:
         OSError: it cannot be written.

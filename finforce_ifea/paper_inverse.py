@@ -68,7 +68,7 @@ class InverseResult:
         residual: root mean square distance of active key points from their targets [m].
         kkt: largest violation of the program's optimality conditions, scaled by its largest term.
         iterations: Newton iterations.
-        converged: whether the last one changed nothing that matters.
+        converged: True if the last iteration changed nothing that matters.
         smallest_det: smallest det F of all elements [-]; at or below zero the mesh has turned inside out.
     """
 

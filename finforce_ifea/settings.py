@@ -1,4 +1,4 @@
-"""What can be set on an estimator: defaults, units, bounds and meanings."""
+"""Settings of an estimator: defaults, units, bounds and meanings."""
 
 from dataclasses import dataclass, replace
 
@@ -70,5 +70,5 @@ class EstimatorSettings:
 
     @property
     def may_be_held(self) -> bool:
-        """Whether only the jaws hold the object, as far as that is known."""
+        """True if only the jaws hold the object, as far as that is known."""
         return self.held in ("yes", "either")

@@ -56,7 +56,7 @@ class Footage:
         depth_step: of the depth images [m].
 
     Args:
-        gripper: what is rendered.
+        gripper: the gripper to render.
         photographer: that renders it.
         seed: of the object tracker's noise.
     """
@@ -117,7 +117,7 @@ def build_footage(
     """Return the footage of a scenario.
 
     Args:
-        scenario: what happens, in which light, before which camera.
+        scenario: motion, light and camera.
         seed: of textures, light and noise.
         camera: intrinsics; those of a D405 at 640 x 480 when absent.
         finger: seed of the jaws' material; what shows the same finger can share a calibration.

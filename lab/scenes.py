@@ -53,7 +53,7 @@ def find_scene(scene: TwinScene, folder: Path | None = None) -> Path:
     """Return the recording of a scene, rendered under a progress bar unless it is there already.
 
     Args:
-        scene: what is rendered.
+        scene: the scene to render.
         folder: of the scenes that were rendered; that in the user's cache without one.
 
     Raises:

@@ -43,7 +43,7 @@ class ObjectMesh(Surface):
 
     Attributes:
         watertight: the triangles bound solids without a gap.
-        name: what messages call the object.
+        name: name of the object in messages.
     """
 
     watertight: bool
@@ -133,7 +133,7 @@ def prepare_object_mesh(
     Args:
         vertices: (n, 3), object frame.
         triangles: (m, 3) vertex indices from 0.
-        name: what messages call the object.
+        name: name of the object in messages.
         unit: of the vertices, one of `UNITS`.
         triangle_limit: the most triangles that are kept.
 

@@ -50,7 +50,7 @@ def is_due(count: int, elapsed: float) -> bool:
 
 
 class Fit(NamedTuple):
-    """How well a reading of the mesh explains an image, in pixels of its grid.
+    """The score of one reading of the mesh against an image, in pixels of its grid.
 
     Attributes:
         gain: pixels at the mesh's depth, minus those behind it; each counts less as it lies off.
@@ -64,12 +64,12 @@ class Fit(NamedTuple):
 
     @property
     def fits(self) -> bool:
-        """Whether the mesh is where the camera sees something, and nowhere else."""
+        """True if the mesh is where the camera sees something, and nowhere else."""
         return self.gain >= LEAST_GAIN * max(self.seen, 1) and self.behind <= BEHIND * self.seen
 
 
 class _Evidence(NamedTuple):
-    """What one image says.
+    """The evidence of one image.
 
     Attributes:
         posed: fit of the mesh as posed.

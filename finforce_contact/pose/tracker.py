@@ -32,7 +32,7 @@ def search_pose(aligner: MeshAligner, image: DepthImage, kept: int = 4) -> list[
     Args:
         aligner: the object.
         image: with a mask.
-        kept: how many.
+        kept: number of candidates.
     """
     starts = [_place(aligner, image, rotation) for rotation in spread_rotations()]
     coarse = _best(aligner, image, [aligner.align(start, image, _COARSE) for start in starts], _KEPT)
@@ -195,7 +195,7 @@ class PoseTracker:
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """How many images gave a pose or none: `located`, `tracked`, `recovered`, `lost`."""
+        """The number of images by outcome: `located`, `tracked`, `recovered`, `lost`."""
         return MappingProxyType(self._counts)
 
     def reset(self) -> None:

@@ -117,7 +117,7 @@ UNIFORM = ScaleFreedom()
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Pull:
-    """What draws points of the mesh: points (n, 3) [m], unit directions (n, 3), ways to go (n,) [m], weights (n,)."""
+    """The residuals of mesh points (n, 3) [m]: unit directions (n, 3), distances (n,) [m], weights (n,)."""
 
     points: NDArray
     directions: NDArray

@@ -45,7 +45,7 @@ class ForceSample:
 
 @dataclass(frozen=True, kw_only=True)
 class TouchSample:
-    """Whether the jaws are reported to touch in the image at `stamp` [s], on the driver's clock."""
+    """Return True if the jaws are reported to touch in the image at `stamp` [s], on the driver's clock."""
 
     stamp: float
     touching: bool
@@ -68,11 +68,11 @@ class LoadWatch:
 
     Attributes:
         model: of force over opening, in use once loaded.
-        loaded: whether something presses.
-        suspect: whether the newest force was rejected as a possible jump.
+        loaded: True if something presses.
+        suspect: True if the newest force was rejected as a possible jump.
         force: the newest that was believed [N]; NaN before the first.
         opening: that belongs to it [m].
-        resting: whether the jaws rested then.
+        resting: True if the jaws rested then.
         peak: the largest while loaded [N].
         stddev: of the force, as its source stated it for the newest that was believed [N].
     """
@@ -152,7 +152,7 @@ class LoadWatch:
         self.loaded = touching or self._above >= _CONFIRMED
 
     def _is_jump(self, force: float, opening: float) -> bool:
-        """Whether neither motion nor noise explains a force.
+        """Return True if neither motion nor noise explains a force.
 
         Raises:
             BackOffError: that is so in two images in a row, and the jaws have just touched something.
@@ -252,7 +252,7 @@ class ForceFeed:
 
     @property
     def heard(self) -> bool:
-        """Whether any force was admitted."""
+        """True if any force was admitted."""
         return not math.isnan(self.stamp)
 
     def touching(self, now: float) -> bool | None:
@@ -364,7 +364,7 @@ _LEAST_NOISE, _LARGEST_NOISE = 0.02, 0.25  # [N]
 
 
 class ForceModel:
-    """What force the fingers have at the opening of the newest image, and how it would change with the opening.
+    """The force of the fingers at the opening of the newest image, and its slope over the opening.
 
     Args:
         stiffness: expected at first [N/m], better too large than too small.

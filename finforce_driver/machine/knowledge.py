@@ -1,4 +1,4 @@
-"""What the replies say of the gripper: which of them are believed, position, speed, faults and telemetry.
+"""The state of the gripper by its replies: plausibility, position, speed, faults and telemetry.
 
 A digit that was corrupted on the serial line makes a valid reply that is wrong; it must never become a state. What
 continues the last reply is believed at once, anything else when it repeats itself.
@@ -139,17 +139,17 @@ class Knowledge:
 
     @property
     def calibrated(self) -> bool:
-        """Whether the position means something."""
+        """True if the position means something."""
         return self.reply is not None and self.reply.calibrated and not self.distrust
 
     @property
     def error(self) -> bool:
-        """Whether a fault is latched."""
+        """True if a fault is latched."""
         return self.reply is not None and self.reply.error
 
     @property
     def driving(self) -> bool:
-        """Whether the gripper's power stage moves or holds the jaws."""
+        """True if the gripper's power stage moves or holds the jaws."""
         return self.reply is not None and self.reply.driving and not self.asleep
 
     @property
@@ -239,12 +239,12 @@ class ReplyFilter:
 
     @property
     def wants_reply(self) -> bool:
-        """Whether a further reply is wanted at once."""
+        """True if a further reply is wanted at once."""
         return bool(self._candidates)
 
     @property
     def alarming(self) -> bool:
-        """Whether an unconfirmed reply, if it is true, changes what the gripper may be told."""
+        """True if an unconfirmed reply, if it is true, changes what the gripper may be told."""
         if self._believed is None:
             return bool(self._candidates)
         status = _drive_status(self._believed)

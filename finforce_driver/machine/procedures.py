@@ -1,4 +1,4 @@
-"""What takes several messages: an emergency stop, the clearing of errors, a calibration."""
+"""Procedures of several messages: an emergency stop, the clearing of errors, a calibration."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class EmergencyStop:
 
 
 class Step(Enum):
-    """What a recovery or a calibration does next."""
+    """The next step of a recovery or a calibration."""
 
     UNFLAG = auto()  # an order without the stop's flag: the flag latches the fault again every 0.2 ms
     CLEAR = auto()
@@ -69,7 +69,7 @@ class Step(Enum):
 
     @property
     def over(self) -> bool:
-        """Whether nothing more is to be done."""
+        """True if nothing more is to be done."""
         return self in (Step.DONE, Step.FAILED)
 
 
@@ -81,7 +81,7 @@ class Recovery:
     """One attempt to clear the errors, with repetitions for messages that are lost.
 
     Attributes:
-        step: what is to be done next.
+        step: next step.
 
     Args:
         unflag: an emergency stop is among what is latched.
@@ -209,7 +209,7 @@ class CalibrationRun:
     """Follows a calibration by its replies.
 
     Attributes:
-        step: what is to be done next.
+        step: next step.
         reason: why it failed, or a remark on its success.
         travel: of the jaws.
 

@@ -54,7 +54,7 @@ class Weighing:
     Attributes:
         factor: by which the modulus has to be multiplied [-].
         stddev: of the factor [-].
-        holds: what was held, in time.
+        holds: the weights held, in order of time.
         weights: readings of the scale [N].
         misfit: root mean square of what is left, relative to each weight [-].
     """
@@ -117,7 +117,7 @@ def calibrate_with_scale(
     Args:
         times: (n,) of the images [s], rising.
         forces: (n,) estimated along the closing direction [N], either sign, or vectors (n, 3); NaN where unknown.
-        grams: what the scale showed at the end of each press, at zero before; in their order.
+        grams: readings of the scale at the end of each press, zeroed before; in their order.
         jaw: that the forces were estimated with, its file or its name.
         calibration: that they were estimated with; None for the material of the jaw file.
         solver: that they were estimated with.

@@ -33,7 +33,7 @@ PICTURES = (".png", ".jpg", ".svg", ".pdf")
 
 @dataclass(frozen=True)
 class CommandResult:
-    """What a command has found, as `--json` writes it, and its exit status."""
+    """The results of a command, as `--json` writes them, and its exit status."""
 
     results: Mapping[str, Any] = field(default_factory=dict)
     status: int = 0

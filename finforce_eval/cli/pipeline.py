@@ -17,7 +17,7 @@ from finforce_eval.errors import OptionError
 
 @dataclass(frozen=True, kw_only=True)
 class _PipelineOptions(ReplayOptions, GripperOptions):
-    """What the command is asked for: what the launch files are, as far as it is about our nodes."""
+    """Options of the command: those of the launch files that concern our nodes."""
 
     jaws: str = setting("both", "Jaws in the images", choices=("left", "right", "both"))
     images: bool = True

@@ -31,7 +31,7 @@ _SECOND = 1_000_000_000
 
 @dataclass(frozen=True, kw_only=True)
 class Change:
-    """What became of one recording.
+    """The outcome of one recording.
 
     Attributes:
         name: of the recording, or of one of its jaws.

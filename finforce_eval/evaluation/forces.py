@@ -188,8 +188,8 @@ def find_forces(
         estimator: one that knows of no recording.
         side: "left" or "right".
         strict: an image that is refused ends the run, else it has no force and says why.
-        as_live: whether the images that the solver's node passes over are left out.
-        stills: whether nothing of one image is known in the next.
+        as_live: True if the images that the solver's node passes over are left out.
+        stills: True if nothing of one image is known in the next.
         progress: called with the number of images done since its last call.
         watch: called with side, stamp [ns] and estimator after every image.
 
@@ -243,7 +243,7 @@ class _JawRun:
         side: "left" or "right".
         jaw: the jaw of that side.
         loop: a fresh one.
-        stills: whether nothing of one image is known in the next.
+        stills: True if nothing of one image is known in the next.
     """
 
     def __init__(self, recording: Recording, side: str, jaw: Any, loop: ForceLoop, stills: bool = False) -> None:

@@ -1,4 +1,4 @@
-"""How far forces, grasp force, contact and key points are from the truth, and how late they come, as numbers.
+"""Errors and delays of forces, grasp force, contact and key points against the truth.
 
 Numbers are named as in the JSON of `finforce evaluate`, with their units; None stands for nothing to compute from.
 """
@@ -92,7 +92,7 @@ class CaseScore:
         solved_place: the same of the estimator's own contact location.
         onset: delay of `touching`; see `onset_stats`.
         delay: of the force after its true onset; see `delay_stats`.
-        sight: how well the key points were seen; see `detection_stats`.
+        sight: errors of the key points; see `detection_stats`.
         detector_ms: time per image of the key point detector.
     """
 

@@ -102,7 +102,7 @@ def open_bag(source: Path, name: str) -> Iterator[BagReader]:
     """Open a bag for the length of a `with` block.
 
     Args:
-        source: what `bag_source` returned.
+        source: result of `bag_source`.
         name: of the recording, for messages.
 
     Raises:

@@ -45,8 +45,8 @@ class FrameImages(Timed):
         count: of all frames.
         read: begins anew to yield all frames, (h, w, 3) RGB.
         times: (count,) of the frames [ns]; None where they follow each other at `fps` from zero on.
-        is_video: whether they are those of a camera that ran, compressed, whose still pictures are alike.
-        ends_at_damage: whether the frames before the first damaged one are read, if there are any.
+        is_video: True if they are those of a camera that ran, compressed, whose still pictures are alike.
+        ends_at_damage: True if the frames before the first damaged one are read, if there are any.
         frames: (n,) numbers of those to be read, rising; None for all.
         depth_scale: without meaning.
     """

@@ -43,7 +43,7 @@ def describe_load(others: Iterable[float]) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class NodeRun:
-    """What came of a run.
+    """The outcome of a run.
 
     Attributes:
         log: the answers, by recorded stamp.
@@ -100,11 +100,11 @@ def run_nodes(
 
     Args:
         processes: to be started, and ended.
-        messages: what is played.
+        messages: the recording to play.
         sides: jaws that are played.
         awaited: topics that somebody has to listen to before it begins; without any those of our own nodes.
         heard: jaws whose own results are heard in addition to the grasp force, at a cost to the nodes; all without.
-        detector: whether the results of a key point detector are heard, too.
+        detector: True if the results of a key point detector are heard, too.
         rate: speed.
         has_clock: keep the stamps, and give the time on /clock; else stamps are shifted to now.
         environment: variables of the processes; without ROS_DOMAIN_ID they have a domain by chance.

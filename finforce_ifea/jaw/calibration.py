@@ -1,4 +1,4 @@
-"""What was identified on one finger, and its file."""
+"""The calibration of one finger, and its file."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -68,7 +68,7 @@ class Calibration(FileModel):
 
     @property
     def is_of_shape(self) -> bool:
-        """Whether it changes the shape of a finger, and not only the material."""
+        """True if it changes the shape of a finger, and not only the material."""
         factors = self.inner_thickness_factor, self.outer_thickness_factor, self.rib_thickness_factor
         return factors != (1.0, 1.0, 1.0) or self.clamped_z > 0.0
 

@@ -58,7 +58,7 @@ def read_volume_mesh(path: Path | str, *, scale: float = 1.0, clamp: ClampRule) 
     Args:
         path: any file that meshio reads (.msh, .vtk, .vtu, .inp, ...), in the jaw frame.
         scale: [-], multiplies the coordinates; 0.001 for millimetres.
-        clamp: which nodes are clamped, in metres after scaling.
+        clamp: rule for the clamped nodes, in metres after scaling.
 
     Returns:
         The checked mesh.

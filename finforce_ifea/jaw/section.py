@@ -87,7 +87,7 @@ class Section:
 
     @cached_property
     def lines(self) -> list[tuple[NDArray, bool]]:
-        """What bounds the section and its layers: lines (n, 2) [m] that meet at their ends alone; whether closed."""
+        """The bounds of the section and its layers: lines (n, 2) [m] that meet at their ends alone; True if closed."""
         if not self.layers:
             return [(ring, True) for ring in self.rings]
         bounds = shapely.union_all([layer.area.boundary for layer in self.layers], grid_size=_GRID)
@@ -282,7 +282,7 @@ class FaceLine:
         heights: z (n,) [m], rising.
         x: at the heights (n,) [m], linear in between.
         plane: x [m] of the plane from which an object's depth is counted; that of a flat face.
-        is_flat: whether it is a plane x = const.
+        is_flat: True if it is a plane x = const.
     """
 
     heights: NDArray

@@ -34,7 +34,7 @@ class PlaneMesh:
     Attributes:
         points: (n, 2) [m], x and z; corners first.
         triangles: (t, 6) indices, corners counterclockwise in (x, z), then the middles of edges 01, 12, 20.
-        corners: how many of the points are corners.
+        corners: number of the points that are corners.
     """
 
     points: NDArray

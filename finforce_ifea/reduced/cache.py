@@ -124,7 +124,7 @@ def reduce_mechanics(full: Mechanics, jaw: Jaw, *, linear: bool = False) -> Mech
 
     Args:
         full: the mechanics that is to be reduced.
-        jaw: what it describes.
+        jaw: the jaw that it describes.
         linear: the unloaded jaw's compliance alone, without the equilibria.
 
     Raises:

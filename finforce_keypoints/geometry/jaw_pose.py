@@ -57,7 +57,7 @@ class Origin:
         x: of the jaw's origin in the gripper base [m].
         stddev: [m].
         shared: the part of it that images in a row have in common [m].
-        noise: what an image errs by alone [m], where that is known apart; such a place is followed at once.
+        noise: error of a single image [m], where that is known apart; such a place is followed at once.
         slip: by which a jaw in a holder that gives has moved along its own z [m].
     """
 
@@ -230,7 +230,7 @@ class ReferencePatch:
 
     @property
     def is_learnt(self) -> bool:
-        """Whether the template is one of enough images, so that it changes no more."""
+        """True if the template is one of enough images, so that it changes no more."""
         return self._count >= TEMPLATE_IMAGES
 
     def refine(
@@ -340,7 +340,7 @@ class OriginTrack:
 
     @property
     def is_lost(self) -> bool:
-        """Whether nobody knows where the jaw is."""
+        """True if nobody knows where the jaw is."""
         return self._stamp is None
 
     @property
@@ -350,7 +350,7 @@ class OriginTrack:
 
     @property
     def speed(self) -> float:
-        """How fast the jaw slides [m/s]."""
+        """The sliding speed of the jaw [m/s]."""
         return float(self._state[1])
 
     def forecast(self, stamp: float) -> Origin | None:

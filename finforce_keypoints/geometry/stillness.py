@@ -57,7 +57,7 @@ class JawSpots:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StillReference:
-    """What one jaw looks like while it stands still: d = design @ c for the differences d (N,) of a picture from it.
+    """The appearance of a jaw at rest: d = design @ c for the differences d (N,) of a picture from it.
 
     Attributes:
         keypoints: the means of its key points, told while nothing moves.

@@ -28,7 +28,7 @@ class Firmware:
         calibration_speed: while looking for the end stops [ticks/s].
         calibration_current: limit meanwhile [mA].
         calibration_margin: largest distance of the current from that limit at a stop [mA].
-        confirm_time: how long a stop must be felt [ms].
+        confirm_time: time for which a stop must be felt [ms].
         calibration_timeout: after which a calibration is given up [ms].
         watchdog_length: data bytes without which the watchdog's setter is ignored.
     """
@@ -80,7 +80,7 @@ VARIANTS = {
 
 
 class Mode(Enum):
-    """What the control loop does."""
+    """The state of the control loop."""
 
     IDLE = 0
     GRIPPER = 6

@@ -155,7 +155,7 @@ def chain_processes(recording: Recording, *, images: bool, off: Sequence[str] = 
 
     Args:
         recording: whose object and camera they are told.
-        images: whether key points are found in images.
+        images: True if key points are found in images.
         off: skip rules that are off in all nodes.
         options: fields of `ReplayOptions` that differ.
     """

@@ -49,7 +49,7 @@ class ReplayedPress:
     """One case as a sequence of images.
 
     Attributes:
-        case: what was pressed.
+        case: object and height of the press.
         observations: n images.
         contacts: image by image, with the "height" of first touch and with the object's "outline".
         force: true forces on the jaw (n, 3) [N].
@@ -97,7 +97,7 @@ def record_press(case: PressHistory, jaw: Jaw, camera: NoisyCamera | None = None
     """Return a press to all levels at 2 mm/s, each held for 1.5 s, after two seconds at rest.
 
     Args:
-        case: what is pressed.
+        case: object and height of the press.
         jaw: the finger, whose key points are those of the truth.
         camera: makes noise and hides points; None sees everything exactly.
         seed: of the noise.
@@ -242,8 +242,8 @@ class Tier:
         name: for tables.
         solver: `EstimatorSettings.solver`.
         mesh: `EstimatorSettings.mesh`.
-        contact: what is known of the object: its "height" of first touch, or its "outline".
-        slow: whether it is left out where time is short.
+        contact: known property of the object: its "height" of first touch, or its "outline".
+        slow: True if it is left out where time is short.
     """
 
     name: str
@@ -310,7 +310,7 @@ def measure(quick: bool) -> Figures:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Run:
-    """What a tier makes of one press.
+    """The answers of a tier to one press.
 
     Attributes:
         press: that it was given.

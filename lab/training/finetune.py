@@ -264,7 +264,7 @@ def load_project(
         folder: that holds them.
         view: of their camera.
         jaw: jaw file, or name of an included jaw.
-        sides: which jaws are labelled.
+        sides: labelled jaws.
         mapping: names of the jaw's points by body part, where they differ.
 
     Raises:

@@ -70,7 +70,7 @@ def compute_losses(network: FingerNetwork, batch: Batch, *, low: bool) -> Losses
     Args:
         network: in training mode.
         batch: on the network's device.
-        low: whether to compute in bfloat16.
+        low: True to compute in bfloat16.
     """
     device = batch.rest.device
     known = torch.isfinite(batch.places).all(dim=2) & (batch.places.abs() < FARTHEST).all(dim=2)
@@ -132,7 +132,7 @@ FINETUNING_DIM = 0.15  # probability of little light: less than in the first tra
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
-    """How long and how fast the network is trained; a run ends after its minutes, whatever it has seen by then."""
+    """The duration and learning rate of a training; a run ends after its minutes, at whatever step."""
 
     minutes: float = setting(80.0, "time that training may take, evaluation included", "min", 0.01, 10_000.0)
     steps: int = setting(0, "batches until the end; 0: until the minutes are over, not repeatable", "", 0, 10**9)
@@ -171,7 +171,7 @@ class FingerTraining:
     """A network, its optimiser, its averaged weights, which are those that are kept, and how far they are.
 
     Args:
-        recipe: how to train.
+        recipe: duration and learning rate.
         network: to begin with; random weights when absent.
     """
 
@@ -190,7 +190,7 @@ class FingerTraining:
 
     @property
     def progress(self) -> float:
-        """How much is done, 0 to 1: by steps where the recipe counts them."""
+        """The share of the training done, 0 to 1: by steps where the recipe counts them."""
         recipe = self.recipe
         return min(self.step / recipe.steps if recipe.steps else self.elapsed / (60.0 * recipe.minutes), 1.0)
 

@@ -57,9 +57,9 @@ class RawSection:
         width: along the extrusion [m], of a tapered finger at the section's origin; None where the file is flat.
         taper: (2,) [-], change of the width along the section's axes.
         base: where the body is no prism of this section, which the clamp has to hold; None for nowhere.
-        unlike: what it is there, unless it is wider.
-        notes: what was found and guessed, a line each.
-        photo: what it was traced from, if that is a photograph.
+        unlike: kind of the part there, unless it is wider.
+        notes: findings and guesses, a line each.
+        photo: photograph that it was traced from, if any.
     """
 
     polygon: shapely.Polygon
@@ -86,7 +86,7 @@ def read_section(path: Path, *, unit: str | None = None, body: int | None = None
     Args:
         path: a surface (.stl and others), a solid (.step), a drawing (.dxf, .svg), a section (.json), or a photograph.
         unit: one of `UNITS`; None for the only one in which it has a finger's size; of a photograph see `SCALE`.
-        body: which one of several bodies, from 1.
+        body: number of the body among several, from 1.
         layered: take a solid as layers along its width, whatever its shape.
 
     Raises:
@@ -286,7 +286,7 @@ class _Cuts:
         return shapely.area(self.found)
 
     def is_short(self, area: shapely.Geometry, share: float) -> bool:
-        """Whether the circle around an area is less than a share of that around the section."""
+        """Return True if the circle around an area is less than a share of that around the section."""
         return shapely.minimum_bounding_radius(area) < share * shapely.minimum_bounding_radius(self.section)
 
     def find_local(self) -> shapely.Geometry | None:
@@ -320,16 +320,16 @@ class _Cuts:
 
     @property
     def is_mark(self) -> bool:
-        """Whether what is another section is too little to matter, as raised letters."""
+        """True if what is another section is too little to matter, as raised letters."""
         return bool(self.areas[self.difference > _OTHER].sum() <= _ALIKE * self.areas.sum())
 
     @property
     def is_one(self) -> bool:
-        """Whether they are one section, but for holes, rounded edges and the like."""
+        """True if they are one section, but for holes, rounded edges and the like."""
         return self.are_alike(np.full(len(self.found), True))
 
     def are_alike(self, chosen: NDArray) -> bool:
-        """Whether chosen ones, (n,) bool, are the section but for holes, rounded edges and the like, without floors."""
+        """Return True if chosen ones, (n,) bool, are the section but for holes and rounded edges, without floors."""
         seen = self.found[chosen & (self.difference > _SEEN)]
         more = shapely.difference(seen, self.section, grid_size=_GRID)
         inside = shapely.intersection(
@@ -408,7 +408,7 @@ def _choose_body(mesh: Surface, body: int | None, notes: list[str]) -> Surface:
 
 
 def _is_void(body: Surface, other: Surface) -> bool:
-    """Whether a body lies inside another one with its surface turned inwards."""
+    """Return True if a body lies inside another one with its surface turned inwards."""
     inside = (body.bounds[0] > other.bounds[0]).all() and (body.bounds[1] < other.bounds[1]).all()
     return bool(inside and body.volume * other.volume < 0.0)
 
@@ -453,7 +453,7 @@ def _cut_tapered(mesh: Surface, axis: NDArray, notes: list[str]) -> RawSection:
     Args:
         mesh: the body [m].
         axis: nearly that direction (3,).
-        notes: what was found, a line each.
+        notes: findings, a line each.
 
     Raises:
         JawFileError: Walls run in several directions, or a side is no plane.

@@ -52,7 +52,7 @@ def find_layers(cut: Callable[[float], shapely.Geometry], ends: tuple[float, flo
 
 
 def _is_even(grid: NDArray, cuts: list[shapely.Geometry]) -> bool:
-    """Whether cuts between places (n + 1,) are alike on both sides of the middle: then layers mirror each other."""
+    """Return True if cuts between heights (n + 1,) mirror each other about the middle, as then layers do."""
     pairs = zip(cuts, reversed(cuts), strict=True)
     are_alike = all(_compare(one, two).area <= _SAME * one.area for one, two in pairs)
     return are_alike and np.abs(grid + grid[::-1]).max() < _STEP

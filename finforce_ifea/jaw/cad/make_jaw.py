@@ -62,9 +62,9 @@ def make_jaw(
         name: of the finger.
         material: a name in `MATERIALS`.
         unit: of the file; None to guess it; of a photograph its scale.
-        body: which one of several bodies, from 1.
+        body: number of the body among several, from 1.
         width: along y [m]; needed for drawings and photographs.
-        overrides: what is stated in place of the guesses.
+        overrides: values stated in place of the guesses.
         picture: the PNG file; None for one next to the jaw file.
         solid: take a closed solid as it is, as layers along its width, whatever its shape.
         measure_warping: returns by what share the stiffness of a layered jaw is off where it is taken as plane;
@@ -191,7 +191,7 @@ def _find_whole(interior: shapely.Geometry, start: NDArray, along: NDArray, acro
     """Return between which shares of an outline's length cells lie: not beside a slot in either end, as of a base.
 
     Args:
-        interior: what is left for cells [m].
+        interior: depth left for cells [m].
         start: the middle of one end of the box around the outline (2,) [m].
         along: from there to the other end (2,) [m].
         across: from side to side (2,) [m].

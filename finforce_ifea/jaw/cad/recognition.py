@@ -112,7 +112,7 @@ class RecognizedFinger(Section):
         face_x: plane of the inner face, x [m].
         face_deviation: how far the inner face leaves its plane [m].
         frame: of the jaw in the section that was read: a rotation, perhaps mirrored, and a shift (2, 3) [m].
-        notes: what was found and guessed, a line each.
+        notes: findings and guesses, a line each.
     """
 
     bolts: NDArray
@@ -144,10 +144,10 @@ class RecognizedFinger(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class Overrides:
-    """What a user states in place of the guesses.
+    """Values that a user states in place of the guesses.
 
     Attributes:
-        flip: whether the wider end is the tip, where both ends are about as wide; None: not stated.
+        flip: True if the wider end is the tip, where both ends are about as wide; None: not stated.
         other_face: the other side is the inner face.
         clamp_z: height of the clamp [m].
         face_x: x of the inner face [m].
@@ -172,10 +172,10 @@ def recognize(
     Args:
         polygon: the section [m], anyhow turned.
         width: of the finger [m], where its sides are no parallel planes that at the origin of the section.
-        overrides: what is given.
+        overrides: values stated by the user.
         taper: (2,) [-], change of the width along the section's axes; None for none.
         base: where the body is no prism of this section, which the clamp has to hold; None for nowhere.
-        unlike: what it is there, unless it is wider and thus clamped as far up as that.
+        unlike: kind of the part there, unless it is wider and thus clamped as far up as that.
 
     Raises:
         JawFileError: The section shows no fin-ray finger; the message says what it shows and what to do.
@@ -232,8 +232,8 @@ def _raise_clamp(clamped_z: float, base: NDArray, ends: tuple[float, float], unl
         clamped_z: height of the clamp without it [m].
         base: heights (n,) [m] of what has to be held.
         ends: of the finger [m]: the lowest point of its cells, and its length.
-        unlike: what the base is, if no wider than the blade.
-        notes: what was found, a line each.
+        unlike: kind of the base, if no wider than the blade.
+        notes: findings, a line each.
 
     Raises:
         JawFileError: No clamp holds that, as it is far up; or it is unlike the blade, and no wider, beside its cells.
@@ -294,7 +294,7 @@ def count_cells(polygon: shapely.Polygon) -> int:
 
 
 def _is_round(hole: NDArray, polygon: shapely.Polygon) -> bool:
-    """Whether a hole of a section is a bolt's: a circle of some corners, the seat of a nut, a slot."""
+    """Return True if a hole of a section is a bolt's: a circle of some corners, the seat of a nut, a slot."""
     shape = shapely.Polygon(hole)
     roundness = 4.0 * np.pi * shape.area / shape.length**2
     if roundness > _ROUND:
@@ -343,7 +343,7 @@ def _drop_windows(polygon: shapely.Polygon, cells: list[NDArray], notes: list[st
 
 
 def _is_slot(shape: shapely.Polygon, cells: list[shapely.Polygon], outline: shapely.LinearRing) -> bool:
-    """Whether a hole is an oblong along the outline, with a much wider cell beside it, or a rib beside its middle."""
+    """Return True if a hole is an oblong along the outline, beside a much wider cell or the end of a rib."""
     left, _, right, _ = shapely.MultiPolygon(cells).bounds
     _, low, _, high = shape.bounds
     levels = [shapely.LineString([(left, z), (right, z)]) for z in low + np.array([0.25, 0.5, 0.75]) * (high - low)]
