@@ -31,10 +31,10 @@ from finforce_sim.footage import (
     info_fields,
     parse_size,
 )
-from finforce_sim.live import LiveScene, build_live_scene
 from finforce_sim.photographer import Shot
 from finforce_sim.scenarios import RATE, Scenario, build_scenario
 from finforce_sim.sensor import Flicker
+from finforce_sim.stored_grasp import LiveScene, build_live_scene
 
 PIXEL_TYPES = {"rgb8": np.uint8, "16UC1": np.uint16}
 TOLD_EVERY = 5.0  # s between two words on how far the rendering is

@@ -9,8 +9,8 @@ from pathlib import Path
 from finforce.errors import MissingDependencyError
 from finforce.settings import setting
 from finforce.systems.launch import options_from_words
-from finforce.systems.live import gripper_process
 from finforce.systems.processes import GripperOptions, Process, ReplayOptions, finish, merge, replay_processes
+from finforce.systems.setups import gripper_process
 from finforce_eval.cli.parser import CommandResult
 from finforce_eval.errors import OptionError
 

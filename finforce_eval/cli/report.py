@@ -13,7 +13,7 @@ from finforce.gripper_frames import SIDES
 from finforce.messages import NANOSECONDS, stamp_of
 from finforce_eval.cli.parser import CommandResult
 from finforce_eval.errors import OptionError, RecordingError
-from finforce_eval.evaluate import read_evaluations
+from finforce_eval.evaluation.batch import read_evaluations
 from finforce_eval.evaluation.scoring import match_truth
 from finforce_eval.figures.report import write_html, write_page
 from finforce_eval.machine import version

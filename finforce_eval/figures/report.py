@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from finforce_eval.evaluation.score_tables import mean_rmse, score_table
 from finforce_eval.evaluation.scoring import Evaluation, rms
-from finforce_eval.evaluation.tables import mean_rmse, score_table
 from finforce_eval.recordings.tracks import DIRECTIONS
 from finforce_eval.table import WAITING, ForceSeries
 

@@ -25,7 +25,7 @@ from finforce.camera_topics import COLOR_TOPIC, relative
 from finforce.gripper_frames import SIDES
 from finforce.ros import node as ros
 from finforce.settings import setting
-from finforce_eval.replay.live import ReplayLog
+from finforce_eval.replay.answers import ReplayLog
 from finforce_eval.replay.playback import Playback, RawMessage, ReadAhead
 
 # what is heard while messages are being sent waits its turn; nothing of it may be lost

@@ -15,9 +15,9 @@ from finforce.camera_topics import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 from finforce.errors import MissingDependencyError
 from finforce.ros.transport import free_domain
 from finforce.systems.processes import PIPELINE, executables_of
-from finforce_eval.replay.live import ReplayLog
+from finforce_eval.replay.answers import ReplayLog
 from finforce_eval.replay.playback import Playback, RawMessage
-from finforce_eval.replay.processes import ProcessError, ProcessGroup, begin_shares, end_shares, resident_bytes
+from finforce_eval.replay.process_group import ProcessError, ProcessGroup, begin_shares, end_shares, resident_bytes
 from finforce_eval.tasks import progress_bar
 
 if TYPE_CHECKING:

@@ -24,7 +24,7 @@ from finforce_eval.evaluation.setup import EvaluationSetup
 from finforce_eval.recordings.objects import find_mesh, read_friction, require_mesh
 from finforce_eval.recordings.tracks import Recording
 from finforce_eval.recordings.writer import write_recording
-from finforce_eval.replay.live import ReplayLog, live_result, with_heard_keypoints
+from finforce_eval.replay.answers import ReplayLog, live_result, with_heard_keypoints
 from finforce_eval.replay.node_run import run_nodes
 from finforce_eval.replay.playback import Playback
 from finforce_ifea.jaw.jaw import Jaw

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from finforce_eval.evaluate import evaluate_all
+from finforce_eval.evaluation.batch import evaluate_all
 from finforce_eval.evaluation.scoring import ONSET_FORCE, Evaluation, force_delays, rms
 from finforce_eval.figures.figures import BLACK, BLUE, GREEN, ORANGE
 from lab.experiments.experiment import (

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.gripper_frames import SIDES
-from finforce_eval.evaluate import evaluate_all
+from finforce_eval.evaluation.batch import evaluate_all
 from finforce_eval.evaluation.scoring import join_net, measure_sharpness, rms
 from finforce_eval.evaluation.setup import EvaluationSetup
 from finforce_eval.recordings.tracks import Recording

@@ -5,7 +5,7 @@ import pytest
 from finforce_ifea.estimator import ForceEstimator
 from finforce_ifea.filter.jump import correct
 from finforce_ifea.jaw.jaw import load_jaw
-from finforce_ifea.reduced.evaluation import linearize_reduced
+from finforce_ifea.reduced.model import linearize_reduced
 from finforce_ifea.settings import EstimatorSettings
 
 

@@ -12,10 +12,10 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
+from finforce_driver.conversions import fill_outcome, name_limp
 from finforce_driver.errors import DriverError, GripperStateError, GripperTimeoutError
 from finforce_driver.grasp.session import GraspSession
 from finforce_driver.gripper import Gripper
-from finforce_driver.messages import fill_outcome, name_limp
 from finforce_driver.settings import DriverParameters
 from finforce_driver.state import ABSENT, GripperState, MoveOutcome, MoveRequest, Phase
 
