@@ -17,10 +17,10 @@ from finforce.messages import SECOND, stamp_of
 from finforce.ros import node as ros
 from finforce.settings import check_bounds
 from finforce.transforms import pose_numbers
+from finforce_contact.contact_session import ContactSession, detections_type
 from finforce_contact.estimator import CONTRADICTED, ContactEstimate
 from finforce_contact.loop import TimedEstimate
 from finforce_contact.mesh.object_mesh import describe_mesh
-from finforce_contact.contact_session import ContactSession, detections_type
 from finforce_contact.parameters import ContactParameters, ContactSettings, TrackerSettings
 from finforce_contact.pose.source import MeshFeed, StampedPose
 from finforce_contact.slip import Slip

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from finforce_contact.estimator import ContactEstimate
 from finforce_contact.contact_session import JawContact, PosePairing, turn_covariance
+from finforce_contact.estimator import ContactEstimate
 from finforce_contact.parameters import ContactSettings
 from finforce_contact.pose.filter import PoseFilter
 

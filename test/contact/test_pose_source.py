@@ -7,8 +7,8 @@ import pytest
 
 from finforce.errors import ObservationError, PoseError
 from finforce.messages import CameraStream
-from finforce_contact.mesh.object_mesh import ObjectMesh
 from finforce_contact.contact_session import ContactSession
+from finforce_contact.mesh.object_mesh import ObjectMesh
 from finforce_contact.parameters import ContactParameters, ContactSettings, TrackerSettings
 from finforce_contact.pose.source import ExternalPoseSource
 from finforce_contact.pose.tracker import check_camera_outside
