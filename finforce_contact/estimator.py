@@ -49,8 +49,8 @@ class ContactEstimate:
         return self.contact is not None and bool(self.contact.touching)
 
 
-# Vertices looked at, and share of them, those farthest behind the face, that no pressed object reaches.
-_JAW_SAMPLES, _BACK = 300, 1.0 / 3.0
+_JAW_SAMPLES = 300  # vertices compared
+_BACK = 1.0 / 3.0  # [-], fraction of the vertices farthest behind the face, which no pressed object reaches
 _SURROUNDED = 0.5  # share of these that lies within an object around the jaw
 # An object with its origin farther off [m] is out of reach.
 _OUT_OF_REACH = 1.0

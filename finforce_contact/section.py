@@ -17,8 +17,8 @@ _OPTIONS = {"cache": True, "error_model": "numpy"}
 # A wall whose far side lies no deeper than this in the jaw is still taken for what the jaw touches [m].
 _THROUGH = 2e-3
 _MOST_CROSSINGS = 64
-# A turn out of the finger's plane [rad] and a shift along its width [m] that need a new outline.
-_RECUT_ANGLE, _RECUT_SHIFT = 0.0175, 1e-3
+_RECUT_ANGLE = 0.0175  # [rad], turn out of the finger's plane that needs a new outline
+_RECUT_SHIFT = 1e-3  # [m], shift along the width that needs a new outline
 
 
 def edges_of(polygons: tuple[NDArray, ...]) -> NDArray:

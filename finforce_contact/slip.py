@@ -14,12 +14,16 @@ from numpy.typing import NDArray
 
 from finforce_contact.parameters import ContactSettings
 
-# The cumulative sum: what is chance of one sample, the most that one may count for, and where it becomes an alarm.
-_CHANCE, _MOST, _ALARM = 1.0, 3.0, 4.5
-# Samples over which the place of rest is averaged, time over which a speed is fitted [s], and fewest samples of it.
-_REST_SAMPLES, _WINDOW, _FEWEST = 45.0, 0.2, 3
-# Noise is learnt over so many samples; what is expected of it counts for some; before it is learnt, nothing slides.
-_SLIP_MEMORY, _SLIP_PRIOR, _TOO_FEW = 60.0, 1.0, 16.0
+# CUSUM test for slip, in units of the sample's standard deviation.
+_CHANCE = 1.0  # [sigma], allowance of each sample
+_MOST = 3.0  # [sigma], largest contribution of one sample
+_ALARM = 4.5  # [sigma], threshold of the sum
+_REST_SAMPLES = 45.0  # samples over which the position of rest is averaged
+_WINDOW = 0.2  # [s], over which a speed is fitted
+_FEWEST = 3  # least samples of a speed
+_SLIP_MEMORY = 60.0  # samples over which noise is learnt
+_SLIP_PRIOR = 1.0  # samples that the expected noise counts for
+_TOO_FEW = 16.0  # samples before which no slip is reported
 # Slow samples in a row, after which an object that slid has come to rest.
 _RESTING = 6
 # A jaw closes or opens where the object moves along x faster than this [m/s] and than along the face: what slides there

@@ -18,7 +18,8 @@ from finforce_driver.settings import GripperSettings, JointSettings, check_numbe
 from finforce_driver.state import ABSENT, GripperState, MoveOutcome, Phase, describe
 
 NEAR = 1.5  # steps within which the target is reached
-STILL, STALL = 1e-3, 0.4  # [m/s], and [s] without motion after which the jaws are stalled
+STILL = 1e-3  # [m/s], below which the jaws do not move
+STALL = 0.4  # [s] without motion, after which the jaws are stalled
 SILENCE = 0.5  # [s] without a state after which the joint counts as disconnected
 EXTRA_TIME = 2.0  # [s] beyond the travel's own time
 TURN = 0.005  # [s] between two looks of one who waits

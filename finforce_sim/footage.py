@@ -27,7 +27,8 @@ START = 1_000 * NANOSECONDS  # [ns] stamp of the first image
 TRACKING_PERIOD = 0.1  # [s]; in the first image of each the object is tracked
 POSITION_STDDEV = 0.3e-3  # [m] of a tracked pose, along each axis
 ANGLE_STDDEV = np.radians(0.3)  # about each axis
-LEAST_SIZE, LARGEST_SIZE = 16, 4096  # [px]
+LEAST_SIZE = 16  # [px]
+LARGEST_SIZE = 4096  # [px]
 WORKERS = min(os.cpu_count() or 1, 4)  # threads, of which each renders an image
 
 

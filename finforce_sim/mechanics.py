@@ -495,8 +495,8 @@ class Assembly:
         return origin
 
 
-# Printed parts are stiffer than the data sheet says; two parts of one print differ less than two prints.
-_STIFFER, _PART_STDDEV = (1.1, 1.4), 0.02
+_STIFFER = (1.1, 1.4)  # [-], range of the modulus of prints over that of the data sheet
+_PART_STDDEV = 0.02  # [-], 1 sigma between parts of one print, which differ less than two prints
 _SHARE = (0.04, 0.09)
 _TIMES = ((1.5, 3.0), (7.0, 14.0))  # [s]
 

@@ -321,8 +321,9 @@ def _place_points(mesh: ObjectMesh, spacing: float) -> _Edges:
 
 _EDGE_POINTS = 200  # of the outline that are compared per image
 _NOISE_WIDTH = 5.0  # [px] over which the errors of the depth are alike
-# Errors of the normals of the mesh and of its outline [rad]: a motion along its surface up to this is not seen.
-_NORMAL_ERROR, _EDGE_ERROR = 0.035, 0.15
+# A motion along the surface up to these errors is not seen.
+_NORMAL_ERROR = 0.035  # [rad], of the normals of the mesh
+_EDGE_ERROR = 0.15  # [rad], of the normals of its outline
 # A surface seen at less than this cosine tells more about flying pixels than about itself.
 _GRAZING = 0.2
 # The end of an object in a depth image is known to about this [px].

@@ -277,7 +277,8 @@ FAULT_BITS = (
     (0x02, "current"),
     (0x01, "E-stop"),
 )
-MOTOR_CALIBRATED, WATCHDOG = 0x80, 0x20  # of byte 1
+MOTOR_CALIBRATED = 0x80  # bit of byte 1
+WATCHDOG = 0x20  # bit of byte 1
 
 
 def encode(node: int, command: int, data: bytes = b"", *, remote: bool = False) -> CanMessage:

@@ -22,7 +22,8 @@ NOISE = 0.05  # [N], standard deviation of a force that is expected at first
 _JUMP = 1.0  # [N] between two images, beyond what motion and noise explain
 _LARGEST_OFFSET = 0.2  # [N] that an unloaded estimate may show
 _CONFIRMED = 2  # images in a row that make an onset, or a jump
-_FROZEN, _FROZEN_WAY = 4, 0.4e-3  # images in a row with the same force to the last digit, and [m] closed meanwhile
+_FROZEN = 4  # images in a row with the same force to the last digit
+_FROZEN_WAY = 0.4e-3  # [m], closed meanwhile, from which on the force counts as frozen
 _EMPTY = 3  # images in a row without force after which the object is gone
 
 
@@ -360,7 +361,8 @@ _DRIFT = 0.15  # [N/sqrt(s)]
 # A finger stiffens from 0.4 to 1.3 N/mm within 5 mm.
 _GROWTH = 9e3  # [N/m per sqrt(m)], 0.28 N/mm after one millimetre
 _NOISE_MEMORY = 0.05  # share of a new innovation
-_LEAST_NOISE, _LARGEST_NOISE = 0.02, 0.25  # [N]
+_LEAST_NOISE = 0.02  # [N]
+_LARGEST_NOISE = 0.25  # [N]
 
 
 class ForceModel:

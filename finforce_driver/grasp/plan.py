@@ -40,7 +40,8 @@ _SMALL = 2.5  # steps: fewer are not planned anew on the way
 _POWERED_AFTER = 0.3  # [s] of the first command, which switches the power stage on
 _LATE = 1.0  # [s] after which jaws that have not come do not follow
 # A byte says the opening to a step; between two bytes it is interpolated. At rest the jaws are within 4 ticks.
-_MOVING_STDDEV, _RESTING_STDDEV = 0.35, 0.1  # [steps]
+_MOVING_STDDEV = 0.35  # [steps]
+_RESTING_STDDEV = 0.1  # [steps]
 
 
 class GraspPlan:

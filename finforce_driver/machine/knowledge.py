@@ -214,7 +214,8 @@ def estimate_position(reply: Reply, order: Move | None) -> float:
 
 
 CURRENT_STEP = 100.0  # [mA] that the current may change by between two replies without a confirmation
-CONFIRMING_STEP, CONFIRMING_RATE = 60.0, 5_000.0  # [mA], [mA/s] between two that confirm each other
+CONFIRMING_STEP = 60.0  # [mA], between two replies that confirm each other
+CONFIRMING_RATE = 5_000.0  # [mA/s], in addition
 CONFIRMATIONS = 3  # replies in a row that have to agree with the first one
 MOST_UNCONFIRMED = 16  # after which numbers are taken to differ for good, as by a noisy current
 FAST_TRAVEL = 3.0  # [counts] between two replies, beyond which each is confirmed: the jaws may have stopped

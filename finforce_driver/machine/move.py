@@ -17,7 +17,8 @@ TOLERANCE = 2  # [counts]: the reply truncates, the gripper stops within a fract
 CLOSED = 250  # [counts] from which contact while closing is with the other jaw
 OPENED = 3  # [counts] up to which contact while opening is with the stop
 CLEAR_CURRENT = 50  # [mA] from which the sign of the current is trusted
-EXTRA_TIME, LEAST_TIME = 1.0, 1.5  # [s] beyond the travel's own time, and in all
+EXTRA_TIME = 1.0  # [s], allowed beyond the travel's own time
+LEAST_TIME = 1.5  # [s], allowed for any move
 
 
 def push_direction(reply: Reply, closing: bool) -> int:

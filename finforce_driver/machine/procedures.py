@@ -120,8 +120,12 @@ BOOT_TIME = 3.0  # [s] after a reset
 START_TIME = 1.0  # [s] in which the motor has to show that it runs
 STARTS = 3
 QUIET_CURRENT = 20  # [mA] that a motor at rest does not exceed
-IDLE_CURRENT, IDLE_REPLIES, LEAST_TIME = 100, 10, 0.7  # [mA], replies and [s] after which it is over
-OPENED, CLOSED = 3, 252  # [counts]
+# A calibration is over after this time and so many replies in a row at rest.
+IDLE_CURRENT = 100  # [mA]
+IDLE_REPLIES = 10  # replies
+LEAST_TIME = 0.7  # [s]
+OPENED = 3  # [counts]
+CLOSED = 252  # [counts]
 END_TIME = 0.5  # [s] in which the position has to follow the flag
 NO_GRIPPER = (
     "the calibration is done, but the position does not follow: configure the controller as a gripper "

@@ -23,7 +23,9 @@ LEAST_HOLD = 1.5  # [s]
 SHORT_HOLD = 0.5  # [s] from which a steady force is mentioned that is too short to count
 LEAST_FORCE = 0.1  # [N]; below it a hold is not told from rest
 _WINDOW = 1.0  # [s] of the end of a hold, when the scale is read
-_DRIFT, _DRIFT_FLOOR = 0.04, 0.02  # of the force and [N] in one window: relaxation is slower, pressing is faster
+# Largest drift in one window of a hold: relaxation is slower, pressing is faster.
+_DRIFT = 0.04  # [-], of the force
+_DRIFT_FLOOR = 0.02  # [N]
 _NOISE_SIGMAS = 3.0  # standard errors of the drift by which noise may exceed that
 _SCALE_ERROR = 0.02  # [N]: two grams
 _RELATIVE_ERROR = 0.02  # of one reading, by the height at which it was pressed

@@ -35,7 +35,8 @@ _POINTS = ("points_x", "points_y", "points_z", "points_weight", "points_touching
 
 
 NOT_FOUND, REFUSED = "not found", "refused"  # status of a jaw that is in none of the images, and of a bad image
-STILL_UPDATES, STILL_PERIOD = 30, 0.03  # as often, and so far apart [s], is a still seen, for its contact to settle
+STILL_UPDATES = 30  # updates with the same still, for its contact to settle
+STILL_PERIOD = 0.03  # [s], between them
 PICKED_STDDEV = 1e-3  # [m] of key points that say nothing of it: picked by hand, they scatter by a millimetre or two
 LEAST_ANSWERED = 0.1  # share of the images with a force, below which there is no such finger in them
 

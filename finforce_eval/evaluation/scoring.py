@@ -18,8 +18,8 @@ from finforce_eval.evaluation.gripper import combine_jaws
 from finforce_eval.recordings.tracks import DetectionTrack, DetectionTruth, Recording, WrenchTrack
 from finforce_eval.table import ForceSeries
 
-# Below it the pressure centre hardly matters; from it on something presses [N].
-LEAST_FORCE, ONSET_FORCE = 0.2, 0.02
+LEAST_FORCE = 0.2  # [N], below which the pressure centre is not scored
+ONSET_FORCE = 0.02  # [N] of true force, from which on something presses
 SHOWN = 0.10  # [N] of estimated force, from which on it shows
 FREE = 5  # images without true force before an onset counts as one
 WAITED = 1.0  # [s] after which a force that did not show is missed

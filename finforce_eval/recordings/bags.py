@@ -21,12 +21,14 @@ NO_DIGEST = "RIHS01_" + 64 * "0"
 MEGABYTE = 1 << 20
 # Bytes that opening a recording, and reading one more message of it, may take.
 STEP_MEMORY = 512 * MEGABYTE
-# Bytes that all chunks of a recording may unpack to, and may for each byte of its files.
-LARGEST_ALL, PER_BYTE = 192 * MEGABYTE, 100
-# Messages of our topics, and bytes of a file that let there be one more.
-MOST_MESSAGES, BYTES_PER_MESSAGE = 250_000, 16
-LARGEST_METADATA = 4 * MEGABYTE
-SECONDS, BYTES_PER_SECOND = 20, 5 * MEGABYTE  # of work on a recording in a process of its own
+# Bounds of all chunks of a recording unpacked, of its messages, and of the time to read it.
+LARGEST_ALL = 192 * MEGABYTE  # [bytes]
+PER_BYTE = 100  # bytes more for each byte of its files
+MOST_MESSAGES = 250_000  # messages of our topics
+BYTES_PER_MESSAGE = 16  # bytes of a file that allow one message more
+LARGEST_METADATA = 4 * MEGABYTE  # [bytes]
+SECONDS = 20  # [s], of work in a process of its own
+BYTES_PER_SECOND = 5 * MEGABYTE  # bytes of a file that allow one second more
 _HINT = f"{BUDGET}=10 would allow ten times as much"
 
 

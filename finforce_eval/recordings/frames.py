@@ -26,7 +26,8 @@ from finforce_eval.recordings.images import ImageChoice, StampedImage
 from finforce_eval.recordings.tracks import JawTrack, KeypointTrack, Recording, Timed, WrenchTrack
 from finforce_keypoints.images import RgbdImage, check_image
 
-LEAST_RATE, MOST_RATE = 1e-2, 1e4  # Hz of frames
+LEAST_RATE = 1e-2  # [Hz] of frames
+MOST_RATE = 1e4  # [Hz] of frames
 Rate = Annotated[Number, Field(ge=LEAST_RATE, le=MOST_RATE)]
 STILL_RATE = 1.0  # Hz of pictures that say nothing of their times
 LARGEST_PICTURE = 1 << 27  # bytes

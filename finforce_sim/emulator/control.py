@@ -10,7 +10,8 @@ from finforce_driver.can.protocol import LARGEST_CURRENT_MA, Move
 from finforce_sim.emulator.mechanism import Jaws
 
 AT_POSITION = 3  # object code
-_SLOWEST, _SPEED_RANGE = 40, 79960  # [ticks/s] of the speed bytes 0 and 255
+_SLOWEST = 40  # [ticks/s], of the speed byte 0
+_SPEED_RANGE = 79960  # [ticks/s], more of the speed byte 255
 _LARGEST = 255
 
 
@@ -211,7 +212,8 @@ def _seek(firmware: Firmware, jaws: Jaws, direction: float) -> Iterator[None]:
         yield
 
 
-_WEAK_CURRENT, _STRONG_CURRENT = 150, 1500  # [mA] that the maker advises against going beyond
+_WEAK_CURRENT = 150  # [mA], least current that the maker advises
+_STRONG_CURRENT = 1500  # [mA], largest current that the maker advises
 _SLOW_SPEED = 3  # byte below which contact is felt while the jaws still move
 
 

@@ -234,8 +234,10 @@ class EmulatedGripper:
         return struct.pack(">BhB", self._position, self.reported_current, status)
 
 
-_COLDEST, _HOTTEST = -20.0, 75.0  # [deg C] of the motor
-_LEAST_SUPPLY, _LARGEST_SUPPLY = 9.0, 29.0  # [V]
+_COLDEST = -20.0  # [deg C], of the motor
+_HOTTEST = 75.0  # [deg C], of the motor
+_LEAST_SUPPLY = 9.0  # [V]
+_LARGEST_SUPPLY = 29.0  # [V]
 
 
 class Fault(Enum):
