@@ -161,11 +161,6 @@ def share_setup(key: str, options: argparse.Namespace) -> EvaluationSetup:
     return _last[key]
 
 
-def forget_setup() -> None:
-    """Forget the setup of the call before."""
-    _last.clear()
-
-
 def parse_settings(solver: str, mesh: str, changes: Sequence[str]) -> EstimatorSettings:
     """Return the settings of the estimator with `NAME=VALUE` changes.
 

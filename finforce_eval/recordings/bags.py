@@ -10,7 +10,7 @@ from errno import EDQUOT, ENOSPC
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from finforce.errors import FinforceError, MissingDependencyError, one_line
+from finforce.errors import FinforceError, one_line
 from finforce.files import BUDGET, FileError, check_plain, parse_yaml, raise_budget, read_text
 from finforce.messages import NANOSECONDS
 from finforce.sandbox import SandboxError, limit_growth, run_limited
@@ -109,13 +109,10 @@ def open_bag(source: Path, name: str) -> Iterator[BagReader]:
 
     Raises:
         RecordingError: damaged or empty; also when it shows later, in the block.
-        MissingDependencyError: rosbags is not installed.
     """
-    try:
-        from rosbags.rosbag2 import Reader
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError as error:
-        raise MissingDependencyError("reading a recording needs rosbags: pip install rosbags") from error
+    from rosbags.rosbag2 import Reader
+    from rosbags.typesys import Stores, get_typestore
+
     # not AnyReader: it registers every definition in the bag and ends at a foreign one it cannot parse
     types = get_typestore(Stores.ROS2_JAZZY)
     with damage_reported(name), ExitStack() as stack:

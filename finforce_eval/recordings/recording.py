@@ -81,7 +81,6 @@ def read_recording(
     Raises:
         RecordingError: nothing there, nothing in it that is whole, out of bounds, empty, without key points and images,
             or with malformed content.
-        MissingDependencyError: rosbags is not installed.
     """
     choice = choice or ImageChoice()
     if is_dataset(Path(path)):

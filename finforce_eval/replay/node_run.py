@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import psutil
 
 from finforce.camera_topics import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
-from finforce.errors import MissingDependencyError
+from finforce.optional import import_ros
 from finforce.ros.transport import free_domain
 from finforce.systems.processes import PIPELINE, executables_of
 from finforce_eval.replay.answers import ReplayLog
@@ -113,10 +113,7 @@ def run_nodes(
         ProcessError: a process cannot be started, ended early, or does not listen.
         MissingDependencyError: ROS 2 is not installed.
     """
-    try:
-        from finforce_eval.replay.node import open_player
-    except ImportError as error:
-        raise MissingDependencyError(f"running nodes needs ROS 2: pip install 'finforce[ros]' ({error})") from error
+    open_player = import_ros("finforce_eval.replay.node", "running nodes").open_player
     log = ReplayLog(tuple(sides))
     environment = dict(environment or {})
     domain = environment.setdefault("ROS_DOMAIN_ID", str(free_domain()))
