@@ -32,9 +32,9 @@ class _ContactOutputs:
 
     Args:
         stage: makes publishers and watches them.
-        parameters: which jaws, and whether the object's poses are found here.
+        parameters: jaws, and source of the object's poses.
         session: knows the camera's stream and the jaws.
-        skips: whether what nobody subscribes to is left out.
+        skips: True if outputs without subscribers are left out.
     """
 
     def __init__(self, stage: ros.Stage, parameters: ContactParameters, session: ContactSession, skips: Skips) -> None:

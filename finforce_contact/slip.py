@@ -1,4 +1,4 @@
-"""Whether a held object slides over a jaw, by its poses.
+"""Slip of a held object over a jaw, by its poses.
 
 Where jaw and object begin to touch, one point of the object is remembered. Its motion along the face, in the jaw frame,
 is slip; its speed is the slope of the last samples. The object slides once its distance from where it rested exceeds

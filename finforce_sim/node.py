@@ -208,7 +208,7 @@ def main() -> int:
 
 @dataclass(frozen=True, kw_only=True)
 class TwinParameters:
-    """What a twin camera node is told; units stand in the metadata."""
+    """Parameters of a twin camera node; units stand in the metadata."""
 
     scene: str = setting("grasp_cylinder", "Scene, by a name that `finforce twin list` prints")
     seed: int = setting(0, "Seed of textures, light and noise", "", 0, 2**31 - 1)

@@ -1,4 +1,4 @@
-"""Whether a posed mesh agrees with what a depth camera sees of it, and which turn, scale or shift of it would."""
+"""The agreement of a posed mesh with depth images, and the turn, scale or shift of it that would agree."""
 
 from __future__ import annotations
 

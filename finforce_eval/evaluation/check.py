@@ -1,4 +1,4 @@
-"""Whether camera, jaw file, extrinsics and picture fit each other, before any force is believed."""
+"""The check that camera, jaw file, extrinsics and picture fit each other, before any force is believed."""
 
 from __future__ import annotations
 

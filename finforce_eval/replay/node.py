@@ -202,7 +202,7 @@ def main() -> int:
 
 @dataclass(frozen=True, kw_only=True)
 class PlayerParameters:
-    """What the player is told; units stand in the metadata."""
+    """Parameters of the player; units stand in the metadata."""
 
     bag: str = setting("", "Recording: rosbag2 folder, .mcap or .db3")
     rate: float = setting(1.0, "Playback speed; 1 as recorded", "", 0.01, 100.0)

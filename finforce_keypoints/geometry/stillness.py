@@ -1,4 +1,4 @@
-"""Whether the jaws stand as they did in the last images, so that their key points hold.
+"""Detection of jaws that stand as they did in the last images, so that their key points hold.
 
 Around every key point, what a picture differs by from a mean picture m is explained by what light does (gain and
 brightness) and by what a jaw does: a shift along its x, one that grows with the height h and one with its square, and a

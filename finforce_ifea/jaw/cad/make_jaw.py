@@ -307,7 +307,7 @@ def _describe_finger(finger: RecognizedFinger, section: str, name: str, stiffnes
     """Return the lines of a jaw file on section, material, key points and candidates.
 
     Args:
-        finger: what was recognized.
+        finger: the recognized finger.
         section: name of its file.
         name: of its material.
         stiffness_error: relative standard deviation of the stiffness for another reason.

@@ -1,4 +1,4 @@
-"""What a section shows of a fin-ray finger: its frame, cells, bands, ribs, bolt holes and clamp."""
+"""Recognition of a fin-ray finger in a section: its frame, cells, bands, ribs, bolt holes and clamp."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ class RecognizedFinger(Section):
         outer: the other one.
         ribs: base to tip.
         face_x: plane of the inner face, x [m].
-        face_deviation: how far the inner face leaves its plane [m].
+        face_deviation: largest distance of the inner face from its plane [m].
         frame: of the jaw in the section that was read: a rotation, perhaps mirrored, and a shift (2, 3) [m].
         notes: findings and guesses, a line each.
     """
