@@ -10,12 +10,11 @@ from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from finforce.errors import suggest
+from finforce_ifea.settings import MESHES, SOLVERS
 
 if TYPE_CHECKING:
     from finforce_eval.tasks import EngineOptions
 
-SOLVERS = ("default", "reduced", "solid", "frame", "plane", "paper")
-MESHES = ("default", "coarse", "fine")
 UNITS = ("m", "cm", "mm", "inch")
 SOURCES = ("images", "keypoints", "truth")
 JAWS_CHOICES = ("left", "right", "both")
