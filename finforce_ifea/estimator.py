@@ -66,7 +66,7 @@ class ForceEstimator:
     """Estimates the force on one jaw; deterministic, one thread.
 
     Attributes:
-        is_idle: whether the jaw was at rest in the last image, its object out of reach.
+        is_idle: True if the jaw was at rest in the last image, its object out of reach.
     """
 
     def __init__(
@@ -168,7 +168,7 @@ class ForceEstimator:
 
     @property
     def tared(self) -> bool:
-        """Whether the key points' offsets are known."""
+        """True if the key points' offsets are known."""
         return self._taring.tared
 
     @property
