@@ -17,10 +17,12 @@ import yaml
 
 from finforce.errors import FinforceError, one_line
 
-# Bytes of a file, of one of YAML; levels of nesting; values, those that references stand for counted as often; digits.
-LARGEST, LARGEST_YAML = 16 << 20, 1 << 19
+LARGEST = 16 << 20  # [bytes], of a file
+LARGEST_YAML = 1 << 19  # [bytes], of a YAML file
 _MOST_BUDGET = 10_000.0
-DEEPEST, MOST_VALUES, MOST_DIGITS = 50, 50_000, 400
+DEEPEST = 50  # levels of nesting
+MOST_VALUES = 50_000  # values, those behind references counted each time
+MOST_DIGITS = 400  # digits of a number
 BUDGET = "FINFORCE_BUDGET"  # of the environment: a factor on what files may cost
 _POINTER = b"version https://git-lfs.github.com/spec/"
 _OPEN = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)

@@ -33,12 +33,15 @@ from lab.harness import Figures, percentiles
 from lab.presses import PressHistory, circle
 
 TRUTH = Path(__file__).parents[1] / "data" / "pressed_bench.npz"
-YOUNG_MODULUS, POISSON_RATIO = 30e6, 0.45
+YOUNG_MODULUS = 30e6  # [Pa]
+POISSON_RATIO = 0.45
 HEIGHTS = {"lower": 0.020, "middle": 0.040, "upper": 0.060}
 QUICK_RADIUS = 0.0125  # of the three cases that do where time is short [m]
 LEVELS = (0.002, 0.004, 0.006, 0.008, 0.010)
 PERIOD = 1.0 / 30.0
-REST_FRAMES, HOLD_FRAMES, SCORED_FRAMES = 60, 45, 30
+REST_FRAMES = 60
+HOLD_FRAMES = 45
+SCORED_FRAMES = 30
 SPEED = 2e-3
 # Constant errors of a tracked object's origin [m] and turn [rad], as the contact estimator expects them.
 _POSE_ERROR = np.array([0.5e-3, 0.5e-3, 5e-3])

@@ -204,7 +204,8 @@ def cut_picture(
 
 FEWEST = 3  # labelled pictures
 HELD_BACK = 6  # every sixth picture judges, the others teach; of fewer than twelve every second one
-MINUTES, RATE = 5.0, 3e-4
+MINUTES = 5.0  # [min] of training
+RATE = 3e-4  # largest learning rate
 MIXED = 2000  # pictures of the data set that are mixed in
 
 

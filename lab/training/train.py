@@ -32,8 +32,10 @@ torch = import_torch()
 POINTS = 12  # of a picture that the fine part looks at in one step
 COVERED = 4  # of them that are key points which cannot be seen, where there are any
 ANYWHERE = 2  # of them that need not be key points
-# px by which guesses are off: some anywhere up to FAR, others with deviation NEAR
-FAR, FAR_SHARE, NEAR = 9.0, 0.25, 1.5
+# Errors of guesses.
+FAR = 9.0  # [px], largest error of a fraction of them, evenly spread
+FAR_SHARE = 0.25  # [-], that fraction
+NEAR = 1.5  # [px], standard deviation of the others
 FARTHEST = 600.0  # px; a place that a slanted view has thrown farther is not learnt
 HIDDEN_WEIGHT = 6.0  # of a hidden point beside a visible one: to accept what is not there costs more than to lose one
 SHARPNESS = 0.05  # px; smaller errors count by their square

@@ -22,27 +22,33 @@ from finforce_ifea.jaw.section import UNITS, Layer, SectionFile, check_loops, jo
 
 SURFACES = (".stl", ".obj", ".ply", ".off", ".3mf", ".glb")
 SUFFIXES = (*SURFACES, ".step", ".stp", ".dxf", ".svg", ".json", *PHOTOS)
-# Largest size of a finger [m]; the second pair is for a unit that was stated.
-_PLAUSIBLE, _POSSIBLE = (0.015, 0.25), (0.005, 1.0)
+_PLAUSIBLE = (0.015, 0.25)  # [m], range of a finger's largest size
+_POSSIBLE = (0.005, 1.0)  # [m], the same where a unit was stated
 # What encloses less than this share of the largest body is no part of a finger.
 _CRUMB = 1e-4
 # So many shells, as of ribs and raised letters, are looked at for whether they overlap.
 _MOST_SHELLS = 40
-# Vertices of open edges that are as close as this [m] are one; an edge of so many sides is that of two triangles.
-_CRACK, _MISSING = 1e-5, 4
-_MOST_TRIANGLES, _LARGEST_FILE = 2_000_000, 200_000_000
-# A surface is prismatic when so much of it stands upright on, or lies across, the direction of extrusion.
-_UPRIGHT, _PRISMATIC = 0.02, 0.97
+_CRACK = 1e-5  # [m], largest distance of vertices of open edges that are merged
+_MISSING = 4  # sides of a hole that counts as two missing triangles
+_MOST_TRIANGLES = 2_000_000
+_LARGEST_FILE = 200_000_000  # [bytes]
+_UPRIGHT = 0.02  # [-], largest cosine of a normal that stands upright on the direction of extrusion
+_PRISMATIC = 0.97  # [-], fraction of a prismatic surface that stands upright or lies across
 # Of a tapered one the normals of walls have less than this along its direction, those of sides more; a side is plane
 # within so much [m].
 _ASIDE, _SIDE, _RULINGS = 0.5, 1e-4, 4
-# Cuts across it, evenly over the width: they may differ from the usual one by so much of its area on average, and few
-# of them by what is seen; what differs by more is another section, by less the same. A small hole is one on average.
-_CUTS, _ALIKE, _SEEN, _RARE, _OTHER, _ROUNDING, _SMALL = 25, 0.02, 0.01, 0.2, 0.1, 1e-4, 5e-3
+# Cuts across a surface, evenly over the width; differences as fractions of the area of the usual cut.
+_CUTS = 25
+_ALIKE = 0.02  # [-], largest mean difference of one section
+_SEEN = 0.01  # [-], difference that is seen
+_RARE = 0.2  # [-], largest fraction of the cuts that differ by that
+_OTHER = 0.1  # [-], difference of another section
+_ROUNDING = 1e-4  # [-], difference of the same section
+_SMALL = 5e-3  # [-], largest mean area of a small hole
 # Cuts of the same walls are one where these move by less than this [m] over the width.
 _ALONG = 2e-6
-# A base fits into a circle of this share of that around the blade on it, and what is in it into one of this share.
-_SHORT, _LOCAL = 0.67, 0.4
+_SHORT = 0.67  # [-], largest circle around a base over that around the blade on it
+_LOCAL = 0.4  # [-], the same of what is in a base
 # Ends of cut triangles are joined on a grid of this size [m].
 _GRID = 2e-7
 _CHORD = 2e-5

@@ -37,22 +37,23 @@ _NARROWER = 0.75
 _GRIP, _WASHER, _LARGEST, _UNLIKE = 3.0, 2.0, 0.125, 2.0
 # So is what lies below all cells, where it is so many times as far from the outline as they are.
 _APART = 2.0
-# A slot in a band fills so much of the rectangle around it, and is narrower than this share of the cell beside it; its
-# distance from the outline changes by less than this share of its length.
-_OBLONG, _NARROW, _ALONG = 0.75, 0.5, 0.15
+# A slot in a band.
+_OBLONG = 0.75  # [-], least fraction of the rectangle around it
+_NARROW = 0.5  # [-], largest width over that of the cell beside it
+_ALONG = 0.15  # [-], largest change of its distance from the outline over its length
 # Least cosine between a cell's side and the face of the band beyond it.
 _FACES = 0.7
 _NEIGHBOURS, _LONGER = 3e-3, 1.4
 # Cells that see each other through so many times the thickness of ribs do so where several ribs end side by side.
 _MERGED = 2.0
 _FEWEST, _FLAT = 5, 1e-4
-# Lines are tried through pairs of so many points, which are on them within so much [m].
-_CHORDS, _SIDE = 24, 5e-5
+_CHORDS = 24  # points through whose pairs lines are tried
+_SIDE = 5e-5  # [m], largest distance of points on a line
 # Cosines to the base that differ by less are alike.
 _EQUAL = 0.02
-# The clamp spans so much of the distance between the bands at least; the edge of a tilted base, which rises so much,
-# this.
-_HELD, _SPANNED, _TILTED = 0.5, 0.7, 0.02
+_HELD = 0.5  # [-], least span of the clamp over the distance between the bands
+_SPANNED = 0.7  # [-], the same of the edge of a tilted base
+_TILTED = 0.02  # [-], least slope of a tilted base
 # Heights of clamps from here on [m] are given in half millimetres.
 _THIN = 2e-3
 # Share of the length up to which there may be a base.
