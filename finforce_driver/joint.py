@@ -43,7 +43,7 @@ class _Ramp:
 
     @property
     def arrives(self) -> float:
-        """When the setpoint is at the target [s]."""
+        """The time at which the setpoint is at the target [s]."""
         return self.begun + abs(self.target - self.start) / self.speed
 
 

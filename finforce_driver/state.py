@@ -35,7 +35,7 @@ def _describe(value: Any, how: Mapping[str, Any]) -> str:
 
 
 class Phase(Enum):
-    """Where the driver is with its gripper."""
+    """The phase of the driver."""
 
     DISCONNECTED = "disconnected"  # no port, or nothing answers for long
     PROBING = "probing"  # the port is open, no reply yet
@@ -129,7 +129,7 @@ class MoveRequest:
 
 
 class GraspPhase(Enum):
-    """Where a grasp is."""
+    """The phase of a grasp."""
 
     APPROACH = "approach"  # nothing presses yet
     LOADING = "loading"  # on the way to the set force

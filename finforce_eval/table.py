@@ -148,7 +148,7 @@ class ForceSeries:
 
     @property
     def side(self) -> str:
-        """Which jaw it is, "left" or "right"."""
+        """The side of the jaw, "left" or "right"."""
         return str(self.table["side"].iloc[0] if len(self) else self.table.attrs["side"])
 
     @property

@@ -76,7 +76,7 @@ class Task:
 
 @dataclass(frozen=True, kw_only=True)
 class EngineOptions:
-    """Where tasks are carried out; raises OptionError where that cannot be.
+    """The workers that carry out tasks; raises OptionError for settings out of bounds.
 
     Attributes:
         workers: processes on this machine; 1: this one, 0: one for each processor.

@@ -254,7 +254,7 @@ class HeldObject:
 
     @property
     def x(self) -> float:
-        """Where the object is on the closing axis [m]."""
+        """The position of the object on the closing axis [m]."""
         return self._balance.x
 
     def follow(self, setting: GraspSetting) -> Mapping[str, JawShape]:

@@ -178,7 +178,7 @@ _TARE_RECORD = 0.5
 
 @dataclass(frozen=True, kw_only=True)
 class Posture:
-    """Where everything stands at one instant.
+    """The positions of everything at one instant.
 
     Attributes:
         closing: of each jaw beyond first touch [m], negative while open.

@@ -1,4 +1,4 @@
-"""Which forces of a camera may be believed, whether the jaws are loaded, and how the force goes with the opening.
+"""Plausibility of a camera's forces, load of the jaws, and the slope of the force over the opening.
 
 Between two images the opening changes by d (closing: d > 0) and the force by k d, where neither stays what it was:
 fingers relax, contact spreads. A Kalman filter follows both,

@@ -15,7 +15,7 @@ _LEAST_STIFFNESS = 1000.0
 
 
 class FrictionProbe:
-    """Where the jaws are to go until the object was probed.
+    """The targets of the jaws until the object was probed.
 
     Attributes:
         is_due: True if that has still to be done.

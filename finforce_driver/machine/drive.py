@@ -220,7 +220,7 @@ class Drive:
 
     @property
     def phase(self) -> Phase:
-        """Where the driver is with the gripper."""
+        """The phase of the driver."""
         if not self.joined or self.silent:
             return Phase.DISCONNECTED
         if self.known.reply is None:

@@ -134,7 +134,7 @@ class Knowledge:
 
     @property
     def stamp(self) -> float:
-        """When the last believed reply came [s]; NaN before the first."""
+        """The time of the last believed reply [s]; NaN before the first."""
         return math.nan if self.reply is None else self.reply.time
 
     @property

@@ -143,12 +143,12 @@ class MoveJob:
 
     @property
     def position(self) -> int:
-        """Where the gripper is to be sent now [counts]."""
+        """The position to which the gripper is to be sent now [counts]."""
         return self.steps.position if self.steps else self.goal.position
 
     @property
     def next_time(self) -> float:
-        """When the target goes on [s]; infinite when it does not."""
+        """The time at which the target goes on [s]; infinite when it does not."""
         return self.steps.next_time if self.steps and not self.steps.done and self.stepping else math.inf
 
     @property

@@ -162,7 +162,7 @@ class Travel:
 
     @property
     def next_time(self) -> float:
-        """When the encoder is asked next [s]; infinite where it never answers."""
+        """The time of the next question to the encoder [s]; infinite where it never answers."""
         return self._next_time if self.answers or self._silences < SILENCES else math.inf
 
     def ask(self, now: float) -> None:

@@ -1,4 +1,4 @@
-"""Where the contact of an image comes from: given once, or estimated from mesh, pose and deformed jaw."""
+"""Sources of the contact of an image: given once, or estimated from mesh, pose and deformed jaw."""
 
 from __future__ import annotations
 
@@ -258,7 +258,7 @@ EXPECTED = f"expected {', '.join(ESTIMATED)}, fixed:Z_MM (millimetres), fixed:ca
 
 @dataclass(frozen=True, kw_only=True)
 class ContactChoice:
-    """Where the contact of a recording comes from.
+    """The source of the contact of a recording.
 
     Attributes:
         mode: "estimate", "closest" or "paper" by the contact estimator; "fixed" at a height; "automatic" is "estimate"

@@ -1,4 +1,4 @@
-"""Where the key points of a recording come from: recorded, true, or found in its images by the detector of the node."""
+"""Sources of a recording's key points: recorded, true, or found in its images by the detector of the node."""
 
 from __future__ import annotations
 

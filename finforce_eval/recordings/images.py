@@ -47,7 +47,7 @@ ALONE = -1  # instead of a depth image's stamp [ns], of a colour image without
 
 @dataclass(frozen=True, kw_only=True)
 class ImageChoice:
-    """Which images of a recording are read.
+    """The images of a recording to read.
 
     Attributes:
         color: topic, of a dataset a feature; "" for the only one there is.
@@ -82,7 +82,7 @@ class StampedImage(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ImageTrack(Timed):
-    """Where the images of a recording lie; iterating reads them.
+    """The images of a recording; iterating reads them.
 
     Attributes:
         source: the bag.

@@ -285,7 +285,7 @@ def _parse_phase(text: str, name: str) -> tuple[int, str, float, str]:
 
 @dataclass(frozen=True, kw_only=True)
 class DetectionTruth(Timed):
-    """Where the key points of one jaw truly were, and which of them the camera could see.
+    """The true key points of one jaw, and which of them the camera could see.
 
     Attributes:
         stamps_ns: (n,) image time [ns], strictly increasing.

@@ -17,7 +17,7 @@ _LARGEST = 255
 
 @dataclass(frozen=True, kw_only=True)
 class Firmware:
-    """Where firmware versions differ.
+    """The differences of firmware versions.
 
     Attributes:
         closing_code: object code of contact while the current drives closed.
