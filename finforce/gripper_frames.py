@@ -1,4 +1,4 @@
-"""Where a wrist camera sits and how the jaws slide before it.
+"""Frames of the gripper: the wrist camera, and the jaws that slide in front of it.
 
 The gripper base has x along the closing axis, from the left to the right jaw, and z along the approach direction.
 """

@@ -142,13 +142,13 @@ class _Slab:
 
     @cached_property
     def side(self) -> NDArray:
-        """Where the vertices (n,) lie: -1 below the slab, 0 in it, 1 above."""
+        """The side (n,) on which vertices lie: -1 below the slab, 0 in it, 1 above."""
         y = self.points[:, 1]
         return (y >= self.half_width).astype(np.int8) - (y < -self.half_width)
 
     @cached_property
     def facing(self) -> NDArray:
-        """Where the triangles (m,) turn from x to z, seen along y; their outside then is on the side of -y."""
+        """The triangles (m,) that turn from x to z, seen along y; their outside then is on the side of -y."""
         x, z = self.points[:, 0][self.mesh.triangles].T, self.points[:, 2][self.mesh.triangles].T
         return (x[1] - x[0]) * (z[2] - z[0]) > (x[2] - x[0]) * (z[1] - z[0])
 

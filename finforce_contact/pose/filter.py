@@ -31,7 +31,7 @@ _REST, _MOTION = 0, 1
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FilteredPose:
-    """Where the object is.
+    """The pose of the object.
 
     Attributes:
         T: T_jaw_object (4, 4).

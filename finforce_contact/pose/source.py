@@ -1,4 +1,4 @@
-"""Where poses of the object come from: another program's messages, or depth images."""
+"""Sources of the object's poses: another program's messages, or depth images."""
 
 from __future__ import annotations
 

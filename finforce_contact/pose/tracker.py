@@ -110,7 +110,7 @@ def _icosphere() -> NDArray:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ObjectPose:
-    """Where the object was in one image.
+    """The pose of the object in one image.
 
     Attributes:
         stamp: capture time of the image [s].

@@ -102,7 +102,7 @@ FINE = (
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ScaleFreedom:
-    """Which scales are free, and how stiffly the axes keep their proportions.
+    """The free scales, and the stiffness of the axes' proportions.
 
     Attributes:
         basis: (3, k) what each free scale does to the logarithms of the three.

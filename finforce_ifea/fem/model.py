@@ -39,7 +39,7 @@ class BandedFactor(Factor):
 
 
 class SparsePlan:
-    """Where the entries of L and D are in the factors L D L^T of all symmetric matrices with one pattern.
+    """The entries of L and D in the factors L D L^T of all symmetric matrices with one pattern.
 
     Args:
         pointer: where each column of the upper triangle begins (n + 1,).

@@ -178,7 +178,7 @@ class _Pattern:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Match:
-    """Which dot is which point: (n,) numbers of dots, -1 for none; the field (5, 2) [m]; cost, 1 per missing dot."""
+    """The assignment of dots to points: (n,) dots, -1 for none; the field (5, 2) [m]; cost, 1 per missing dot."""
 
     dots: NDArray
     field: NDArray

@@ -289,7 +289,7 @@ class DepthScale:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SideFit:
-    """Where the points of a jaw are across its side.
+    """The positions of the points of a jaw across its side.
 
     Attributes:
         y: (K + 1,) above the side plane, expected value [m].

@@ -1,4 +1,4 @@
-"""Where a camera is in the gripper, from the jaws at rest.
+"""The pose of a camera in the gripper, from the jaws at rest.
 
 The jaws stand still, open and unloaded: their key points lie where the jaw file says, on either side of the middle of
 the gripper by the same half opening. That is a target of known shape but for one number.

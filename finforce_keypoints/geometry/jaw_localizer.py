@@ -152,7 +152,7 @@ class JawLocalizer:
 
     @property
     def place(self) -> float:
-        """Where the jaw's origin is on the closing axis [m]; NaN when it is lost."""
+        """The position of the jaw's origin on the closing axis [m]; NaN when it is lost."""
         return self._track.place
 
     @property

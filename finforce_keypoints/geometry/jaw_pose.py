@@ -1,4 +1,4 @@
-"""Where a jaw stands on the closing axis: from the rays to its rigid points, what surrounds one of them, and over time.
+"""The position of a jaw on the closing axis: by the rays to its rigid points, the patch around one, and over time.
 
 A network places the reference point a little differently in every light and before every background, and all key points
 of the jaw would share the error. What surrounds the point is rigid and does not change: registered image by
@@ -345,7 +345,7 @@ class OriginTrack:
 
     @property
     def place(self) -> float:
-        """Where the jaw's origin is on the closing axis [m]; NaN when it is lost."""
+        """The position of the jaw's origin on the closing axis [m]; NaN when it is lost."""
         return float("nan") if self.is_lost else float(self._state[0])
 
     @property

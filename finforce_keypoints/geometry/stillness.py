@@ -40,7 +40,7 @@ _RIDGE = 1e-3  # keeps a picture without any contrast regular
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class JawSpots:
-    """Where one jaw is watched, and how its key points move in the picture.
+    """The watched region of one jaw, and the motion of its key points in the picture.
 
     Attributes:
         places: (3, n, s, s) of red, green and blue of the patches in the flat picture.
