@@ -267,7 +267,7 @@ class RgbdFeed:
 
     @property
     def rhythm(self) -> str:
-        """The period of the stamps of colour images, and whether they come in bursts, as those of arrivals do."""
+        """How far apart the stamps of colour images are, and whether they come in bursts, as those of arrivals do."""
         if len(self._stamps) <= _KNOWN:
             return "not known yet"
         gaps = np.diff(self._stamps)
@@ -367,12 +367,12 @@ class RgbdFeed:
 
     @property
     def _is_late(self) -> bool:
-        """True if most of the last depth images came later than their colour images may wait."""
+        """Whether most of the last depth images came later than their colour images may wait."""
         return bool(self._delays) and median(self._delays) > self._longest_wait
 
     @property
     def delay_of_depth(self) -> str:
-        """The effect of late depth on the images, in a sentence; empty while it comes in time."""
+        """What depth that comes too late means for the images; empty while it comes in time."""
         if not self._is_late:
             return ""
         late, wait = (f"{1e3 * SECOND * time:.0f} ms" for time in (median(self._delays), self._longest_wait))

@@ -54,7 +54,7 @@ class Pipeline:
     after them, with the newest message.
 
     Args:
-        is_shared: True if there are several nodes; they are connected by `open`, and a fault stops one of them alone.
+        is_shared: whether there are several nodes; they are connected by `open`, and a fault stops one of them alone.
     """
 
     def __init__(self, is_shared: bool = True) -> None:
@@ -145,7 +145,7 @@ class Port:
         topic: its full name.
         callback: takes messages, guarded.
         subscribe: makes the subscription to what comes from outside.
-        can_wait: True if the process goes on without it where it takes too long.
+        can_wait: whether the process goes on without it where it takes too long.
         is_contested: says whether several nodes outside publish the topic, whose messages are then dropped.
         outside: the subscription to what comes from outside; None while there is none.
     """
@@ -166,7 +166,7 @@ class Port:
 
     @property
     def is_slow(self) -> bool:
-        """True if it takes more than its budget, and others need not wait for it."""
+        """Whether it takes more than its budget, and others need not wait for it."""
         return self.can_wait and len(self._times) == WATCHED and median(self._times) > BUDGET
 
     def take(self, message: Any) -> None:
@@ -203,7 +203,7 @@ class Outlet:
         pipeline: of the process.
         topic_name: the full name of the topic.
         publisher: to the outside.
-        is_kept: True if messages are kept for listeners that come later.
+        is_kept: whether messages are kept for listeners that come later.
     """
 
     pipeline: Pipeline
@@ -228,7 +228,7 @@ class Stage:
     Attributes:
         node: whose ends these are.
         pipeline: of its process.
-        fault: reason why this node stopped while others of its process go on; empty while it works.
+        fault: what has stopped this node while others of its process go on; empty while it works.
 
     Args:
         node: whose ends these are.
