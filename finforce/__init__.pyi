@@ -7,7 +7,7 @@ from finforce_contact.mesh.object_mesh import load_object_mesh as load_object_me
 from finforce_driver.can import build_bus as build_bus
 from finforce_driver.gripper import Gripper as Gripper
 from finforce_eval.calibration.weighing import calibrate_with_scale as calibrate_with_scale
-from finforce_eval.evaluate import evaluate as evaluate
+from finforce_eval.evaluation.batch import evaluate as evaluate
 from finforce_eval.recordings.objects import find_mesh as find_mesh
 from finforce_eval.recordings.objects import iter_frames as iter_frames
 from finforce_eval.recordings.recording import DEMO as DEMO

@@ -1,4 +1,4 @@
-"""Where what was built once is kept."""
+"""The cache of what is built once."""
 
 from __future__ import annotations
 

@@ -118,7 +118,7 @@ class CameraIntrinsics:
 
 @dataclass(frozen=True, kw_only=True)
 class ImageLayout:
-    """How the bytes of an image lie: rows, columns, bytes per row (0: no padding) and byte order."""
+    """The layout of the bytes of an image: rows, columns, bytes per row (0: no padding) and byte order."""
 
     height: int
     width: int
@@ -174,7 +174,7 @@ def decode_depth(
     Args:
         data: the image (h, w), or its bytes together with their layout.
         encoding: 16UC1 (or mono16), in steps of `scale`, 0 where invalid; or 32FC1, in metres.
-        layout: how the bytes lie.
+        layout: layout of the bytes.
         scale: one step of a 16-bit image [m].
 
     Returns:
@@ -281,7 +281,7 @@ def decode_color(data: NDArray | bytes, encoding: str, layout: ImageLayout | Non
     Args:
         data: the image (h, w, channels), (h, w) with one channel, or its bytes together with their layout.
         encoding: one of `COLOR_ENCODINGS`, as in sensor_msgs/Image; 8UC3 is taken for bgr8, as OpenCV has it.
-        layout: how the bytes lie.
+        layout: layout of the bytes.
 
     Returns:
         (h, w, 3) uint8, contiguous; a view of the data where nothing has to move.

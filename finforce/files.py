@@ -17,10 +17,12 @@ import yaml
 
 from finforce.errors import FinforceError, one_line
 
-# Bytes of a file, of one of YAML; levels of nesting; values, those that references stand for counted as often; digits.
-LARGEST, LARGEST_YAML = 16 << 20, 1 << 19
+LARGEST = 16 << 20  # [bytes], of a file
+LARGEST_YAML = 1 << 19  # [bytes], of a YAML file
 _MOST_BUDGET = 10_000.0
-DEEPEST, MOST_VALUES, MOST_DIGITS = 50, 50_000, 400
+DEEPEST = 50  # levels of nesting
+MOST_VALUES = 50_000  # values, those behind references counted each time
+MOST_DIGITS = 400  # digits of a number
 BUDGET = "FINFORCE_BUDGET"  # of the environment: a factor on what files may cost
 _POINTER = b"version https://git-lfs.github.com/spec/"
 _OPEN = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
@@ -108,7 +110,7 @@ def read_yaml(path: str | Path, *, text_keys: bool = True) -> Any:
 
     Args:
         path: of the file.
-        text_keys: whether keys that are no texts are refused.
+        text_keys: True if keys that are no texts are refused.
 
     Raises:
         FileError: it cannot be read, is no YAML, or is out of bounds; a key stands twice, or is no text.
@@ -145,7 +147,7 @@ class _BoundedLoader(yaml.SafeLoader):
     """The safe loader, which counts what it builds and refuses a key that stands twice.
 
     Attributes:
-        text_keys: whether keys have to be texts.
+        text_keys: True if keys have to be texts.
     """
 
     text_keys = True

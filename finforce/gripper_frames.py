@@ -1,4 +1,4 @@
-"""Where a wrist camera sits and how the jaws slide before it.
+"""Frames of the gripper: the wrist camera, and the jaws that slide in front of it.
 
 The gripper base has x along the closing axis, from the left to the right jaw, and z along the approach direction.
 """
@@ -38,7 +38,7 @@ def jaw_in_camera(T_gripper_camera: NDArray, side: str, origin_x: float, turn: A
 
 @dataclass(frozen=True, kw_only=True)
 class OpeningRange:
-    """How far from the middle of the gripper a jaw's origin can be along the closing axis [m]."""
+    """The range of a jaw's origin along the closing axis, from the middle of the gripper [m]."""
 
     nearest: float = 0.010
     farthest: float = 0.070

@@ -1,4 +1,4 @@
-"""How a node is doing: which images it answers, rates, latencies, rejections, and the level that follows."""
+"""The health of a node: images answered, rates, latencies, rejections, and the level that follows."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ class Idling:
 
     @property
     def is_idle(self) -> bool:
-        """Whether nothing happened in the last image that was answered."""
+        """True if nothing happened in the last image that was answered."""
         return self._answered is not None
 
     def passes(self, stamp: int) -> bool:
@@ -116,7 +116,7 @@ class Level(IntEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """What became of one message: its level, one word to count it by, one sentence."""
+    """The outcome of one message: its level, one word to count it by, one sentence."""
 
     level: Level
     reason: str
@@ -146,7 +146,7 @@ class Health:
 
     Attributes:
         source: the topic that drives the node.
-        times: what latency and age of a message are called.
+        times: names of the latency and of the age of a message.
 
     Args:
         source: the same, as far as it is known at the start.

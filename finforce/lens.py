@@ -7,7 +7,8 @@ from numba import njit
 
 _OPTIONS = {"cache": True, "error_model": "numpy", "nogil": True}
 POLYNOMIAL, FISHEYE = 1.0, 2.0  # kinds of lenses in addition to the pinhole, the fifth number of a lens
-STEPS, TOLERANCE = 50, 1e-10  # of the iterations that invert a distortion; of a ray with z = 1
+STEPS = 50  # iterations that invert a distortion, at most
+TOLERANCE = 1e-10  # [-], their last change, of a ray with z = 1
 
 
 @njit(**_OPTIONS)

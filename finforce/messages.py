@@ -482,7 +482,7 @@ def color_from_message(message: Any) -> NDArray[np.uint8]:
 
 
 class CameraStream:
-    """What one camera sends: messages of one frame, that which is named, else that of the first message.
+    """The messages of one camera: those of one frame, the named one, else that of the first message.
 
     Attributes:
         frame: of the camera, empty while it is not known.

@@ -6,13 +6,14 @@ from types import ModuleType
 from finforce.errors import MissingDependencyError
 
 
-def import_library(name: str, purpose: str, package: str = "") -> ModuleType:
+def import_library(name: str, purpose: str, package: str = "", title: str = "") -> ModuleType:
     """Return a library.
 
     Args:
         name: of the module.
-        purpose: what needs it, for the message.
-        package: what `pip install` calls it; empty: the module's name.
+        purpose: its user, for the message.
+        package: its name for `pip install`; empty: the module's name.
+        title: its name in the message; empty: the module's name.
 
     Raises:
         MissingDependencyError: it is not installed.
@@ -20,7 +21,13 @@ def import_library(name: str, purpose: str, package: str = "") -> ModuleType:
     try:
         return import_module(name)
     except ImportError as error:
-        raise MissingDependencyError(f"{purpose} needs {name}: pip install {package or name} ({error})") from error
+        advice = f"{purpose} needs {title or name}: pip install {package or name} ({error})"
+        raise MissingDependencyError(advice) from error
+
+
+def import_ros(name: str, purpose: str) -> ModuleType:
+    """Return a module of finforce that needs ROS 2; raises MissingDependencyError where that is not installed."""
+    return import_library(name, purpose, "'finforce[ros]'", "ROS 2")
 
 
 def import_manifold3d() -> ModuleType:

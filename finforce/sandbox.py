@@ -17,7 +17,8 @@ from typing import Any, TypeVar
 from finforce.errors import FinforceError, one_line
 from finforce.files import BUDGET, raise_budget
 
-MEMORY, SECONDS = 1 << 30, 20
+MEMORY = 1 << 30  # [bytes]
+SECONDS = 20  # [s] of computing
 WAITS = 5  # how much longer than it computes a process may take, on a machine with other work
 _CHILD = "from finforce.sandbox import _serve; _serve()"
 

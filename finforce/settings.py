@@ -27,7 +27,7 @@ def setting(
 
     Args:
         default: the default value; without one the field has to be given.
-        description: what it means, for `ros2 param describe` and error messages.
+        description: its meaning, for `ros2 param describe` and error messages.
         unit: of value and bounds.
         low: least value.
         high: largest value.
@@ -40,7 +40,7 @@ def setting(
 
 @dataclass(frozen=True, kw_only=True)
 class TimeParameters:
-    """What every node that answers images is told about time and frames; units stand in the metadata."""
+    """Parameters of time and frames of every node that answers images; units stand in the metadata."""
 
     max_age: float = setting(0.2, "Maximum age of data when a result is published", "s", 0.001, 60.0, settable=True)
     diagnostics_period: float = setting(1.0, "Period of the diagnostics", "s", 0.05, 60.0)
@@ -92,7 +92,7 @@ def bounds_of(entry: Field) -> tuple[float, float] | None:
 
 
 def _may_be_nan(entry: Field) -> bool:
-    """Whether a field's default is NaN, which a range would refuse."""
+    """Return True if a field's default is NaN, which a range would refuse."""
     return entry.default != entry.default
 
 

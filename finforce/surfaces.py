@@ -29,7 +29,8 @@ LARGEST = 1 << 30  # bytes, more than any format needs for millions of triangles
 # What these formats take goes with the size of the file.
 _PLAIN = (".stl", ".obj", ".ply", ".off")
 _STL = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])  # after 80 bytes and a number
-_MEMORY, _SECONDS = 2 << 30, 60
+_MEMORY = 2 << 30  # [bytes]
+_SECONDS = 60  # [s]
 
 
 def read_surface(path: Path) -> tuple[NDArray, NDArray]:

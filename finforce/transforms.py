@@ -20,7 +20,7 @@ def check_pose(T: ArrayLike, what: str = "pose") -> NDArray:
 
     Args:
         T: matrix [[R, t], [0, 1]] (4, 4), t in [m].
-        what: what the pose is called in the message.
+        what: name of the pose in the message.
 
     Returns:
         A copy of the pose, its R the nearest rotation.

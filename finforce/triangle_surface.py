@@ -37,7 +37,7 @@ class EdgeTable:
 
     @cached_property
     def uses(self) -> NDArray:
-        """How many triangles meet at each edge (e,): two wherever the surface is closed."""
+        """The number of triangles at each edge (e,): two wherever the surface is closed."""
         return np.bincount(self.of_triangles.ravel(), minlength=len(self.ends))
 
     @cached_property
@@ -48,7 +48,7 @@ class EdgeTable:
 
     @cached_property
     def surplus(self) -> NDArray:
-        """How often (e,) triangles run along each edge, less how often against it."""
+        """The number (e,) of triangles that run along each edge, less those that run against it."""
         return self.sum_along(np.ones(len(self.of_triangles)))
 
     @cached_property
@@ -69,7 +69,7 @@ class Surface:
     Attributes:
         vertices: (n, 3) [m], each of a triangle.
         triangles: (m, 3) indices, counterclockwise as seen from outside.
-        notes: what was done to it, a sentence each.
+        notes: changes made to it, a sentence each.
     """
 
     vertices: NDArray

@@ -1,4 +1,4 @@
-"""What an object shows to one jaw, image after image: poses in; outline, first touch and slip out."""
+"""The contact of an object with one jaw, image by image: poses in; outline, first touch and slip out."""
 
 from collections import Counter
 from dataclasses import dataclass
@@ -23,12 +23,12 @@ from finforce_ifea.observation import Contact, ObjectOutline
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ContactEstimate:
-    """What an object shows to a jaw in one image.
+    """The contact of an object with a jaw in one image.
 
     Attributes:
         stamp: of the image [s].
         status: "touching", "apart", "no_object", "no_pose" or "contradicted".
-        message: what to tell the user, empty when there is nothing to tell.
+        message: note for the user, or empty.
         contact: where the object touches or would touch first, as one point, with its outline in mode "estimate";
             whether it touches is what pose and mesh say. Without points when there is no object; None when nobody
             knows.
@@ -45,12 +45,12 @@ class ContactEstimate:
 
     @property
     def touching(self) -> bool:
-        """Whether the meshes of object and jaw intersect."""
+        """True if the meshes of object and jaw intersect."""
         return self.contact is not None and bool(self.contact.touching)
 
 
-# Vertices looked at, and share of them, those farthest behind the face, that no pressed object reaches.
-_JAW_SAMPLES, _BACK = 300, 1.0 / 3.0
+_JAW_SAMPLES = 300  # vertices compared
+_BACK = 1.0 / 3.0  # [-], fraction of the vertices farthest behind the face, which no pressed object reaches
 _SURROUNDED = 0.5  # share of these that lies within an object around the jaw
 # An object with its origin farther off [m] is out of reach.
 _OUT_OF_REACH = 1.0
@@ -84,7 +84,7 @@ class ContactEstimator:
 
     @property
     def needs_surface(self) -> bool:
-        """Whether the deformed surface of the jaw is looked at."""
+        """True if the deformed surface of the jaw is looked at."""
         return self._localizer is not None and self._localizer.needs_surface
 
     @property

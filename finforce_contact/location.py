@@ -1,4 +1,4 @@
-"""Where an outline would touch the undeformed inner face."""
+"""The location at which an outline would touch the undeformed inner face."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class InnerFace:
 
     @cached_property
     def front(self) -> float:
-        """Where the surface stands out most, x [m]."""
+        """The x of the surface where it stands out most [m]."""
         return float(self.line[:, 0].max())
 
 
@@ -67,11 +67,11 @@ def build_inner_face(jaw: Jaw, density: str) -> InnerFace:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ContactLocation:
-    """Where the object touches, or would touch first.
+    """The location at which the object touches, or would touch first.
 
     Attributes:
         height: on the undeformed inner surface [m].
-        touching: whether the meshes of object and jaw intersect.
+        touching: True if the meshes of object and jaw intersect.
     """
 
     height: float

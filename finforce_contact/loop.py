@@ -34,8 +34,8 @@ class ContactSource(Protocol):
     """Gives the contact of one image after the other.
 
     Attributes:
-        name: what it is, for reports.
-        estimate: what a contact estimator said last; None for a contact that was given.
+        name: its name in reports.
+        estimate: last answer of the contact estimator; None for a contact that was given.
     """
 
     name: str
@@ -109,7 +109,7 @@ class ContactLoop:
 
     @property
     def is_out_of_reach(self) -> bool:
-        """Whether the object was out of the jaw's reach in the last contact."""
+        """True if the object was out of the jaw's reach in the last contact."""
         contact = self.estimate.contact if self.estimate else None
         return contact is not None and is_out_of_reach(contact, self.estimator.jaw.inner_face_x)
 
@@ -149,7 +149,7 @@ class ContactLoop:
 
     @property
     def estimate(self) -> ContactEstimate | None:
-        """What the estimator said last."""
+        """The last answer of the estimator."""
         return self.last.estimate if self.last else None
 
     def contact_at(self, stamp: int, surface: Surface | None = None) -> Contact | None:

@@ -17,12 +17,12 @@ from finforce.messages import SECOND, stamp_of
 from finforce.ros import node as ros
 from finforce.settings import check_bounds
 from finforce.transforms import pose_numbers
+from finforce_contact.contact_session import ContactSession, detections_type
 from finforce_contact.estimator import CONTRADICTED, ContactEstimate
 from finforce_contact.loop import TimedEstimate
 from finforce_contact.mesh.object_mesh import describe_mesh
 from finforce_contact.parameters import ContactParameters, ContactSettings, TrackerSettings
 from finforce_contact.pose.source import MeshFeed, StampedPose
-from finforce_contact.session import ContactSession, detections_type
 from finforce_contact.slip import Slip
 from finforce_ifea.messages import columns_from_contact, columns_from_outline
 
@@ -32,9 +32,9 @@ class _ContactOutputs:
 
     Args:
         stage: makes publishers and watches them.
-        parameters: which jaws, and whether the object's poses are found here.
+        parameters: jaws, and source of the object's poses.
         session: knows the camera's stream and the jaws.
-        skips: whether what nobody subscribes to is left out.
+        skips: True if outputs without subscribers are left out.
     """
 
     def __init__(self, stage: ros.Stage, parameters: ContactParameters, session: ContactSession, skips: Skips) -> None:

@@ -10,6 +10,7 @@ from finforce.camera_topics import AUTO, DEPTH_TOPIC, INFO_TOPIC, TRANSPORTS, re
 from finforce.errors import PoseError
 from finforce.settings import Bounded, TimeParameters, setting
 from finforce_ifea.errors import ContactError
+from finforce_ifea.settings import MESHES
 
 if TYPE_CHECKING:
     from finforce_contact.reconstruction.evidence import GeneratedMesh
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
 
 
 MODES = ("estimate", "paper", "closest")
-MESHES = ("coarse", "default", "fine")
 # How many times the middle of the mesh's bounding box, in the mesh's axes, is taken off a pose: some trackers tell that
 # of the middle, and isaac_ros_foundationpose up to release 4.4 adds the middle where it ought to be taken off.
 ORIGINS = {"mesh": 0.0, "middle": 1.0, "added": 2.0}
@@ -123,7 +123,7 @@ class ContactParameters(TimeParameters):
 
     @property
     def tracks(self) -> bool:
-        """Whether the object's pose is found here, from depth images."""
+        """True if the object's pose is found here, from depth images."""
         return self.pose_source == "tracker"
 
 

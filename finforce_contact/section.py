@@ -17,8 +17,8 @@ _OPTIONS = {"cache": True, "error_model": "numpy"}
 # A wall whose far side lies no deeper than this in the jaw is still taken for what the jaw touches [m].
 _THROUGH = 2e-3
 _MOST_CROSSINGS = 64
-# A turn out of the finger's plane [rad] and a shift along its width [m] that need a new outline.
-_RECUT_ANGLE, _RECUT_SHIFT = 0.0175, 1e-3
+_RECUT_ANGLE = 0.0175  # [rad], turn out of the finger's plane that needs a new outline
+_RECUT_SHIFT = 1e-3  # [m], shift along the width that needs a new outline
 
 
 def edges_of(polygons: tuple[NDArray, ...]) -> NDArray:
@@ -142,13 +142,13 @@ class _Slab:
 
     @cached_property
     def side(self) -> NDArray:
-        """Where the vertices (n,) lie: -1 below the slab, 0 in it, 1 above."""
+        """The side (n,) on which vertices lie: -1 below the slab, 0 in it, 1 above."""
         y = self.points[:, 1]
         return (y >= self.half_width).astype(np.int8) - (y < -self.half_width)
 
     @cached_property
     def facing(self) -> NDArray:
-        """Where the triangles (m,) turn from x to z, seen along y; their outside then is on the side of -y."""
+        """The triangles (m,) that turn from x to z, seen along y; their outside then is on the side of -y."""
         x, z = self.points[:, 0][self.mesh.triangles].T, self.points[:, 2][self.mesh.triangles].T
         return (x[1] - x[0]) * (z[2] - z[0]) > (x[2] - x[0]) * (z[1] - z[0])
 

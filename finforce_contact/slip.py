@@ -1,4 +1,4 @@
-"""Whether a held object slides over a jaw, by its poses.
+"""Slip of a held object over a jaw, by its poses.
 
 Where jaw and object begin to touch, one point of the object is remembered. Its motion along the face, in the jaw frame,
 is slip; its speed is the slope of the last samples. The object slides once its distance from where it rested exceeds
@@ -14,12 +14,16 @@ from numpy.typing import NDArray
 
 from finforce_contact.parameters import ContactSettings
 
-# The cumulative sum: what is chance of one sample, the most that one may count for, and where it becomes an alarm.
-_CHANCE, _MOST, _ALARM = 1.0, 3.0, 4.5
-# Samples over which the place of rest is averaged, time over which a speed is fitted [s], and fewest samples of it.
-_REST_SAMPLES, _WINDOW, _FEWEST = 45.0, 0.2, 3
-# Noise is learnt over so many samples; what is expected of it counts for some; before it is learnt, nothing slides.
-_SLIP_MEMORY, _SLIP_PRIOR, _TOO_FEW = 60.0, 1.0, 16.0
+# CUSUM test for slip, in units of the sample's standard deviation.
+_CHANCE = 1.0  # [sigma], allowance of each sample
+_MOST = 3.0  # [sigma], largest contribution of one sample
+_ALARM = 4.5  # [sigma], threshold of the sum
+_REST_SAMPLES = 45.0  # samples over which the position of rest is averaged
+_WINDOW = 0.2  # [s], over which a speed is fitted
+_FEWEST = 3  # least samples of a speed
+_SLIP_MEMORY = 60.0  # samples over which noise is learnt
+_SLIP_PRIOR = 1.0  # samples that the expected noise counts for
+_TOO_FEW = 16.0  # samples before which no slip is reported
 # Slow samples in a row, after which an object that slid has come to rest.
 _RESTING = 6
 # A jaw closes or opens where the object moves along x faster than this [m/s] and than along the face: what slides there
@@ -35,13 +39,13 @@ _LONGEST_GAP = 0.5
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Slip:
-    """How an object moves over a jaw.
+    """The motion of an object over a jaw.
 
     Attributes:
         stamp: of the newest pose [s].
         velocity: of the object over the jaw, along the undeformed face where they touch (3,) [m/s], jaw frame.
         stddev: of its tangential parts [m/s].
-        sliding: whether a held object slides beyond chance.
+        sliding: True if a held object slides beyond chance.
     """
 
     stamp: float
@@ -110,7 +114,7 @@ class SlipWatch:
             T: T_jaw_object (4, 4), as measured.
             face: at the followed height.
             closing: speed of the object along x, filtered [m/s].
-            odd: whether the pose is not that of an object that goes on as it did.
+            odd: True if the pose is not that of an object that goes on as it did.
         """
         if odd and not self._samples:
             return self.slip

@@ -1,4 +1,4 @@
-"""What can be wrong with a gripper, its link and what is asked of it."""
+"""Errors of a gripper, its link and its commands."""
 
 from finforce.errors import FinforceError
 

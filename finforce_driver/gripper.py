@@ -27,7 +27,8 @@ from finforce_driver.settings import GripperSettings
 from finforce_driver.state import GripperState
 
 LOG = logging.getLogger(__name__)
-FIRST_PAUSE, LONGEST_PAUSE = 0.5, 5.0  # [s] between two tries to open the bus
+FIRST_PAUSE = 0.5  # [s], between the first two attempts to open the bus
+LONGEST_PAUSE = 5.0  # [s], between later ones
 SHORTEST_WAIT = 1e-4  # [s], so that a rounding error of the clock makes no endless loop
 LATE_MESSAGES = 64  # that are taken at most between two requests, however many come
 LEAVING_TURNS = 20  # that the last order may take
@@ -50,11 +51,11 @@ class Clock:
 
 
 class StateSource:
-    """What has a state that others listen to and wait for.
+    """A source of states that others listen to and wait for.
 
     Attributes:
         state: the present one; reading it never blocks.
-        clock: what it lives by.
+        clock: its time.
     """
 
     state: GripperState

@@ -18,7 +18,8 @@ from finforce_driver.settings import GripperSettings, JointSettings, check_numbe
 from finforce_driver.state import ABSENT, GripperState, MoveOutcome, Phase, describe
 
 NEAR = 1.5  # steps within which the target is reached
-STILL, STALL = 1e-3, 0.4  # [m/s], and [s] without motion after which the jaws are stalled
+STILL = 1e-3  # [m/s], below which the jaws do not move
+STALL = 0.4  # [s] without motion, after which the jaws are stalled
 SILENCE = 0.5  # [s] without a state after which the joint counts as disconnected
 EXTRA_TIME = 2.0  # [s] beyond the travel's own time
 TURN = 0.005  # [s] between two looks of one who waits
@@ -42,7 +43,7 @@ class _Ramp:
 
     @property
     def arrives(self) -> float:
-        """When the setpoint is at the target [s]."""
+        """The time at which the setpoint is at the target [s]."""
         return self.begun + abs(self.target - self.start) / self.speed
 
 
@@ -54,7 +55,7 @@ class JointGripper(StateSource):
             at once.
         settings: stroke, offset and default speed.
         joint: relates the joint's value to the opening.
-        clock: what it lives by; the machine's own where none is given.
+        clock: its time; the machine's own where none is given.
 
     Attributes:
         settings: the same.

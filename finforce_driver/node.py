@@ -21,13 +21,7 @@ from finforce.messages import stamp_of
 from finforce.optional import import_library
 from finforce.ros import node as ros
 from finforce_driver.can import build_bus
-from finforce_driver.errors import GraspError, TargetError
-from finforce_driver.grasp.controller import check_force_value
-from finforce_driver.grasp.load_watch import ForceSample
-from finforce_driver.grasp.session import GraspSession
-from finforce_driver.gripper import Gripper
-from finforce_driver.joint import JointGripper, SendCommand
-from finforce_driver.messages import (
+from finforce_driver.conversions import (
     GripperHealth,
     MessageTimes,
     fill_gripper_command,
@@ -41,9 +35,15 @@ from finforce_driver.messages import (
     outcome_of_grasp,
     outcome_of_state,
 )
+from finforce_driver.errors import GraspError, TargetError
+from finforce_driver.grasp.controller import check_force_value
+from finforce_driver.grasp.load_watch import ForceSample
+from finforce_driver.grasp.session import GraspSession
+from finforce_driver.gripper import Gripper
+from finforce_driver.joint import JointGripper, SendCommand
+from finforce_driver.services import GripperTasks, MoveAction
 from finforce_driver.settings import DriverParameters, GraspGoal, GraspSettings, GripperSettings, JointSettings
 from finforce_driver.state import GripperState, describe_record
-from finforce_driver.tasks import GripperTasks, MoveAction
 
 JAWS = ("left", "right")
 LINKS = ("joint_command", "parallel_gripper_command", "gripper_command")  # of other grippers

@@ -1,4 +1,4 @@
-"""What can be set on a gripper, its grasps and its driver node; SI units into the gripper's bytes and back."""
+"""Settings of a gripper, its grasps and its driver node; SI units into the gripper's bytes and back."""
 
 from __future__ import annotations
 
@@ -171,7 +171,7 @@ class GripperSettings(_Bounded):
 
 @dataclass(frozen=True, kw_only=True)
 class JointSettings(_Bounded):
-    """How a joint's value goes with the opening, and how it follows its commands; units stand in the metadata.
+    """The relation of a joint's value to the opening and to its commands; units stand in the metadata.
 
     The opening is linear between the two ends: `gripper.closed_opening` at `closed`, that and `gripper.stroke` at
     `open`.

@@ -1,4 +1,4 @@
-"""What is asked of a gripper and what is known of it and its grasp at one instant, in SI units and in a sentence."""
+"""Commands to a gripper, and its state and that of its grasp at one instant, in SI units and in a sentence."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def _describe(value: Any, how: Mapping[str, Any]) -> str:
 
 
 class Phase(Enum):
-    """Where the driver is with its gripper."""
+    """The phase of the driver."""
 
     DISCONNECTED = "disconnected"  # no port, or nothing answers for long
     PROBING = "probing"  # the port is open, no reply yet
@@ -52,7 +52,7 @@ ABSENT = (Phase.DISCONNECTED, Phase.PROBING)  # nothing has answered
 
 
 class MoveOutcome(Enum):
-    """What became of the last move."""
+    """The outcome of the last move."""
 
     NONE = "none"  # none yet, or still under way
     REACHED = "reached"
@@ -77,7 +77,7 @@ class GripperState:
         force: grip force by the maker's curve [N], positive when it drives closed.
         target: opening that the gripper was told to go to [m]; NaN without one.
         contact: "", "closing" or "opening": what the motor pushes against.
-        at_target: whether the gripper says so.
+        at_target: True if the gripper says so.
         calibrated: the gripper knows its end stops.
         activated: its power stage may move it, and does not sleep since a fault or a calibration.
         faults: names of what is latched, in the gripper's order.
@@ -129,7 +129,7 @@ class MoveRequest:
 
 
 class GraspPhase(Enum):
-    """Where a grasp is."""
+    """The phase of a grasp."""
 
     APPROACH = "approach"  # nothing presses yet
     LOADING = "loading"  # on the way to the set force
@@ -157,7 +157,7 @@ class GraspStatus:
         resolution: change of the force with one step of the gripper [N].
         target: opening that the jaws were told to go to [m]; NaN before the first move.
         stddev: of the newest force, as its source states it [N].
-        failure: how it failed; None: it did not, it was ended by a command, or something has been commanded since.
+        failure: kind of failure; None: it did not fail, was ended by a command, or something has been commanded since.
         rejected: forces and touches that were not used, by reason.
     """
 
@@ -180,12 +180,12 @@ class GraspStatus:
 
     @property
     def failed(self) -> bool:
-        """Whether it failed."""
+        """True if it failed."""
         return self.failure is not None
 
     @property
     def unseen(self) -> bool:
-        """Whether it failed because the motor pressed much harder than the camera said."""
+        """True if it failed because the motor pressed much harder than the camera said."""
         return self.failed and issubclass(self.failure, UnseenForceError)
 
 

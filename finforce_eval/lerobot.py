@@ -101,7 +101,7 @@ class ForceProcessorStep(_processor.ObservationProcessorStep):
 
     @property
     def status(self) -> str:
-        """What keeps the last image from having a grasp force, "ok" where nothing does, "" before the first."""
+        """The reason why the last image has no grasp force, "ok" where it has one, "" before the first."""
         return self._input.last.status if self._input.last else ""
 
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:

@@ -129,7 +129,7 @@ class ForceInput:
 
     Args:
         sensor: of the gripper.
-        forces: what a row holds.
+        forces: groups of columns of a row.
         fps: images per second, as the dataset has them.
     """
 

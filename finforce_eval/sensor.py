@@ -78,7 +78,7 @@ class ForceSensor:
         sides: jaws in the images.
         detector: parameters of the detector that differ from the defaults, by the names that `--detector` takes.
         settings: settings of the estimator, or only those that differ from the defaults, by name.
-        is_video: whether the images come from a video, where a scene at rest may repeat itself bit by bit.
+        is_video: True if the images come from a video, where a scene at rest may repeat itself bit by bit.
 
     Raises:
         FinforceError: one of these cannot be used.

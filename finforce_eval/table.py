@@ -148,7 +148,7 @@ class ForceSeries:
 
     @property
     def side(self) -> str:
-        """Which jaw it is, "left" or "right"."""
+        """The side of the jaw, "left" or "right"."""
         return str(self.table["side"].iloc[0] if len(self) else self.table.attrs["side"])
 
     @property
@@ -230,7 +230,7 @@ def write_table(path: Path, series: Sequence[ForceSeries], about: Mapping[str, A
     Args:
         path: of the file.
         series: of the jaws.
-        about: what JSON can hold: what was run, and on what; in the metadata of the file.
+        about: settings and machine of the run, as JSON in the metadata of the file.
 
     Raises:
         OSError: it cannot be written.

@@ -33,7 +33,7 @@ class Task:
         name: of the recording, of its own among the tasks.
         key: hash of all that the outcome depends on.
         work: a function of a module, which another process can import; returns figures.
-        given: what `work` is called with.
+        given: arguments of `work`.
         output: file or folder that is there once it is done; "" without one.
         files: that it reads, of which a worker of a cluster must see the first ones as they are here.
     """
@@ -76,7 +76,7 @@ class Task:
 
 @dataclass(frozen=True, kw_only=True)
 class EngineOptions:
-    """Where tasks are carried out; raises OptionError where that cannot be.
+    """The workers that carry out tasks; raises OptionError for settings out of bounds.
 
     Attributes:
         workers: processes on this machine; 1: this one, 0: one for each processor.
@@ -168,7 +168,7 @@ def run_tasks(tasks: Sequence[Task], options: EngineOptions, manifest: Manifest,
         tasks: with names of their own.
         options: where.
         manifest: where lines are kept; what it holds as done with the same key is not done again.
-        unit: what a task is, for the bar.
+        unit: noun for a task, for the bar.
 
     Raises:
         MissingDependencyError: a cluster is asked for, and Dask is not installed.

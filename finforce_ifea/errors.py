@@ -1,4 +1,4 @@
-"""What can be wrong with jaws, key points and contacts; what is not raised on purpose is a defect."""
+"""Errors of jaws, key points and contacts; anything else that is raised is a defect."""
 
 from finforce.errors import FinforceError, MissingDependencyError  # noqa: F401 - the base of those here
 

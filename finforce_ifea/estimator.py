@@ -56,8 +56,6 @@ _UNTARED = "no tare: the jaw was loaded from the start; key point offsets are un
 _UNCALIBRATED = 0.1
 # Relative error of forces at the distance from stored shapes that those are good for.
 _EXTRAPOLATED = 0.015
-# Relative error of a jaw that is taken to be linear, 10 mm deep.
-_LINEAR = 0.05
 # Share of a force that was found but not told by which it may be off.
 _UNTOLD = 0.5
 # Fingers and settings for which this process has compiled everything.
@@ -68,7 +66,7 @@ class ForceEstimator:
     """Estimates the force on one jaw; deterministic, one thread.
 
     Attributes:
-        is_idle: whether the jaw was at rest in the last image, its object out of reach.
+        is_idle: True if the jaw was at rest in the last image, its object out of reach.
     """
 
     def __init__(
@@ -105,10 +103,8 @@ class ForceEstimator:
         self._gate = KeypointGate(self.jaw, self.settings)
         terms = calibration.relaxation if calibration else ()
         self._relaxation, self._untold = Relaxation(terms), Relaxation(terms)
-        solver = self.settings.solver
-        known = calibration.expect_error(self.jaw, solver) if calibration else _UNCALIBRATED
         self._modulus_error = 0.0 if calibration else self.jaw.material.spread
-        self._force_error = float(np.hypot(known, _LINEAR)) if solver == "linear" else known
+        self._force_error = calibration.expect_error(self.jaw, self.settings.solver) if calibration else _UNCALIBRATED
         self._taring = TareKeeper(
             self.jaw.keypoints, self.settings, lambda *chance: self._tracker.significance(*chance)
         )
@@ -172,7 +168,7 @@ class ForceEstimator:
 
     @property
     def tared(self) -> bool:
-        """Whether the key points' offsets are known."""
+        """True if the key points' offsets are known."""
         return self._taring.tared
 
     @property

@@ -18,7 +18,7 @@ R_GRIPPER_JAW = {side: jaw_in_gripper(side, 0.0)[:3, :3] for side in SIDES}
 
 
 class Wrench(NamedTuple):
-    """What the object does to a jaw: force (3,) [N] and torque (3,) [N m] about the jaw's origin, in the jaw frame."""
+    """The object's load on a jaw: force (3,) [N] and torque (3,) [N m] about the jaw's origin, in the jaw frame."""
 
     force: NDArray[np.float64]
     torque: NDArray[np.float64]
@@ -26,7 +26,7 @@ class Wrench(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Grasp:
-    """What the object does to the gripper; all in `gripper_base`.
+    """The load of the object on the gripper; all in `gripper_base`.
 
     Attributes:
         grasp: (3,) [N], along x: how hard the object is held.
@@ -68,7 +68,7 @@ def single_jaw_grasp(wrench: Wrench, side: Side) -> Grasp:
 
 
 class JawDistance:
-    """How far the jaws' origins are from each other, by their poses in the camera's frame."""
+    """The distance between the jaws' origins, by their poses in the camera's frame."""
 
     def __init__(self, max_age: float) -> None:
         """Keep the greatest distance in time of a pose from what it is used for [s]."""

@@ -73,7 +73,7 @@ class CalibrationFit:
         radii: radius of curvature of each recording's object [m], None where its outline was known.
         force_rms: root mean square force residual over the steady loads [N].
         shape_rms: root mean square key point residual [m].
-        plateaus: how many steady loads were used.
+        plateaus: number of steady loads used.
     """
 
     calibration: Calibration

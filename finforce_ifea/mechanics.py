@@ -22,7 +22,6 @@ from finforce_ifea.jaw.jaw_file import Material
 from finforce_ifea.jaw.mesh import VolumeMesh, shape_gradients, to_tet4, to_tet10
 from finforce_ifea.settings import EstimatorSettings
 
-_REDUCED = ("reduced", "linear")
 # Compliances (2, 3) of the solid finger and of its section in plane strain, by shape, Poisson's ratio and size of
 # elements.
 _COMPLIANCES: dict[tuple, NDArray] = {}
@@ -35,7 +34,7 @@ def build_mechanics(jaw: Jaw, settings: EstimatorSettings) -> Mechanics:
         JawFileError: The jaw cannot be described by that model.
         MeshError: The mesh cannot be built.
     """
-    if settings.solver in _REDUCED:
+    if settings.solver == "reduced":
         return _reduce(jaw, settings)
     name = jaw.model if settings.solver == "default" else settings.solver
     density = settings.mesh if jaw.mesh_file is None else None
@@ -131,7 +130,7 @@ def build_chosen(jaw: Jaw, settings: EstimatorSettings) -> Mechanics:
 
 def choose_full(settings: EstimatorSettings) -> EstimatorSettings:
     """Return settings with the full mechanics behind the solver that they name."""
-    return replace(settings, solver="default") if settings.solver in _REDUCED else settings
+    return replace(settings, solver="default") if settings.solver == "reduced" else settings
 
 
 def _reduce(jaw: Jaw, settings: EstimatorSettings) -> Mechanics:
@@ -139,11 +138,8 @@ def _reduce(jaw: Jaw, settings: EstimatorSettings) -> Mechanics:
     from finforce_ifea.reduced.cache import reduce_mechanics
 
     if settings.force_axes != "normal":
-        raise JawFileError(
-            f"solver {settings.solver} supports only forces in the jaw's plane; expected force_axes normal"
-        )
-    full = build_mechanics(jaw, choose_full(settings))
-    return reduce_mechanics(full, jaw, linear=settings.solver == "linear")
+        raise JawFileError("solver reduced supports only forces in the jaw's plane; expected force_axes normal")
+    return reduce_mechanics(build_mechanics(jaw, choose_full(settings)), jaw)
 
 
 # At this Poisson's ratio 10-node tetrahedra do not lock; the stiffness of bands at others follows from plane strain.

@@ -53,7 +53,7 @@ def contact_from_cloud(cloud: Any, frame: str, *, free: bool) -> Contact:
     Args:
         cloud: points on the undeformed inner surface, in the jaw frame.
         frame: the jaw frame.
-        free: whether the solver may move the contact.
+        free: True if the solver may move the contact.
 
     Raises:
         ObservationError: the frame, the height, the fields or the buffer are wrong.
@@ -177,7 +177,7 @@ class ContactFeed:
     Args:
         frame: the jaw frame, in which contacts have to come.
         fixed: a contact that holds for ever, instead of messages.
-        free: whether the solver may move a contact that came by message.
+        free: True if the solver may move a contact that came by message.
         max_age: greatest distance between the stamps of contact and image [ns].
         timeout: after an image, in which its contact comes in time [s].
     """
@@ -209,7 +209,7 @@ class ContactFeed:
 
     @property
     def is_fixed(self) -> bool:
-        """Whether messages are needed at all."""
+        """True if messages are needed at all."""
         return self._fixed is not None
 
     def take(self, cloud: Any, stamp: int) -> None:

@@ -48,8 +48,8 @@ class _SolverOutputs:
 
     Args:
         stage: makes publishers and watches them.
-        parameters: which jaw, and whether the forces on the gripper are completed here.
-        skips: whether what nobody subscribes to is left out.
+        parameters: side of the jaw, and True if the forces on the gripper are completed here.
+        skips: True if outputs without subscribers are left out.
     """
 
     def __init__(self, stage: ros.Stage, parameters: NodeParameters, skips: Skips) -> None:

@@ -1,4 +1,4 @@
-"""What goes into an estimator and what comes out: key points, the contact or the object's outline, the solution."""
+"""Inputs and outputs of an estimator: key points, the contact or the object's outline, the solution."""
 
 from __future__ import annotations
 
@@ -70,8 +70,8 @@ class Contact:
     Attributes:
         points: (n, 3) [m], on the undeformed inner surface.
         weights: (n,) fractions of the force.
-        touching: whether object and jaw intersect; None if unknown.
-        free: whether the points are those of first touch, from which the solver tracks the contact.
+        touching: True if object and jaw intersect; None if unknown.
+        free: True if the points are those of first touch, from which the solver tracks the contact.
         outline: outline of the object, whose position the solver estimates together with the force. It has priority
             over the points.
     """
@@ -98,7 +98,7 @@ class Contact:
 
 
 def is_out_of_reach(contact: Contact, face_x: float) -> bool:
-    """Whether a contact's outline is in front of a surface x = face_x [m] by more than `AWAY` and its uncertainty."""
+    """Return True if a contact's outline is in front of a surface x = face_x [m] by over `AWAY` and its uncertainty."""
     outline = contact.outline
     if outline is None or contact.touching is not False:
         return False
@@ -124,7 +124,7 @@ class Solution(NamedTuple):
         kkt: scaled violation of the optimality conditions by the returned force.
         keypoints_used: (K,) bool.
         iterations: Newton iterations for this image.
-        converged: whether the last iteration changed the result by less than the tolerance.
+        converged: True if the last iteration changed the result by less than the tolerance.
     """
 
     stamp: float
@@ -146,12 +146,12 @@ class Solution(NamedTuple):
 
     @property
     def trusted(self) -> bool:
-        """Whether a wrench may be published."""
+        """True if a wrench may be published."""
         return self.status in TRUSTED
 
     @property
     def touching(self) -> bool:
-        """Whether the object touches, as far as that can be trusted."""
+        """True if the object touches, as far as that can be trusted."""
         return self.trusted and bool(is_touch(np.linalg.norm(self.force), self.magnitude_stddev))
 
 
@@ -266,7 +266,7 @@ def check_periods(stamps: Sequence[float]) -> None:
 
 @njit(cache=True)
 def _are_possible(points, likelihood):
-    """Whether no coordinate (K, 3) is infinite and all likelihoods (K,) are from 0 to 1."""
+    """Return True if no coordinate (K, 3) is infinite and all likelihoods (K,) are from 0 to 1."""
     for k in range(len(points)):
         for a in range(3):
             if np.isinf(points[k, a]):
@@ -297,7 +297,7 @@ def check_contact(contact: Contact, jaw: Jaw) -> None:
 
 @njit(cache=True)
 def _are_near(points, face):
-    """Whether points (n, 3) [m] are finite and at x of the inner face (n,) [m]."""
+    """Return True if points (n, 3) [m] are finite and at x of the inner face (n,) [m]."""
     off = 0
     for i in range(len(points)):
         off += not (np.isfinite(points[i].sum()) and abs(points[i, 0] - face[i]) <= _OFF_FACE)
@@ -306,7 +306,7 @@ def _are_near(points, face):
 
 @njit(cache=True)
 def _are_weights(weights):
-    """Whether weights (n,) are finite, none negative, and not all zero."""
+    """Return True if weights (n,) are finite, none negative, and not all zero."""
     for weight in weights:
         if not 0.0 <= weight < np.inf:
             return False
@@ -327,7 +327,7 @@ _LARGEST = 1.0
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ObjectOutline:
-    """What an object shows to a finger that bends in the x-z plane.
+    """The outline of an object in the x-z plane, in which the finger bends.
 
     Attributes:
         polygons: (n, 2) each, x and z [m] about the outline's origin; outer ones counterclockwise, holes clockwise.

@@ -22,8 +22,8 @@ from finforce_ifea.fem.model import JawModel
 
 EnergyForm = Literal["paper", "sofa"]
 UNBOUNDED = 1e30
-# Largest KKT residual of a returned solution, and the pull of a bound that is let go.
-KKT_LIMIT, _LEAST_PULL = 1e-8, 1e-12
+KKT_LIMIT = 1e-8  # [-], largest KKT residual of a returned solution
+_LEAST_PULL = 1e-12  # [-], least pull of a bound that is let go
 _SINGULAR = 1e-12
 _REFINEMENTS = 2
 
@@ -68,7 +68,7 @@ class InverseResult:
         residual: root mean square distance of active key points from their targets [m].
         kkt: largest violation of the program's optimality conditions, scaled by its largest term.
         iterations: Newton iterations.
-        converged: whether the last one changed nothing that matters.
+        converged: True if the last iteration changed nothing that matters.
         smallest_det: smallest det F of all elements [-]; at or below zero the mesh has turned inside out.
     """
 

@@ -43,7 +43,7 @@ class Relaxation:
 
     @property
     def overstress(self) -> NDArray:
-        """What the past adds to the elastic force (3,) [N]."""
+        """The overstress that remains of past forces (3,) [N]."""
         return self._over.sum(axis=0)
 
     @property

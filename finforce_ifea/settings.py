@@ -1,14 +1,15 @@
-"""What can be set on an estimator: defaults, units, bounds and meanings."""
+"""Settings of an estimator: defaults, units, bounds and meanings."""
 
 from dataclasses import dataclass, replace
 
 from finforce.errors import ObservationError
 from finforce.settings import check_bounds, setting
 
-SOLVERS = ("default", "reduced", "solid", "frame", "plane", "linear", "paper")
+SOLVERS = ("default", "reduced", "solid", "frame", "plane", "paper")
+MESHES = ("coarse", "default", "fine")
 _SOLVER_MEANING = (
     "mechanics: reduced (default), stored equilibria of the model that the jaw file recommends; solid, plane or frame, "
-    "a full model; linear, the compliance of the unloaded jaw; paper, the published setting"
+    "a full model; paper, the published setting"
 )
 
 
@@ -20,7 +21,7 @@ class EstimatorSettings:
     """
 
     solver: str = setting("default", _SOLVER_MEANING, choices=SOLVERS)
-    mesh: str = setting("default", "mesh density of a drawing", choices=("coarse", "default", "fine"))
+    mesh: str = setting("default", "mesh density of a drawing", choices=MESHES)
     likelihood_threshold: float = setting(0.6, "minimum likelihood of a used key point", "1", 0.0, 1.0)
     ignored_keypoints: str = setting("", "names of unused key points, comma-separated")
     minimum_keypoints: int = setting(3, "minimum number of used key points for a force", "1", 1, 100)
@@ -70,5 +71,5 @@ class EstimatorSettings:
 
     @property
     def may_be_held(self) -> bool:
-        """Whether only the jaws hold the object, as far as that is known."""
+        """True if only the jaws hold the object, as far as that is known."""
         return self.held in ("yes", "either")

@@ -1,4 +1,4 @@
-"""What the unloaded finger tells of its key points, constant offsets and noise, and when it is learnt."""
+"""The tare: constant offsets and noise of the key points of the unloaded finger."""
 
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -20,7 +20,7 @@ _LONGEST_TARE = 300
 
 
 class StatedNoise(NamedTuple):
-    """What a tare found of key points that came with standard deviations.
+    """The result of a tare of key points that came with standard deviations.
 
     Attributes:
         covariance: of each key point in an image in which it states `stddev` (K, 3, 3) [m^2].
@@ -154,7 +154,7 @@ class Tare:
 
     @cached_property
     def is_taken(self) -> bool:
-        """Whether any key point has an offset."""
+        """True if any key point has an offset."""
         return bool(self.counts.any())
 
     def offset_variance(self, unseen: float = OFFSET_STDDEV) -> NDArray:
@@ -272,12 +272,12 @@ class TareKeeper:
 
     @property
     def tared(self) -> bool:
-        """Whether the offsets are known."""
+        """True if the offsets are known."""
         return self.tare.is_taken
 
     @property
     def is_noisy(self) -> bool:
-        """Whether the key points of the tare were those of a camera, whose noise no two images share."""
+        """True if the key points of the tare were those of a camera, whose noise no two images share."""
         return self.tared and bool(np.trace(self.tare.noise) > 3.0 * (1.01 * _NOISE_FLOOR) ** 2)
 
     @property
@@ -370,7 +370,7 @@ class TareKeeper:
             raise UnderLoadError(f"cannot tare: the load is changing ({sigma:.1f} standard deviations)")
 
     def is_at_rest(self, points: NDArray) -> bool:
-        """Whether key points (K, 3) [m] of one frame are where the tared, unloaded jaw has them.
+        """Return True if key points (K, 3) [m] of one frame are where the tared, unloaded jaw has them.
 
         Neither the frame nor the average of the last ones may be bent, nor look loaded.
         """

@@ -38,9 +38,9 @@ def build_detector(
         jaws: side -> jaw.
         parameters: of the node.
         settings: of the geometry.
-        dots: how dots look, where they are used.
-        rests: whether pixels and depth are left out where nothing has moved.
-        watched: whether pictures that repeat themselves mean a frozen camera; a video repeats whatever stands still.
+        dots: appearance of dots, where they are used.
+        rests: True if pixels and depth are left out where nothing has moved.
+        watched: True if pictures that repeat themselves mean a frozen camera; a video repeats whatever stands still.
 
     Raises:
         PoseError: the camera's pose is none.

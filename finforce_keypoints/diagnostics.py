@@ -1,4 +1,4 @@
-"""What a key point detector says about itself: words for the diagnostics, key points drawn into a picture."""
+"""Diagnostics of a key point detector: words, and key points drawn into a picture."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ class _DetectorOutputs:
 
     Args:
         stage: makes publishers and watches them.
-        parameters: which jaws, and the names of their frames.
+        parameters: jaws, and the names of their frames.
         stream: of the camera.
         frames: by which the jaws' poses go to /tf.
         names: of the rows of the clouds; sent once, and kept for whoever comes later.
@@ -79,7 +79,7 @@ class _DetectorOutputs:
 
     @property
     def are_heard(self) -> bool:
-        """Whether anybody subscribes to what is made of images."""
+        """True if anybody subscribes to what is made of images."""
         outputs = (*self.keypoints.values(), *self.pose.values(), self.annotated)
         return any(output.get_subscription_count() for output in outputs)
 

@@ -117,7 +117,7 @@ class DetectorParameters(GripperParameters):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class JawMount:
-    """How one jaw stands in the gripper, and what its holder covers.
+    """The mounting of one jaw in the gripper, and the part that its holder covers.
 
     Attributes:
         turn: rotation vector (3,) against the gripper's axes, jaw frame [rad].
@@ -137,7 +137,7 @@ class JawMount:
 
     @property
     def is_held(self) -> bool:
-        """Whether a jaw's place is told by its tag and all points that are seen, as its reference point is covered."""
+        """True if a jaw's place is told by its tag and all points that are seen, as its reference point is covered."""
         return self.tag is not None or REFERENCE in self.covered
 
     def believe(self, likelihood: NDArray) -> NDArray:

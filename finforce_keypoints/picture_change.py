@@ -1,4 +1,4 @@
-"""How pictures would have to be changed for a rig to fit them: turned over, zoomed, shifted, turned.
+"""Changes of pictures for a rig to fit them: turned over, zoomed, shifted, turned.
 
 A zoom is another focal length, a shift another principal point, and a turn one of the camera about its axis. As in
 `placement`, the outlines say whether jaws are there, and how large; key points then say where exactly. A shift along
@@ -50,7 +50,7 @@ STEADY = 4  # pictures that tell whether all of them move
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PictureChange:
-    """How one picture was changed.
+    """The change of one picture.
 
     Attributes:
         zoom: factor on the focal length.

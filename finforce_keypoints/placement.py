@@ -111,7 +111,7 @@ class CameraPlacement:
 
 
 class OutlineContrast:
-    """What tells the outline of a jaw from its surroundings.
+    """The contrast of the outline of a jaw with its surroundings.
 
     Args:
         jaw: whose side is drawn.
@@ -471,7 +471,7 @@ class _Refinement:
 
     @property
     def likeliest(self) -> float:
-        """How likely the points are in the mean where they are likeliest."""
+        """The mean of the points' largest likelihoods."""
         return self._best[0]
 
     def _keep_best(self) -> None:

@@ -1,4 +1,4 @@
-"""Whether the ribs in pictures of open jaws are where a rig has them, or explain the pictures as well elsewhere."""
+"""The check that ribs in pictures of open jaws are where a rig has them, and match no other position as well."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def compare_rig(
         images: (h, w, 3) uint8 RGB, of open and unloaded jaws.
         camera: intrinsics.
         T_gripper_camera: (4, 4).
-        mounts: how the jaws are mounted, by side.
+        mounts: mounting of the jaws, by side.
         opening: where the jaws can be.
     """
     patterns, poses = {side: RibPattern(jaw) for side, jaw in jaws.items()}, {}
@@ -202,7 +202,7 @@ def _find_places(
 
 
 class _Fit(NamedTuple):
-    """How well a picture fits a place: its warp (2, 3), the correlation of the ribs, and the contrast of the tip."""
+    """The match of a picture with a position: its warp (2, 3), the correlation of the ribs, the contrast of the tip."""
 
     warp: NDArray
     ribs: float

@@ -50,7 +50,7 @@ class RigTag(FileModel):
 
 
 class RigJaw(FileModel):
-    """How a jaw is mounted."""
+    """The mounting of a jaw."""
 
     turn: tuple[Number, Number, Number] = Field((0.0, 0.0, 0.0), description="Rotation vector in its own frame [rad]")
     covered: tuple[Text, ...] = Field((), description="Names of key points that are never seen")

@@ -27,7 +27,8 @@ START = 1_000 * NANOSECONDS  # [ns] stamp of the first image
 TRACKING_PERIOD = 0.1  # [s]; in the first image of each the object is tracked
 POSITION_STDDEV = 0.3e-3  # [m] of a tracked pose, along each axis
 ANGLE_STDDEV = np.radians(0.3)  # about each axis
-LEAST_SIZE, LARGEST_SIZE = 16, 4096  # [px]
+LEAST_SIZE = 16  # [px]
+LARGEST_SIZE = 4096  # [px]
 WORKERS = min(os.cpu_count() or 1, 4)  # threads, of which each renders an image
 
 
@@ -56,7 +57,7 @@ class Footage:
         depth_step: of the depth images [m].
 
     Args:
-        gripper: what is rendered.
+        gripper: the gripper to render.
         photographer: that renders it.
         seed: of the object tracker's noise.
     """
@@ -117,7 +118,7 @@ def build_footage(
     """Return the footage of a scenario.
 
     Args:
-        scenario: what happens, in which light, before which camera.
+        scenario: motion, light and camera.
         seed: of textures, light and noise.
         camera: intrinsics; those of a D405 at 640 x 480 when absent.
         finger: seed of the jaws' material; what shows the same finger can share a calibration.

@@ -30,7 +30,7 @@ TWIN_DENSITY = MeshDensity(between_ribs=10, through_band=1, along_rib=10, throug
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Load:
-    """What acts on a jaw from outside; all in the jaw frame.
+    """The loads on a jaw from outside; all in the jaw frame.
 
     Attributes:
         origin: x and z of the outline's origin (2,) [m].
@@ -89,9 +89,9 @@ class PressedJaw:
 
         Args:
             jaw: the jaw, of its own side.
-            material: what this one is made of.
+            material: material of this jaw.
             density: of the mesh of a drawing.
-            lateral: whether loads along y will come; else a mesh that mirrors itself is halved.
+            lateral: True if loads along y will come; else a mesh that mirrors itself is halved.
         """
         self.jaw = jaw
         self.mesh = jaw.build_mesh(density if jaw.drawing is not None else None)
@@ -196,7 +196,7 @@ _STRONGEST = 50.0  # [N]; fingers that bend give way far below
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GraspSetting:
-    """What the jaws are told to do.
+    """The command to the jaws.
 
     Attributes:
         opening: of the jaws' origins from the middle [m].
@@ -241,7 +241,7 @@ class HeldObject:
         Args:
             jaws: by side.
             x: of the object [m].
-            guided: whether a hand holds the object.
+            guided: True if a hand holds the object.
             friction: share of a pressure that the pull may have before the object slides.
             drag: of a sliding object [N s/m]; 0: it would fall, which is an error.
         """
@@ -254,7 +254,7 @@ class HeldObject:
 
     @property
     def x(self) -> float:
-        """Where the object is on the closing axis [m]."""
+        """The position of the object on the closing axis [m]."""
         return self._balance.x
 
     def follow(self, setting: GraspSetting) -> Mapping[str, JawShape]:
@@ -393,7 +393,7 @@ class Assembly:
     """The jaws of a scenario, of a material drawn from a seed, and its object.
 
     Attributes:
-        scenario: what is put together.
+        scenario: object, jaws and motion.
         material: of the jaws.
         pressed: the jaws' mechanics and meshes, by side.
         object_mesh: in its own frame; None without an object.
@@ -404,7 +404,7 @@ class Assembly:
         """Build jaws and object.
 
         Args:
-            scenario: what is put together.
+            scenario: object, jaws and motion.
             seed: of the material; the same seed gives the same forces to the last digit.
             density: of the jaws' meshes, where they are drawings.
 
@@ -495,15 +495,15 @@ class Assembly:
         return origin
 
 
-# Printed parts are stiffer than the data sheet says; two parts of one print differ less than two prints.
-_STIFFER, _PART_STDDEV = (1.1, 1.4), 0.02
+_STIFFER = (1.1, 1.4)  # [-], range of the modulus of prints over that of the data sheet
+_PART_STDDEV = 0.02  # [-], 1 sigma between parts of one print, which differ less than two prints
 _SHARE = (0.04, 0.09)
 _TIMES = ((1.5, 3.0), (7.0, 14.0))  # [s]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PrintedMaterial:
-    """What the jaws of one gripper are made of.
+    """The material of the jaws of one gripper.
 
     Attributes:
         elastic: of each side.

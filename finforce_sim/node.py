@@ -31,10 +31,10 @@ from finforce_sim.footage import (
     info_fields,
     parse_size,
 )
-from finforce_sim.live import LiveScene, build_live_scene
 from finforce_sim.photographer import Shot
 from finforce_sim.scenarios import RATE, Scenario, build_scenario
 from finforce_sim.sensor import Flicker
+from finforce_sim.stored_grasp import LiveScene, build_live_scene
 
 PIXEL_TYPES = {"rgb8": np.uint8, "16UC1": np.uint16}
 TOLD_EVERY = 5.0  # s between two words on how far the rendering is
@@ -208,7 +208,7 @@ def main() -> int:
 
 @dataclass(frozen=True, kw_only=True)
 class TwinParameters:
-    """What a twin camera node is told; units stand in the metadata."""
+    """Parameters of a twin camera node; units stand in the metadata."""
 
     scene: str = setting("grasp_cylinder", "Scene, by a name that `finforce twin list` prints")
     seed: int = setting(0, "Seed of textures, light and noise", "", 0, 2**31 - 1)

@@ -28,7 +28,7 @@ class Light:
     Attributes:
         direction: (3,) unit vector towards the lamp, gripper frame.
         color: (3,) linear intensity.
-        casts_shadow: whether bodies hide it from each other.
+        casts_shadow: True if bodies hide it from each other.
     """
 
     direction: NDArray
@@ -38,7 +38,7 @@ class Light:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Exposure:
-    """What the sensor makes of the light.
+    """The response of the sensor to light.
 
     Attributes:
         brightness: of the whole scene; 1 is a lit room, 0.05 is dim.
@@ -61,7 +61,7 @@ class Exposure:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Lighting:
-    """How a scene looks, apart from its bodies' materials.
+    """The appearance of a scene, apart from its bodies' materials.
 
     Attributes:
         ambient: (3,) linear light from everywhere.
@@ -149,7 +149,7 @@ VOLUME_SIZE = 64  # of the tileable noise volume, per axis; a power of two
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Paint:
-    """What a surface looks like.
+    """The appearance of a surface.
 
     Attributes:
         color: (3,) linear red, green, blue in [0, 1].
@@ -313,7 +313,7 @@ class RenderedScene:
     """Bodies ready to be looked at.
 
     Args:
-        bodies: what stands before the camera.
+        bodies: bodies in front of the camera.
         look: lights and background.
         R_camera_gripper: (3, 3), for the look's directions.
         base: (3,) [m] origin of the gripper in the camera frame.
@@ -460,7 +460,7 @@ def _light_up(on, rays, normals, albedo, gloss, light, lamps, lit, color):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Hits:
-    """What rays met: depth (n,) [m], body (n,), triangle (n,), weights in it (n, 2), its normal (n, 3)."""
+    """The hits of rays: depth (n,) [m], body (n,), triangle (n,), weights in it (n, 2), its normal (n, 3)."""
 
     depth: NDArray
     owner: NDArray

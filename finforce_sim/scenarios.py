@@ -1,4 +1,4 @@
-"""What happens in a synthetic recording, as numbers with names, and how it goes on over time."""
+"""The scenes of synthetic recordings, as numbers with names, and their motion over time."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ class Scenario:
 
     @property
     def is_guided(self) -> bool:
-        """Whether the object is held by something else than the jaws."""
+        """True if the object is held by something else than the jaws."""
         return bool(self.camera == "bench" or self.slide or self.rock)
 
 
@@ -178,7 +178,7 @@ _TARE_RECORD = 0.5
 
 @dataclass(frozen=True, kw_only=True)
 class Posture:
-    """Where everything stands at one instant.
+    """The positions of everything at one instant.
 
     Attributes:
         closing: of each jaw beyond first touch [m], negative while open.

@@ -1,1 +1,1 @@
-"""What judges the product: benchmarks, stress, the paper's experiments and training; not installed."""
+"""Evaluation of the product: benchmarks, stress, the paper's experiments and training; not installed."""

@@ -98,7 +98,7 @@ class TrueImages:
         displacement: of the key points (n, K) [m].
         places: of the key points, x and z (n, K, 2) [m].
         modes: of the force by the same four (n, 3, 4).
-        seen: which key points can be used (n, K).
+        seen: mask of the key points that can be used (n, K).
         noise: of one along x and z, its y known (2, 2) [m^2].
         offset_variance: of the tare (K,) [m^2].
         pose: standard deviation of tilt [rad] and height [m] (2,).

@@ -20,7 +20,7 @@ from finforce_eval.machine import without_nan
 
 @dataclass(frozen=True, kw_only=True)
 class Figures:
-    """What was measured.
+    """The figures of one measurement.
 
     Attributes:
         tables: by name.

@@ -238,7 +238,7 @@ def keep_shear(contact: RigidContact, q: NDArray, x: NDArray, traction: Traction
 
 
 def _snaps(before: PressState, after: PressState) -> bool:
-    """Whether the jaw has jumped to another shape between two depths, or has let go of the object."""
+    """Return True if the jaw has jumped to another shape between two depths, or has let go of the object."""
     push, last = -after.force[0], -before.force[0]
     if last > 0.0 and push == 0.0:
         return True

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from shutil import rmtree
 from tempfile import mkdtemp
 from typing import TYPE_CHECKING, Any
+
+from finforce.caches import cache_folder
 
 if TYPE_CHECKING:
     from finforce_sim.scenarios import Scenario
@@ -53,14 +54,13 @@ def find_scene(scene: TwinScene, folder: Path | None = None) -> Path:
     """Return the recording of a scene, rendered under a progress bar unless it is there already.
 
     Args:
-        scene: what is rendered.
+        scene: the scene to render.
         folder: of the scenes that were rendered; that in the user's cache without one.
 
     Raises:
         FinforceError: the scene cannot be rendered, or a library is missing.
     """
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    folder = folder or cache / "finforce" / "scenes"
+    folder = folder or cache_folder() / "scenes"
     path = folder / f"{scene.scenario}_{scene.seed}_{fingerprint(scene)}"
     if path.exists():
         return path

@@ -7,8 +7,8 @@ hardware.
 from pathlib import Path
 
 from finforce.systems.launch import describe_system
-from finforce.systems.live import bench_processes
 from finforce.systems.processes import BenchOptions
+from finforce.systems.setups import bench_processes
 
 SHARE = Path(__file__).resolve().parents[1]
 

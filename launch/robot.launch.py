@@ -6,8 +6,8 @@
 from pathlib import Path
 
 from finforce.systems.launch import describe_system
-from finforce.systems.live import robot_processes
 from finforce.systems.processes import RobotOptions
+from finforce.systems.setups import robot_processes
 
 SHARE = Path(__file__).resolve().parents[1]
 

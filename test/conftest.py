@@ -23,7 +23,7 @@ def nothing_kept_warm(request):
     def forget():
         setup = sys.modules.get("finforce_eval.evaluation.setup")
         if patches and setup is not None:
-            setup.forget_setup()
+            setup._last.clear()
 
     patches = "monkeypatch" in request.fixturenames
     forget()

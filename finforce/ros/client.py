@@ -98,7 +98,7 @@ class GripperClient:
 
     @property
     def grasp_state(self) -> str:
-        """What the driver says of the last grasp, as "holding: holds the set force"; empty before the first."""
+        """The driver's report on the last grasp, as "holding: holds the set force"; empty before the first."""
         return self._grasp
 
     def calibrate(self) -> str:

@@ -40,7 +40,7 @@ class Frames:
         """Return the newest T_target_source (4, 4); None where /tf does not connect them.
 
         Raises:
-            PoseError: what /tf says is no pose.
+            PoseError: The transform of /tf is no pose.
         """
         if self._buffer is None:
             return None

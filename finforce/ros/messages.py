@@ -180,7 +180,7 @@ def points_marker(
         kind: "triangles", "spheres" or "arrow".
         points: in the frame of the header; none of them deletes the marker.
         color: red, green, blue, opacity.
-        scale: what the kind makes of it [m].
+        scale: size of the marker, by its kind [m].
         colors: one per point, in place of `color`.
     """
     known = [Point(x=x, y=y, z=z) for x, y, z in np.asarray(points, dtype=np.float64).reshape(-1, 3).tolist()]

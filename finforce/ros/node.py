@@ -1,4 +1,4 @@
-"""What every node shares: parameters, quality of service, diagnostics, start and stop, and messages."""
+"""Shared parts of all nodes: parameters, quality of service, diagnostics, start and stop, and messages."""
 
 from __future__ import annotations
 
@@ -173,8 +173,8 @@ class ImageNode(Node):
     """A node that answers images of one jaw or two: what it cannot use is rejected, said and counted.
 
     Attributes:
-        health: how each jaw's answers are doing, by side; filled by the node.
-        answer: what is not published of a rejected image, as "wrench".
+        health: health of each jaw's answers, by side; filled by the node.
+        answer: message that a rejected image does not get, as "wrench".
     """
 
     answer = "answer"

@@ -1,4 +1,4 @@
-"""When the callbacks of a process began and ended, image by image, written to a file where somebody asks for it."""
+"""Times of the callbacks of a process, image by image, written to a file on request."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How Fast DDS is to carry images, and which domain is free."""
+"""Settings of Fast DDS for images, and a free domain."""
 
 from __future__ import annotations
 

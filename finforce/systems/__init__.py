@@ -1,1 +1,1 @@
-"""Which processes make up a bench, a robot and a replay; launch files read them."""
+"""The processes of a bench, a robot and a replay; launch files read them."""

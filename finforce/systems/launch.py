@@ -1,4 +1,4 @@
-"""What the launch files share: the arguments of every system, and an action per process or included file."""
+"""Launch arguments of every system, and an action per process or included file."""
 
 from __future__ import annotations
 

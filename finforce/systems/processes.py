@@ -45,7 +45,7 @@ class Process:
         arguments: of the program, before those of ROS.
         ends_all: the whole system ends with this process.
         optional: the rest starts without it where its package is not installed.
-        advice: what else would do, for who has not got the package.
+        advice: alternative for users without the package.
     """
 
     package: str = "finforce"
@@ -68,12 +68,12 @@ class Process:
 
     @property
     def label(self) -> str:
-        """What the process is called."""
+        """The name of the process."""
         return self.name or self.executable
 
     @property
     def respawns(self) -> bool:
-        """Whether it is started again when it dies; a driver is not, whose gripper goes on holding."""
+        """True if it is started again when it dies; a driver is not, whose gripper goes on holding."""
         return self.executable in RESPAWNED
 
     @property
@@ -102,7 +102,7 @@ class Include:
         arguments: of that file.
         environment: variables for its processes only.
         programs: that it calls, each named as the package it comes with.
-        advice: what else would do, for who has not got the package.
+        advice: alternative for users without the package.
     """
 
     package: str
@@ -306,7 +306,7 @@ _INTERFACE = "slcan for a serial CAN adapter, or an interface of python-can, suc
 
 @dataclass(frozen=True, kw_only=True)
 class SolverOptions:
-    """What every system with solvers is asked for; NaN and empty texts leave the node's own default.
+    """Options of every system with solvers; NaN and empty texts leave the node's own default.
 
     Each option is an argument of the launch files, where none stands for an empty text.
     """
@@ -335,7 +335,7 @@ class SolverOptions:
         choices=("aligned", "auto", "none"),
     )
     T_gripper_camera: str = setting("", "Pose of the camera in the gripper frame: x y z [m] qx qy qz qw")
-    solver: str = setting("", "Mechanics: reduced, solid, frame, linear or paper (Eq. 1)")
+    solver: str = setting("", "Mechanics: reduced, solid, frame, plane or paper (Eq. 1)")
     parameter_file: str = setting("", "YAML file with node parameters; none: that of the system")
     use_sim_time: bool = setting(False, "Time from /clock")
     composed: bool = setting(True, "Detector, contact estimator and solvers in one process; false: one process each")
@@ -356,7 +356,7 @@ class ReplayOptions(SolverOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class GripperOptions(SolverOptions):
-    """What a system with the gripper is asked for in addition to the forces."""
+    """Options of a system with the gripper, in addition to those of the forces."""
 
     gripper_port: str = setting("", f"{_PORT}; none: from the parameter file, with sim a temporary one")
     gripper_interface: str = setting("", _INTERFACE)
@@ -389,7 +389,7 @@ class RobotOptions(GripperOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class StackOptions:
-    """What is asked of a gripper that a manipulation stack drives."""
+    """Options of a gripper that a manipulation stack drives."""
 
     description: str = setting("", "xacro or URDF file of the robot; none: only the gripper")
     semantics: str = setting("", "SRDF file of the robot, for MoveIt; none: that of the gripper")

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 
 UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "inch": 0.0254}
 FORMATS = (".stl", ".obj", ".ply", ".off", ".glb", ".3mf", ".step", ".stp")
-SMALLEST, LARGEST = 0.005, 0.6  # [m], largest extent of what a gripper of 50 mm stroke holds by some part
+SMALLEST = 0.005  # [m], least largest extent of an object
+LARGEST = 0.6  # [m], largest extent of an object that a gripper of 50 mm stroke holds by some part
 THINNEST = 1e-4  # [m], a mesh that is thinner is a sheet, and has no inside
 FARTHEST = 1.0  # [m], of a vertex from the origin of its frame; poses are of that origin, and turn about it
 TRIANGLE_BOUND = 2_000_000  # a closed mesh of so many takes some ten seconds, an open one a minute
@@ -43,7 +44,7 @@ class ObjectMesh(Surface):
 
     Attributes:
         watertight: the triangles bound solids without a gap.
-        name: what messages call the object.
+        name: name of the object in messages.
     """
 
     watertight: bool
@@ -133,7 +134,7 @@ def prepare_object_mesh(
     Args:
         vertices: (n, 3), object frame.
         triangles: (m, 3) vertex indices from 0.
-        name: what messages call the object.
+        name: name of the object in messages.
         unit: of the vertices, one of `UNITS`.
         triangle_limit: the most triangles that are kept.
 

@@ -17,7 +17,7 @@ LEAST_PIXELS = 30
 
 
 class Visibility(IntEnum):
-    """What the image says about one point of the surface."""
+    """The evidence of the image for one point of the surface."""
 
     UNKNOWN = 0  # no depth there, or outside the image
     SEEN = 1  # where it should be
@@ -44,11 +44,11 @@ class Samples:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Glance:
-    """What should be seen of an object in one pose, on the grid of every `step`-th pixel.
+    """The predicted view of an object in one pose, on the grid of every `step`-th pixel.
 
     Attributes:
         depth: grid of depths (h, w) [m], NaN beside the object.
-        surface: what is seen of the surface, camera frame.
+        surface: visible part of the surface, camera frame.
         step: pixels from one to the next.
     """
 
@@ -226,7 +226,7 @@ def compare_outline(outline: Outline, image: DepthImage, reach: float) -> Compar
     Args:
         outline: in the camera frame, as of `_MeshOutline.find`.
         image: where to look.
-        reach: how far to look to either side [m].
+        reach: range of the search to either side [m].
     """
     places, along = _walk_across(outline.samples, image.camera, reach)
     depth, edge_depth = image.look(places), outline.samples.points[:, 2:3]
@@ -321,8 +321,9 @@ def _place_points(mesh: ObjectMesh, spacing: float) -> _Edges:
 
 _EDGE_POINTS = 200  # of the outline that are compared per image
 _NOISE_WIDTH = 5.0  # [px] over which the errors of the depth are alike
-# Errors of the normals of the mesh and of its outline [rad]: a motion along its surface up to this is not seen.
-_NORMAL_ERROR, _EDGE_ERROR = 0.035, 0.15
+# A motion along the surface up to these errors is not seen.
+_NORMAL_ERROR = 0.035  # [rad], of the normals of the mesh
+_EDGE_ERROR = 0.15  # [rad], of the normals of its outline
 # A surface seen at less than this cosine tells more about flying pixels than about itself.
 _GRAZING = 0.2
 # The end of an object in a depth image is known to about this [px].
@@ -365,7 +366,7 @@ class Alignment:
 
 @dataclass(frozen=True, kw_only=True)
 class Effort:
-    """How hard to try.
+    """The effort of an alignment.
 
     Attributes:
         gates: surface farther off than this [m] is not the object, one after the other; each looks afresh.
@@ -421,7 +422,7 @@ class _Normal:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Expected:
-    """What should be seen, object frame; `step` as of `Glance`."""
+    """The predicted view in the object frame; `step` as of `Glance`."""
 
     surface: Samples
     outline: Outline | None
@@ -430,7 +431,7 @@ class _Expected:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _About:
-    """What normal equations are about: middle (3,) and radius of the object [m], deviation of the residuals [m]."""
+    """The scale of normal equations: middle (3,) and radius of the object [m], deviation of the residuals [m]."""
 
     middle: NDArray
     radius: float
@@ -474,7 +475,7 @@ class MeshAligner:
         Args:
             T_camera_object: pose (4, 4) to start from; directions that the image does not tell keep it.
             image: the image.
-            effort: how hard to try.
+            effort: iterations and starts.
         """
         T = T_camera_object
         for gate in effort.gates:
@@ -556,7 +557,7 @@ def _normal_equations(samples: Samples, seen: Comparison, about: _About, error: 
     """Return sum w J^T J and sum w J^T r with J = [d, (p - m) x d / radius] and Cauchy weights w over stddev^2.
 
     Directions d that are off by an angle `error` make a motion along the surface look like one across it, this much
-    smaller: what is told must be more than error^2 sum w.
+    smaller: the information must exceed error^2 sum w.
     """
     chosen = seen.sights == Visibility.SEEN
     directions, residuals = samples.directions[chosen], seen.residuals[chosen]

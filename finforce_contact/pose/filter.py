@@ -17,12 +17,12 @@ from finforce_contact.parameters import ContactSettings
 _DRIFT = np.repeat([0.1e-3, 2e-3], 3) ** 2
 _ACCELERATION = np.repeat([2e-3, 0.04], 3) ** 2
 _START = np.repeat([8e-3, 0.15], 3) ** 2
-# Mean times of rest and motion [s].
-_RESTS, _MOVES = 20.0, 5.0
+_RESTS = 20.0  # [s], mean time of rest
+_MOVES = 5.0  # [s], mean time of motion
 _GATE = 5.0  # [sigma]; a pose farther off is not believed at once
 _JUMP_POSES = 3  # in a row off the trajectory that agree with each other are believed
-# Samples over which noise is learnt, and how many the assumed noise counts for.
-_NOISE_MEMORY, _NOISE_PRIOR = 60.0, 6.0
+_NOISE_MEMORY = 60.0  # samples over which noise is learnt
+_NOISE_PRIOR = 6.0  # samples that the assumed noise counts for
 _NOISE_RANGE = (1e-2, 1e2)
 _MOST_ALIKE = 0.9  # correlation of errors from one pose to the next
 _LONGEST_FORECAST = 0.2
@@ -31,7 +31,7 @@ _REST, _MOTION = 0, 1
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FilteredPose:
-    """Where the object is.
+    """The pose of the object.
 
     Attributes:
         T: T_jaw_object (4, 4).

@@ -1,4 +1,4 @@
-"""Whether a posed mesh agrees with what a depth camera sees of it, and which turn, scale or shift of it would."""
+"""The agreement of a posed mesh with depth images, and the turn, scale or shift of it that would agree."""
 
 from __future__ import annotations
 
@@ -21,17 +21,20 @@ if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
 PIXELS = 400  # of the object that are compared in an image
-# Farther off, surface and depth disagree: six standard deviations of `pose_bias` [m], error of depth by distance [-].
-TOLERANCE, DEPTH_ERROR = 0.003, 0.01
+TOLERANCE = 0.003  # [m], six standard deviations of `pose_bias`; farther off, surface and depth disagree
+DEPTH_ERROR = 0.01  # [-], error of depth over distance, in addition
 SHORTEST_ARM = 0.04  # [m], of the part of an object that a gripper holds: by how much a turn moves that
-LEAST_IMAGES, MOST_IMAGES = 3, 12  # before a verdict, and that it rests on
-FIRST_PERIOD, PERIOD = 0.3, 2.0  # [s] from one comparison to the next, of the first images and of those that follow
+LEAST_IMAGES = 3  # images before a verdict
+MOST_IMAGES = 12  # images that a verdict rests on
+FIRST_PERIOD = 0.3  # [s], between comparisons of the first images
+PERIOD = 2.0  # [s], between later comparisons
 LEAST_PIXELS = 30  # per image that a verdict rests on
 BEHIND = 0.12  # [-], share of the surface that the camera sees through, from which on the mesh is another one
 LEAST_GAIN = 0.35  # [-], of the visible surface, from which on a mesh fits
 NO_GAIN = 0.25  # [-], of the visible surface, below which an aligned mesh has another shape
 NAMED_IN = 3  # images that another reading is looked for in
-_NEAR, _FAR = (0.01, 0.006), (0.02, 0.01, 0.006)  # [m], gates of the alignment of a mesh that fits as posed, or not
+_NEAR = (0.01, 0.006)  # [m], gates of the alignment of a mesh that fits as posed
+_FAR = (0.02, 0.01, 0.006)  # [m], gates of the alignment of a mesh that does not
 FARTHEST = 0.045  # [m], of a shift that is named: farther off, a table may look like the object
 _REACH = 0.012 * np.arange(-2, 3)  # [m], shifts along each axis of the camera that are tried
 _UNITS = np.array([1e-3, 1e-2, 0.0254, 0.1, 10.0, 1.0 / 0.0254, 100.0, 1e3])
@@ -50,7 +53,7 @@ def is_due(count: int, elapsed: float) -> bool:
 
 
 class Fit(NamedTuple):
-    """How well a reading of the mesh explains an image, in pixels of its grid.
+    """The score of one reading of the mesh against an image, in pixels of its grid.
 
     Attributes:
         gain: pixels at the mesh's depth, minus those behind it; each counts less as it lies off.
@@ -64,12 +67,12 @@ class Fit(NamedTuple):
 
     @property
     def fits(self) -> bool:
-        """Whether the mesh is where the camera sees something, and nowhere else."""
+        """True if the mesh is where the camera sees something, and nowhere else."""
         return self.gain >= LEAST_GAIN * max(self.seen, 1) and self.behind <= BEHIND * self.seen
 
 
 class _Evidence(NamedTuple):
-    """What one image says.
+    """The evidence of one image.
 
     Attributes:
         posed: fit of the mesh as posed.

@@ -1,4 +1,4 @@
-"""Where poses of the object come from: another program's messages, or depth images."""
+"""Sources of the object's poses: another program's messages, or depth images."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class ExternalPoseSource:
     Args:
         stream: of the camera, in whose frame the messages must be.
         mesh: the object, for the check that it is not around the camera; None to do without.
-        origin: what the poses are of, one of `ORIGINS`.
+        origin: reference of the poses, one of `ORIGINS`.
     """
 
     def __init__(self, stream: CameraStream, *, mesh: ObjectMesh | None = None, origin: str = "mesh") -> None:
@@ -154,7 +154,7 @@ class MeshFeed:
 
     @property
     def is_due(self) -> bool:
-        """Whether a depth image is wanted."""
+        """True if a depth image is wanted."""
         with self._arrival:
             poses = self._poses.entries(POSES)
             elapsed = SECOND * poses[-1].stamp - self._last if poses else 0.0

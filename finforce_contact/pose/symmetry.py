@@ -21,9 +21,10 @@ _FLIPPED = 0.6
 # Turns that no polygon of a mesh shares, by which a round thing is known, and folds that are looked for [-].
 _ODD_TURNS = np.radians([37.0, 71.0, 113.0])
 _FOLDS = (6, 5, 4, 3, 2)
-# Surface points that are turned, those that they are compared with, and which share of them may be off by more than
-# this part of the object's size: edges of a mesh are.
-_TURNED, _SAMPLES, _SHARE, _OFF = 400, 8000, 0.95, 0.01
+_TURNED = 400  # surface points that are turned
+_SAMPLES = 8000  # surface points that they are compared with
+_SHARE = 0.95  # [-], fraction that must agree; edges of a mesh do not
+_OFF = 0.01  # [-], largest distance of points that agree, over the object's size
 _MOST = 60  # turns of an icosahedron: no object has more but for round ones
 
 

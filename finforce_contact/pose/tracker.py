@@ -16,8 +16,8 @@ from finforce_contact.mesh.object_mesh import ObjectMesh, surrounds
 from finforce_contact.parameters import TrackerSettings
 from finforce_contact.pose.alignment import LEAST_PIXELS, Alignment, DepthImage, Effort, MeshAligner
 
-# Depth farther off than this [m] is not the object, at first and in the end.
-_WIDE_GATE, _GATE = 0.006, 0.003
+_WIDE_GATE = 0.006  # [m], largest distance of depth that belongs to the object, in the first steps
+_GATE = 0.003  # [m], the same in the last steps
 # Depths farther apart than this [m] disagree altogether.
 _WORST = 0.01
 _COARSE = Effort(gates=(0.03, 0.015), steps=3, points=150, outline=False)
@@ -32,7 +32,7 @@ def search_pose(aligner: MeshAligner, image: DepthImage, kept: int = 4) -> list[
     Args:
         aligner: the object.
         image: with a mask.
-        kept: how many.
+        kept: number of candidates.
     """
     starts = [_place(aligner, image, rotation) for rotation in spread_rotations()]
     coarse = _best(aligner, image, [aligner.align(start, image, _COARSE) for start in starts], _KEPT)
@@ -110,7 +110,7 @@ def _icosphere() -> NDArray:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ObjectPose:
-    """Where the object was in one image.
+    """The pose of the object in one image.
 
     Attributes:
         stamp: capture time of the image [s].
@@ -147,14 +147,17 @@ def check_camera_outside(T_camera_object: ArrayLike, mesh: ObjectMesh) -> NDArra
 _SOURCE = "tracker"
 # Without any image, an object is known to be within reach [m], turned anyhow [rad]: a uniform angle's deviation.
 _UNKNOWN = np.array([0.1] * 3 + [np.pi / np.sqrt(3.0)] * 3)
-# How far around the last pose a lost object is looked for: so far, twice, three times as far, and again.
-_NEAR, _TURNED, _RINGS = 0.012, np.deg2rad(15.0), 3
+# A lost object is searched for around its last pose, in rings at one, two and three times these distances.
+_NEAR = 0.012  # [m]
+_TURNED = np.deg2rad(15.0)  # [rad]
+_RINGS = 3  # rings
 _NEARBY = 12  # starts around the last pose, for each image
 _FINALISTS = 3  # of them that are looked at closely
 _QUICK = Effort(gates=(0.012, 0.006), steps=3, points=250)
-# Out of nothing, a pose must agree better than from one image to the next: this fitness, this share of the surface and
-# of the outline; a wall has no outline.
-_FIT, _SHOWN, _OUTLINED = 0.85, 0.6, 0.35
+# Without a pose before, a pose must agree better than from one image to the next; a wall has no outline.
+_FIT = 0.85  # [-], least fitness
+_SHOWN = 0.6  # [-], least visible fraction of the surface
+_OUTLINED = 0.35  # [-], least matched fraction of the outline
 # The least agreement with a mask; the right mesh has 0.83 to 0.92 at a D405's noise, and loses 0.1 by a mask that is
 # two pixels wide of an object of 80.
 _AGREEING = 0.7
@@ -195,7 +198,7 @@ class PoseTracker:
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """How many images gave a pose or none: `located`, `tracked`, `recovered`, `lost`."""
+        """The number of images by outcome: `located`, `tracked`, `recovered`, `lost`."""
         return MappingProxyType(self._counts)
 
     def reset(self) -> None:

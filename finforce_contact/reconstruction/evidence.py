@@ -1,4 +1,4 @@
-"""What a depth image shows of an object, and how well a shape explains it."""
+"""The evidence of a masked depth image for an object, and the score of a shape against it."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ MISFIT_BOUND = 5e-3  # [m] beyond which a pixel is simply not explained
 
 @dataclass(frozen=True, kw_only=True)
 class ShapeScore:
-    """How well a mesh explains an image.
+    """The score of a mesh against an image.
 
     Attributes:
         misfit: root mean square over the pixels of mask and mesh together, each at most `MISFIT_BOUND` [m].

@@ -21,7 +21,8 @@ from finforce_contact.reconstruction.evidence import ImageEvidence
 PLACE, OPACITY = ("x", "y", "z"), "opacity"
 HEADER_BOUND = 65536  # bytes
 FAINT = 0.1  # opacity below which a splat is none
-MOST, FEWEST = 30000, 100  # splats that a surface is made of
+MOST = 30000  # splats that a surface is made of, at most
+FEWEST = 100  # and at least
 NEIGHBOURS = 24
 STRAY = 3.0  # times the usual distance to its neighbours: a splat that far away is none
 

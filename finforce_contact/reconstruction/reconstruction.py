@@ -55,7 +55,7 @@ def complete_surface(evidence: ImageEvidence, shape: Reconstruction, report: Rep
 
     Args:
         evidence: of the masked depth image.
-        shape: what `fit_primitive` makes of it, agreeing or not.
+        shape: result of `fit_primitive`, agreeing or not.
         report: called with the name of a stage and the share of it that is done.
 
     Raises:

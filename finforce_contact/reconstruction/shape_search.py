@@ -74,7 +74,9 @@ NEAR = 3e-4  # [m] from the surface, below which the direction to it is its norm
 OUTLINE_WEIGHT = 0.5  # of all outline pixels together, that of all surface points being one
 STEP_TOLERANCE = 2e-5  # [rad], [m] or in the logarithm
 DAMPING = 1e-4
-LARGEST_TURN, LARGEST_MOVE, LARGEST_STRETCH = 0.3, 0.03, 0.2  # of one step [rad], [m], in the logarithm
+LARGEST_TURN = 0.3  # [rad], of one step
+LARGEST_MOVE = 0.03  # [m], of one step
+LARGEST_STRETCH = 0.2  # [-], of one step, logarithm of the scale
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,7 +102,7 @@ FINE = (
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ScaleFreedom:
-    """Which scales are free, and how stiffly the axes keep their proportions.
+    """The free scales, and the stiffness of the axes' proportions.
 
     Attributes:
         basis: (3, k) what each free scale does to the logarithms of the three.
@@ -117,7 +119,7 @@ UNIFORM = ScaleFreedom()
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Pull:
-    """What draws points of the mesh: points (n, 3) [m], unit directions (n, 3), ways to go (n,) [m], weights (n,)."""
+    """The residuals of mesh points (n, 3) [m]: unit directions (n, 3), distances (n,) [m], weights (n,)."""
 
     points: NDArray
     directions: NDArray
@@ -234,9 +236,11 @@ def scale_mesh(mesh: ObjectMesh, log_scale: NDArray) -> ObjectMesh:
 
 HIDDEN_SHARE = 0.15  # of the outline, above which the mask says too little about the size
 HIDDEN_GROWTH = 0.35
-KEPT_COARSE, KEPT_MIDDLE = 8, 3
+KEPT_COARSE = 8  # placements kept of the coarse stage
+KEPT_MIDDLE = 3  # placements kept of the middle stage
 SEAT_ROUNDS = 3
-SEAT_STEP, COARSE_STEP = 8, 4  # [px]
+SEAT_STEP = 8  # [px], grid of the views for seating
+COARSE_STEP = 4  # [px], grid of the views for scoring coarse fits
 TURN_PENALTY = 0.05  # of the misfit, for half a turn away from the given rotation: decides between equals only
 
 
@@ -354,7 +358,8 @@ BALL_POINTS = 600
 STIFFNESS = 0.005
 # of the misfit: a shape with more freedom has to explain the image better by as much
 HANDICAP = {"sphere": 1.0, "cylinder": 1.05, "box": 1.1}
-AXIS_STARTS, BOX_STARTS = 12, 16
+AXIS_STARTS = 12  # directions of a cylinder's axis to start from
+BOX_STARTS = 16  # rotations of a box to start from
 ELONGATIONS = (0.0, 0.7, -0.7)  # logarithm of length over diameter
 
 

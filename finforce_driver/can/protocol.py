@@ -28,7 +28,7 @@ class CanMessage:
     Attributes:
         id: identifier of 11 bits.
         data: 0 to 8 bytes; none in a remote message.
-        remote: whether it asks for a message instead of being one.
+        remote: True if it asks for a message instead of being one.
     """
 
     id: int
@@ -47,7 +47,7 @@ class CanMessage:
 
 
 class Bus(ABC):
-    """What carries messages; opened and closed again and again.
+    """A carrier of messages; opened and closed again and again.
 
     `send` may be called from any thread while another one waits in `receive`.
 
@@ -114,7 +114,7 @@ class Bus(ABC):
 
     @property
     def suspicion(self) -> str:
-        """What seems wrong with the link, in a sentence of advice; empty when nothing does."""
+        """The likely fault of the link, in a sentence of advice; empty without one."""
         return ""
 
     def _opened(self) -> Any:
@@ -147,7 +147,7 @@ CONTACT = (1, 2)  # which of them means closing depends on the firmware: the cur
 
 
 class Command(IntEnum):
-    """What a message is about."""
+    """The purpose of a message."""
 
     ESTOP = 0
     CLEAR = 1
@@ -197,22 +197,22 @@ class Move:
 
     @property
     def activated(self) -> bool:
-        """Whether the power stage may move the jaws."""
+        """True if the power stage may move the jaws."""
         return bool(self.flags & Flag.ACTIVATE)
 
     @property
     def action(self) -> bool:
-        """Whether to go to the position."""
+        """True if it orders a motion to the position."""
         return bool(self.flags & Flag.GO)
 
     @property
     def estop(self) -> bool:
-        """Whether it asks for an emergency stop."""
+        """True if it asks for an emergency stop."""
         return bool(self.flags & Flag.ESTOP)
 
     @property
     def drives(self) -> bool:
-        """Whether the gripper would move by it."""
+        """True if the gripper would move by it."""
         return self.activated and self.action and not self.estop
 
 
@@ -248,22 +248,22 @@ class Reply:
 
     @property
     def faults(self) -> tuple[bool, ...]:
-        """What the reply says of faults."""
+        """The faults in the reply."""
         return self.error, self.overheated, self.watchdog, self.estopped
 
     @property
     def driving(self) -> bool:
-        """Whether the power stage moves or holds the jaws."""
+        """True if the power stage moves or holds the jaws."""
         return self.activated and self.action and not self.error
 
     @property
     def contact(self) -> bool:
-        """Whether the motor pushes without getting on."""
+        """True if the motor pushes without getting on."""
         return self.code in CONTACT
 
     @property
     def at_target(self) -> bool:
-        """Whether the gripper takes itself to be where it was sent."""
+        """True if the gripper takes itself to be where it was sent."""
         return self.code == AT_TARGET
 
 
@@ -277,7 +277,8 @@ FAULT_BITS = (
     (0x02, "current"),
     (0x01, "E-stop"),
 )
-MOTOR_CALIBRATED, WATCHDOG = 0x80, 0x20  # of byte 1
+MOTOR_CALIBRATED = 0x80  # bit of byte 1
+WATCHDOG = 0x20  # bit of byte 1
 
 
 def encode(node: int, command: int, data: bytes = b"", *, remote: bool = False) -> CanMessage:

@@ -85,7 +85,7 @@ class PythonCanBus(Bus):
 
     @property
     def suspicion(self) -> str:
-        """What the received messages say is wrong with the bus, with advice, in one sentence; empty: nothing."""
+        """The fault of the bus by the received messages, with advice, in one sentence; empty: none."""
         if self._counts["bus_errors"] and not self._counts["messages"]:
             return (
                 f"CAN interface {self._interface} {self._channel} reports only errors: check 24 V, CANH/CANL, "

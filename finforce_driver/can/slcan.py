@@ -203,7 +203,7 @@ class SerialBus(Bus):
 
     @property
     def suspicion(self) -> str:
-        """What the received bytes say is wrong with the adapter, with advice, in one sentence; empty: nothing."""
+        """The fault of the adapter by the received bytes, with advice, in one sentence; empty: none."""
         if self._parser.unexplained >= _SUSPICIOUS_BYTES:
             return (
                 f"only garbage comes from {self._name} at {self._baud_rate} baud: wrong adapter speed? set baud_rate "

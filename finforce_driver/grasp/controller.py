@@ -21,7 +21,9 @@ _RELAXATION = 0.4  # share of the set force that holding may make up for by clos
 _SETTLED = 3  # images at rest without a reason to move after which the force is held
 _SATURATED_AFTER = 1.0  # [s] at the least opening
 _RESERVE_STEPS = 3  # that holding may close in any case
-_WITHIN, _FARTHEST = 0.2, 1.0  # share of the set force, and [N], below it that still hold it; a step may be more
+# Shortfall from the set force that still holds it.
+_WITHIN = 0.2  # [-], of the set force, or that of one step of the jaws if it is more
+_FARTHEST = 1.0  # [N], at most
 _FIRST_GRASPS = 9  # that teach how the motor's force goes with the camera's
 _FACTOR = 1.5  # times the camera's force, that the motor's may be at rest
 _FRICTION_DOUBT = "does the gear have more friction than motor_friction"

@@ -1,4 +1,4 @@
-"""Which forces of a camera may be believed, whether the jaws are loaded, and how the force goes with the opening.
+"""Plausibility of a camera's forces, load of the jaws, and the slope of the force over the opening.
 
 Between two images the opening changes by d (closing: d > 0) and the force by k d, where neither stays what it was:
 fingers relax, contact spreads. A Kalman filter follows both,
@@ -22,7 +22,8 @@ NOISE = 0.05  # [N], standard deviation of a force that is expected at first
 _JUMP = 1.0  # [N] between two images, beyond what motion and noise explain
 _LARGEST_OFFSET = 0.2  # [N] that an unloaded estimate may show
 _CONFIRMED = 2  # images in a row that make an onset, or a jump
-_FROZEN, _FROZEN_WAY = 4, 0.4e-3  # images in a row with the same force to the last digit, and [m] closed meanwhile
+_FROZEN = 4  # images in a row with the same force to the last digit
+_FROZEN_WAY = 0.4e-3  # [m], closed meanwhile, from which on the force counts as frozen
 _EMPTY = 3  # images in a row without force after which the object is gone
 
 
@@ -45,7 +46,7 @@ class ForceSample:
 
 @dataclass(frozen=True, kw_only=True)
 class TouchSample:
-    """Whether the jaws are reported to touch in the image at `stamp` [s], on the driver's clock."""
+    """Return True if the jaws are reported to touch in the image at `stamp` [s], on the driver's clock."""
 
     stamp: float
     touching: bool
@@ -68,11 +69,11 @@ class LoadWatch:
 
     Attributes:
         model: of force over opening, in use once loaded.
-        loaded: whether something presses.
-        suspect: whether the newest force was rejected as a possible jump.
+        loaded: True if something presses.
+        suspect: True if the newest force was rejected as a possible jump.
         force: the newest that was believed [N]; NaN before the first.
         opening: that belongs to it [m].
-        resting: whether the jaws rested then.
+        resting: True if the jaws rested then.
         peak: the largest while loaded [N].
         stddev: of the force, as its source stated it for the newest that was believed [N].
     """
@@ -152,7 +153,7 @@ class LoadWatch:
         self.loaded = touching or self._above >= _CONFIRMED
 
     def _is_jump(self, force: float, opening: float) -> bool:
-        """Whether neither motion nor noise explains a force.
+        """Return True if neither motion nor noise explains a force.
 
         Raises:
             BackOffError: that is so in two images in a row, and the jaws have just touched something.
@@ -252,7 +253,7 @@ class ForceFeed:
 
     @property
     def heard(self) -> bool:
-        """Whether any force was admitted."""
+        """True if any force was admitted."""
         return not math.isnan(self.stamp)
 
     def touching(self, now: float) -> bool | None:
@@ -360,11 +361,12 @@ _DRIFT = 0.15  # [N/sqrt(s)]
 # A finger stiffens from 0.4 to 1.3 N/mm within 5 mm.
 _GROWTH = 9e3  # [N/m per sqrt(m)], 0.28 N/mm after one millimetre
 _NOISE_MEMORY = 0.05  # share of a new innovation
-_LEAST_NOISE, _LARGEST_NOISE = 0.02, 0.25  # [N]
+_LEAST_NOISE = 0.02  # [N]
+_LARGEST_NOISE = 0.25  # [N]
 
 
 class ForceModel:
-    """What force the fingers have at the opening of the newest image, and how it would change with the opening.
+    """The force of the fingers at the opening of the newest image, and its slope over the opening.
 
     Args:
         stiffness: expected at first [N/m], better too large than too small.

@@ -1,4 +1,4 @@
-"""How far the jaws of a force-controlled grasp may go, how fast, and where they were at the time of an image.
+"""Travel and speed limits of a force-controlled grasp, and the jaws' opening at the time of an image.
 
 The gripper is only ever told to go where the force cannot be above the set one: from the newest image, with the force F
 at the opening o, to
@@ -40,7 +40,8 @@ _SMALL = 2.5  # steps: fewer are not planned anew on the way
 _POWERED_AFTER = 0.3  # [s] of the first command, which switches the power stage on
 _LATE = 1.0  # [s] after which jaws that have not come do not follow
 # A byte says the opening to a step; between two bytes it is interpolated. At rest the jaws are within 4 ticks.
-_MOVING_STDDEV, _RESTING_STDDEV = 0.35, 0.1  # [steps]
+_MOVING_STDDEV = 0.35  # [steps]
+_RESTING_STDDEV = 0.1  # [steps]
 
 
 class GraspPlan:
@@ -151,11 +152,11 @@ class GraspPlan:
 
     @property
     def _uncertainty(self) -> float:
-        """What the force's stated deviation has beyond the tolerance [N]: so much nearer to the set force it may be."""
+        """The force's stated deviation beyond the tolerance [N]: so much nearer to the set force it may be."""
         return max(0.0, self._load.stddev - _TOLERANCE)
 
     def is_worth(self, target: float, speed: float, opening: float) -> bool:
-        """Whether a target [m] with a speed [m/s] is worth a command to jaws that are at `opening` [m] now."""
+        """Return True if a target [m] with a speed [m/s] is worth a command to jaws that are at `opening` [m] now."""
         if math.isnan(self.target):
             return True
         steps = (self.target - target) / self.step
@@ -196,7 +197,7 @@ class GraspPlan:
         return max(0.0, allowed - load.model.force_stddev - self._uncertainty) if allowed > 0.0 else allowed
 
     def _may_step(self, allowed: float) -> bool:
-        """Whether jaws at rest may close by one step for an allowed rise of the force [N]: its effect will be seen."""
+        """Return True if jaws at rest may close by one step for an allowed rise of the force [N]."""
         load = self._load
         if not load.loaded:
             return load.force < load.onset
@@ -236,11 +237,11 @@ class GraspPlan:
             raise GraspError("the gripper's power stage is off: did somebody else switch it off?")
 
     def rests_at(self, stamp: float, reported: float) -> bool:
-        """Whether the jaws stood at their target at the time `stamp` [s], when `reported` [m] was their opening."""
+        """Return True if the jaws stood at their target at `stamp` [s], when `reported` [m] was their opening."""
         return stamp >= self._arrives and abs(reported - self.target) <= _NEAR * self.step
 
     def is_late(self, now: float, reported: float) -> bool:
-        """Whether the jaws should have been at their target for long and are not there."""
+        """Return True if the jaws should have been at their target for long and are not there."""
         return now > self._arrives + _LATE and abs(reported - self.target) > (_NEAR + 1.0) * self.step
 
     def locate(self, stamp: float, state: GripperState, opening_at: Callable[[float], float]) -> JawPosition:

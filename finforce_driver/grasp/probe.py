@@ -15,10 +15,10 @@ _LEAST_STIFFNESS = 1000.0
 
 
 class FrictionProbe:
-    """Where the jaws are to go until the object was probed.
+    """The targets of the jaws until the object was probed.
 
     Attributes:
-        is_due: whether that has still to be done.
+        is_due: True if that has still to be done.
 
     Args:
         length: by which the jaws open on the way back [m]; 0 for no probe.
@@ -31,7 +31,7 @@ class FrictionProbe:
 
     @property
     def goes_back(self) -> bool:
-        """Whether the jaws are on their way back."""
+        """True if the jaws are on their way back."""
         return not math.isnan(self._back)
 
     def find_target(self, plan: GraspPlan, load: LoadWatch, set_force: float) -> float:

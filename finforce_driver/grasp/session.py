@@ -57,7 +57,7 @@ class GraspSession:
 
     @property
     def runs(self) -> bool:
-        """Whether a grasp is under way, or holds."""
+        """True if a grasp is under way, or holds."""
         return self._grasp is not None
 
     def set_goal(self, goal: GraspGoal) -> None:

@@ -1,4 +1,4 @@
-"""What the driver knows of one gripper and wants of it, and the request that follows: the most urgent one first."""
+"""Knowledge and goals of the driver for one gripper, and the request that follows: the most urgent one first."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Request:
     Attributes:
         message: it.
         move: the order in it, where there is one.
-        counted: whether silence says that the gripper does not answer.
+        counted: True if silence says that the gripper does not answer.
     """
 
     message: CanMessage
@@ -90,7 +90,7 @@ class Exchange:
 
     @property
     def in_step(self) -> bool:
-        """Whether the next reply belongs to the next request."""
+        """True if the next reply belongs to the next request."""
         return self._tries == 0
 
     def begin(self, request: Request, now: float) -> None:
@@ -155,9 +155,9 @@ class Drive:
 
     Attributes:
         settings: of the gripper.
-        known: what the replies say.
+        known: content of the replies.
         exchange: requests and replies.
-        orders: what the gripper shall do.
+        orders: orders to the gripper.
         order_sent: when the last order was answered [s].
         stop: the emergency stop.
         recovery: errors being cleared; None: none are.
@@ -166,7 +166,7 @@ class Drive:
         ended: outcome of the last move that is no job any more.
         joined: the link is open.
         silent: nothing has answered for long.
-        arrival: whether the jaws move by an order from before the link was there; None: that is known.
+        arrival: True if the jaws move by an order from before the link was there; None: that is known.
         watchdogs: messages that set the gripper's watchdog and have still to leave.
         hold_wanted: the jaws are to be held where the next reply says that they are.
         note: sentence that stays until the next command.
@@ -220,7 +220,7 @@ class Drive:
 
     @property
     def phase(self) -> Phase:
-        """Where the driver is with the gripper."""
+        """The phase of the driver."""
         if not self.joined or self.silent:
             return Phase.DISCONNECTED
         if self.known.reply is None:
@@ -237,29 +237,29 @@ class Drive:
 
     @property
     def moving(self) -> bool:
-        """Whether a move is under way."""
+        """True if a move is under way."""
         return self.job is not None and self.job.outcome is MoveOutcome.NONE
 
     @property
     def outcome(self) -> MoveOutcome:
-        """What became of the last move."""
+        """The outcome of the last move."""
         outcome = self.ended if self.job is None else self.job.outcome
         limp = self.known.reply is not None and not self.known.driving
         return MoveOutcome.NONE if outcome is MoveOutcome.GRASPED and limp else outcome
 
     @property
     def may_drive(self) -> bool:
-        """Whether an order that moves the jaws may leave: everything that speaks against it is known and does not."""
+        """True if an order that moves the jaws may leave: everything that speaks against it is known and does not."""
         return self.phase in USABLE and self.exchange.in_step and not self.known.filter.alarming
 
     @property
     def has_orders(self) -> bool:
-        """Whether an order or an emergency stop has still to be sent."""
+        """True if an order or an emergency stop has still to be sent."""
         return self.orders.pending or bool(self.watchdogs) or (self.stop.active and not self.known.error)
 
     @property
     def must_reopen(self) -> bool:
-        """Whether nothing has answered for so long that the link is to be opened anew."""
+        """True if nothing has answered for so long that the link is to be opened anew."""
         return self.exchange.misses >= MISSED_REPLIES
 
     def position_now(self, now: float) -> float:
@@ -397,13 +397,13 @@ class Drive:
         return request
 
     def _quiet(self, now: float) -> bool:
-        """Whether the gripper boots and nothing is to be sent; an emergency stop is sent all the same."""
+        """Return True if the gripper boots and nothing is to be sent; an emergency stop is sent all the same."""
         run = self.calibration
         return run is not None and run.quiet_until(now) is not None and not self.stop.active
 
     @property
     def _busy(self) -> bool:
-        """Whether a stop, a recovery or a calibration keeps orders back."""
+        """True if a stop, a recovery or a calibration keeps orders back."""
         return self.stop.active or self.recovery is not None or self.calibration is not None
 
     def _urgent_order(self, _: float) -> Request | None:
@@ -477,7 +477,7 @@ class Drive:
         return Request(message=encode(self._searched, Command.PING, remote=True))
 
     def _rests(self, now: float) -> bool:
-        """Whether a late reply is waited for: the way back into step without markers."""
+        """Return True if a late reply is waited for: the way back into step without markers."""
         if not self._resting():
             return False
         if now < self.exchange.sent + LATEST_REPLY:

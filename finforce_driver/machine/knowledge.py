@@ -1,4 +1,4 @@
-"""What the replies say of the gripper: which of them are believed, position, speed, faults and telemetry.
+"""The state of the gripper by its replies: plausibility, position, speed, faults and telemetry.
 
 A digit that was corrupted on the serial line makes a valid reply that is wrong; it must never become a state. What
 continues the last reply is believed at once, anything else when it repeats itself.
@@ -134,22 +134,22 @@ class Knowledge:
 
     @property
     def stamp(self) -> float:
-        """When the last believed reply came [s]; NaN before the first."""
+        """The time of the last believed reply [s]; NaN before the first."""
         return math.nan if self.reply is None else self.reply.time
 
     @property
     def calibrated(self) -> bool:
-        """Whether the position means something."""
+        """True if the position means something."""
         return self.reply is not None and self.reply.calibrated and not self.distrust
 
     @property
     def error(self) -> bool:
-        """Whether a fault is latched."""
+        """True if a fault is latched."""
         return self.reply is not None and self.reply.error
 
     @property
     def driving(self) -> bool:
-        """Whether the gripper's power stage moves or holds the jaws."""
+        """True if the gripper's power stage moves or holds the jaws."""
         return self.reply is not None and self.reply.driving and not self.asleep
 
     @property
@@ -214,7 +214,8 @@ def estimate_position(reply: Reply, order: Move | None) -> float:
 
 
 CURRENT_STEP = 100.0  # [mA] that the current may change by between two replies without a confirmation
-CONFIRMING_STEP, CONFIRMING_RATE = 60.0, 5_000.0  # [mA], [mA/s] between two that confirm each other
+CONFIRMING_STEP = 60.0  # [mA], between two replies that confirm each other
+CONFIRMING_RATE = 5_000.0  # [mA/s], in addition
 CONFIRMATIONS = 3  # replies in a row that have to agree with the first one
 MOST_UNCONFIRMED = 16  # after which numbers are taken to differ for good, as by a noisy current
 FAST_TRAVEL = 3.0  # [counts] between two replies, beyond which each is confirmed: the jaws may have stopped
@@ -239,12 +240,12 @@ class ReplyFilter:
 
     @property
     def wants_reply(self) -> bool:
-        """Whether a further reply is wanted at once."""
+        """True if a further reply is wanted at once."""
         return bool(self._candidates)
 
     @property
     def alarming(self) -> bool:
-        """Whether an unconfirmed reply, if it is true, changes what the gripper may be told."""
+        """True if an unconfirmed reply, if it is true, changes what the gripper may be told."""
         if self._believed is None:
             return bool(self._candidates)
         status = _drive_status(self._believed)

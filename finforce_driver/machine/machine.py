@@ -68,7 +68,7 @@ class GripperMachine(Drive):
     """Drives one gripper, without input or output of its own; what is known and wanted changes here.
 
     Attributes:
-        state: what is known now; reading it never blocks.
+        state: the present state; reading it never blocks.
 
     Args:
         settings: of the gripper.
@@ -272,7 +272,7 @@ class GripperMachine(Drive):
         Args:
             message: as it came.
             now: when [s].
-            link_counts: what the link counts, to be shown in the state.
+            link_counts: counters of the link, shown in the state.
         """
         self.link_counts = link_counts or self.link_counts
         if not self.exchange.answers(message):

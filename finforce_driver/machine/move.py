@@ -17,7 +17,8 @@ TOLERANCE = 2  # [counts]: the reply truncates, the gripper stops within a fract
 CLOSED = 250  # [counts] from which contact while closing is with the other jaw
 OPENED = 3  # [counts] up to which contact while opening is with the stop
 CLEAR_CURRENT = 50  # [mA] from which the sign of the current is trusted
-EXTRA_TIME, LEAST_TIME = 1.0, 1.5  # [s] beyond the travel's own time, and in all
+EXTRA_TIME = 1.0  # [s], allowed beyond the travel's own time
+LEAST_TIME = 1.5  # [s], allowed for any move
 
 
 def push_direction(reply: Reply, closing: bool) -> int:
@@ -59,7 +60,7 @@ class Steps:
 
     @property
     def done(self) -> bool:
-        """Whether the target has arrived."""
+        """True if the target has arrived."""
         return self.position == self.goal
 
     def ramp(self, now: float) -> float:
@@ -91,7 +92,7 @@ PRESSING = (MoveOutcome.GRASPED, MoveOutcome.BLOCKED)
 
 @dataclass(frozen=True, kw_only=True)
 class Goal:
-    """What was asked for.
+    """The goal of a move.
 
     Attributes:
         opening: to be reached [m].
@@ -114,8 +115,8 @@ class MoveJob:
     """Carries out a goal; one that stalls goes on pressing, and on moving when what it presses on gives way.
 
     Attributes:
-        goal: what was asked for.
-        outcome: what became of it; NONE while it is under way.
+        goal: target, speed and current.
+        outcome: its outcome; NONE while it is under way.
         sent: an order of it has left.
         steps: target of a slow move; None: the gripper goes to the end by itself.
 
@@ -142,17 +143,17 @@ class MoveJob:
 
     @property
     def position(self) -> int:
-        """Where the gripper is to be sent now [counts]."""
+        """The position to which the gripper is to be sent now [counts]."""
         return self.steps.position if self.steps else self.goal.position
 
     @property
     def next_time(self) -> float:
-        """When the target goes on [s]; infinite when it does not."""
+        """The time at which the target goes on [s]; infinite when it does not."""
         return self.steps.next_time if self.steps and not self.steps.done and self.stepping else math.inf
 
     @property
     def stepping(self) -> bool:
-        """Whether the target may go on: under way, or pressing on something that may give way."""
+        """True if the target may go on: under way, or pressing on something that may give way."""
         return self.outcome is MoveOutcome.NONE or self.outcome in PRESSING
 
     def advance(self, now: float, jaws: float, stamp: float) -> None:
@@ -209,7 +210,7 @@ class MoveJob:
         return MoveOutcome.TIMED_OUT if reply.time > self._deadline else MoveOutcome.NONE
 
     def _lasting_contact(self, reply: Reply) -> bool:
-        """Whether a contact has lasted for long enough at one position."""
+        """Return True if a contact has lasted for long enough at one position."""
         if not reply.contact:
             self._contact = None
             return False
@@ -219,7 +220,7 @@ class MoveJob:
         return reply.time - self._contact.time >= CONTACT_TIME and self._contacts >= CONTACT_REPLIES
 
     def _rests_next_to_goal(self, reply: Reply, final: bool) -> bool:
-        """Whether the jaws have come to rest a count off the goal, which old firmware never calls reached."""
+        """Return True if the jaws have come to rest a count off the goal, which old firmware never calls reached."""
         near = abs(reply.position - self.goal.position) <= 1
         if not final or reply.contact or not near or reply.position != self._rest_position:
             self._rest_position, self._rest_since = reply.position, reply.time
@@ -237,8 +238,8 @@ class Orders:
     speed: a free flag changes, so that they differ.
 
     Attributes:
-        wanted: what the gripper shall do; None: whatever it does.
-        taken: what it has acknowledged; None: unknown.
+        wanted: order for the gripper; None: none.
+        taken: order that it has acknowledged; None: unknown.
         urgent: the wanted order makes it stop, and does not wait for the link to be in step.
 
     Args:
@@ -254,7 +255,7 @@ class Orders:
 
     @property
     def pending(self) -> bool:
-        """Whether the wanted order has still to be sent."""
+        """True if the wanted order has still to be sent."""
         return self.wanted is not None and self.wanted != self.taken
 
     def want(self, move: Move, urgent: bool = False) -> None:
@@ -321,7 +322,7 @@ class OrderWatch:
 
     @property
     def rests(self) -> bool:
-        """Whether the jaws have come to rest under a known order."""
+        """True if the jaws have come to rest under a known order."""
         return self._order is not None and self._order.drives and self._high - self._low <= 2.0
 
     def send(self, order: Move, now: float, position: float) -> None:

@@ -1,4 +1,4 @@
-"""What takes several messages: an emergency stop, the clearing of errors, a calibration."""
+"""Procedures of several messages: an emergency stop, the clearing of errors, a calibration."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class EmergencyStop:
 
 
 class Step(Enum):
-    """What a recovery or a calibration does next."""
+    """The next step of a recovery or a calibration."""
 
     UNFLAG = auto()  # an order without the stop's flag: the flag latches the fault again every 0.2 ms
     CLEAR = auto()
@@ -69,7 +69,7 @@ class Step(Enum):
 
     @property
     def over(self) -> bool:
-        """Whether nothing more is to be done."""
+        """True if nothing more is to be done."""
         return self in (Step.DONE, Step.FAILED)
 
 
@@ -81,7 +81,7 @@ class Recovery:
     """One attempt to clear the errors, with repetitions for messages that are lost.
 
     Attributes:
-        step: what is to be done next.
+        step: next step.
 
     Args:
         unflag: an emergency stop is among what is latched.
@@ -120,8 +120,12 @@ BOOT_TIME = 3.0  # [s] after a reset
 START_TIME = 1.0  # [s] in which the motor has to show that it runs
 STARTS = 3
 QUIET_CURRENT = 20  # [mA] that a motor at rest does not exceed
-IDLE_CURRENT, IDLE_REPLIES, LEAST_TIME = 100, 10, 0.7  # [mA], replies and [s] after which it is over
-OPENED, CLOSED = 3, 252  # [counts]
+# A calibration is over after this time and so many replies in a row at rest.
+IDLE_CURRENT = 100  # [mA]
+IDLE_REPLIES = 10  # replies
+LEAST_TIME = 0.7  # [s]
+OPENED = 3  # [counts]
+CLOSED = 252  # [counts]
 END_TIME = 0.5  # [s] in which the position has to follow the flag
 NO_GRIPPER = (
     "the calibration is done, but the position does not follow: configure the controller as a gripper "
@@ -158,7 +162,7 @@ class Travel:
 
     @property
     def next_time(self) -> float:
-        """When the encoder is asked next [s]; infinite where it never answers."""
+        """The time of the next question to the encoder [s]; infinite where it never answers."""
         return self._next_time if self.answers or self._silences < SILENCES else math.inf
 
     def ask(self, now: float) -> None:
@@ -209,7 +213,7 @@ class CalibrationRun:
     """Follows a calibration by its replies.
 
     Attributes:
-        step: what is to be done next.
+        step: next step.
         reason: why it failed, or a remark on its success.
         travel: of the jaws.
 

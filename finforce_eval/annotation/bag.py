@@ -227,7 +227,7 @@ def write_annotated(
     Files next to the bag in its own folder, as a `case.json` or the object's mesh, are copied, too.
 
     Args:
-        recording: what was read of the bag.
+        recording: content of the bag.
         source: the bag, as `bag_source` returned it.
         forces: the new messages.
         folder: to be made; see `new_folder`.

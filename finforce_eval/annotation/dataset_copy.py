@@ -42,8 +42,8 @@ class Column:
     Attributes:
         entry: of `meta/info.json`; None leaves the feature out.
         rows: by episode, (n, k) new numbers, truths or texts.
-        kept: how many numbers of a row stay, before the new ones.
-        has_stats: whether the new numbers, all finite, have statistics.
+        kept: number of values of a row that stay, before the new ones.
+        has_stats: True if the new numbers, all finite, have statistics.
     """
 
     entry: Mapping[str, Any] | None
@@ -68,7 +68,7 @@ def write_copy(dataset: Dataset, target: Path, columns: Mapping[str, Column]) ->
     Videos are hard links where the file system has them, else copies.
 
     Args:
-        dataset: what is copied.
+        dataset: the original.
         target: folder of the copy, which is there and empty.
         columns: by feature.
 
@@ -181,7 +181,7 @@ class _StatsWriter:
     """Writes the statistics of a copy, wherever its layout keeps some.
 
     Args:
-        dataset: what is copied.
+        dataset: the original.
         columns: by feature.
     """
 

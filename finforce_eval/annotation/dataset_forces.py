@@ -76,7 +76,7 @@ def _check_files(dataset: Dataset) -> None:
     """Refuse a dataset some of whose files are not there, or lead out of it.
 
     Raises:
-        RecordingError: which, and how many.
+        RecordingError: Episodes are missing; names them.
     """
     files, missing = {path for each in dataset.episodes for path in (each.video, each.data) if path is not None}, {}
     for path in sorted(files):
@@ -227,7 +227,7 @@ def _check_names(dataset: Dataset, options: argparse.Namespace) -> None:
     """Refuse names that the dataset has for something else, and a state that cannot be extended.
 
     Raises:
-        FinforceError: which.
+        FinforceError: Its images or options cannot be used.
     """
     check_prefix(options.prefix)
     own = (f"{options.prefix}.", f"observation.{options.prefix}")

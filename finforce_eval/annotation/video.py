@@ -84,7 +84,7 @@ class ForceOverlay:
 
 
 class _Overlay:
-    """What is drawn of one jaw."""
+    """The drawing of one jaw."""
 
     def __init__(self, track: JawTrack, forces: ForceSeries, camera: CameraIntrinsics, scale: int) -> None:
         self._track, self._forces, self._camera, self._scale = track, forces, camera, scale

@@ -23,7 +23,9 @@ LEAST_HOLD = 1.5  # [s]
 SHORT_HOLD = 0.5  # [s] from which a steady force is mentioned that is too short to count
 LEAST_FORCE = 0.1  # [N]; below it a hold is not told from rest
 _WINDOW = 1.0  # [s] of the end of a hold, when the scale is read
-_DRIFT, _DRIFT_FLOOR = 0.04, 0.02  # of the force and [N] in one window: relaxation is slower, pressing is faster
+# Largest drift in one window of a hold: relaxation is slower, pressing is faster.
+_DRIFT = 0.04  # [-], of the force
+_DRIFT_FLOOR = 0.02  # [N]
 _NOISE_SIGMAS = 3.0  # standard errors of the drift by which noise may exceed that
 _SCALE_ERROR = 0.02  # [N]: two grams
 _RELATIVE_ERROR = 0.02  # of one reading, by the height at which it was pressed
@@ -54,7 +56,7 @@ class Weighing:
     Attributes:
         factor: by which the modulus has to be multiplied [-].
         stddev: of the factor [-].
-        holds: what was held, in time.
+        holds: the weights held, in order of time.
         weights: readings of the scale [N].
         misfit: root mean square of what is left, relative to each weight [-].
     """
@@ -117,7 +119,7 @@ def calibrate_with_scale(
     Args:
         times: (n,) of the images [s], rising.
         forces: (n,) estimated along the closing direction [N], either sign, or vectors (n, 3); NaN where unknown.
-        grams: what the scale showed at the end of each press, at zero before; in their order.
+        grams: readings of the scale at the end of each press, zeroed before; in their order.
         jaw: that the forces were estimated with, its file or its name.
         calibration: that they were estimated with; None for the material of the jaw file.
         solver: that they were estimated with.

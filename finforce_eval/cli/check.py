@@ -8,8 +8,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from finforce.camera_topics import COLOR_TOPIC, COMPRESSED_COLOR, DEPTH_TOPIC, INFO_TOPIC
-from finforce.errors import MissingDependencyError
 from finforce.messages import read_stamp
+from finforce.optional import import_cv2, import_ros
 from finforce_contact.mesh.object_mesh import UNITS
 from finforce_eval.cli.extrinsics import read_at_rest
 from finforce_eval.cli.parser import BAG_HELP, CommandResult, add_rest_options
@@ -73,10 +73,7 @@ def record_camera(topics: Sequence[str], count: int, folder: Path, domain: int |
         RecordingError: images or intrinsics do not come; the message says which topics do.
         MissingDependencyError: ROS is not there.
     """
-    try:
-        from finforce.ros.monitor import listen
-    except ImportError as error:
-        raise MissingDependencyError(f"listening to topics needs ROS 2: {error}") from error
+    listen = import_ros("finforce.ros.monitor", "listening to topics").listen
     color, info = topics[:2]
     is_packed = color.endswith(COMPRESSED_COLOR)
     kinds = dict(zip(topics, (COMPRESSED if is_packed else IMAGE, CAMERA_INFO, IMAGE), strict=False))
@@ -98,8 +95,6 @@ def record_camera(topics: Sequence[str], count: int, folder: Path, domain: int |
 
 
 def _check(options: argparse.Namespace) -> CommandResult:
-    from finforce.optional import import_cv2
-
     source, recording = read_at_rest(options)
     with progress_bar(ROUNDS * len(recording.images), "image") as bar:
         found, picture = check_recording(recording, source, bar.update)

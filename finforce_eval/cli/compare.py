@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from finforce_eval.cli.parser import CommandResult
-from finforce_eval.evaluate import read_evaluations
+from finforce_eval.evaluation.batch import read_evaluations
 from finforce_eval.evaluation.comparison import (
     BETTER,
     LOST,
@@ -24,7 +24,7 @@ from finforce_eval.evaluation.comparison import (
     read_evaluation,
     total_change,
 )
-from finforce_eval.evaluation.tables import evaluation_json
+from finforce_eval.evaluation.score_tables import evaluation_json
 from finforce_eval.machine import without_nan
 
 WORSE_FOUND = 1

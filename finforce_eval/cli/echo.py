@@ -8,7 +8,7 @@ from itertools import islice
 
 import yaml
 
-from finforce.errors import MissingDependencyError
+from finforce.optional import import_ros
 from finforce_eval.cli.parser import CommandResult, whole_number
 
 EXAMPLES = """examples:
@@ -27,13 +27,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> CommandResult:
     """Print messages until there were enough, or Ctrl-C."""
-    try:
-        from finforce.ros.monitor import describe_message, iter_messages
-    except ImportError as error:
-        raise MissingDependencyError(f"echo needs ROS 2: pip install 'finforce[ros]' ({error})") from error
-    messages = iter_messages(options.topic, lambda text: print(f"note: {text}", file=sys.stderr, flush=True))
+    monitor = import_ros("finforce.ros.monitor", "echo")
+    messages = monitor.iter_messages(options.topic, lambda text: print(f"note: {text}", file=sys.stderr, flush=True))
     for message in islice(messages, options.count):
         style = {"default_flow_style": True if options.line else None, "width": sys.maxsize}
-        text = yaml.safe_dump(describe_message(message), sort_keys=False, allow_unicode=True, **style)
+        text = yaml.safe_dump(monitor.describe_message(message), sort_keys=False, allow_unicode=True, **style)
         print(text if options.line else f"{text}---\n", end="", flush=True)
     return CommandResult()

@@ -10,9 +10,9 @@ from tempfile import TemporaryDirectory
 
 from finforce_eval.cli.parser import BAG_HELP, CommandResult, add_engine_options, add_run_options, read_engine
 from finforce_eval.errors import OptionError
-from finforce_eval.evaluate import evaluate_many
+from finforce_eval.evaluation.batch import evaluate_many
+from finforce_eval.evaluation.score_tables import evaluation_json, format_tables
 from finforce_eval.evaluation.setup import make_setup
-from finforce_eval.evaluation.tables import evaluation_json, format_tables
 
 EXAMPLES = """examples:
   finforce evaluate BAG --calibration twin                             # as recorded, scored

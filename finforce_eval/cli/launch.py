@@ -13,7 +13,6 @@ from finforce.errors import MissingDependencyError
 from finforce.settings import describe
 from finforce.signals import StopSignals
 from finforce.systems.launch import default_text, find_share, missing, options_from_words
-from finforce.systems.live import bench_processes, robot_processes
 from finforce.systems.processes import (
     BenchOptions,
     Include,
@@ -22,9 +21,10 @@ from finforce.systems.processes import (
     RobotOptions,
     replay_processes,
 )
+from finforce.systems.setups import bench_processes, robot_processes
 from finforce_eval.cli.parser import CommandResult
 from finforce_eval.errors import OptionError
-from finforce_eval.replay.processes import ProcessGroup
+from finforce_eval.replay.process_group import ProcessGroup
 
 SYSTEMS = {
     "robot": (RobotOptions, robot_processes),

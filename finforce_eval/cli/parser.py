@@ -10,12 +10,11 @@ from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from finforce.errors import suggest
+from finforce_ifea.settings import MESHES, SOLVERS
 
 if TYPE_CHECKING:
     from finforce_eval.tasks import EngineOptions
 
-SOLVERS = ("default", "reduced", "solid", "frame", "plane", "linear", "paper")
-MESHES = ("default", "coarse", "fine")
 UNITS = ("m", "cm", "mm", "inch")
 SOURCES = ("images", "keypoints", "truth")
 JAWS_CHOICES = ("left", "right", "both")
@@ -33,7 +32,7 @@ PICTURES = (".png", ".jpg", ".svg", ".pdf")
 
 @dataclass(frozen=True)
 class CommandResult:
-    """What a command has found, as `--json` writes it, and its exit status."""
+    """The results of a command, as `--json` writes them, and its exit status."""
 
     results: Mapping[str, Any] = field(default_factory=dict)
     status: int = 0

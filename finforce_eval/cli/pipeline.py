@@ -6,18 +6,18 @@ import argparse
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
-from finforce.errors import MissingDependencyError
+from finforce.optional import import_ros
 from finforce.settings import setting
 from finforce.systems.launch import options_from_words
-from finforce.systems.live import gripper_process
 from finforce.systems.processes import GripperOptions, Process, ReplayOptions, finish, merge, replay_processes
+from finforce.systems.setups import gripper_process
 from finforce_eval.cli.parser import CommandResult
 from finforce_eval.errors import OptionError
 
 
 @dataclass(frozen=True, kw_only=True)
 class _PipelineOptions(ReplayOptions, GripperOptions):
-    """What the command is asked for: what the launch files are, as far as it is about our nodes."""
+    """Options of the command: those of the launch files that concern our nodes."""
 
     jaws: str = setting("both", "Jaws in the images", choices=("left", "right", "both"))
     images: bool = True
@@ -53,9 +53,5 @@ def pipeline_process(words: list[str]) -> Process:
 def run(options: argparse.Namespace) -> CommandResult:
     """Run the process until Ctrl-C; its exit status is that of the command."""
     process = pipeline_process(options.words)
-    try:
-        from finforce.ros.composition import main
-    except ImportError as error:
-        raise MissingDependencyError(f"the pipeline needs ROS 2: pip install 'finforce[ros]' ({error})") from error
-    status = main([*process.arguments, "--ros-args"])
+    status = import_ros("finforce.ros.composition", "the pipeline").main([*process.arguments, "--ros-args"])
     return CommandResult({"processes": [process.executable]}, status=status)

@@ -74,13 +74,14 @@ def prepare(jaws: Sequence[str], calibration: str) -> Iterator[str]:
 
 
 def compile_mechanics() -> None:
-    """Compile the mechanics that an image is solved with, by a jaw taken to be linear, which needs no equilibria."""
+    """Compile the mechanics that an image is solved with, by a jaw at rest alone, which needs no equilibria."""
     from finforce_ifea.jaw.jaw import load_jaw
     from finforce_ifea.mechanics import build_mechanics
+    from finforce_ifea.reduced.cache import reduce_mechanics
     from finforce_ifea.settings import EstimatorSettings
 
     jaw = load_jaw("bench")
-    mechanics = build_mechanics(jaw, EstimatorSettings(solver="linear"))
+    mechanics = reduce_mechanics(build_mechanics(jaw, EstimatorSettings()), jaw, linear=True)
     contact, model = mechanics.contact, mechanics.model
     state = np.array([0.0, 0.0, np.median(jaw.candidates[:, 2])])
     rest, keypoints = contact.begin(state[2]), model.attach(jaw.keypoints)

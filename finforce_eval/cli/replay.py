@@ -13,8 +13,8 @@ from finforce_eval.annotation.video import ForceOverlay
 from finforce_eval.cli.parser import BAG_HELP, CommandResult, add_run_options
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.keypoint_source import parse_source
+from finforce_eval.evaluation.score_tables import evaluation_json
 from finforce_eval.evaluation.setup import make_setup
-from finforce_eval.evaluation.tables import evaluation_json
 from finforce_eval.replay.replay import Playing, Replay, replay
 
 GRASP = "grasp.png"  # picture on top of the report

@@ -13,7 +13,7 @@ from finforce.gripper_frames import SIDES
 from finforce.messages import NANOSECONDS, stamp_of
 from finforce_eval.cli.parser import CommandResult
 from finforce_eval.errors import OptionError, RecordingError
-from finforce_eval.evaluate import read_evaluations
+from finforce_eval.evaluation.batch import read_evaluations
 from finforce_eval.evaluation.scoring import match_truth
 from finforce_eval.figures.report import write_html, write_page
 from finforce_eval.machine import version
@@ -93,17 +93,20 @@ def read_forces(path: Path) -> list[ForceSeries]:
 
 def _read_episodes(dataset: Dataset) -> list[ForceSeries]:
     """Return the forces of all episodes of a dataset, as `annotate` writes them."""
-    names = [name for name in dataset.info["features"] if name.endswith(tuple(f".force.{side}" for side in SIDES))]
+    features = dataset.info["features"]
+    names = [name for name in features if {f"{name}.stddev", f"{name}.valid"} <= features.keys()]
     if not names:
-        raise RecordingError(f"{dataset.folder.name}: no forces: no feature ends in .force.left or .force.right")
+        raise RecordingError(f"{dataset.folder.name}: no forces: no features as force.left and force.left.valid")
     found = []
     for episode in dataset.episodes:
         rows = rows_of(read_parquet(episode.data), episode, dataset.folder.name)
         stamps = np.rint(np.arange(len(rows)) * (NANOSECONDS / float(dataset.info["fps"]))).astype(np.int64)
         for name in names:
             side, values = name.rpartition(".")[2], {}
+            valid = np.array(rows[f"{name}.valid"].to_pylist(), bool).reshape(-1, 1)
             for column, end in (("force", ""), ("force_stddev", ".stddev")):
-                values[column] = np.array(rows[name + end].to_pylist(), dtype=np.float64).reshape(-1, 3)
+                told = np.array(rows[name + end].to_pylist(), dtype=np.float64).reshape(-1, 3)
+                values[column] = np.where(valid, told, np.nan)
             stddev = stddev_along(values["force"], values["force_stddev"])
             case = f"{dataset.folder.name}/episode_{episode.index:06d}/{side}"
             found.append(ForceSeries.build(case, side, stamps, **values, magnitude_stddev=stddev, status=""))

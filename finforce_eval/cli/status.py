@@ -9,8 +9,8 @@ from dataclasses import asdict
 from shutil import get_terminal_size
 from typing import TYPE_CHECKING
 
-from finforce.errors import MissingDependencyError
 from finforce.health import Level
+from finforce.optional import import_ros
 from finforce_eval.cli.parser import CommandResult
 
 if TYPE_CHECKING:
@@ -31,10 +31,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> CommandResult:
     """Show the state of every part of a running system, once or until Ctrl-C."""
-    try:
-        from finforce.ros.monitor import iter_statuses
-    except ImportError as error:
-        raise MissingDependencyError(f"status needs ROS 2: pip install 'finforce[ros]' ({error})") from error
+    iter_statuses = import_ros("finforce.ros.monitor", "status").iter_statuses
     if options.once or options.json or not sys.stdout.isatty():
         statuses = next(iter_statuses(COLLECTED))
         print(format_statuses(statuses))

@@ -168,7 +168,7 @@ def write_footage(
     """Write footage as a rosbag2 folder with its `case.json` and the object's mesh.
 
     Args:
-        footage: what is written; one image after the other, never all of them in memory.
+        footage: images and truth; one image after the other, never all of them in memory.
         folder: the new folder, which must not exist.
         compressed: jpeg colour and png depth; else plain images.
         case: further content of the `case.json`.

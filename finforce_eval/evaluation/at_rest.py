@@ -36,7 +36,7 @@ def first_images(recording: Recording, count: int) -> Recording:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class JawsAtRest:
-    """What a detector saw.
+    """The key points that a detector saw.
 
     Attributes:
         jaws: by side.

@@ -1,4 +1,4 @@
-"""Whether camera, jaw file, extrinsics and picture fit each other, before any force is believed."""
+"""The check that camera, jaw file, extrinsics and picture fit each other, before any force is believed."""
 
 from __future__ import annotations
 
@@ -35,12 +35,15 @@ from finforce_keypoints.parameters import NO_DEPTH, find_mounts
 from finforce_keypoints.rib_check import compare_rig, describe_ribs
 
 OK, WARNING, FAULT = "ok", "warning", "fault"
-DARK, BRIGHT = 25.0, 235.0  # of 255: mean brightness beyond which a picture shows little
+DARK = 25.0  # of 255, least mean brightness
+BRIGHT = 235.0  # of 255, greatest mean brightness
 BLURRED = 0.16  # share of the finest detail in that of the next scale, of a picture out of focus
 COVERED = 0.30  # share of the picture's parts without any detail, from which on something may cover the lens
-FLAT, TILES = 1.5, 12  # of 255: contrast of such a part; parts each way
+FLAT = 1.5  # of 255, contrast of a part without detail
+TILES = 12  # parts along each side of the image
 GOOD_RESIDUAL = 1.0  # [px] left over when jaws at rest are laid on what is seen
-FAR, TURNED = 3e-3, np.radians(1.5)  # [m], [rad] by which the camera may be elsewhere than it is stated to be
+FAR = 3e-3  # [m], tolerated error of the stated camera position
+TURNED = np.radians(1.5)  # [rad], tolerated error of the stated camera rotation
 # Share of a jaw's key points that have to be seen for another reading to be named: pictures of fingers that are none of
 # the known ones show at most 0.75 of a wrong one's.
 ENOUGH = 0.8

@@ -21,17 +21,17 @@ from finforce_eval.errors import OptionError
 from finforce_eval.table import ForceSeries
 
 BETTER, WORSE, SAME, UNSURE, GAINED, LOST = "better", "worse", "same", "unsure", "new", "gone"
-# A difference smaller than this [N] matters to nobody, however sure it is; a surer one than so many deviations counts.
-LEAST, SIGMAS = 0.002, 3.0
+LEAST = 0.002  # [N], difference below which an outcome is "same", however certain
+SIGMAS = 3.0  # [sigma], certainty of a difference that counts
 LEAST_ANSWERS = 5.0  # fewer percents of the frames answered, from which on a recording got worse whatever its error
-# Seconds that err alike, and blocks without which nothing is known of chance.
-_BLOCK, _FEWEST = 4, 4
+_BLOCK = 4  # [s], of correlated errors
+_FEWEST = 4  # blocks for a standard deviation
 _SECOND = 1_000_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
 class Change:
-    """What became of one recording.
+    """The outcome of one recording.
 
     Attributes:
         name: of the recording, or of one of its jaws.

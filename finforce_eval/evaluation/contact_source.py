@@ -1,4 +1,4 @@
-"""Where the contact of an image comes from: given once, or estimated from mesh, pose and deformed jaw."""
+"""Sources of the contact of an image: given once, or estimated from mesh, pose and deformed jaw."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ class RecordedCheck:
 
     @property
     def is_sure(self) -> bool:
-        """Whether there are images enough for a verdict."""
+        """True if there are images enough for a verdict."""
         return len(self._poses) >= self._least
 
     def at(self, stamp: int) -> str:
@@ -154,11 +154,11 @@ def build_source(
     """Return a fresh contact source for one jaw of a recording.
 
     Args:
-        choice: what was asked for.
+        choice: contact that was asked for.
         recording: it tells height, or mesh and poses.
         jaw: the jaw of that side, as calibrated.
         mesh: mesh density of the solver, whose surface the paper's method gets.
-        as_live: whether images are passed over as by the contact estimator's node.
+        as_live: True if images are passed over as by the contact estimator's node.
 
     Raises:
         FinforceError: height, mesh or poses are missing or cannot be used.
@@ -206,7 +206,7 @@ def first_touch(choice: ContactChoice, recording: Recording, jaw: Jaw, mesh: str
     enters with 1/sqrt(n) of its size only.
 
     Args:
-        choice: what was asked for.
+        choice: contact that was asked for.
         recording: with ground truth.
         jaw: the jaw of that side.
         mesh: mesh density of the solver.
@@ -258,7 +258,7 @@ EXPECTED = f"expected {', '.join(ESTIMATED)}, fixed:Z_MM (millimetres), fixed:ca
 
 @dataclass(frozen=True, kw_only=True)
 class ContactChoice:
-    """Where the contact of a recording comes from.
+    """The source of the contact of a recording.
 
     Attributes:
         mode: "estimate", "closest" or "paper" by the contact estimator; "fixed" at a height; "automatic" is "estimate"

@@ -35,7 +35,8 @@ _POINTS = ("points_x", "points_y", "points_z", "points_weight", "points_touching
 
 
 NOT_FOUND, REFUSED = "not found", "refused"  # status of a jaw that is in none of the images, and of a bad image
-STILL_UPDATES, STILL_PERIOD = 30, 0.03  # as often, and so far apart [s], is a still seen, for its contact to settle
+STILL_UPDATES = 30  # updates with the same still, for its contact to settle
+STILL_PERIOD = 0.03  # [s], between them
 PICKED_STDDEV = 1e-3  # [m] of key points that say nothing of it: picked by hand, they scatter by a millimetre or two
 LEAST_ANSWERED = 0.1  # share of the images with a force, below which there is no such finger in them
 
@@ -188,8 +189,8 @@ def find_forces(
         estimator: one that knows of no recording.
         side: "left" or "right".
         strict: an image that is refused ends the run, else it has no force and says why.
-        as_live: whether the images that the solver's node passes over are left out.
-        stills: whether nothing of one image is known in the next.
+        as_live: True if the images that the solver's node passes over are left out.
+        stills: True if nothing of one image is known in the next.
         progress: called with the number of images done since its last call.
         watch: called with side, stamp [ns] and estimator after every image.
 
@@ -243,7 +244,7 @@ class _JawRun:
         side: "left" or "right".
         jaw: the jaw of that side.
         loop: a fresh one.
-        stills: whether nothing of one image is known in the next.
+        stills: True if nothing of one image is known in the next.
     """
 
     def __init__(self, recording: Recording, side: str, jaw: Any, loop: ForceLoop, stills: bool = False) -> None:

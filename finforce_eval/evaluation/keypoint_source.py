@@ -1,4 +1,4 @@
-"""Where the key points of a recording come from: recorded, true, or found in its images by the detector of the node."""
+"""Sources of a recording's key points: recorded, true, or found in its images by the detector of the node."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ LIVE = ("max_age", "diagnostics_period")  # without meaning where no clock runs
 
 
 class DetectorRecords(NamedTuple):
-    """What a detector is built with."""
+    """The parameters that a detector is built with."""
 
     parameters: DetectorParameters
     settings: DetectorSettings
@@ -60,7 +60,7 @@ class DetectorRecords(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class KeypointSource:
-    """What key points a run uses, and the detector that finds them where they come from images.
+    """The key points of a run, and the detector that finds them where they come from images.
 
     Attributes:
         source: "images", "keypoints", "truth", or "" for key points where they were recorded, else images.
@@ -68,8 +68,8 @@ class KeypointSource:
         parameters: parameters of the detector node that differ from its defaults, by their ROS names.
         strict: refuse recordings that are damaged.
         as_live: leave out the images that the detector's node leaves out.
-        stills: whether nothing of one image is known in the next.
-        choice: which images are read.
+        stills: True if nothing of one image is known in the next.
+        choice: images to read.
         sides: jaws that are in the images, whether or not a topic tells of them.
     """
 
@@ -290,7 +290,7 @@ def parse_changes(option: str, kind: str, texts: Sequence[str], defaults: Mappin
 
     Args:
         option: of the command line, for messages.
-        kind: what a name is the name of, for messages.
+        kind: noun for the names, for messages.
         texts: as they were given.
         defaults: by name; a list takes its values with commas between.
 
@@ -332,8 +332,8 @@ def detect_keypoints(
     Args:
         recording: with images.
         detector: a fresh one, of the recording's jaws.
-        as_live: whether the images that the detector's node leaves out have no row.
-        stills: whether nothing of one image is known in the next.
+        as_live: True if the images that the detector's node leaves out have no row.
+        stills: True if nothing of one image is known in the next.
         progress: called with the number of images done since its last call.
 
     Raises:

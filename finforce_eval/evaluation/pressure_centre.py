@@ -1,4 +1,4 @@
-"""Where the measured force meets a jaw, as a height on the undeformed inner surface."""
+"""The point at which the measured force meets a jaw, as a height on the undeformed inner surface."""
 
 from __future__ import annotations
 

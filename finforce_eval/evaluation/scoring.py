@@ -1,4 +1,4 @@
-"""How far forces, grasp force, contact and key points are from the truth, and how late they come, as numbers.
+"""Errors and delays of forces, grasp force, contact and key points against the truth.
 
 Numbers are named as in the JSON of `finforce evaluate`, with their units; None stands for nothing to compute from.
 """
@@ -18,8 +18,8 @@ from finforce_eval.evaluation.gripper import combine_jaws
 from finforce_eval.recordings.tracks import DetectionTrack, DetectionTruth, Recording, WrenchTrack
 from finforce_eval.table import ForceSeries
 
-# Below it the pressure centre hardly matters; from it on something presses [N].
-LEAST_FORCE, ONSET_FORCE = 0.2, 0.02
+LEAST_FORCE = 0.2  # [N], below which the pressure centre is not scored
+ONSET_FORCE = 0.02  # [N] of true force, from which on something presses
 SHOWN = 0.10  # [N] of estimated force, from which on it shows
 FREE = 5  # images without true force before an onset counts as one
 WAITED = 1.0  # [s] after which a force that did not show is missed
@@ -92,7 +92,7 @@ class CaseScore:
         solved_place: the same of the estimator's own contact location.
         onset: delay of `touching`; see `onset_stats`.
         delay: of the force after its true onset; see `delay_stats`.
-        sight: how well the key points were seen; see `detection_stats`.
+        sight: errors of the key points; see `detection_stats`.
         detector_ms: time per image of the key point detector.
     """
 

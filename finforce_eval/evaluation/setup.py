@@ -26,7 +26,8 @@ from finforce_ifea.jaw.calibration import Calibration, load_calibration
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_ifea.settings import EstimatorSettings
 
-TARE_TIME, LEAST_TARE = 1.5, 15  # [s], and images, of the tare of a video
+TARE_TIME = 1.5  # [s], of the tare of a video
+LEAST_TARE = 15  # images of the tare of a video, at least
 # Options that change nothing in the forces of a recording.
 _OUTSIDE = (
     "bags", "out", "workers", "memory", "scheduler", "run", "prefix", "into", "columns", "remove", "json", "report",
@@ -158,11 +159,6 @@ def share_setup(key: str, options: argparse.Namespace) -> EvaluationSetup:
         _last.clear()
         _last[key] = make_setup(options)
     return _last[key]
-
-
-def forget_setup() -> None:
-    """Forget the setup of the call before."""
-    _last.clear()
 
 
 def parse_settings(solver: str, mesh: str, changes: Sequence[str]) -> EstimatorSettings:

@@ -25,7 +25,7 @@ _SPARE = 15  # images beyond those of a tare, some of which may show too little
 
 @dataclass(frozen=True, kw_only=True)
 class TareSource:
-    """Where the jaws are unloaded: in the first images of an episode, or from a time [s] of each recording on."""
+    """The images of unloaded jaws: the first of an episode, or those from a time [s] of each recording on."""
 
     episode: int | None = None
     seconds: float = 0.0

@@ -1,4 +1,4 @@
-"""Why the jaws of a rig are not seen where it has them, in the images of a recording."""
+"""Reasons why the jaws of a rig are not seen where it has them, in the images of a recording."""
 
 from __future__ import annotations
 

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from finforce_eval.evaluation.score_tables import mean_rmse, score_table
 from finforce_eval.evaluation.scoring import Evaluation, rms
-from finforce_eval.evaluation.tables import mean_rmse, score_table
 from finforce_eval.recordings.tracks import DIRECTIONS
 from finforce_eval.table import WAITING, ForceSeries
 
@@ -27,7 +27,7 @@ def write_overview(
     Args:
         evaluation: scores and time series.
         folder: of the report; made when missing.
-        about: what was run: solver, jaw, contact, ...
+        about: settings of the run: solver, jaw, contact, ...
         headline: its first sentence; the mean RMSE of the cases without.
         picture: PNG file in the folder that stands on top; empty for none.
 
@@ -60,7 +60,7 @@ def write_page(
     Args:
         evaluation: scores and time series.
         path: of the page.
-        about: what was run: solver, jaw, contact, ...
+        about: settings of the run: solver, jaw, contact, ...
         title: heading of the page.
         headline: its first sentence; the mean RMSE of the cases without.
         pictures: PNG files.
@@ -99,7 +99,7 @@ def write_html(
         series: one plot each.
         path: of the page.
         title: its heading.
-        about: what was run, name by name.
+        about: settings of the run, by name.
         columns: of a table above the plots; the first holds names.
         rows: of the table: one for each series, in their order, and any after them; without one, images and answers.
         headline: its first sentence; errors, forces and answers of the series without.

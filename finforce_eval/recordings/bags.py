@@ -10,7 +10,7 @@ from errno import EDQUOT, ENOSPC
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from finforce.errors import FinforceError, MissingDependencyError, one_line
+from finforce.errors import FinforceError, one_line
 from finforce.files import BUDGET, FileError, check_plain, parse_yaml, raise_budget, read_text
 from finforce.messages import NANOSECONDS
 from finforce.sandbox import SandboxError, limit_growth, run_limited
@@ -21,12 +21,14 @@ NO_DIGEST = "RIHS01_" + 64 * "0"
 MEGABYTE = 1 << 20
 # Bytes that opening a recording, and reading one more message of it, may take.
 STEP_MEMORY = 512 * MEGABYTE
-# Bytes that all chunks of a recording may unpack to, and may for each byte of its files.
-LARGEST_ALL, PER_BYTE = 192 * MEGABYTE, 100
-# Messages of our topics, and bytes of a file that let there be one more.
-MOST_MESSAGES, BYTES_PER_MESSAGE = 250_000, 16
-LARGEST_METADATA = 4 * MEGABYTE
-SECONDS, BYTES_PER_SECOND = 20, 5 * MEGABYTE  # of work on a recording in a process of its own
+# Bounds of all chunks of a recording unpacked, of its messages, and of the time to read it.
+LARGEST_ALL = 192 * MEGABYTE  # [bytes]
+PER_BYTE = 100  # bytes more for each byte of its files
+MOST_MESSAGES = 250_000  # messages of our topics
+BYTES_PER_MESSAGE = 16  # bytes of a file that allow one message more
+LARGEST_METADATA = 4 * MEGABYTE  # [bytes]
+SECONDS = 20  # [s], of work in a process of its own
+BYTES_PER_SECOND = 5 * MEGABYTE  # bytes of a file that allow one second more
 _HINT = f"{BUDGET}=10 would allow ten times as much"
 
 
@@ -102,18 +104,15 @@ def open_bag(source: Path, name: str) -> Iterator[BagReader]:
     """Open a bag for the length of a `with` block.
 
     Args:
-        source: what `bag_source` returned.
+        source: result of `bag_source`.
         name: of the recording, for messages.
 
     Raises:
         RecordingError: damaged or empty; also when it shows later, in the block.
-        MissingDependencyError: rosbags is not installed.
     """
-    try:
-        from rosbags.rosbag2 import Reader
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError as error:
-        raise MissingDependencyError("reading a recording needs rosbags: pip install rosbags") from error
+    from rosbags.rosbag2 import Reader
+    from rosbags.typesys import Stores, get_typestore
+
     # not AnyReader: it registers every definition in the bag and ends at a foreign one it cannot parse
     types = get_typestore(Stores.ROS2_JAZZY)
     with damage_reported(name), ExitStack() as stack:

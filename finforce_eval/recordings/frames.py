@@ -26,7 +26,8 @@ from finforce_eval.recordings.images import ImageChoice, StampedImage
 from finforce_eval.recordings.tracks import JawTrack, KeypointTrack, Recording, Timed, WrenchTrack
 from finforce_keypoints.images import RgbdImage, check_image
 
-LEAST_RATE, MOST_RATE = 1e-2, 1e4  # Hz of frames
+LEAST_RATE = 1e-2  # [Hz] of frames
+MOST_RATE = 1e4  # [Hz] of frames
 Rate = Annotated[Number, Field(ge=LEAST_RATE, le=MOST_RATE)]
 STILL_RATE = 1.0  # Hz of pictures that say nothing of their times
 LARGEST_PICTURE = 1 << 27  # bytes
@@ -45,8 +46,8 @@ class FrameImages(Timed):
         count: of all frames.
         read: begins anew to yield all frames, (h, w, 3) RGB.
         times: (count,) of the frames [ns]; None where they follow each other at `fps` from zero on.
-        is_video: whether they are those of a camera that ran, compressed, whose still pictures are alike.
-        ends_at_damage: whether the frames before the first damaged one are read, if there are any.
+        is_video: True if they are those of a camera that ran, compressed, whose still pictures are alike.
+        ends_at_damage: True if the frames before the first damaged one are read, if there are any.
         frames: (n,) numbers of those to be read, rising; None for all.
         depth_scale: without meaning.
     """

@@ -106,7 +106,7 @@ def read_intrinsics(words: Sequence[str], shape: tuple[int, int], *, is_cut: boo
     Args:
         words: fx fy cx cy [and k1 k2 p1 p2 k3], also with commas, or what `read_camera` takes.
         shape: height and width of the images.
-        is_cut: whether these may be the middle of the file's images, scaled.
+        is_cut: True if these may be the middle of the file's images, scaled.
 
     Raises:
         OptionError: they are neither, or of a camera with images of another size.

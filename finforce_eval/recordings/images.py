@@ -47,7 +47,7 @@ ALONE = -1  # instead of a depth image's stamp [ns], of a colour image without
 
 @dataclass(frozen=True, kw_only=True)
 class ImageChoice:
-    """Which images of a recording are read.
+    """The images of a recording to read.
 
     Attributes:
         color: topic, of a dataset a feature; "" for the only one there is.
@@ -56,7 +56,7 @@ class ImageChoice:
         intrinsics: words of --intrinsics, instead of camera_info.
         camera: of a rig file, for images that do not describe theirs; others have to agree with it.
         T_gripper_camera: (4, 4), for what is recorded in the axes of the camera; None where nothing tells it.
-        is_cut: whether images may be the middle of those that the intrinsics are of, scaled.
+        is_cut: True if images may be the middle of those that the intrinsics are of, scaled.
         episode: of a dataset.
         pairing: greatest distance between the stamps of a colour and a depth image that belong together [ns]; half a
             period of the colour images when absent.
@@ -82,7 +82,7 @@ class StampedImage(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ImageTrack(Timed):
-    """Where the images of a recording lie; iterating reads them.
+    """The images of a recording; iterating reads them.
 
     Attributes:
         source: the bag.
@@ -119,7 +119,7 @@ class ImageTrack(Timed):
 
     @property
     def has_depth(self) -> bool:
-        """Whether there are depth images."""
+        """True if there are depth images."""
         return bool(self.topics[1])
 
     def all_colors(self) -> ImageTrack:
@@ -177,7 +177,7 @@ def find_images(bag: BagReader, source: Path, choice: ImageChoice | None = None)
     Args:
         bag: where they lie.
         source: of the bag.
-        choice: which of them.
+        choice: topics and images to read.
 
     Raises:
         RecordingError: there are colour images, but no camera_info; there are several cameras; there is depth, but
@@ -261,7 +261,7 @@ def _find_topic(bag: BagReader, ends: Sequence[str]) -> str:
 
 
 class _FirstImage(NamedTuple):
-    """What the first image of a topic tells of all: its frame, its height and width, and what it shows."""
+    """Properties of all images of a topic, by the first: frame, height and width, and content."""
 
     frame: str
     shape: tuple[int, int]

@@ -162,7 +162,7 @@ def pose_object_in_images(recording: Recording, tolerance: int) -> ObjectTrack |
 
 
 class RecordedImage(NamedTuple):
-    """What a recording knows of one image of a jaw.
+    """The data of a recording for one image of a jaw.
 
     Attributes:
         poses: stamp [s] and T_jaw_object (4, 4) [m] of every pose of the object since the image before.

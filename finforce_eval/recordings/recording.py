@@ -55,7 +55,7 @@ _CHECKED = 10_000  # messages after which their number is looked at
 
 
 class _Content(NamedTuple):
-    """What lies in a bag: messages by topic, phases by their time of receipt [ns], images, and notes."""
+    """The content of a bag: messages by topic, phases by their time of receipt [ns], images, and notes."""
 
     samples: Mapping[str, list[Any]]
     phases: Sequence[tuple[int, str]]
@@ -74,14 +74,13 @@ def read_recording(
 
     Args:
         path: rosbag2 folder, .mcap, .db3, folder of a dataset or of pictures, .zarr, .zarr.zip, or video.
-        choice: which images.
+        choice: images to read.
         sides: jaws that are in the images, whether or not a topic tells of them; both where none tells of any.
         strict: refuse a recording that is damaged.
 
     Raises:
         RecordingError: nothing there, nothing in it that is whole, out of bounds, empty, without key points and images,
             or with malformed content.
-        MissingDependencyError: rosbags is not installed.
     """
     choice = choice or ImageChoice()
     if is_dataset(Path(path)):

@@ -30,7 +30,7 @@ class SalvagedCopy:
 
     Attributes:
         path: of the bag.
-        note: how much it is.
+        note: number and duration of its messages.
     """
 
     def __init__(self, source: Path, reason: str) -> None:

@@ -109,7 +109,7 @@ class PoseTrack(Timed):
 
 @dataclass(frozen=True, kw_only=True)
 class PhaseTrack(Timed):
-    """What the bench was doing, published on change.
+    """The phase of the bench, published on change.
 
     Attributes:
         stamps_ns: (m,) [ns], begin of each phase.
@@ -141,14 +141,14 @@ class PhaseTrack(Timed):
 
 @dataclass(frozen=True, kw_only=True)
 class JawTrack:
-    """What a recording holds of one jaw.
+    """The data of one jaw in a recording.
 
     Attributes:
         keypoints: as they were recorded, or as they were found in images; empty before that.
         truth: measured wrenches.
         pose: T_camera_jaw over time, of the key point detector.
         sight: true key points, `true_pose` the true T_camera_jaw: of a synthetic recording.
-        detection: what the detector reported, where this call found the key points in images.
+        detection: report of the detector, where this call found the key points in images.
     """
 
     keypoints: KeypointTrack
@@ -160,7 +160,7 @@ class JawTrack:
 
     @property
     def is_awaited(self) -> bool:
-        """Whether key points and poses are still to come from images."""
+        """True if key points and poses are still to come from images."""
         return not len(self.keypoints.stamps_ns)
 
 
@@ -175,7 +175,7 @@ class Recording:
         object_pose: T_camera_object over time.
         phases: phases of the bench, None outside the bench.
         case: content of `case.json`, empty without it.
-        notes: what was left aside on reading, one sentence each.
+        notes: content that was not read, one sentence each.
         images: its RGB-D images, read one by one; None without any.
         copy: of what could be read of it, where it is damaged; None where it is whole.
     """
@@ -192,7 +192,7 @@ class Recording:
 
     @property
     def source(self) -> Path:
-        """What can be read to its end: the recording itself, or the copy of its good part."""
+        """The bag that can be read to its end: the recording itself, or the copy of its good part."""
         return self.path if self.copy is None else self.copy.path
 
     def jaw(self, side: str) -> JawTrack:
@@ -285,7 +285,7 @@ def _parse_phase(text: str, name: str) -> tuple[int, str, float, str]:
 
 @dataclass(frozen=True, kw_only=True)
 class DetectionTruth(Timed):
-    """Where the key points of one jaw truly were, and which of them the camera could see.
+    """The true key points of one jaw, and which of them the camera could see.
 
     Attributes:
         stamps_ns: (n,) image time [ns], strictly increasing.
@@ -302,7 +302,7 @@ class DetectionTruth(Timed):
 
 @dataclass(frozen=True, kw_only=True)
 class DetectionTrack(Timed):
-    """What the key point detector reported of one jaw in addition to the key points, image by image.
+    """The report of the key point detector on one jaw in addition to the key points, image by image.
 
     Attributes:
         stamps_ns: (n,) image time [ns], strictly increasing.

@@ -24,7 +24,8 @@ from finforce_eval.recordings.zarr_store import ZarrStore
 ENDS, CAMERA, CAMERA_FT = "meta/episode_ends", "camera0_rgb", "rgb_0"
 RATE = 60000 / 1001  # Hz of UMI's GoPro: a replay buffer does not tell its times
 LARGEST_FORCE = 500.0  # N; more are counts, or newtons of something else than a finger
-_FRAME_STEP, _WRENCH_STEP = (5e-3, 0.5), (2e-4, 0.05)  # [s] between samples: what is outside is not in seconds
+_FRAME_STEP = (5e-3, 0.5)  # [s], range of the steps between images; others are not in seconds
+_WRENCH_STEP = (2e-4, 0.05)  # [s], range of the steps between wrenches
 _FIRM = 90.0  # percentile of the forces that tell which way the sensors count
 _FEEBLE = 0.1  # N of these that tell nothing
 

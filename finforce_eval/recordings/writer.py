@@ -132,7 +132,7 @@ def write_recording(
     """Write a recording as a rosbag2 folder with its `case.json`.
 
     Args:
-        recording: what to write; its tracks are interleaved by stamp.
+        recording: tracks to write, interleaved by stamp.
         folder: the new folder, which must not exist.
         storage: "mcap" or "sqlite3".
         compressed: compress the chunks (mcap only).

@@ -25,7 +25,7 @@ from finforce.camera_topics import COLOR_TOPIC, relative
 from finforce.gripper_frames import SIDES
 from finforce.ros import node as ros
 from finforce.settings import setting
-from finforce_eval.replay.live import ReplayLog
+from finforce_eval.replay.answers import ReplayLog
 from finforce_eval.replay.playback import Playback, RawMessage, ReadAhead
 
 # what is heard while messages are being sent waits its turn; nothing of it may be lost
@@ -202,7 +202,7 @@ def main() -> int:
 
 @dataclass(frozen=True, kw_only=True)
 class PlayerParameters:
-    """What the player is told; units stand in the metadata."""
+    """Parameters of the player; units stand in the metadata."""
 
     bag: str = setting("", "Recording: rosbag2 folder, .mcap or .db3")
     rate: float = setting(1.0, "Playback speed; 1 as recorded", "", 0.01, 100.0)

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING
 import psutil
 
 from finforce.camera_topics import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
-from finforce.errors import MissingDependencyError
+from finforce.optional import import_ros
 from finforce.ros.transport import free_domain
 from finforce.systems.processes import PIPELINE, executables_of
-from finforce_eval.replay.live import ReplayLog
+from finforce_eval.replay.answers import ReplayLog
 from finforce_eval.replay.playback import Playback, RawMessage
-from finforce_eval.replay.processes import ProcessError, ProcessGroup, begin_shares, end_shares, resident_bytes
+from finforce_eval.replay.process_group import ProcessError, ProcessGroup, begin_shares, end_shares, resident_bytes
 from finforce_eval.tasks import progress_bar
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ def describe_load(others: Iterable[float]) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class NodeRun:
-    """What came of a run.
+    """The outcome of a run.
 
     Attributes:
         log: the answers, by recorded stamp.
@@ -100,11 +100,11 @@ def run_nodes(
 
     Args:
         processes: to be started, and ended.
-        messages: what is played.
+        messages: the recording to play.
         sides: jaws that are played.
         awaited: topics that somebody has to listen to before it begins; without any those of our own nodes.
         heard: jaws whose own results are heard in addition to the grasp force, at a cost to the nodes; all without.
-        detector: whether the results of a key point detector are heard, too.
+        detector: True if the results of a key point detector are heard, too.
         rate: speed.
         has_clock: keep the stamps, and give the time on /clock; else stamps are shifted to now.
         environment: variables of the processes; without ROS_DOMAIN_ID they have a domain by chance.
@@ -113,10 +113,7 @@ def run_nodes(
         ProcessError: a process cannot be started, ended early, or does not listen.
         MissingDependencyError: ROS 2 is not installed.
     """
-    try:
-        from finforce_eval.replay.node import open_player
-    except ImportError as error:
-        raise MissingDependencyError(f"running nodes needs ROS 2: pip install 'finforce[ros]' ({error})") from error
+    open_player = import_ros("finforce_eval.replay.node", "running nodes").open_player
     log = ReplayLog(tuple(sides))
     environment = dict(environment or {})
     domain = environment.setdefault("ROS_DOMAIN_ID", str(free_domain()))

@@ -60,7 +60,7 @@ class Playback:
     Args:
         path: rosbag2 folder, .mcap or .db3 file.
         without: topics to be left out.
-        images: which are played to the nodes; without it those of the usual names.
+        images: topics to play to the nodes; None: those of the usual names.
 
     Raises:
         RecordingError: the bag cannot be read, or holds nothing to be played.
@@ -132,7 +132,7 @@ class ReadAhead:
     """The items of a generator, up to `depth` of them ready; making them begins at once, in another thread.
 
     Args:
-        items: what is read.
+        items: source of the items.
         depth: items that may wait.
     """
 

@@ -24,7 +24,7 @@ from finforce_eval.evaluation.setup import EvaluationSetup
 from finforce_eval.recordings.objects import find_mesh, read_friction, require_mesh
 from finforce_eval.recordings.tracks import Recording
 from finforce_eval.recordings.writer import write_recording
-from finforce_eval.replay.live import ReplayLog, live_result, with_heard_keypoints
+from finforce_eval.replay.answers import ReplayLog, live_result, with_heard_keypoints
 from finforce_eval.replay.node_run import run_nodes
 from finforce_eval.replay.playback import Playback
 from finforce_ifea.jaw.jaw import Jaw
@@ -34,7 +34,7 @@ RESULTS = ("wrench", "wrench_stddev", "surface", "markers", "contact", "object_o
 
 @dataclass(frozen=True, kw_only=True)
 class Playing:
-    """How a recording is played.
+    """The options of playing a recording.
 
     Attributes:
         rate: speed; at 1 the stamps are shifted to now, else they stay and the nodes take their time from /clock.
@@ -49,19 +49,19 @@ class Playing:
 
     @property
     def has_clock(self) -> bool:
-        """Whether the nodes take their time from /clock."""
+        """True if the nodes take their time from /clock."""
         return self.rate != 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Replay:
-    """What came of a replay.
+    """The outcome of a replay.
 
     Attributes:
         evaluation: scores and time series; their step times are from key points out to wrench in.
         grasp: stamp [ns] -> grasp force [N].
         health: node -> its last diagnostics.
-        grasp_score: how far the grasp force is from the truth, and how late.
+        grasp_score: error and delay of the grasp force.
         recording: that was played, with the key points that it was played with.
     """
 
@@ -85,10 +85,10 @@ def replay(
     From images it goes through the key point detector's node, too. Nothing outlives the call.
 
     Args:
-        recording: what is played.
+        recording: the recording to play.
         setup: jaw, settings and contact.
         calibration_file: as the nodes load it; empty for none.
-        playing: how it is played.
+        playing: rate, domain and trace.
         keypoints: where the key points come from; where they were recorded, else from images, without it.
 
     Raises:

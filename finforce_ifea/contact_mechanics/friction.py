@@ -25,7 +25,7 @@ class Coefficient(NamedTuple):
 
 
 class Touch(NamedTuple):
-    """What an object does to one surface point.
+    """The load of an object on one surface point.
 
     Attributes:
         fx: force along x [N].
@@ -47,7 +47,7 @@ class Touch(NamedTuple):
 
 
 class Traction(NamedTuple):
-    """What acts along the surface while an object presses.
+    """The traction along the surface while an object presses.
 
     Attributes:
         ratio: of tangential to normal force at all points [-], where friction is not followed.

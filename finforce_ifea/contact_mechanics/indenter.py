@@ -42,7 +42,7 @@ class PressedObject(NamedTuple):
     """An indenter for compiled code.
 
     Attributes:
-        is_round: whether it is a cylinder, of which the rest tells nothing.
+        is_round: True if it is a cylinder, of which the rest tells nothing.
         coefficients: depth below the outline over a grid in its own frame, negative outside (a, b) [m].
         low: x and z of the first coefficient (2,) [m].
         front: distance from the origin to the leading point, against x [m].
@@ -253,7 +253,7 @@ class FaceProfile(NamedTuple):
 
     Attributes:
         points: its x and z, rising (p, 2) [m]; of a flat one the first and the last suffice.
-        is_flat: whether all x are the same.
+        is_flat: True if all x are the same.
         x: of the inner face, from which depths count [m].
     """
 
@@ -291,7 +291,7 @@ def pose_object(pressed, face_x, x):
 
 @njit(**_OPTIONS)
 def is_clear_of(pressed, pose, x, z):
-    """Whether a point at x and z [m] is surely outside an object."""
+    """Return True if a point at x and z [m] is surely outside an object."""
     dx, dz = x - pose.x, z - pose.z
     if pressed.is_round:
         return dx * dx + dz * dz >= pose.radius * pose.radius
@@ -408,7 +408,7 @@ class Indenter:
         highest: largest shape.
         largest_change: of the shape at once.
         settled_change: of the shape that no longer matters.
-        has_corners: whether it has corners.
+        has_corners: True if it has corners.
     """
 
     pressed: PressedObject
@@ -428,7 +428,7 @@ class Indenter:
             stiffness: of each point (p,) [N/m].
             face_x: from which depths count [m].
             x: state of the contact (3,).
-            traction: what acts along the surface.
+            traction: traction along the surface.
         """
         pose = pose_object(self.pressed, face_x, x)
         return PenaltyContact(*_press_points(self.pressed, pose, traction, points, stiffness))
@@ -469,17 +469,17 @@ class OutlineIndenter(Indenter):
         self.pressed = build_outline(polygons)
 
     def describes(self, outline: ObjectOutline) -> bool:
-        """Whether an outline has this object's polygons."""
+        """Return True if an outline has this object's polygons."""
         return are_same_polygons(outline.polygons, self.polygons)
 
     def resembles(self, other: "OutlineIndenter") -> bool:
-        """Whether another outline has about the size of this one, as two cuts of one object do."""
+        """Return True if another outline has about the size of this one, as two cuts of one object do."""
         return other is self or bool((np.abs(np.log(self._size / other._size)) < np.log(_OTHER_SIZE)).all())
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ExpectedObject:
-    """What a contact says of its object before any key point.
+    """The prior of a contact's object before any key point.
 
     Attributes:
         indenter: the object.
@@ -517,7 +517,7 @@ def expect_object(contact: Contact, settings: EstimatorSettings, known: Indenter
 
     Args:
         contact: where the object touches.
-        settings: what is expected of objects.
+        settings: prior of objects.
         known: the object so far, taken over if it has the contact's outline.
 
     Raises:

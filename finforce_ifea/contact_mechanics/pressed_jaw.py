@@ -54,7 +54,7 @@ class PressedState(NamedTuple):
     """Linearised equilibrium of one state of jaw and object.
 
     Attributes:
-        touches: whether any surface point is in contact.
+        touches: True if any surface point is in contact.
         correction: Newton step of the unknowns towards equilibrium (size,); with contact, within the model's reach.
         modes: motions of the unknowns by depth [per m], shape and height [per m], (size, 3); where forces
             have a traction ratio, by that too (size, 4).

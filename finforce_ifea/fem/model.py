@@ -1,4 +1,4 @@
-"""What every mechanical model of a jaw offers to the solvers, and factorised stiffness matrices: banded or sparse."""
+"""The interface of every mechanical model of a jaw, and factorised stiffness matrices: banded or sparse."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -39,7 +39,7 @@ class BandedFactor(Factor):
 
 
 class SparsePlan:
-    """Where the entries of L and D are in the factors L D L^T of all symmetric matrices with one pattern.
+    """The entries of L and D in the factors L D L^T of all symmetric matrices with one pattern.
 
     Args:
         pointer: where each column of the upper triangle begins (n + 1,).
@@ -214,7 +214,7 @@ class SparseFactor(Factor):
 
     @property
     def positive(self) -> bool:
-        """Whether the matrix is positive definite: elimination along the diagonal meets positive pivots alone."""
+        """True if the matrix is positive definite: elimination along the diagonal meets positive pivots alone."""
         plain = _factorise_sparse(self._matrix, 0.0)
         return bool((plain.perm_r == plain.perm_c).all() and (plain.U.diagonal() > 0.0).all())
 
@@ -281,7 +281,7 @@ class JawModel(Protocol):
         size: number of unknowns.
         across: where along y contact points stand: in the "middle" of a planar model, on "half" of the width where each
             stands for its mirror image too, or on "both" halves.
-        rotations: which unknowns are rotations (size,) bool; None when all are of one kind.
+        rotations: mask of the unknowns that are rotations (size,) bool; None when all are of one kind.
         reach: largest change of each unknown at once (size,), or of all: 2 mm, 0.3 rad.
     """
 

@@ -50,7 +50,7 @@ class SolidModel:
 
     @property
     def across(self) -> Across:
-        """Where along y contact points stand."""
+        """The positions of contact points along y."""
         return "half" if self.symmetric else "both"
 
     def __init__(self, mesh: VolumeMesh, material: Material, *, symmetric: bool = True) -> None:

@@ -26,7 +26,7 @@ _LEAST_WEIGHT = -9.0
 
 
 class Posterior(NamedTuple):
-    """What an image leaves.
+    """The posterior after an image.
 
     Attributes:
         x: means of the hypotheses (N, n).

@@ -159,7 +159,7 @@ class TractionHypotheses:
 
     @property
     def follows_path(self) -> bool:
-        """Whether any hypothesis depends on the path."""
+        """True if any hypothesis depends on the path."""
         return self._held < 1.0
 
     def estimate(self, weights: NDArray) -> Coefficient:

@@ -1,4 +1,4 @@
-"""Whether part of the state has jumped since the last image: a second process noise, chosen by its likelihood.
+"""Jumps of part of the state since the last image: a second process noise, chosen by its likelihood.
 
 With Q the covariance of the jump in some entries of x, H_j their columns of the measurement matrix, the innovation nu
 and its covariance S,
@@ -96,7 +96,7 @@ def correct(measured, weight, ratios, x, log_weights, P, jumps, possible):
         log_weights: see `update`.
         P: predicted covariance (n, n); widened where part of the state has jumped.
         jumps: that may be (J,).
-        possible: which of them are possible now (J,).
+        possible: mask of those possible now (J,).
     """
     HP, S = innovate(measured.H, measured.rows, measured.u, P, measured.R)
     found = NO_JUMP
@@ -123,7 +123,7 @@ def detect_jump(measured, weight, nu, S, jumps, possible):
         nu: mean innovation (2 m,) [m].
         S: its covariance for key points without weights (2 m, 2 m).
         jumps: that may be (J,).
-        possible: which of them are possible now (J,).
+        possible: mask of those possible now (J,).
     """
     L = np.linalg.cholesky(widen(S, divide_noise(measured.R, weight), measured.R))
     white_H, white = solve_lower(L, measured.H), solve_lower(L, nu.reshape(-1, 1))

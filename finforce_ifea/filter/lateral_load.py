@@ -108,7 +108,7 @@ def measure_torsion(jaw: Jaw, mesh: VolumeMesh) -> Torsion | None:
 
 
 class _Answers(NamedTuple):
-    """How a model at rest moves, steps (size, 2 m), by a moment and a lateral force at each height; see `Torsion`."""
+    """The motion of a model at rest, (size, 2 m), by a moment and a lateral force at each height; see `Torsion`."""
 
     model: SolidModel
     steps: NDArray

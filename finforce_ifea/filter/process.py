@@ -60,7 +60,7 @@ PLACE_TIME = 1.0
 
 
 class Expectation(NamedTuple):
-    """What the state returns to.
+    """The prior that the state returns to.
 
     Attributes:
         mean: of shape and height (2,).

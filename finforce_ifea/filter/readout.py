@@ -1,4 +1,4 @@
-"""What the state of the filter says of force and contact."""
+"""Force and contact by the state of the filter."""
 
 from __future__ import annotations
 

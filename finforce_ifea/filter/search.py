@@ -230,7 +230,7 @@ class ContactSearch:
 
     @property
     def friction(self) -> Coefficient:
-        """What is known of the coefficient of friction."""
+        """The estimate of the coefficient of friction."""
         return self.hypotheses.estimate(self.weights)
 
     @property
@@ -446,7 +446,7 @@ def _follow_level(level, distances):
 
 @njit(**_OPTIONS)
 def _is_settled(moved, missing, share, expectation):
-    """Whether a step that moved the model by (3,), and left (3,) out, changed nothing that matters."""
+    """Return True if a step that moved the model by (3,), and left (3,) out, changed nothing that matters."""
     tolerance = (_SETTLED, expectation[()].settled_change, _SETTLED)
     for i in range(3):
         if abs(moved[i]) >= tolerance[i] or (share > _UNDECIDED and abs(missing[i]) >= tolerance[i]):
@@ -456,7 +456,7 @@ def _is_settled(moved, missing, share, expectation):
 
 @njit(**_OPTIONS)
 def _is_believed(posterior, V):
-    """Whether most key points agree, and the camera has moved no farther than a bump, or V (n,), allows."""
+    """Return True if most key points agree, and the camera has moved no farther than a bump, or V (n,), allows."""
     for i in range(len(BUMPED.entries)):
         entry = BUMPED.entries[i]
         if not abs(posterior.mean[entry]) < _LARGEST_BUMP * max(BUMPED.stddev[i], np.sqrt(V[entry])):

@@ -1,4 +1,4 @@
-"""How much of its friction an object uses, for several coefficients at once, from its path.
+"""Mobilized friction of an object, for several coefficients at once, from its path.
 
 While the contact sticks, a motion of the object turns the force by the angle that the tangential stiffness of jaw and
 surface tells; it slides once the traction ratio kappa reaches the cone. For each coefficient mu,

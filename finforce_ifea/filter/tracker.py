@@ -269,7 +269,7 @@ class ContactTracker:
 
     @property
     def friction(self) -> Coefficient:
-        """What is known of the object's coefficient of friction."""
+        """The estimate of the object's coefficient of friction."""
         return self._search.friction
 
     @property
@@ -281,7 +281,7 @@ class ContactTracker:
 
     @property
     def _is_known(self) -> bool:
-        """Whether the object is known by its outline."""
+        """True if the object is known by its outline."""
         return self._outline is self._contact.indenter
 
     def learn(self) -> None:

@@ -1,4 +1,4 @@
-"""What was identified on one finger, and its file."""
+"""The calibration of one finger, and its file."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -21,8 +21,8 @@ _MECHANICS = ("solid", "frame", "plane", "paper")
 # Forces of the solid and the frame of one finger differ by 1 to 3 % up to 10 mm.
 _MODELS_DIFFER = 0.03
 
-# [Pa] of the TPU that fingers are printed of, over all its hardnesses; and how far off a data sheet is at most.
-_SOFT, _DATASHEET_FACTOR = (5e6, 200e6), 3.0
+_SOFT = (5e6, 200e6)  # [Pa], range of the modulus of printed TPU over all its hardnesses
+_DATASHEET_FACTOR = 3.0  # [-], largest ratio of a modulus to that of its data sheet
 
 Factor = Annotated[Number, Field(ge=0.3, le=3.0)]
 
@@ -68,7 +68,7 @@ class Calibration(FileModel):
 
     @property
     def is_of_shape(self) -> bool:
-        """Whether it changes the shape of a finger, and not only the material."""
+        """True if it changes the shape of a finger, and not only the material."""
         factors = self.inner_thickness_factor, self.outer_thickness_factor, self.rib_thickness_factor
         return factors != (1.0, 1.0, 1.0) or self.clamped_z > 0.0
 

@@ -85,8 +85,8 @@ class Drawing:
         ribs: from base to tip; none is allowed.
         tip_z: [m], the height from which the tip is solid; None for a rigid tip that joins the two band ends.
         clamped_z: [m], everything up to this height is clamped.
-        joints: whether the ribs are stiffly joined to the bands or hinged.
-        bars: whether the ribs bend or are rigid.
+        joints: joint of ribs and bands, stiff or hinged.
+        bars: ribs, elastic or rigid.
     """
 
     length: float
@@ -121,7 +121,7 @@ class Drawing:
 
     @property
     def is_solid(self) -> bool:
-        """Whether a solid can describe the finger: a solid tip, elastic ribs, stiff joints."""
+        """True if a solid can describe the finger: a solid tip, elastic ribs, stiff joints."""
         return self.tip_z is not None and self.joints == "stiff" and self.bars == "elastic"
 
     @property
@@ -254,7 +254,7 @@ def _check_ribs(drawing: Drawing) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class MeshDensity:
-    """How many elements a drawing is divided into.
+    """The number of elements of a drawing.
 
     Attributes:
         between_ribs: along the bands, between two ribs, below the first and above the last.

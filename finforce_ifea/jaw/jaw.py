@@ -40,13 +40,13 @@ class Jaw:
         drawing: the parametric finger, or None.
         section: the section of a prismatic finger of any shape, or None.
         mesh_file: the volume mesh file and how to read it, or None.
-        material: what it is made of.
+        material: its material.
         keypoint_names: (K,), in the order of the key point messages.
         keypoints: (K, 3) [m].
         reference_point: (3,) [m], the point by which the jaw is found in an image.
         candidates: (C, 3) [m], possible contact places on the inner surface.
         inner_face_x: [m], the plane of the inner surface.
-        model: what the file recommends: "solid", "frame" or "plane".
+        model: recommendation of the file: "solid", "frame" or "plane".
     """
 
     name: str
@@ -115,7 +115,7 @@ class Jaw:
 
     @cached_property
     def digest(self) -> str:
-        """What the finger's shape is known by: 12 hexadecimal digits of its content, the same for both sides."""
+        """The identifier of the finger's shape: 12 hexadecimal digits of its content, the same for both sides."""
         shape = self.drawing or self.section
         if shape is None:
             file = self.mesh_file

@@ -182,7 +182,7 @@ class DrawingEntry(FileModel):
 
 
 class SectionClamp(FileModel):
-    """What the holder keeps from moving: all below a height, circles about bolts, or both."""
+    """The clamped region of the finger: all below a height, circles about bolts, or both."""
 
     z_below: Length | None = Field(None, description="All up to this height at x = 0 [m]")
     slope: Number = Field(0.0, gt=-2.0, lt=2.0, description="Rise of that height with x [-], of a tilted base")

@@ -80,7 +80,7 @@ class VolumeMesh:
 
     @property
     def is_hexahedral(self) -> bool:
-        """Whether it is made of hexahedra."""
+        """True if it is made of hexahedra."""
         return self.elements.shape[1] == 8
 
     def mirrored(self) -> "VolumeMesh":
@@ -380,7 +380,7 @@ def _check_hinges(nodes: NDArray, elements: NDArray, face: NDArray, clamped: NDA
 
 
 def _on_one_line(points: NDArray, nodes: NDArray) -> bool:
-    """Whether points (p, 3) lie on one line, as fewer than three do."""
+    """Return True if points (p, 3) lie on one line, as fewer than three do."""
     if len(points) < 3:
         return True
     sizes = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)

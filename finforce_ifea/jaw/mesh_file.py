@@ -19,7 +19,7 @@ _OTHER_CELLS = ("vertex", "line", "line3", "triangle", "triangle6", "quad", "qua
 
 
 class ClampRule(FileModel):
-    """Which nodes of a mesh are clamped, by one rule of three."""
+    """The clamped nodes of a mesh, by one rule of three."""
 
     z_below: Length | None = Field(None, description="All up to this height [m]")
     box: Annotated[list[Point], Field(min_length=2, max_length=2), AfterValidator(np.array)] | None = Field(
@@ -58,7 +58,7 @@ def read_volume_mesh(path: Path | str, *, scale: float = 1.0, clamp: ClampRule) 
     Args:
         path: any file that meshio reads (.msh, .vtk, .vtu, .inp, ...), in the jaw frame.
         scale: [-], multiplies the coordinates; 0.001 for millimetres.
-        clamp: which nodes are clamped, in metres after scaling.
+        clamp: rule for the clamped nodes, in metres after scaling.
 
     Returns:
         The checked mesh.

@@ -16,9 +16,10 @@ from finforce.files import parse_json, read_text
 from finforce_ifea.errors import JawFileError
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "inch": 25.4e-3}
-_LARGEST_FILE, _MOST_VERTICES = 5_000_000, 100_000
-# Points this close [m] to a layer are of it; lines of layers meet on a grid of this size [m].
-_AT, _GRID = 1e-4, 1e-5
+_LARGEST_FILE = 5_000_000  # [bytes]
+_MOST_VERTICES = 100_000
+_AT = 1e-4  # [m], largest distance of points of a layer
+_GRID = 1e-5  # [m], grid on which lines of layers meet
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -87,7 +88,7 @@ class Section:
 
     @cached_property
     def lines(self) -> list[tuple[NDArray, bool]]:
-        """What bounds the section and its layers: lines (n, 2) [m] that meet at their ends alone; whether closed."""
+        """The bounds of the section and its layers: lines (n, 2) [m] that meet at their ends alone; True if closed."""
         if not self.layers:
             return [(ring, True) for ring in self.rings]
         bounds = shapely.union_all([layer.area.boundary for layer in self.layers], grid_size=_GRID)
@@ -282,7 +283,7 @@ class FaceLine:
         heights: z (n,) [m], rising.
         x: at the heights (n,) [m], linear in between.
         plane: x [m] of the plane from which an object's depth is counted; that of a flat face.
-        is_flat: whether it is a plane x = const.
+        is_flat: True if it is a plane x = const.
     """
 
     heights: NDArray

@@ -11,15 +11,15 @@ from finforce_ifea.errors import MeshError
 from finforce_ifea.jaw.mesh import VolumeMesh, build_volume_mesh, to_tet10
 from finforce_ifea.jaw.section import Section
 
-# Size [m] of the elements of the default mesh, unless that makes too many, and of presets as a share of it.
-_SIZE, _MOST_TRIANGLES = 1.0e-3, 1500
+_SIZE = 1.0e-3  # [m], size of the elements of the default mesh
+_MOST_TRIANGLES = 1500  # more are avoided by larger elements
 SHARES = {"coarse": 2.0, "default": 1.0, "fine": 0.6}
-# A turn of the outline by more than this [rad] is a corner, less is a curve, of which a full turn has so many elements.
-_CORNER, _PER_TURN = np.radians(25.0), 12
-# The least size [m] along a curve, and how fast sizes grow with the distance from it [-].
-_LEAST, _GROWTH = 2e-4, 0.35
-# What is clamped, so many elements below the edge of the clamp, may be so much coarser.
-_EDGE, _COARSER = 3.0, 2.5
+_CORNER = np.radians(25.0)  # [rad], turn of the outline from which on it is a corner, not a curve
+_PER_TURN = 12  # elements along a full turn of a curve
+_LEAST = 2e-4  # [m], least size along a curve
+_GROWTH = 0.35  # [-], growth of the size with the distance from it
+_EDGE = 3.0  # elements below the edge of the clamp, beyond which the mesh may be coarser
+_COARSER = 2.5  # [-], by this factor
 _FLAT = 1e-3
 _PASSES = 200
 _EDGES = ((0, 1), (1, 2), (2, 0))
@@ -34,7 +34,7 @@ class PlaneMesh:
     Attributes:
         points: (n, 2) [m], x and z; corners first.
         triangles: (t, 6) indices, corners counterclockwise in (x, z), then the middles of edges 01, 12, 20.
-        corners: how many of the points are corners.
+        corners: number of the points that are corners.
     """
 
     points: NDArray

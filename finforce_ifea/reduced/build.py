@@ -292,7 +292,7 @@ def _find_own_rows(mechanics: Mechanics) -> tuple[NDArray, float]:
 
 
 def has_own_rows(mechanics: Mechanics) -> bool:
-    """Whether the rows can be those of the mesh's nodes: of a frame always, which has no mesh of its own."""
+    """Return True if the rows can be those of the mesh's nodes: of a frame always, which has no mesh of its own."""
     if not isinstance(mechanics.model, SolidModel):
         return True
     own, base = _find_own_rows(mechanics)
@@ -307,7 +307,7 @@ def _divide(largest: float) -> NDArray:
 
 
 def _are_joined(start: _Equilibrium, end: _Equilibrium) -> bool:
-    """Whether a jaw went from one equilibrium to another as it moves at both, and not over to another shape."""
+    """Return True if a jaw went from one equilibrium to another as it moves at both, and not over to another shape."""
     moved = end.q - start.q
     along = 0.5 * (end.depth - start.depth) * (start.state.modes[:, 0] + end.state.modes[:, 0])
     if end.depth - start.depth <= _SURE:

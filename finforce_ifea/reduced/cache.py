@@ -31,7 +31,7 @@ from finforce_ifea.jaw.jaw import Jaw
 from finforce_ifea.reduced import build as manifold_build
 from finforce_ifea.reduced.build import Share, build_manifold, build_rest
 from finforce_ifea.reduced.equilibria import Manifold
-from finforce_ifea.reduced.evaluation import ReducedContact, ReducedModel, scale_manifold
+from finforce_ifea.reduced.model import ReducedContact, ReducedModel, scale_manifold
 
 # To be raised when what is stored, or how it is found, changes.
 VERSION = 8
@@ -124,7 +124,7 @@ def reduce_mechanics(full: Mechanics, jaw: Jaw, *, linear: bool = False) -> Mech
 
     Args:
         full: the mechanics that is to be reduced.
-        jaw: what it describes.
+        jaw: the jaw that it describes.
         linear: the unloaded jaw's compliance alone, without the equilibria.
 
     Raises:

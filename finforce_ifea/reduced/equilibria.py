@@ -162,8 +162,9 @@ _EXACT = {"cache": True, "error_model": "numpy"}
 # Every so manieth row tells how near a stored equilibrium is; the grid coordinates move by at most so much at once.
 WATCHED = 4
 LARGEST_GRID_STEP = 2.0
-# Damping of the search for the nearest equilibrium, as a share of the largest curvature, and as squared metres.
-_DAMPING, _DAMPING_FLOOR = 1e-6, 1e-12
+# Damping of the search for the nearest equilibrium.
+_DAMPING = 1e-6  # [-], of the largest curvature
+_DAMPING_FLOOR = 1e-12  # [m^2]
 # A step of the grid coordinates that leads away from the stored equilibria is halved so often, then left out; by so
 # much it may, as a share and in metres.
 _HALVINGS, _SLACK, _SLACK_FLOOR = 4, 1e-2, 1e-8

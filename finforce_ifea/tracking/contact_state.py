@@ -1,4 +1,4 @@
-"""What one image tells of a contact: the state, its uncertainty, the elastic force, and when to reject it.
+"""The state of a contact by one image: its uncertainty, the elastic force, and when to reject it.
 
 The state x is depth [m], shape and height [m] of the pressing object. Records of these types are read by name in
 Python, as `state["x"]`, and in compiled code, as `state.x`.
@@ -133,7 +133,7 @@ def find_rejection_reason(state: ContactState, *, largest_residual: float, settl
     Args:
         state: of one image.
         largest_residual: of key points of the jaw, see `bound_residual` [m].
-        settles: whether the solver iterates until nothing changes, so that one that has not is rejected.
+        settles: True if the solver iterates until nothing changes, so that one that has not is rejected.
     """
     magnitude, agreement = float(state["magnitude"]), int(state["agreed"]) / int(state["known"])
     if settles and not state["converged"] and state["ambiguity"] > _AMBIGUOUS:

@@ -33,7 +33,7 @@ class InfluenceCoefficients:
         motions: of the key points in the plane per force (m, K, 2) [m/N].
         stiffness: force over depth (m,) [N/m].
         turns: of the inner face where they touch, by the depth (m,) [rad/m].
-        fits: what `bound_force` has found for the key points that it saw last.
+        fits: results of `bound_force` for the key points that it saw last.
     """
 
     heights: NDArray
@@ -99,7 +99,7 @@ def measure_influence(contact: RigidContact, probe: Any, keypoints: int) -> Infl
     Args:
         contact: model and contact surface, see `RigidContact`.
         probe: of the key points.
-        keypoints: how many they are.
+        keypoints: their number.
     """
     low, high = contact.surface.heights[[0, -1]]
     # the ends of the surface are left out: next to the clamp a force moves hardly anything
@@ -200,7 +200,7 @@ class ReachWatch:
         self._mean, self._count = 0.0, 0
 
     def is_idle(self, contact: Contact, points: NDArray, tare: Tare) -> bool:
-        """Whether the contact's object is away and the key points (K, 3) [m] show the unloaded jaw."""
+        """Return True if the contact's object is away and the key points (K, 3) [m] show the unloaded jaw."""
         if contact is not self._contact:
             self._contact, self._is_out_of_reach = contact, is_out_of_reach(contact, self._face_x)
         if not self._is_out_of_reach:
@@ -211,7 +211,7 @@ class ReachWatch:
         return self._is_at_rest(points - self._keypoints - tare.offsets, tare)
 
     def _is_at_rest(self, deviations: NDArray, tare: Tare) -> bool:
-        """Whether deviations (K, 3) [m] from the tared jaw are chance."""
+        """Return True if deviations (K, 3) [m] from the tared jaw are chance."""
         ways = np.sqrt((deviations * deviations).sum(axis=1))
         near = (ways < _FARTHEST) & (tare.counts > 0)
         known = int(np.isfinite(ways).sum())

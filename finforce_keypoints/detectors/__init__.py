@@ -1,1 +1,1 @@
-"""What finds the pixels of key points in an image: a network on the side plane or the whole image, or dots."""
+"""Detectors of key points in an image: a network on the side plane or the whole image, or dots."""

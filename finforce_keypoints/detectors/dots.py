@@ -25,7 +25,7 @@ Weigh = Callable[[tuple[slice, slice]], NDArray]  # how much the pixels of a par
 
 @dataclass(frozen=True, kw_only=True)
 class DotSettings(Bounded):
-    """How the dots look; one dot on every key point and on the reference point, on the side that the camera sees.
+    """The appearance of dots; one on every key point and on the reference point, on the side that the camera sees.
 
     Raises:
         DetectorSettingsError: a setting is out of its bounds.
@@ -70,7 +70,7 @@ def find_dots(color: NDArray, settings: DotSettings, diameter: float) -> Dots:
 
     Args:
         color: (h, w, 3) uint8 RGB.
-        settings: how they look.
+        settings: appearance of the dots.
         diameter: of a dot [px], about.
 
     Returns:
@@ -178,7 +178,7 @@ class _Pattern:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Match:
-    """Which dot is which point: (n,) numbers of dots, -1 for none; the field (5, 2) [m]; cost, 1 per missing dot."""
+    """The assignment of dots to points: (n,) dots, -1 for none; the field (5, 2) [m]; cost, 1 per missing dot."""
 
     dots: NDArray
     field: NDArray
@@ -203,7 +203,7 @@ class DotDetector:
 
         Args:
             jaws: side -> jaw.
-            settings: how the dots look.
+            settings: appearance of the dots.
             T_gripper_camera: (4, 4) camera optical frame in the gripper base, for the search of lost jaws.
             opening: where the jaws can be.
 

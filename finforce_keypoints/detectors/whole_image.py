@@ -43,7 +43,7 @@ class Crop:
 
 @dataclass(frozen=True, kw_only=True)
 class _CropView:
-    """What the network is shown for some sides: a part of the image, blank but for a window, mirrored or not."""
+    """The input of the network for some sides: a part of the image, blank but for a window, mirrored or not."""
 
     sides: tuple[str, ...]
     canvas: Crop
@@ -73,7 +73,7 @@ class WholeImageDetector:
             model: the network.
             names: its body parts.
             jaws: side -> jaw.
-            allow_resize: whether images of another size than the training's are scaled uniformly, less accurate.
+            allow_resize: True if images of another size than the training's are scaled uniformly, less accurate.
         """
         self.name, self.sha256 = f"frame {model.path.stem}", model.sha256
         self._model, self._names = model, names

@@ -52,7 +52,7 @@ class SideSamples:
 
 @dataclass(frozen=True, eq=False)
 class DepthEvidence:
-    """What the depth image says about points on the finger's side.
+    """The evidence of the depth image for points on the finger's side.
 
     Attributes:
         excess: (n,) measured less expected depth [m]; NaN where there are no depths of the finger.
@@ -262,7 +262,7 @@ def look_along(rays: NDArray, T_camera_jaw: NDArray) -> SideView:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SideModel:
-    """What is known beforehand of a jaw's side and of the depth image.
+    """The prior of a jaw's side and of the depth image.
 
     Attributes:
         places: (K + 1, 2) x and z of the points at rest, the reference point last [m].
@@ -289,7 +289,7 @@ class DepthScale:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SideFit:
-    """Where the points of a jaw are across its side.
+    """The positions of the points of a jaw across its side.
 
     Attributes:
         y: (K + 1,) above the side plane, expected value [m].
@@ -316,7 +316,7 @@ def fit_side(model: SideModel, measured: NDArray, stddev: NDArray, lever: NDArra
         measured: (K + 1,) measured y above the side plane [m], NaN without depth; the reference point last.
         stddev: (K + 1,) of the measurements' own noise n [m].
         lever: (K + 1,) derivative l of y by the depth's relative error [m].
-        scale: what is known of the relative error s beforehand.
+        scale: prior of the relative error s.
     """
     beforehand = np.array([model.offset, model.tilt, model.tilt, model.bow, scale.stddev])
     places = np.ascontiguousarray(model.places)

@@ -123,7 +123,7 @@ class JawLocalizer:
 
     @property
     def warning(self) -> str:
-        """What is suspicious about this jaw, in a sentence; "" for nothing."""
+        """A warning about this jaw, in a sentence; "" for none."""
         if self._is_tag_elsewhere:
             return f"tag {self._mount.tag.id} is not where the rig has it: is it on the other side, or of another rig?"
         if abs(self._astray) > MOST_SLIP:
@@ -147,17 +147,17 @@ class JawLocalizer:
 
     @property
     def is_lost(self) -> bool:
-        """Whether the jaw has to be looked for everywhere."""
+        """True if the jaw has to be looked for everywhere."""
         return self._track.is_lost
 
     @property
     def place(self) -> float:
-        """Where the jaw's origin is on the closing axis [m]; NaN when it is lost."""
+        """The position of the jaw's origin on the closing axis [m]; NaN when it is lost."""
         return self._track.place
 
     @property
     def is_settled(self) -> bool:
-        """Whether the jaw's place is no longer learnt, so that images in a row tell the same."""
+        """True if the jaw's place is no longer learnt, so that images in a row tell the same."""
         return self._patch.is_learnt
 
     def rest(self, stamp: float) -> None:
@@ -197,7 +197,7 @@ class JawLocalizer:
         return None if found is None else self._origin.place(found)
 
     def has_tag_at(self, image: RgbdImage, corners: NDArray) -> bool:
-        """Whether a jaw of the opening range has its tag at corners (4, 2) [px] of an image."""
+        """Return True if a jaw of the opening range has its tag at corners (4, 2) [px] of an image."""
         return not self._origin.is_elsewhere(rays_from_pixels(corners, image.camera))
 
     def locate(
@@ -208,7 +208,7 @@ class JawLocalizer:
         Args:
             image: the image, checked.
             detection: the pixels found; None when the pixel_detector saw nothing of the jaw.
-            scale: what is known of the depth image's scale beforehand.
+            scale: prior of the depth image's scale.
             corners: of its tag (4, 2) [px]; None where it is not seen.
         """
         if detection is None:

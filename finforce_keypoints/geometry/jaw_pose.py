@@ -1,4 +1,4 @@
-"""Where a jaw stands on the closing axis: from the rays to its rigid points, what surrounds one of them, and over time.
+"""The position of a jaw on the closing axis: by the rays to its rigid points, the patch around one, and over time.
 
 A network places the reference point a little differently in every light and before every background, and all key points
 of the jaw would share the error. What surrounds the point is rigid and does not change: registered image by
@@ -57,7 +57,7 @@ class Origin:
         x: of the jaw's origin in the gripper base [m].
         stddev: [m].
         shared: the part of it that images in a row have in common [m].
-        noise: what an image errs by alone [m], where that is known apart; such a place is followed at once.
+        noise: error of a single image [m], where that is known apart; such a place is followed at once.
         slip: by which a jaw in a holder that gives has moved along its own z [m].
     """
 
@@ -230,7 +230,7 @@ class ReferencePatch:
 
     @property
     def is_learnt(self) -> bool:
-        """Whether the template is one of enough images, so that it changes no more."""
+        """True if the template is one of enough images, so that it changes no more."""
         return self._count >= TEMPLATE_IMAGES
 
     def refine(
@@ -340,17 +340,17 @@ class OriginTrack:
 
     @property
     def is_lost(self) -> bool:
-        """Whether nobody knows where the jaw is."""
+        """True if nobody knows where the jaw is."""
         return self._stamp is None
 
     @property
     def place(self) -> float:
-        """Where the jaw's origin is on the closing axis [m]; NaN when it is lost."""
+        """The position of the jaw's origin on the closing axis [m]; NaN when it is lost."""
         return float("nan") if self.is_lost else float(self._state[0])
 
     @property
     def speed(self) -> float:
-        """How fast the jaw slides [m/s]."""
+        """The sliding speed of the jaw [m/s]."""
         return float(self._state[1])
 
     def forecast(self, stamp: float) -> Origin | None:

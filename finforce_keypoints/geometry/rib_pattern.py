@@ -1,4 +1,4 @@
-"""How well the ribs, the cells and the tip of a finger explain what a picture shows, at a place and beside it.
+"""The match of the ribs, the cells and the tip of a finger with a picture, at a position and beside it.
 
 A network finds a rib wherever there is one, and the outline of a finger hardly changes when it is one rib further along
 itself. Two measures tell such places apart: the correlation of ribs and cells with the picture, which is high at one
@@ -40,7 +40,7 @@ BEYOND = 0.3  # share of the compared pixels outside the image, from which on no
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RibScan:
-    """How well ribs and cells fit a picture at many places of a finger.
+    """The match of ribs and cells with a picture at many positions of a finger.
 
     Attributes:
         ribs: correlation by stretch, slant and shifts along and across the finger (s, k, n, m), positive where ribs are

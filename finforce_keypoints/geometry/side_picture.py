@@ -27,7 +27,7 @@ _OPTIONS = {"cache": True, "error_model": "numpy", "nogil": True}
 
 @dataclass(frozen=True, kw_only=True)
 class PlaneGrid:
-    """Where the pixels of a picture lie on the side plane.
+    """The positions of the pixels of a picture on the side plane.
 
     Attributes:
         scale: size of a pixel [m].

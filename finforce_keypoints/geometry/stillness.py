@@ -1,4 +1,4 @@
-"""Whether the jaws stand as they did in the last images, so that their key points hold.
+"""Detection of jaws that stand as they did in the last images, so that their key points hold.
 
 Around every key point, what a picture differs by from a mean picture m is explained by what light does (gain and
 brightness) and by what a jaw does: a shift along its x, one that grows with the height h and one with its square, and a
@@ -40,7 +40,7 @@ _RIDGE = 1e-3  # keeps a picture without any contrast regular
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class JawSpots:
-    """Where one jaw is watched, and how its key points move in the picture.
+    """The watched region of one jaw, and the motion of its key points in the picture.
 
     Attributes:
         places: (3, n, s, s) of red, green and blue of the patches in the flat picture.
@@ -57,7 +57,7 @@ class JawSpots:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StillReference:
-    """What one jaw looks like while it stands still: d = design @ c for the differences d (N,) of a picture from it.
+    """The appearance of a jaw at rest: d = design @ c for the differences d (N,) of a picture from it.
 
     Attributes:
         keypoints: the means of its key points, told while nothing moves.

@@ -1,4 +1,4 @@
-"""What a finger looks like from its side at rest, and the shapes that it can take.
+"""The appearance of a finger from its side at rest, and the shapes that it can take.
 
 A network that looks at small pieces mistakes one thin rib for the next. The finger's own compliance does not: few
 motions, one for each way of loading its face, describe where all its key points can be at once.
@@ -274,9 +274,9 @@ def fit_motion(shapes: NDArray, moves: NDArray, stddev: NDArray, weight: NDArray
 
     Args:
         shapes: of `span_shapes` (2 K, m).
-        moves: how far points seem to have moved (K, 2) [px]; not finite where nobody knows.
+        moves: apparent motion of points (K, 2) [px]; not finite where unknown.
         stddev: of each along a row or a column (K,) [px].
-        weight: how much each is believed (K,), 0 to 1.
+        weight: weight of each (K,), 0 to 1.
     """
     numbers = (np.ascontiguousarray(values, dtype=float) for values in (moves, stddev, weight))
     return _fit_motion(shapes, *numbers)

@@ -34,7 +34,7 @@ class TrainingSize(FileModel):
 
 
 class OwnSection(FileModel):
-    """What this package keeps in a configuration; no other keys."""
+    """The section of this package in a configuration; no other keys."""
 
     training_size: TrainingSize | None = Field(None, description="Size of the training images")
     pooled: StrictBool = Field(False, description="Whether the offsets around a peak are averaged")
@@ -67,7 +67,7 @@ Strides = tuple[Annotated[Number, Field(gt=1e-3, lt=1e3)], ...]
 
 
 class ModelMetadata(FileModel):
-    """What is read of a DeepLabCut configuration; an empty value stands for its default."""
+    """The keys read of a DeepLabCut configuration; an empty value stands for its default."""
 
     model_config = ConfigDict(extra="ignore")
 
@@ -207,7 +207,7 @@ class NameMap:
     Attributes:
         rows: side -> (K + 1,) numbers of the body parts: the key points in the order of the jaw file, the reference
             point last.
-        is_of_one_jaw: whether the network knows one jaw and is used on each of them in turn.
+        is_of_one_jaw: True if the network knows one jaw and is used on each of them in turn.
     """
 
     rows: Mapping[str, NDArray]

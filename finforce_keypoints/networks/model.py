@@ -30,13 +30,13 @@ _CENTRE = 4  # of the 3 x 3 cells in row order; 3 and 5 are its neighbours in th
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DecodingRule:
-    """How the maps of one network become pixels.
+    """The conversion of the maps of one network into pixels.
 
     Attributes:
         stride: input pixels per cell.
         locref_std: scale of the offset channels [px].
-        apply_sigmoid: whether the maps are logits.
-        pooled: whether the places that the 3 x 3 cells around a peak vote for are averaged, weighted by their scores;
+        apply_sigmoid: True if the maps are logits.
+        pooled: True if the places that the 3 x 3 cells around a peak vote for are averaged, weighted by their scores;
             DeepLabCut takes the peak's own.
         likelihood_stddev: (n, 2) likelihood, standard deviation [px of the network's input].
     """
@@ -230,7 +230,7 @@ _STRIDE_TOLERANCE = 0.6  # of log2(H / h / stride)
 
 @dataclass(frozen=True, kw_only=True)
 class InputLayout:
-    """What a network takes.
+    """The input of a network.
 
     Attributes:
         channel_axis: 1 of NCHW, 3 of NHWC.
@@ -294,7 +294,7 @@ class KeypointModel:
 
     Attributes:
         path: the .onnx file.
-        metadata: what stands beside it.
+        metadata: the metadata beside it.
     """
 
     def __init__(self, path: str | Path, threads: int = 2) -> None:
@@ -335,7 +335,7 @@ class KeypointModel:
 
     @property
     def sees_whole(self) -> bool:
-        """Whether a cut-out of a picture changes all of the network's answer, as group normalisation does."""
+        """True if a cut-out of a picture changes all of the network's answer, as group normalisation does."""
         return self._network.sees_whole
 
     @property

@@ -176,7 +176,7 @@ class Network:
     Attributes:
         inputs: name, shape (numbers, or names of free axes) and type of each.
         output_names: of its outputs.
-        sees_whole: whether every output depends on the whole picture, so that a cut-out of it changes all of them.
+        sees_whole: True if every output depends on the whole picture, so that a cut-out of it changes all of them.
 
     Args:
         path: the .onnx file.

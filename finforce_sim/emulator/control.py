@@ -10,13 +10,14 @@ from finforce_driver.can.protocol import LARGEST_CURRENT_MA, Move
 from finforce_sim.emulator.mechanism import Jaws
 
 AT_POSITION = 3  # object code
-_SLOWEST, _SPEED_RANGE = 40, 79960  # [ticks/s] of the speed bytes 0 and 255
+_SLOWEST = 40  # [ticks/s], of the speed byte 0
+_SPEED_RANGE = 79960  # [ticks/s], more of the speed byte 255
 _LARGEST = 255
 
 
 @dataclass(frozen=True, kw_only=True)
 class Firmware:
-    """Where firmware versions differ.
+    """The differences of firmware versions.
 
     Attributes:
         closing_code: object code of contact while the current drives closed.
@@ -28,7 +29,7 @@ class Firmware:
         calibration_speed: while looking for the end stops [ticks/s].
         calibration_current: limit meanwhile [mA].
         calibration_margin: largest distance of the current from that limit at a stop [mA].
-        confirm_time: how long a stop must be felt [ms].
+        confirm_time: time for which a stop must be felt [ms].
         calibration_timeout: after which a calibration is given up [ms].
         watchdog_length: data bytes without which the watchdog's setter is ignored.
     """
@@ -80,7 +81,7 @@ VARIANTS = {
 
 
 class Mode(Enum):
-    """What the control loop does."""
+    """The state of the control loop."""
 
     IDLE = 0
     GRIPPER = 6
@@ -211,7 +212,8 @@ def _seek(firmware: Firmware, jaws: Jaws, direction: float) -> Iterator[None]:
         yield
 
 
-_WEAK_CURRENT, _STRONG_CURRENT = 150, 1500  # [mA] that the maker advises against going beyond
+_WEAK_CURRENT = 150  # [mA], least current that the maker advises
+_STRONG_CURRENT = 1500  # [mA], largest current that the maker advises
 _SLOW_SPEED = 3  # byte below which contact is felt while the jaws still move
 
 

@@ -35,7 +35,7 @@ class EmulatedGripper:
         protection: temperature, supply, encoder and the latched faults.
         node_id: on the CAN bus.
         mode: of the control loop.
-        calibrated: whether the firmware believes in its end stops.
+        calibrated: True if the firmware believes in its end stops.
         configured: as a gripper; else it calibrates, but never moves nor changes its position byte.
         violations: of good practice by name.
     """
@@ -234,12 +234,14 @@ class EmulatedGripper:
         return struct.pack(">BhB", self._position, self.reported_current, status)
 
 
-_COLDEST, _HOTTEST = -20.0, 75.0  # [deg C] of the motor
-_LEAST_SUPPLY, _LARGEST_SUPPLY = 9.0, 29.0  # [V]
+_COLDEST = -20.0  # [deg C], of the motor
+_HOTTEST = 75.0  # [deg C], of the motor
+_LEAST_SUPPLY = 9.0  # [V]
+_LARGEST_SUPPLY = 29.0  # [V]
 
 
 class Fault(Enum):
-    """What can be latched: its bits in a reply, and in the two bytes of the error state."""
+    """Errors that can be latched: their bits in a reply, and in the two bytes of the error state."""
 
     TEMPERATURE = (0x08, 0x40, 0x00)
     ENCODER = (0x00, 0x20, 0x00)
@@ -257,8 +259,8 @@ class _Protection:
     Attributes:
         temperature: of the motor [deg C].
         voltage: of the supply [V].
-        magnet: whether the encoder sees its magnet.
-        motor_calibrated: whether the motor itself was ever calibrated.
+        magnet: True if the encoder sees its magnet.
+        motor_calibrated: True if the motor itself was ever calibrated.
         estop_flag: of the last order; it latches its fault again and again.
         watchdog_period: longest silence [ms]; 0: any.
         faults: that are latched.

@@ -8,7 +8,8 @@ from collections.abc import Callable
 
 STEP = 0.001  # [s]
 TURN = 16384  # ticks of the encoder
-STOP_OPEN, STOP_CLOSED = 10329, -229  # [ticks] of the motor at the end stops
+STOP_OPEN = 10329  # [ticks], of the motor at the open end stop
+STOP_CLOSED = -229  # [ticks], of the motor at the closed end stop
 STROKE = 0.048  # [m] of the opening between them; closed jaws touch
 FORCE_PER_CURRENT = 47.7  # [N/A]
 _PER_TICK = STROKE / (STOP_OPEN - STOP_CLOSED)

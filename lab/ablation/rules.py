@@ -29,7 +29,7 @@ class Rule:
     Attributes:
         name: short.
         stands_on: constants or functions.
-        purpose: what it is for.
+        purpose: its purpose.
         off: values that switch it off, by the place where each is used.
         scenes: that reach it.
     """

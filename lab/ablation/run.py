@@ -108,7 +108,7 @@ def play(scene: Scene) -> dict[str, float]:
 def play_recordings(bags: Iterable[str], options: Mapping[str, Any]) -> dict[str, dict[str, float]]:
     """Return the figures of recordings, by name, as `finforce evaluate` has them."""
     from finforce_eval.cli.main import parse
-    from finforce_eval.evaluate import evaluate_all
+    from finforce_eval.evaluation.batch import evaluate_all
     from finforce_eval.evaluation.keypoint_source import parse_source
     from finforce_eval.evaluation.setup import make_setup, read_recordings
 

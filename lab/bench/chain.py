@@ -35,7 +35,7 @@ from finforce_eval.recordings.objects import require_mesh
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.tracks import Recording
 from finforce_eval.recordings.writer import write_recording
-from finforce_eval.replay.live import ReplayLog
+from finforce_eval.replay.answers import ReplayLog
 from finforce_eval.replay.node_run import OBJECT_TOPIC, NodeRun, describe_load, run_nodes
 from finforce_eval.replay.playback import Playback, RawMessage
 from lab.harness import Figures, percentiles
@@ -155,7 +155,7 @@ def chain_processes(recording: Recording, *, images: bool, off: Sequence[str] = 
 
     Args:
         recording: whose object and camera they are told.
-        images: whether key points are found in images.
+        images: True if key points are found in images.
         off: skip rules that are off in all nodes.
         options: fields of `ReplayOptions` that differ.
     """

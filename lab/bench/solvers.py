@@ -33,12 +33,15 @@ from lab.harness import Figures, percentiles
 from lab.presses import PressHistory, circle
 
 TRUTH = Path(__file__).parents[1] / "data" / "pressed_bench.npz"
-YOUNG_MODULUS, POISSON_RATIO = 30e6, 0.45
+YOUNG_MODULUS = 30e6  # [Pa]
+POISSON_RATIO = 0.45
 HEIGHTS = {"lower": 0.020, "middle": 0.040, "upper": 0.060}
 QUICK_RADIUS = 0.0125  # of the three cases that do where time is short [m]
 LEVELS = (0.002, 0.004, 0.006, 0.008, 0.010)
 PERIOD = 1.0 / 30.0
-REST_FRAMES, HOLD_FRAMES, SCORED_FRAMES = 60, 45, 30
+REST_FRAMES = 60
+HOLD_FRAMES = 45
+SCORED_FRAMES = 30
 SPEED = 2e-3
 # Constant errors of a tracked object's origin [m] and turn [rad], as the contact estimator expects them.
 _POSE_ERROR = np.array([0.5e-3, 0.5e-3, 5e-3])
@@ -49,7 +52,7 @@ class ReplayedPress:
     """One case as a sequence of images.
 
     Attributes:
-        case: what was pressed.
+        case: object and height of the press.
         observations: n images.
         contacts: image by image, with the "height" of first touch and with the object's "outline".
         force: true forces on the jaw (n, 3) [N].
@@ -97,7 +100,7 @@ def record_press(case: PressHistory, jaw: Jaw, camera: NoisyCamera | None = None
     """Return a press to all levels at 2 mm/s, each held for 1.5 s, after two seconds at rest.
 
     Args:
-        case: what is pressed.
+        case: object and height of the press.
         jaw: the finger, whose key points are those of the truth.
         camera: makes noise and hides points; None sees everything exactly.
         seed: of the noise.
@@ -242,8 +245,8 @@ class Tier:
         name: for tables.
         solver: `EstimatorSettings.solver`.
         mesh: `EstimatorSettings.mesh`.
-        contact: what is known of the object: its "height" of first touch, or its "outline".
-        slow: whether it is left out where time is short.
+        contact: known property of the object: its "height" of first touch, or its "outline".
+        slow: True if it is left out where time is short.
     """
 
     name: str
@@ -258,7 +261,6 @@ class Tier:
 
 
 TIERS = (
-    Tier(name="linear", solver="linear"),
     Tier(name="reduced", solver="reduced"),
     Tier(name="frame", solver="frame"),
     Tier(name="solid, 522 vertices", solver="solid", mesh="coarse"),
@@ -311,7 +313,7 @@ def measure(quick: bool) -> Figures:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Run:
-    """What a tier makes of one press.
+    """The answers of a tier to one press.
 
     Attributes:
         press: that it was given.

@@ -18,7 +18,8 @@ from lab.experiments.experiment import Case, Experiment, RunOptions, draw_panels
 from lab.experiments.grasp_world import EstimatorSensor, GraspCase, ImageSensor, NoisySensor, World, build_plant
 from lab.harness import Figures
 
-BEARS, BREAKS = 5.0, 5.43  # [N]
+BEARS = 5.0  # [N]
+BREAKS = 5.43  # [N]
 SPEED = 0.004  # [m/s] of the opening
 LATENCY = 0.06  # [s] of an image
 GRASPS, QUICK_GRASPS = 20, 2

@@ -54,7 +54,7 @@ class Case:
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions:
-    """How recordings are solved.
+    """The settings with which recordings are solved.
 
     Attributes:
         bags: recordings of one's own; none for scenes of the twin.
@@ -178,7 +178,7 @@ class Experiment:
     Attributes:
         name: of the command line.
         title: of the page.
-        about: what is done, and how it differs from the paper's own.
+        about: summary, with the differences from the paper's own.
         list_cases: returns what is to be run; raises FinforceError where recordings lack what the experiment needs.
         run: returns the figures of a case as JSON has them, those that are only drawn under `drawn`; files go into a
             folder of the experiment's own.
@@ -215,8 +215,8 @@ def run_experiment(
     A case that fails is told of, costs itself only, and is tried again by the next run.
 
     Args:
-        experiment: what is run.
-        options: how.
+        experiment: the experiment to run.
+        options: settings of the run.
         report: folder of all experiments.
         engine: where the cases are run; here, one after the other, without.
 

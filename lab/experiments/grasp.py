@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from finforce_eval.evaluate import evaluate_all
+from finforce_eval.evaluation.batch import evaluate_all
 from finforce_eval.evaluation.scoring import ONSET_FORCE, Evaluation, force_delays, rms
 from finforce_eval.figures.figures import BLACK, BLUE, GREEN, ORANGE
 from lab.experiments.experiment import (
@@ -37,7 +37,8 @@ LEVELS = {"low": (1.5, 0.001), "medium": (2.5, 0.002), "high": (4.0, 0.004)}
 HOLD = {"settle": 0.5, "record": 2.5, "clearance": 0.003}  # [s, s, m]
 QUICK = {"settle": 0.2, "record": 0.6, "clearance": 0.001}
 QUICK_CASES = (("cylinder", "middle", "high"), ("cube", "upper", "medium"), ("asymmetric", "lower", "high"))
-RISEN, FALLEN = 0.97, 0.75  # of the largest true force: where loading ends, and where letting go begins
+RISEN = 0.97  # [-], of the largest true force: where loading ends
+FALLEN = 0.75  # [-], of the largest true force: where letting go begins
 COLOURS = {"low": BLUE, "medium": GREEN, "high": ORANGE}
 PHASES = ("all", "load", "hold", "release")
 DRAWN_EVERY = 2  # images

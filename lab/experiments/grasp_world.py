@@ -65,10 +65,10 @@ class Plant:
 
 
 class Sensor(Protocol):
-    """What makes a force [N] of an image; None where it does not trust itself.
+    """A source of forces [N] from images; None where it does not trust itself.
 
     Attributes:
-        touching: whether the jaws were said to touch in the last image; None where nobody says it.
+        touching: True if the jaws were said to touch in the last image; None where nobody says it.
         stddev: that is stated of the last force [N].
     """
 
@@ -107,7 +107,7 @@ class GraspCase:
 
 @dataclass(kw_only=True)
 class GraspTrace:
-    """What happened: true force and opening over time, and the controller's words."""
+    """The record of a grasp: true force and opening over time, and the controller's words."""
 
     times: list[float] = field(default_factory=list)
     forces: list[float] = field(default_factory=list)
@@ -264,7 +264,7 @@ class EstimatorSensor:
     """The force that the whole chain finds from the true key points with noise, of both jaws as the nodes pair them.
 
     Attributes:
-        touching: whether a jaw was said to touch in the last image.
+        touching: True if a jaw was said to touch in the last image.
         stddev: of the jaw whose force is less certain, as the driver takes it from `wrench_stddev` [N].
         told: stated deviation and error of every force [N].
         untold: time [s] of every image without a force since the first one with, and what the jaws said.

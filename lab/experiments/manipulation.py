@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.gripper_frames import SIDES
-from finforce_eval.evaluate import evaluate_all
+from finforce_eval.evaluation.batch import evaluate_all
 from finforce_eval.evaluation.scoring import join_net, measure_sharpness, rms
 from finforce_eval.evaluation.setup import EvaluationSetup
 from finforce_eval.recordings.tracks import Recording
@@ -22,7 +22,8 @@ from finforce_sim.scenarios import build_scenario, write_script
 from lab.experiments.experiment import SHARP, Case, Experiment, RunOptions, average, build_setup, tabulate
 from lab.harness import Figures
 
-MASS, SPEED = 0.1, 1.2  # [kg], [rad/s]
+MASS = 0.1  # [kg], the paper's weight
+SPEED = 1.2  # [rad/s], of the turn
 # The axis of the turn, and how the gripper looks at first: level for a turn about where it points, else down.
 TURNS = {
     "roll": {"turn_tilt": 0.5 * np.pi, "pitch": 0.5 * np.pi},

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from finforce_eval.errors import RecordingError
-from finforce_eval.evaluate import evaluate_all
+from finforce_eval.evaluation.batch import evaluate_all
 from finforce_eval.evaluation.contact_source import ContactChoice
 from finforce_eval.evaluation.scoring import ONSET_FORCE
 from finforce_eval.evaluation.setup import EvaluationSetup

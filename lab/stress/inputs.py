@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.errors import FinforceError
-from finforce_eval.replay.processes import resident_bytes
+from finforce_eval.replay.process_group import resident_bytes
 from finforce_ifea.observation import Contact, ObjectOutline
 from lab.stress.session import PERIOD, Bench, Session, SessionStep, noise_of, open_session, take_another
 from lab.stress.stress import Family, Plan, Trial

@@ -27,7 +27,7 @@ POSE_NOISE = 1e-4
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PressedImage:
-    """What is true in one image: pose T_jaw_object (4, 4), key points (K, 3) [m], force [N] and torque [N m] (3,)."""
+    """The truth in one image: pose T_jaw_object (4, 4), key points (K, 3) [m], force [N] and torque [N m] (3,)."""
 
     T: NDArray
     points: NDArray
@@ -162,7 +162,7 @@ class HardScene:
         tilt: its turn from x to z [rad].
         depth: of the press below the undeformed surface [m]; negative: it stays away.
         across: of its origin along the width [m].
-        is_impossible: whether no press is like this: the jaw stays at rest, whatever the poses say.
+        is_impossible: True if no press is like this: the jaw stays at rest, whatever the poses say.
     """
 
     name: str

@@ -31,7 +31,7 @@ FRICTIONLESS = {"friction": 0.0, "friction_stddev": 0.03}
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SessionStep:
-    """What an estimator is given in one image, and the truth.
+    """The input of an estimator in one image, and the truth.
 
     Attributes:
         stamp: [s].
@@ -53,7 +53,7 @@ class SessionStep:
 
     @property
     def observation(self) -> Observation:
-        """What an estimator sees of the step."""
+        """The observation of the step."""
         return Observation(stamp=self.stamp, points=self.points, likelihood=self.likelihood)
 
 
@@ -71,7 +71,7 @@ class Session:
         bench: whose estimator it is.
         random: of the noise.
         history: the press.
-        contact: what the estimator is told of the place.
+        contact: contact that is given to the estimator.
         offsets: of the key points, constant (K, 3) [m].
         start: stamp of the last unloaded image [s].
         level: see `Trial`.

@@ -1,4 +1,4 @@
-"""What a stress family is, how one of its trials is run, what they come to, and which rules they break."""
+"""Stress families: their trials, results and violated rules."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ class Trial:
 
     Attributes:
         seed: of the trial, so that it can be run alone.
-        level: what was set in this trial, such as "noise 2 mm".
-        sure: whether it was given as one that may be published.
+        level: setting of this trial, such as "noise 2 mm".
+        sure: True if it was given as one that may be published.
         errors: sizes of the errors along `AXES` [N, N m]; none where there is no truth to compare with.
         stated: standard deviations that were stated along `AXES` [N, N m].
         step_time: CPU time of the step [s]; NaN where it is not to be compared with the others.
-        nan: whether something that is not finite left in an answer that was sure.
+        nan: True if something that is not finite left in an answer that was sure.
         outcome: "answer", "refused" by one of our errors, "crashed" by any other, or "hung".
         note: the error's words, or what else is to be known.
     """
@@ -76,7 +76,7 @@ class Trial:
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """What one run of a family is asked for.
+    """The options of one run of a family.
 
     Attributes:
         seed: of everything that is drawn.
@@ -108,11 +108,11 @@ class Family:
 
     Attributes:
         name: one word or two, for the command line.
-        what: what is done, in one line.
+        what: summary, in one line.
         run: yields the trials of a plan.
         least_sure: share of the trials that must be answered surely; a code that is never sure is honest and useless.
-        timed: whether no step may exceed ten times the median; not where the trials differ in size on purpose.
-        ruled: whether the exit status asks for the rule; not where what the estimator is told is false on purpose.
+        timed: True if no step may exceed ten times the median; not where the trials differ in size on purpose.
+        ruled: True if the exit status asks for the rule; not where what the estimator is told is false on purpose.
     """
 
     name: str
@@ -137,7 +137,7 @@ def attempt(
         seed: of the trial.
         work: the step.
         judge: returns the trial of the step's result.
-        level: what was set in this trial.
+        level: setting of this trial.
         limit: wall time [s] after which the step counts as hung; kept in the main thread alone.
     """
     begin = thread_time()

@@ -21,7 +21,7 @@ MOST_BATCHES = 10**9
 
 @dataclass(frozen=True, kw_only=True)
 class AugmentSettings:
-    """How far pictures are changed; every probability is per picture.
+    """The ranges of random changes to pictures; every probability is per picture.
 
     Attributes:
         shift: largest shift along a row and a column [px].
@@ -96,7 +96,7 @@ def load_batches(
 
     Args:
         pictures: to draw from.
-        augmentation: how far they are changed.
+        augmentation: ranges of the changes.
         size: pictures in a batch.
         workers: processes that make them; 0 for none but this one.
         seed: of order and augmentation.
@@ -184,7 +184,7 @@ def augment(
         picture: (h, w, 3) uint8 RGB with padding.
         points: (K, 2) column and row in it [px].
         visible: (K,) bool.
-        settings: how far it is changed.
+        settings: ranges of the changes.
         rng: source of chance.
     """
     sample = _warp(picture, points, visible, settings, rng)

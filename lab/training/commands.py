@@ -1,4 +1,4 @@
-"""What the commands of training share: their errors, the libraries that only they need, settings as options."""
+"""Shared parts of the training commands: errors, libraries that only they need, settings as options."""
 
 from __future__ import annotations
 

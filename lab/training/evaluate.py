@@ -70,7 +70,7 @@ def format_scores(scores: Mapping[str, Score]) -> str:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Detections:
-    """What a network says of n pictures, and what is true of them.
+    """The answers of a network to n pictures, and their truth.
 
     Attributes:
         pixels: (n, K, 2) found column and row [px].
@@ -113,7 +113,7 @@ def gather_detections(pictures: FingerPictures, pixels: NDArray, likelihood: NDA
 
 @dataclass(frozen=True, kw_only=True)
 class Score:
-    """How well points were found; NaN where nothing was to be scored.
+    """The errors of the points found; NaN where nothing was to be scored.
 
     Attributes:
         pictures: number of pictures.

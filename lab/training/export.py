@@ -66,7 +66,7 @@ def write_network(network: FingerNetwork, folder: Path, factor: float) -> None:
     Args:
         network: in evaluation mode.
         folder: of the files.
-        factor: what its deviations are multiplied with to be standard deviations along an axis.
+        factor: ratio of standard deviations along an axis to the deviations of the network.
     """
     folder.mkdir(parents=True, exist_ok=True)
     folded = network if network.shape.folded else fold_batch_norm(network)

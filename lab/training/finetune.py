@@ -204,7 +204,8 @@ def cut_picture(
 
 FEWEST = 3  # labelled pictures
 HELD_BACK = 6  # every sixth picture judges, the others teach; of fewer than twelve every second one
-MINUTES, RATE = 5.0, 3e-4
+MINUTES = 5.0  # [min] of training
+RATE = 3e-4  # largest learning rate
 MIXED = 2000  # pictures of the data set that are mixed in
 
 
@@ -264,7 +265,7 @@ def load_project(
         folder: that holds them.
         view: of their camera.
         jaw: jaw file, or name of an included jaw.
-        sides: which jaws are labelled.
+        sides: labelled jaws.
         mapping: names of the jaw's points by body part, where they differ.
 
     Raises:

@@ -52,7 +52,7 @@ class Finger:
         keypoints: (K, 2) [m], where ribs meet bands, of few also half way between, and at last the tip.
         reference: (2,) [m], a mark on what is held.
         bolts: (b, 3) [m], x, z and radius of what is seen on its side: heads of screws.
-        has_hinges: whether its ribs are bars that turn on the bands.
+        has_hinges: True if its ribs are bars that turn on the bands.
     """
 
     polygon: shapely.Polygon
@@ -300,7 +300,7 @@ class BentFinger:
             spread: its standard deviation [m].
             slope: its share along z.
             largest: [m].
-            states: how many equilibria are wanted, evenly spread.
+            states: number of equilibria, evenly spread.
         """
         load = np.zeros(self._count + 1)
         front = np.flatnonzero(self._side == 0)

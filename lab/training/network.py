@@ -30,7 +30,7 @@ class NetworkShape:
         width: of the picture [px], a multiple of 16.
         coarse: channels of the coarse part at strides 4, 8, 16 and 32 of the picture; multiples of 16 are fastest.
         fine: channels of the fine part at strides 2 and 4.
-        folded: whether convolutions have a bias instead of batch norm, as in an exported network.
+        folded: True if convolutions have a bias instead of batch norm, as in an exported network.
     """
 
     height: int = 224

@@ -165,7 +165,7 @@ def make_all(tasks: Sequence[Task], engine: EngineOptions, folder: Path, unit: s
         tasks: each makes a file.
         engine: where they are carried out.
         folder: of the files, and of a manifest that lets a run go on where one was killed.
-        unit: what a task is, for the bar.
+        unit: noun for a task, for the bar.
 
     Raises:
         TrainingError: one of them failed; which, and how many.

@@ -32,8 +32,10 @@ torch = import_torch()
 POINTS = 12  # of a picture that the fine part looks at in one step
 COVERED = 4  # of them that are key points which cannot be seen, where there are any
 ANYWHERE = 2  # of them that need not be key points
-# px by which guesses are off: some anywhere up to FAR, others with deviation NEAR
-FAR, FAR_SHARE, NEAR = 9.0, 0.25, 1.5
+# Errors of guesses.
+FAR = 9.0  # [px], largest error of a fraction of them, evenly spread
+FAR_SHARE = 0.25  # [-], that fraction
+NEAR = 1.5  # [px], standard deviation of the others
 FARTHEST = 600.0  # px; a place that a slanted view has thrown farther is not learnt
 HIDDEN_WEIGHT = 6.0  # of a hidden point beside a visible one: to accept what is not there costs more than to lose one
 SHARPNESS = 0.05  # px; smaller errors count by their square
@@ -70,7 +72,7 @@ def compute_losses(network: FingerNetwork, batch: Batch, *, low: bool) -> Losses
     Args:
         network: in training mode.
         batch: on the network's device.
-        low: whether to compute in bfloat16.
+        low: True to compute in bfloat16.
     """
     device = batch.rest.device
     known = torch.isfinite(batch.places).all(dim=2) & (batch.places.abs() < FARTHEST).all(dim=2)
@@ -132,7 +134,7 @@ FINETUNING_DIM = 0.15  # probability of little light: less than in the first tra
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
-    """How long and how fast the network is trained; a run ends after its minutes, whatever it has seen by then."""
+    """The duration and learning rate of a training; a run ends after its minutes, at whatever step."""
 
     minutes: float = setting(80.0, "time that training may take, evaluation included", "min", 0.01, 10_000.0)
     steps: int = setting(0, "batches until the end; 0: until the minutes are over, not repeatable", "", 0, 10**9)
@@ -171,7 +173,7 @@ class FingerTraining:
     """A network, its optimiser, its averaged weights, which are those that are kept, and how far they are.
 
     Args:
-        recipe: how to train.
+        recipe: duration and learning rate.
         network: to begin with; random weights when absent.
     """
 
@@ -190,7 +192,7 @@ class FingerTraining:
 
     @property
     def progress(self) -> float:
-        """How much is done, 0 to 1: by steps where the recipe counts them."""
+        """The share of the training done, 0 to 1: by steps where the recipe counts them."""
         recipe = self.recipe
         return min(self.step / recipe.steps if recipe.steps else self.elapsed / (60.0 * recipe.minutes), 1.0)
 

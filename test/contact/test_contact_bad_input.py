@@ -7,12 +7,12 @@ import pytest
 from contact_fakes import FACE, JAW, bent, box, cylinder, opened, pose
 
 from finforce.errors import ObservationError, PoseError
+from finforce_contact.contact_session import ContactSession
 from finforce_contact.errors import ObjectMeshError
 from finforce_contact.estimator import ContactEstimator
 from finforce_contact.parameters import MODES, ContactParameters, ContactSettings, TrackerSettings
 from finforce_contact.reconstruction import evidence as image_evidence
 from finforce_contact.reconstruction import reconstruction
-from finforce_contact.session import ContactSession
 from finforce_ifea.errors import MeshError
 
 RADIUS = 0.0125

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from finforce_contact.contact_session import JawContact, PosePairing, turn_covariance
 from finforce_contact.estimator import ContactEstimate
 from finforce_contact.parameters import ContactSettings
 from finforce_contact.pose.filter import PoseFilter
-from finforce_contact.session import JawContact, PosePairing, turn_covariance
 
 MS = 1_000_000
 FRAME = 33 * MS

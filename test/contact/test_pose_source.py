@@ -7,11 +7,11 @@ import pytest
 
 from finforce.errors import ObservationError, PoseError
 from finforce.messages import CameraStream
+from finforce_contact.contact_session import ContactSession
 from finforce_contact.mesh.object_mesh import ObjectMesh
 from finforce_contact.parameters import ContactParameters, ContactSettings, TrackerSettings
 from finforce_contact.pose.source import ExternalPoseSource
 from finforce_contact.pose.tracker import check_camera_outside
-from finforce_contact.session import ContactSession
 from finforce_sim.objects import build_object
 
 FRAME = "camera_color_optical_frame"

@@ -14,8 +14,8 @@ import yaml
 from finforce.gripper_frames import BENCH_CAMERA
 from finforce.settings import TimeParameters, is_parameter
 from finforce.systems.launch import options_from_texts
-from finforce.systems.live import bench_processes
 from finforce.systems.processes import BenchOptions, Process, ReplayOptions, RobotOptions, replay_processes
+from finforce.systems.setups import bench_processes
 from finforce_contact.parameters import ContactParameters, ContactSettings
 from finforce_driver.node import LINKS
 from finforce_driver.settings import DriverParameters, GraspSettings, GripperSettings, JointSettings

@@ -10,12 +10,6 @@ import yaml
 
 from finforce.gripper_frames import ROBOT_CAMERA
 from finforce.ros.transport import CHOICES, PROFILES, TRANSPORT, free_domain
-from finforce.systems.live import (
-    SIM_OBJECT,
-    bench_processes,
-    camera_pose,
-    robot_processes,
-)
 from finforce.systems.processes import (
     BenchOptions,
     Include,
@@ -23,6 +17,12 @@ from finforce.systems.processes import (
     ReplayOptions,
     RobotOptions,
     replay_processes,
+)
+from finforce.systems.setups import (
+    SIM_OBJECT,
+    bench_processes,
+    camera_pose,
+    robot_processes,
 )
 from finforce_contact.mesh.object_mesh import load_object_mesh
 from finforce_contact.parameters import ContactParameters

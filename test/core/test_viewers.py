@@ -19,8 +19,8 @@ from rclpy.qos import (
 )
 from std_msgs.msg import String
 
-from finforce.systems.live import robot_processes
 from finforce.systems.processes import RobotOptions
+from finforce.systems.setups import robot_processes
 
 ROOT = Path(__file__).resolve().parents[2]
 TYPES = {

@@ -7,8 +7,8 @@ from driver_node_fakes import READY, Caller, FakeGripper
 from test_driver_tasks import Grasping, build
 
 from finforce.health import Level
+from finforce_driver.conversions import news_of_state, outcome_of_state
 from finforce_driver.errors import GraspError, GripperStateError
-from finforce_driver.messages import news_of_state, outcome_of_state
 from finforce_driver.state import MoveOutcome, Phase
 
 

@@ -10,9 +10,7 @@ from driver_node_fakes import READY, FakeGripper
 from finforce.health import Level, StampError
 from finforce.messages import NANOSECONDS
 from finforce.settings import ParameterError
-from finforce_driver.errors import TargetError
-from finforce_driver.grasp.session import GraspSession
-from finforce_driver.messages import (
+from finforce_driver.conversions import (
     MessageTimes,
     goal_from_joint_state,
     move_from_gripper_command,
@@ -20,6 +18,8 @@ from finforce_driver.messages import (
     news_of_state,
     outcome_of_state,
 )
+from finforce_driver.errors import TargetError
+from finforce_driver.grasp.session import GraspSession
 from finforce_driver.node import build_gripper
 from finforce_driver.settings import DriverParameters, GraspGoal, GraspSettings, GripperSettings
 from finforce_driver.state import MoveOutcome, Phase, describe_record

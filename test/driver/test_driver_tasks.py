@@ -8,19 +8,19 @@ import pytest
 from driver_node_fakes import READY, Caller, FakeGoal, FakeGripper
 from emulator_fakes import Rig
 
-from finforce_driver.errors import DriverError, GraspError, GripperStateError, TargetError
-from finforce_driver.grasp.load_watch import ForceSample
-from finforce_driver.grasp.session import GraspSession
-from finforce_driver.messages import (
+from finforce_driver.conversions import (
     fill_gripper_command,
     move_from_gripper_command,
     move_from_joint_state,
     news_of_state,
     outcome_of_state,
 )
+from finforce_driver.errors import DriverError, GraspError, GripperStateError, TargetError
+from finforce_driver.grasp.load_watch import ForceSample
+from finforce_driver.grasp.session import GraspSession
+from finforce_driver.services import GripperTasks, MoveAction
 from finforce_driver.settings import DriverParameters, GraspGoal, GraspSettings
 from finforce_driver.state import GraspPhase, MoveOutcome, Phase
-from finforce_driver.tasks import GripperTasks, MoveAction
 
 
 def build(gripper=None, **parameters):

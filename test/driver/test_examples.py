@@ -22,8 +22,8 @@ from sensor_msgs.msg import JointState
 from finforce import GripperClient
 from finforce.errors import ServiceError
 from finforce.ros.transport import free_domain
-from finforce.systems.live import robot_processes
 from finforce.systems.processes import RobotOptions
+from finforce.systems.setups import robot_processes
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "examples"

@@ -9,8 +9,8 @@ from eval_fakes import FakeEstimator, FakeJaw, evaluate_recording, make_recordin
 from finforce_contact.loop import GivenContact
 from finforce_eval.cli.main import main
 from finforce_eval.evaluation.comparison import compare_evaluations, total_change
+from finforce_eval.evaluation.score_tables import evaluation_json
 from finforce_eval.evaluation.scoring import score_results, true_range
-from finforce_eval.evaluation.tables import evaluation_json
 from finforce_eval.machine import write_figures
 from finforce_eval.table import write_table
 

@@ -10,8 +10,8 @@ from finforce.errors import FinforceError, ObservationError
 from finforce_contact.loop import GivenContact
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.contact_source import RecordedContact, parse_contacts
+from finforce_eval.evaluation.score_tables import evaluation_json, format_tables, score_table
 from finforce_eval.evaluation.scoring import score_results
-from finforce_eval.evaluation.tables import evaluation_json, format_tables, score_table
 from finforce_eval.recordings.objects import track_object
 from finforce_eval.recordings.tracks import DetectionTruth, JawTrack
 from finforce_ifea.observation import Contact

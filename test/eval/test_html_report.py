@@ -12,7 +12,7 @@ from eval_fakes import FakeEstimator, FakeJaw, cut, evaluate_recording, make_rec
 from finforce_contact.loop import GivenContact
 from finforce_eval.cli.main import main
 from finforce_eval.errors import RecordingError
-from finforce_eval.evaluate import read_evaluations
+from finforce_eval.evaluation.batch import read_evaluations
 from finforce_eval.evaluation.scoring import score_results, true_range
 from finforce_eval.figures.report import describe_series, write_html, write_page
 from finforce_eval.recordings.writer import write_recording

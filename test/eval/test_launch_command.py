@@ -9,7 +9,7 @@ from finforce.errors import MissingDependencyError
 from finforce.systems.processes import executables_of
 from finforce_eval.cli import demo, launch
 from finforce_eval.cli.main import main
-from finforce_eval.replay import processes
+from finforce_eval.replay import process_group
 
 
 @pytest.fixture(autouse=True)
@@ -92,7 +92,7 @@ def test_a_process_whose_settings_cannot_be_used_ends_all_and_is_named(monkeypat
 
 
 def test_a_node_that_dies_is_started_again_and_a_driver_is_not(monkeypatch, capsys, tmp_path):
-    monkeypatch.setattr(processes, "RESPAWN_DELAY", 0.0)
+    monkeypatch.setattr(process_group, "RESPAWN_DELAY", 0.0)
     code = "import pathlib; file = pathlib.Path({!r}); file.open('a').write('x'); raise SystemExit({})"
     solver, driver = tmp_path / "solver", tmp_path / "driver"
     wait = f"import pathlib, time\nwhile not pathlib.Path({str(solver)!r}).exists() or "

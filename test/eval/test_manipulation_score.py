@@ -9,8 +9,8 @@ from test_scoring import make_result
 from finforce.gripper_frames import ROBOT_CAMERA, jaw_in_camera
 from finforce.transforms import quaternion_from_pose
 from finforce_eval.evaluation.gripper import with_distances
+from finforce_eval.evaluation.score_tables import format_manipulation
 from finforce_eval.evaluation.scoring import join_net, score_manipulation, score_net
-from finforce_eval.evaluation.tables import format_manipulation
 from finforce_eval.recordings.tracks import PoseTrack
 
 

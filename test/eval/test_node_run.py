@@ -9,7 +9,7 @@ from finforce_eval.recordings.recording import POSE
 from finforce_eval.recordings.writer import pose_message, typestore
 from finforce_eval.replay.node_run import describe_load, run_nodes
 from finforce_eval.replay.playback import RawMessage
-from finforce_eval.replay.processes import ProcessError
+from finforce_eval.replay.process_group import ProcessError
 from lab.bench.chain import SyntheticStream
 
 TOPIC = "/left/jaw_pose"

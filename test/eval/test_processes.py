@@ -8,7 +8,7 @@ from time import monotonic, sleep
 
 import pytest
 
-from finforce_eval.replay.processes import ProcessError, ProcessGroup
+from finforce_eval.replay.process_group import ProcessError, ProcessGroup
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def test_all_are_ended_when_the_block_fails():
 
 def test_one_that_ignores_signals_is_killed(monkeypatch):
     patience = ((signal.SIGINT, 0.2), (signal.SIGTERM, 0.2), (signal.SIGKILL, 5.0))
-    monkeypatch.setattr("finforce_eval.replay.processes.PATIENCE", patience)
+    monkeypatch.setattr("finforce_eval.replay.process_group.PATIENCE", patience)
     with ProcessGroup([Script("a", STUBBORN), Script("b", WAIT)], {}) as group:
         sleep(0.5)
         started = pids(group)

@@ -23,7 +23,7 @@ from finforce_eval.cli.main import main
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.writer import write_recording
 from finforce_eval.replay import replay as replaying
-from finforce_eval.replay.live import ReplayLog, live_result
+from finforce_eval.replay.answers import ReplayLog, live_result
 from finforce_eval.replay.node import open_player
 
 SHIPPED = Path(replaying.__file__).parents[1] / "data" / "bench_cyl25_middle"

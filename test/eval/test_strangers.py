@@ -356,20 +356,22 @@ def test_a_small_table_that_unpacks_to_far_more_than_its_size_is_refused(dataset
 def test_forces_of_a_dataset_are_shown_as_those_of_a_bag(dataset):
     from finforce_eval.cli.report import read_forces
 
-    with pytest.raises(RecordingError, match="no forces: no feature ends in .force.left"):
+    with pytest.raises(RecordingError, match="no forces: no features as force.left and force.left.valid"):
         read_forces(dataset)
     info = json.loads((dataset / "meta/info.json").read_text())
-    info["features"] |= dict.fromkeys(("observation.force.left", "observation.force.left.stddev"), {"dtype": "float32"})
+    info["features"] |= dict.fromkeys(("force.left", "force.left.stddev", "force.left.valid"), {"dtype": "float32"})
     (dataset / "meta/info.json").write_text(json.dumps(info))
     for path in (dataset / "data").rglob("*.parquet"):
         table = parquet.read_table(path)
-        for number, name in enumerate(("observation.force.left", "observation.force.left.stddev")):
-            table = table.append_column(name, [[[-2.0 + 1.9 * number, 0.0, 0.0]] * len(table)])
+        valid = np.arange(len(table)) > 0
+        for name, force in (("force.left", -2.0), ("force.left.stddev", -0.1)):
+            table = table.append_column(name, [[[force * known, 0.0, 0.0] for known in valid]])
+        table = table.append_column("force.left.valid", [valid.tolist()])
         parquet.write_table(table, path)
     short, long = read_forces(dataset)
     assert (short.name, long.name) == ("noise/episode_000000/left", "noise/episode_000001/left")
-    assert len(long) == 8 and (long.magnitude == 2.0).all()
-    np.testing.assert_allclose(long.column("magnitude_stddev"), 0.1, atol=1e-6)
+    assert len(long) == 8 and not long.solved[0] and (long.magnitude[1:] == 2.0).all()
+    np.testing.assert_allclose(long.column("magnitude_stddev")[1:], 0.1, atol=1e-6)
     (dataset.parent / "manifest.jsonl").write_text("{}\n")
     page = dataset.parent / "page.html"
     assert main(["report", str(dataset), str(dataset.parent / "manifest.jsonl"), "-o", str(page)]) == 0

@@ -12,8 +12,8 @@ from finforce_contact.loop import GivenContact
 from finforce_eval.cli.main import main, parse
 from finforce_eval.cli.twin import write_footage
 from finforce_eval.evaluation.keypoint_source import detect_keypoints
+from finforce_eval.evaluation.score_tables import evaluation_json, format_tables, sight_table
 from finforce_eval.evaluation.scoring import score_results
-from finforce_eval.evaluation.tables import evaluation_json, format_tables, sight_table
 from finforce_eval.recordings.objects import read_friction
 from finforce_eval.recordings.recording import read_recording
 from finforce_sim.scenarios import SCENARIOS

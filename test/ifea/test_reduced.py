@@ -63,12 +63,6 @@ def test_boxes_are_pressed_in_as_by_the_full_mechanics(tilt):
     assert shape.max() < 0.06e-3
 
 
-def test_rest_stiffness_alone_is_right_for_small_loads_and_wrong_for_large_ones():
-    force, _ = compare(RoundIndenter, 0.0125, 0.060, mechanics=bench_mechanics("coarse", "linear"))
-    assert abs(force[0]) < 0.01
-    assert abs(force[-1]) > 0.03
-
-
 def test_modes_are_the_derivatives_of_the_equilibrium_by_depth_radius_and_height():
     contact = reduced().contact
     place = np.array([0.004, 0.0125, 0.031])

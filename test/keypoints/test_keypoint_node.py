@@ -322,7 +322,7 @@ def test_dots_on_the_jaws_become_key_points_in_the_jaw_frame(probe, side):
 def test_what_a_cloud_says_against_each_key_point_is_what_the_detector_said():
     from keypoint_node_fakes import FakeKeypoints
 
-    from finforce_eval.replay.live import heard_keypoints
+    from finforce_eval.replay.answers import heard_keypoints
     from finforce_keypoints.geometry.jaw_localizer import REASONS
     from finforce_keypoints.node import keypoint_columns
 

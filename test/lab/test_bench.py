@@ -19,7 +19,7 @@ from finforce_eval.errors import OptionError
 from finforce_eval.machine import write_figures
 from finforce_eval.recordings.recording import DEMO as RECORDING
 from finforce_eval.recordings.recording import read_recording
-from finforce_eval.replay.processes import resident_bytes
+from finforce_eval.replay.process_group import resident_bytes
 from finforce_ifea.jaw.jaw import load_jaw
 from lab import harness
 from lab.cli import bench

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from finforce.messages import NANOSECONDS
-from finforce_eval.replay.live import ReplayLog
+from finforce_eval.replay.answers import ReplayLog
 from finforce_eval.replay.node_run import NodeRun
 from finforce_sim.footage import START
 from lab.bench.chain import (

@@ -8,8 +8,8 @@ from rgbd_fakes import CAMERA_POSE, FakeLens
 
 from finforce.transforms import invert_pose
 from finforce_sim.gripper import PressedGrasp
-from finforce_sim.live import BEFORE_TOUCH, COUNTS, OPEN_STRIDE, TAKES, LiveScene, choose_openings
 from finforce_sim.scenarios import ScenarioError, build_scenario
+from finforce_sim.stored_grasp import BEFORE_TOUCH, COUNTS, OPEN_STRIDE, TAKES, LiveScene, choose_openings
 
 STROKE = 0.048
 COUNT = STROKE / COUNTS
@@ -31,7 +31,9 @@ def scene(grasp):
 @pytest.fixture
 def few(monkeypatch):
     """The openings that deserve an image are these."""
-    return lambda openings: monkeypatch.setattr("finforce_sim.live.choose_openings", lambda grasp: np.array(openings))
+    return lambda openings: monkeypatch.setattr(
+        "finforce_sim.stored_grasp.choose_openings", lambda grasp: np.array(openings)
+    )
 
 
 @dataclass
@@ -92,7 +94,7 @@ def test_the_same_seed_gives_the_same_images_whatever_the_threads(grasp, few, mo
     few(np.linspace(0.0, 0.03, 12))
     reels = []
     for workers in (1, 4):
-        monkeypatch.setattr("finforce_sim.live.WORKERS", workers)
+        monkeypatch.setattr("finforce_sim.stored_grasp.WORKERS", workers)
         scene = LiveScene(grasp, FakeLens(), 5)
         scene.render(lambda frame: frame.color, lambda done, count: None)
         reels.append([scene.take(opening, 0.0).picture for opening in scene.openings for _ in range(TAKES)])

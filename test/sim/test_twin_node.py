@@ -19,9 +19,9 @@ from finforce.ros import node as ros
 from finforce_sim import node as twin_node
 from finforce_sim.footage import encode_depth, parse_size
 from finforce_sim.gripper import PressedGrasp
-from finforce_sim.live import LiveScene
 from finforce_sim.node import TwinCameraNode, TwinParameters
 from finforce_sim.scenarios import ScenarioError, build_scenario
+from finforce_sim.stored_grasp import LiveScene
 
 COLOR = "/camera/camera/color/image_raw"
 DEPTH = "/camera/camera/aligned_depth_to_color/image_raw"

@@ -22,27 +22,33 @@ from finforce_ifea.jaw.section import UNITS, Layer, SectionFile, check_loops, jo
 
 SURFACES = (".stl", ".obj", ".ply", ".off", ".3mf", ".glb")
 SUFFIXES = (*SURFACES, ".step", ".stp", ".dxf", ".svg", ".json", *PHOTOS)
-# Largest size of a finger [m]; the second pair is for a unit that was stated.
-_PLAUSIBLE, _POSSIBLE = (0.015, 0.25), (0.005, 1.0)
+_PLAUSIBLE = (0.015, 0.25)  # [m], range of a finger's largest size
+_POSSIBLE = (0.005, 1.0)  # [m], the same where a unit was stated
 # What encloses less than this share of the largest body is no part of a finger.
 _CRUMB = 1e-4
 # So many shells, as of ribs and raised letters, are looked at for whether they overlap.
 _MOST_SHELLS = 40
-# Vertices of open edges that are as close as this [m] are one; an edge of so many sides is that of two triangles.
-_CRACK, _MISSING = 1e-5, 4
-_MOST_TRIANGLES, _LARGEST_FILE = 2_000_000, 200_000_000
-# A surface is prismatic when so much of it stands upright on, or lies across, the direction of extrusion.
-_UPRIGHT, _PRISMATIC = 0.02, 0.97
+_CRACK = 1e-5  # [m], largest distance of vertices of open edges that are merged
+_MISSING = 4  # sides of a hole that counts as two missing triangles
+_MOST_TRIANGLES = 2_000_000
+_LARGEST_FILE = 200_000_000  # [bytes]
+_UPRIGHT = 0.02  # [-], largest cosine of a normal that stands upright on the direction of extrusion
+_PRISMATIC = 0.97  # [-], fraction of a prismatic surface that stands upright or lies across
 # Of a tapered one the normals of walls have less than this along its direction, those of sides more; a side is plane
 # within so much [m].
 _ASIDE, _SIDE, _RULINGS = 0.5, 1e-4, 4
-# Cuts across it, evenly over the width: they may differ from the usual one by so much of its area on average, and few
-# of them by what is seen; what differs by more is another section, by less the same. A small hole is one on average.
-_CUTS, _ALIKE, _SEEN, _RARE, _OTHER, _ROUNDING, _SMALL = 25, 0.02, 0.01, 0.2, 0.1, 1e-4, 5e-3
+# Cuts across a surface, evenly over the width; differences as fractions of the area of the usual cut.
+_CUTS = 25
+_ALIKE = 0.02  # [-], largest mean difference of one section
+_SEEN = 0.01  # [-], difference that is seen
+_RARE = 0.2  # [-], largest fraction of the cuts that differ by that
+_OTHER = 0.1  # [-], difference of another section
+_ROUNDING = 1e-4  # [-], difference of the same section
+_SMALL = 5e-3  # [-], largest mean area of a small hole
 # Cuts of the same walls are one where these move by less than this [m] over the width.
 _ALONG = 2e-6
-# A base fits into a circle of this share of that around the blade on it, and what is in it into one of this share.
-_SHORT, _LOCAL = 0.67, 0.4
+_SHORT = 0.67  # [-], largest circle around a base over that around the blade on it
+_LOCAL = 0.4  # [-], the same of what is in a base
 # Ends of cut triangles are joined on a grid of this size [m].
 _GRID = 2e-7
 _CHORD = 2e-5
@@ -57,9 +63,9 @@ class RawSection:
         width: along the extrusion [m], of a tapered finger at the section's origin; None where the file is flat.
         taper: (2,) [-], change of the width along the section's axes.
         base: where the body is no prism of this section, which the clamp has to hold; None for nowhere.
-        unlike: what it is there, unless it is wider.
-        notes: what was found and guessed, a line each.
-        photo: what it was traced from, if that is a photograph.
+        unlike: kind of the part there, unless it is wider.
+        notes: findings and guesses, a line each.
+        photo: photograph that it was traced from, if any.
     """
 
     polygon: shapely.Polygon
@@ -86,7 +92,7 @@ def read_section(path: Path, *, unit: str | None = None, body: int | None = None
     Args:
         path: a surface (.stl and others), a solid (.step), a drawing (.dxf, .svg), a section (.json), or a photograph.
         unit: one of `UNITS`; None for the only one in which it has a finger's size; of a photograph see `SCALE`.
-        body: which one of several bodies, from 1.
+        body: number of the body among several, from 1.
         layered: take a solid as layers along its width, whatever its shape.
 
     Raises:
@@ -286,7 +292,7 @@ class _Cuts:
         return shapely.area(self.found)
 
     def is_short(self, area: shapely.Geometry, share: float) -> bool:
-        """Whether the circle around an area is less than a share of that around the section."""
+        """Return True if the circle around an area is less than a share of that around the section."""
         return shapely.minimum_bounding_radius(area) < share * shapely.minimum_bounding_radius(self.section)
 
     def find_local(self) -> shapely.Geometry | None:
@@ -320,16 +326,16 @@ class _Cuts:
 
     @property
     def is_mark(self) -> bool:
-        """Whether what is another section is too little to matter, as raised letters."""
+        """True if what is another section is too little to matter, as raised letters."""
         return bool(self.areas[self.difference > _OTHER].sum() <= _ALIKE * self.areas.sum())
 
     @property
     def is_one(self) -> bool:
-        """Whether they are one section, but for holes, rounded edges and the like."""
+        """True if they are one section, but for holes, rounded edges and the like."""
         return self.are_alike(np.full(len(self.found), True))
 
     def are_alike(self, chosen: NDArray) -> bool:
-        """Whether chosen ones, (n,) bool, are the section but for holes, rounded edges and the like, without floors."""
+        """Return True if chosen ones, (n,) bool, are the section but for holes and rounded edges, without floors."""
         seen = self.found[chosen & (self.difference > _SEEN)]
         more = shapely.difference(seen, self.section, grid_size=_GRID)
         inside = shapely.intersection(
@@ -408,7 +414,7 @@ def _choose_body(mesh: Surface, body: int | None, notes: list[str]) -> Surface:
 
 
 def _is_void(body: Surface, other: Surface) -> bool:
-    """Whether a body lies inside another one with its surface turned inwards."""
+    """Return True if a body lies inside another one with its surface turned inwards."""
     inside = (body.bounds[0] > other.bounds[0]).all() and (body.bounds[1] < other.bounds[1]).all()
     return bool(inside and body.volume * other.volume < 0.0)
 
@@ -453,7 +459,7 @@ def _cut_tapered(mesh: Surface, axis: NDArray, notes: list[str]) -> RawSection:
     Args:
         mesh: the body [m].
         axis: nearly that direction (3,).
-        notes: what was found, a line each.
+        notes: findings, a line each.
 
     Raises:
         JawFileError: Walls run in several directions, or a side is no plane.

@@ -18,10 +18,11 @@ _SHARE, _LARGEST = 0.1, 5.0
 _SAME = 2e-3
 # Half as far is tried as long as outlines change a layer by more than this share of its area.
 _LOST = 0.02
-# Of the edge of what an outline leaves as it moves half is along the rest, of a wall the ends are, within so much [m].
-_ALONG, _AT = 0.4, 1e-6
-# Areas are compared on a grid of this size [m], which keeps them valid; parts of less area [m^2] are left by that.
-_GRID, _SPECK = 1e-8, 1e-10
+# What an outline leaves as it moves has half of its edge along the rest; a wall has its ends there.
+_ALONG = 0.4  # [-], least fraction of the edge
+_AT = 1e-6  # [m], largest distance of an edge along the rest
+_GRID = 1e-8  # [m], grid on which areas are compared, which keeps them valid
+_SPECK = 1e-10  # [m^2], largest area of a part that the grid leaves
 # Steps closer to each other than this [m] are one.
 _STEP = 2e-5
 
@@ -52,7 +53,7 @@ def find_layers(cut: Callable[[float], shapely.Geometry], ends: tuple[float, flo
 
 
 def _is_even(grid: NDArray, cuts: list[shapely.Geometry]) -> bool:
-    """Whether cuts between places (n + 1,) are alike on both sides of the middle: then layers mirror each other."""
+    """Return True if cuts between heights (n + 1,) mirror each other about the middle, as then layers do."""
     pairs = zip(cuts, reversed(cuts), strict=True)
     are_alike = all(_compare(one, two).area <= _SAME * one.area for one, two in pairs)
     return are_alike and np.abs(grid + grid[::-1]).max() < _STEP

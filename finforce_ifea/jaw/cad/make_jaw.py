@@ -20,22 +20,28 @@ from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_ifea.jaw.jaw_file import MATERIALS
 from finforce_ifea.jaw.section import cut_below, find_face, find_reach, order_rings
 
-# Key points [m] above the clamp at least; candidates so far from either end of the inner face, and from each other.
-_ABOVE, _AWAY, _STEP = 1e-3, 4e-3, 4e-3
-_FEWEST, _MOST = 6, 30
+_ABOVE = 1e-3  # [m], least height of key points above the clamp
+_AWAY = 4e-3  # [m], least distance of contact candidates from either end of the inner face
+_STEP = 4e-3  # [m], between candidates
+_FEWEST = 6  # candidates
+_MOST = 30  # candidates
 _TIP = 2.5e-3
 # With fewer key points where ribs meet bands, those between them are taken, too: an object hides some.
 FEW = 12
 BANDS = ("inner", "outer")
-# A finger without ribs is given so many cells between these shares of its length, apart by twice this share, under a
-# skin of this share of its width; slots reach so far into its ends.
-_CELLS, _CELLS_FROM, _GAP, _SKIN = 8, (0.08, 0.95), 0.008, 0.06
-_SLOT, _LEVELS = 0.3, 200
-# Layers that warp by more than this share need a solid, whose elements are of this size [m].
-_WARPING, _SIZE = 0.25, 0.002
-# Walls in a photograph are so many pixels across at least. They are uncertain by this share of the width of its edges
-# and, where a camera a metre away sees dark sides, of the finger's; bending goes with the cube.
-_ACROSS, _BLURRED, _SIDES = 5, 0.2, 0.025
+# Cells that a finger without ribs is given.
+_CELLS = 8
+_CELLS_FROM = (0.08, 0.95)  # [-], range of the cells over its length
+_GAP = 0.008  # [-], half of the gap between cells over its length
+_SKIN = 0.06  # [-], skin over them over its width
+_SLOT = 0.3  # [-], depth of slots in its ends
+_LEVELS = 200
+_WARPING = 0.25  # [-], warping of layers, see `measure_warping`, from which on a finger needs a solid
+_SIZE = 0.002  # [m], of the elements of that solid
+# Walls in a photograph, of whose thickness bending takes the cube.
+_ACROSS = 5  # [px], least thickness
+_BLURRED = 0.2  # [-], uncertainty of the thickness over the width of edges in the picture
+_SIDES = 0.025  # [-], the same over the finger's width, where a camera a metre away sees dark sides
 # A reference point [m] below a clamp that the section does not show.
 _BELOW = -6e-3
 
@@ -62,9 +68,9 @@ def make_jaw(
         name: of the finger.
         material: a name in `MATERIALS`.
         unit: of the file; None to guess it; of a photograph its scale.
-        body: which one of several bodies, from 1.
+        body: number of the body among several, from 1.
         width: along y [m]; needed for drawings and photographs.
-        overrides: what is stated in place of the guesses.
+        overrides: values stated in place of the guesses.
         picture: the PNG file; None for one next to the jaw file.
         solid: take a closed solid as it is, as layers along its width, whatever its shape.
         measure_warping: returns by what share the stiffness of a layered jaw is off where it is taken as plane;
@@ -191,7 +197,7 @@ def _find_whole(interior: shapely.Geometry, start: NDArray, along: NDArray, acro
     """Return between which shares of an outline's length cells lie: not beside a slot in either end, as of a base.
 
     Args:
-        interior: what is left for cells [m].
+        interior: depth left for cells [m].
         start: the middle of one end of the box around the outline (2,) [m].
         along: from there to the other end (2,) [m].
         across: from side to side (2,) [m].
@@ -307,7 +313,7 @@ def _describe_finger(finger: RecognizedFinger, section: str, name: str, stiffnes
     """Return the lines of a jaw file on section, material, key points and candidates.
 
     Args:
-        finger: what was recognized.
+        finger: the recognized finger.
         section: name of its file.
         name: of its material.
         stiffness_error: relative standard deviation of the stiffness for another reason.

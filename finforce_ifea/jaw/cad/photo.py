@@ -17,14 +17,17 @@ PHOTOS = (".jpg", ".jpeg", ".png")
 SCALE = "--scale X1,Y1,X2,Y2=50 (two marks of the ruler in pixels, the mm between them) or --scale MM_PER_PIXEL"
 _NUMBER = r"(\d{1,6}(?:\.\d*)?)"
 _LARGEST_FILE, _MOST_PIXELS = 100_000_000, 16_000_000  # more pixels are reduced: they are finer than any lens
-# Length of a finger [m]; area [m^2] below which a hole is a speck; a second piece has this share of the first's area.
-_LENGTHS, _SPECK, _SIMILAR = (0.02, 0.3), 1e-6, 0.25
+_LENGTHS = (0.02, 0.3)  # [m], range of a finger's length
+_SPECK = 1e-6  # [m^2], largest area of a hole that is a speck
+_SIMILAR = 0.25  # [-], area of a second piece over that of the first
 # The background is seen in this share of the picture at its edge. A piece is off it by so many times the usual
 # deviation and by so much light (white: 1); light is sure to be its own where it is off by this share of the most.
 _EDGE, _OFF, _FAINT, _SURE = 0.06, 6.0, 0.04, 0.6
-# Light is fitted on a grid of so many cells, in rounds that leave out what is off by so many times the usual deviation.
-_CELLS, _ROUNDS, _TRIMMED = 64, 6, 3.0
-_FINE, _GREY = 0.05, 0.4  # how closely a line follows the edge [px]; what is no further from half a share is grey
+_CELLS = 64  # cells of the grid on which light is fitted
+_ROUNDS = 6  # rounds of the fit, each of which leaves out outliers
+_TRIMMED = 3.0  # usual deviations from which on a cell is an outlier
+_FINE = 0.05  # [px], largest distance of a line from the edge
+_GREY = 0.4  # [-], largest distance of a grey pixel's coverage from one half
 
 
 class Photo(NamedTuple):

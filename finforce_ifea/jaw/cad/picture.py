@@ -22,7 +22,7 @@ def draw_finger(finger: RecognizedFinger, jaw: Jaw, path: Path) -> None:
     """Draw a finger into a PNG file.
 
     Args:
-        finger: what was recognized.
+        finger: the recognized finger.
         jaw: that was made of it.
         path: of the picture.
     """

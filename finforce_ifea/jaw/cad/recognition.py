@@ -1,4 +1,4 @@
-"""What a section shows of a fin-ray finger: its frame, cells, bands, ribs, bolt holes and clamp."""
+"""Recognition of a fin-ray finger in a section: its frame, cells, bands, ribs, bolt holes and clamp."""
 
 from __future__ import annotations
 
@@ -37,22 +37,23 @@ _NARROWER = 0.75
 _GRIP, _WASHER, _LARGEST, _UNLIKE = 3.0, 2.0, 0.125, 2.0
 # So is what lies below all cells, where it is so many times as far from the outline as they are.
 _APART = 2.0
-# A slot in a band fills so much of the rectangle around it, and is narrower than this share of the cell beside it; its
-# distance from the outline changes by less than this share of its length.
-_OBLONG, _NARROW, _ALONG = 0.75, 0.5, 0.15
+# A slot in a band.
+_OBLONG = 0.75  # [-], least fraction of the rectangle around it
+_NARROW = 0.5  # [-], largest width over that of the cell beside it
+_ALONG = 0.15  # [-], largest change of its distance from the outline over its length
 # Least cosine between a cell's side and the face of the band beyond it.
 _FACES = 0.7
 _NEIGHBOURS, _LONGER = 3e-3, 1.4
 # Cells that see each other through so many times the thickness of ribs do so where several ribs end side by side.
 _MERGED = 2.0
 _FEWEST, _FLAT = 5, 1e-4
-# Lines are tried through pairs of so many points, which are on them within so much [m].
-_CHORDS, _SIDE = 24, 5e-5
+_CHORDS = 24  # points through whose pairs lines are tried
+_SIDE = 5e-5  # [m], largest distance of points on a line
 # Cosines to the base that differ by less are alike.
 _EQUAL = 0.02
-# The clamp spans so much of the distance between the bands at least; the edge of a tilted base, which rises so much,
-# this.
-_HELD, _SPANNED, _TILTED = 0.5, 0.7, 0.02
+_HELD = 0.5  # [-], least span of the clamp over the distance between the bands
+_SPANNED = 0.7  # [-], the same of the edge of a tilted base
+_TILTED = 0.02  # [-], least slope of a tilted base
 # Heights of clamps from here on [m] are given in half millimetres.
 _THIN = 2e-3
 # Share of the length up to which there may be a base.
@@ -110,9 +111,9 @@ class RecognizedFinger(Section):
         outer: the other one.
         ribs: base to tip.
         face_x: plane of the inner face, x [m].
-        face_deviation: how far the inner face leaves its plane [m].
+        face_deviation: largest distance of the inner face from its plane [m].
         frame: of the jaw in the section that was read: a rotation, perhaps mirrored, and a shift (2, 3) [m].
-        notes: what was found and guessed, a line each.
+        notes: findings and guesses, a line each.
     """
 
     bolts: NDArray
@@ -144,10 +145,10 @@ class RecognizedFinger(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class Overrides:
-    """What a user states in place of the guesses.
+    """Values that a user states in place of the guesses.
 
     Attributes:
-        flip: whether the wider end is the tip, where both ends are about as wide; None: not stated.
+        flip: True if the wider end is the tip, where both ends are about as wide; None: not stated.
         other_face: the other side is the inner face.
         clamp_z: height of the clamp [m].
         face_x: x of the inner face [m].
@@ -172,10 +173,10 @@ def recognize(
     Args:
         polygon: the section [m], anyhow turned.
         width: of the finger [m], where its sides are no parallel planes that at the origin of the section.
-        overrides: what is given.
+        overrides: values stated by the user.
         taper: (2,) [-], change of the width along the section's axes; None for none.
         base: where the body is no prism of this section, which the clamp has to hold; None for nowhere.
-        unlike: what it is there, unless it is wider and thus clamped as far up as that.
+        unlike: kind of the part there, unless it is wider and thus clamped as far up as that.
 
     Raises:
         JawFileError: The section shows no fin-ray finger; the message says what it shows and what to do.
@@ -232,8 +233,8 @@ def _raise_clamp(clamped_z: float, base: NDArray, ends: tuple[float, float], unl
         clamped_z: height of the clamp without it [m].
         base: heights (n,) [m] of what has to be held.
         ends: of the finger [m]: the lowest point of its cells, and its length.
-        unlike: what the base is, if no wider than the blade.
-        notes: what was found, a line each.
+        unlike: kind of the base, if no wider than the blade.
+        notes: findings, a line each.
 
     Raises:
         JawFileError: No clamp holds that, as it is far up; or it is unlike the blade, and no wider, beside its cells.
@@ -294,7 +295,7 @@ def count_cells(polygon: shapely.Polygon) -> int:
 
 
 def _is_round(hole: NDArray, polygon: shapely.Polygon) -> bool:
-    """Whether a hole of a section is a bolt's: a circle of some corners, the seat of a nut, a slot."""
+    """Return True if a hole of a section is a bolt's: a circle of some corners, the seat of a nut, a slot."""
     shape = shapely.Polygon(hole)
     roundness = 4.0 * np.pi * shape.area / shape.length**2
     if roundness > _ROUND:
@@ -343,7 +344,7 @@ def _drop_windows(polygon: shapely.Polygon, cells: list[NDArray], notes: list[st
 
 
 def _is_slot(shape: shapely.Polygon, cells: list[shapely.Polygon], outline: shapely.LinearRing) -> bool:
-    """Whether a hole is an oblong along the outline, with a much wider cell beside it, or a rib beside its middle."""
+    """Return True if a hole is an oblong along the outline, beside a much wider cell or the end of a rib."""
     left, _, right, _ = shapely.MultiPolygon(cells).bounds
     _, low, _, high = shape.bounds
     levels = [shapely.LineString([(left, z), (right, z)]) for z in low + np.array([0.25, 0.5, 0.75]) * (high - low)]

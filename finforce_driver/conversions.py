@@ -108,8 +108,8 @@ def goal_from_joint_state(message: Any, last: GraspGoal) -> GraspGoal:
     """Return the goal of a sensor_msgs/JointState: effort = force, velocity = speed, position = least opening.
 
     Args:
-        message: what it does not say stays as it was.
-        last: how it was.
+        message: new values; others stay as they were.
+        last: values before.
 
     Raises:
         TargetError: there is nothing in it, a field has several values, or a value cannot be.

@@ -76,7 +76,7 @@ def evaluate(
         source: of the key points: "images", "keypoints" as recorded, or "truth" of a simulation; "" for recorded ones
             where there are some, else images.
         sides: jaws in the images, where no topic tells.
-        stills: whether every image is a photograph by itself, without a tare.
+        stills: True if every image is a photograph by itself, without a tare.
         episode: of a dataset.
         detector: parameters of the detector that differ from their defaults.
         settings: of the estimator, whole or those that differ from their defaults.

@@ -1,4 +1,4 @@
-"""What the nodes answered during a replay, as the time series of an offline run."""
+"""The answers of the nodes during a replay, as the time series of an offline run."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ class ProcessGroup:
     """Runs processes as long as the `with` block lasts; none outlives it.
 
     Args:
-        processes: what to run, with this Python.
+        processes: commands to run, with this Python.
         environment: variables in addition to those of this process.
         quiet: keep what they print, of which a complaint has the last line; else they print to the terminal.
     """

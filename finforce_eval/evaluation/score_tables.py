@@ -183,7 +183,7 @@ def evaluation_json(evaluation: Evaluation, **about: Any) -> dict[str, Any]:
 
     Args:
         evaluation: the scores.
-        about: what else stands at the top: jaw, solver, contact, ...
+        about: further entries at the top: jaw, solver, contact, ...
     """
     cases = {}
     for name, score in evaluation.scores.items():

@@ -142,7 +142,7 @@ UNMOVED = 0.2e-3  # [m] and, for its axes, [1]: a jaw that differs by less has n
 
 
 class PoseStep(NamedTuple):
-    """What is to be done next.
+    """The next work to do.
 
     Attributes:
         stamp: of the image [ns].

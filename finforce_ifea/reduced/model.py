@@ -57,8 +57,8 @@ class _Probe:
     Attributes:
         points: undeformed positions (p, 3) [m].
         shapes: their motions at the stored equilibria (T, Z, 3 p) [m].
-        compliance: what loads on the rows do to them (T, Z, 3 p, 2 n) [m/N], in single precision.
-        rows: what share each row has in a point (p, n), for loads.
+        compliance: motion of points by loads on the rows (T, Z, 3 p, 2 n) [m/N], in single precision.
+        rows: weight of each row in a point (p, n), for loads.
     """
 
     points: NDArray
@@ -73,7 +73,7 @@ class _FacePoints:
 
     Attributes:
         points: undeformed positions (p, 3) [m].
-        rows: what share each row has in a point (p, n).
+        rows: weight of each row in a point (p, n).
     """
 
     points: NDArray
@@ -319,7 +319,7 @@ class _Gathered(NamedTuple):
     Attributes:
         loads: now, and by what changes the contact (2 n, 5) [N].
         stiffness: band with the entries i - 3 ... i + 3 of each line i (2 n, 7) [N/m].
-        held: what the clamp takes of the contact, now and by what changes it (2, 5) [N].
+        held: force of the contact taken by the clamp, and its derivatives (2, 5) [N].
         grip: springs between the clamp and the first row (2, 2) [N/m].
         size: sum of the sizes of the forces [N].
         point: pressure centre (3,) [m], NaN without contact.

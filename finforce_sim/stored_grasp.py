@@ -23,10 +23,10 @@ TRACKED_EVERY = 3  # images: the object is tracked at 10 Hz
 
 
 class Moment(NamedTuple):
-    """What is seen and what is true when an image is taken.
+    """The image and the truth at one instant.
 
     Attributes:
-        picture: what was kept of an image at the nearest opening.
+        picture: stored image at the nearest opening.
         wrenches: on the jaws, by side, relaxed.
         T_camera_object: (4, 4) as a tracker measures it; None where it did not, or without an object.
     """
@@ -40,13 +40,13 @@ class LiveScene:
     """A grasp that follows a gripper's opening.
 
     Attributes:
-        grasp: what is rendered.
+        grasp: the grasp to render.
         camera: intrinsics.
         depth_step: of the depth images [m].
         openings: (n,) at which images were rendered, growing [m]; none before.
 
     Args:
-        grasp: what is rendered.
+        grasp: the grasp to render.
         photographer: that renders it.
         seed: of the object tracker's noise.
 

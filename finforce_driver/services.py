@@ -1,4 +1,4 @@
-"""What a gripper's services and actions do, each as one call that answers with a sentence or a result.
+"""Services and actions of a gripper, each as one call that answers with a sentence or a result.
 
 Of an action both an opening that is reached and something that is grasped on the way are a success; the result says
 which. A goal that cannot be is rejected.
@@ -12,10 +12,10 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
+from finforce_driver.conversions import fill_outcome, name_limp
 from finforce_driver.errors import DriverError, GripperStateError, GripperTimeoutError
 from finforce_driver.grasp.session import GraspSession
 from finforce_driver.gripper import Gripper
-from finforce_driver.messages import fill_outcome, name_limp
 from finforce_driver.settings import DriverParameters
 from finforce_driver.state import ABSENT, GripperState, MoveOutcome, MoveRequest, Phase
 
@@ -35,7 +35,7 @@ class GripperTasks:
     Args:
         gripper: that is commanded.
         session: its grasps by force.
-        parameters: how far and how fast it opens, and how hard it grasps without vision.
+        parameters: opening, speed, and current of a grasp without vision.
     """
 
     def __init__(self, gripper: Gripper, session: GraspSession, parameters: DriverParameters) -> None:
