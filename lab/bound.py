@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from scipy.interpolate import RegularGridInterpolator
+from scipy.interpolate import interp1d
 from scipy.ndimage import uniform_filter1d
 
 from finforce_eval.errors import RecordingError
@@ -29,7 +29,7 @@ from finforce_eval.evaluation.setup import EvaluationSetup
 from finforce_eval.recordings.objects import read_friction
 from finforce_eval.recordings.tracks import Recording
 from finforce_eval.tasks import progress_bar
-from finforce_ifea.contact_mechanics.friction import Coefficient, constant_traction
+from finforce_ifea.contact_mechanics.friction import FRICTIONLESS, Coefficient
 from finforce_ifea.contact_mechanics.indenter import OutlineIndenter
 from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE
@@ -39,9 +39,7 @@ from lab.ablation.scenes import settle
 from lab.harness import Figures
 
 _D, _V, _TILT, _HEIGHT, _MU, _DK, _E, _CX, _CZ, _CPHI, _SHARED = range(11)
-_LEAST_DEPTH, _DEEPEST, _EVERY = 0.05e-3, 12e-3, 0.4e-3
-# Traction ratio up to which the mechanics is linearised [-]: of objects that slide freely.
-_SMOOTH = 0.05
+_LEAST_DEPTH, _EVERY = 0.05e-3, 0.4e-3
 # A true force from which on the object touches [N], and a change of the depth from which on it moves [m/s].
 _TOUCH, _MOVES = 0.02, 0.2e-3
 _SEEN, _WINDOW = 0.6, 31  # likelihood of a visible key point, and images in half of which it is seen
@@ -205,11 +203,14 @@ def _update(P: NDArray, H: NDArray, noise: NDArray) -> NDArray:
 def read_truth(recording: Recording, side: str, setup: EvaluationSetup) -> TrueImages:
     """Return the truth of one jaw of a recording, linearised by the full mechanics of the jaw.
 
-    Depth and traction ratio are those at which the mechanics has the size and the direction of the true force.
+    The depth is that at which the mechanics has the size of the true force, the share of friction that is used follows
+    from its direction. Derivatives are those without traction: their change by it is of second order.
 
     Raises:
-        FinforceError: truth or outline are missing.
+        FinforceError: truth, phases or outline are missing.
     """
+    if recording.phases is None:
+        raise RecordingError(f"{recording.name}: no /bench/phase, which tells how deep the object was pressed")
     own, track = setup.side(side), recording.jaw(side).keypoints
     jaw = own.calibration.apply(own.jaw) if own.calibration else own.jaw
     force = match_truth(recording.truth(side), track.stamps_ns)
@@ -218,15 +219,21 @@ def read_truth(recording: Recording, side: str, setup: EvaluationSetup) -> TrueI
     for stamp in track.stamps_ns[: int(np.argmax(size)) + 1].tolist():
         contact = source.contact_at(stamp, lambda: jaw.keypoints)
         outline = contact.outline if contact is not None and contact.outline is not None else outline
+    if outline is None:
+        raise RecordingError(f"{recording.name}: no outline of the object; expected its mesh and poses")
     mechanics = build_mechanics(jaw, replace(own.settings, solver=jaw.model))
     height = 1e-3 * float(recording.case["object"]["z"])
     friction, indenter = read_friction(recording), OutlineIndenter(outline.polygons)
-    largest = float(size.max()), _SMOOTH
-    depths, table, forces = tabulate(mechanics, jaw.keypoints, indenter, height, largest)
-    smooth = forces[:, 1]
+    deepest = 1e-3 * float(recording.phases.displacement_mm.max())
+    depths, table, smooth = tabulate(mechanics, jaw.keypoints, indenter, height, deepest)
     depth = np.where(size > _TOUCH, np.interp(size, np.linalg.norm(smooth, axis=1), depths), 0.0)
-    at = np.stack([np.maximum(depth, _LEAST_DEPTH), np.zeros_like(depth)], axis=1)
-    values = table(at)
+    mobilised = np.ones_like(depth)
+    if friction is None:
+        friction = Coefficient(own.settings.friction, own.settings.friction_stddev)
+        flat = np.interp(depth, depths, np.arctan2(smooth[:, 2], -smooth[:, 0]))
+        ratio = np.where(size > 5 * _TOUCH, np.tan(np.arctan2(force[:, 2], -force[:, 0]) - flat), 0.0)
+        mobilised = np.clip(ratio / np.quantile(np.abs(ratio[size > 5 * _TOUCH]), 0.9), -1.0, 1.0)
+    values = table(np.maximum(depth, _LEAST_DEPTH))
     count = len(jaw.keypoints)
     motions, places = np.split(values[:, : 10 * count].reshape(-1, count, 10), [8], axis=2)
     motions, modes = motions.reshape(-1, count, 2, 4), values[:, 10 * count :].reshape(-1, 3, 4)
@@ -242,7 +249,7 @@ def read_truth(recording: Recording, side: str, setup: EvaluationSetup) -> TrueI
     return TrueImages(
         stamps=track.stamps,
         depth=depth,
-        mobilised=np.ones_like(depth),
+        mobilised=mobilised,
         motions=motions,
         displacement=np.linalg.norm(places - rest, axis=2),
         places=places,
@@ -256,9 +263,9 @@ def read_truth(recording: Recording, side: str, setup: EvaluationSetup) -> TrueI
 
 
 def tabulate(
-    mechanics: Mechanics, keypoints: NDArray, indenter: OutlineIndenter, height: float, largest: tuple[float, float]
-) -> tuple[NDArray, RegularGridInterpolator, NDArray]:
-    """Return depths (m,) [m], what is linearised there, and forces (m, 3, 3) [N] at three traction ratios.
+    mechanics: Mechanics, keypoints: NDArray, indenter: OutlineIndenter, height: float, deepest: float
+) -> tuple[NDArray, interp1d, NDArray]:
+    """Return depths (m,) [m], what is linearised there without traction, and forces (m, 3) [N].
 
     What is linearised: of each key point eight derivatives and its place, then twelve derivatives of the force.
 
@@ -267,48 +274,39 @@ def tabulate(
         keypoints: (K, 3) [m].
         indenter: the object.
         height: of its origin [m].
-        largest: force [N] up to which it is pressed, and traction ratio.
+        deepest: depth up to which it is pressed [m].
     """
-    contact, ratios = mechanics.contact, np.array([-1.0, 0.0, 1.0]) * largest[1]
+    contact, rows, forces = mechanics.contact, [], []
     contact.set_indenter(indenter)
-    probe = contact.model.attach(keypoints, KEYPOINT_DISTANCE)
+    probe, q = contact.model.attach(keypoints, KEYPOINT_DISTANCE), np.zeros(contact.model.size)
     touch = contact.find_touch(np.array([0.0, 0.0, height]))
-    shapes, rows, forces, depths = [np.zeros(contact.model.size)] * 3, [], [], []
-    for depth in np.concatenate([[_LEAST_DEPTH], np.arange(_EVERY, _DEEPEST, _EVERY)]):
-        x, row, found = np.array([depth + touch, 0.0, height]), [], []
-        for i, ratio in enumerate(ratios):
-            traction = constant_traction(ratio)
-            q, _, _ = settle(contact, shapes[i], x, traction, tolerance=1e-4)
-            pressed = contact.linearize(q, x, traction)
-            motions = contact.model.project(probe, q, pressed.modes)[:, [0, 2]].reshape(len(keypoints), 8)
-            places = contact.model.positions(probe, q)[:, [0, 2]]
-            row.append(np.r_[np.hstack([motions, places]).ravel(), pressed.force_modes.ravel()])
-            found.append(pressed.force)
-            shapes[i] = q + _EVERY * pressed.modes[:, 0]  # ahead, where the next one is
-        rows, forces, depths = [*rows, row], [*forces, found], [*depths, depth]
-        if np.linalg.norm(found[1]) > largest[0]:
-            break
-    table = RegularGridInterpolator((np.array(depths), ratios), np.array(rows), bounds_error=False, fill_value=None)
-    return np.array(depths), table, np.array(forces)
+    depths = np.concatenate([[_LEAST_DEPTH], np.arange(_EVERY, deepest + 0.5 * _EVERY, _EVERY)])
+    for depth in depths:
+        x = np.array([depth + touch, 0.0, height])
+        q, _, _ = settle(contact, q, x, FRICTIONLESS)
+        pressed = contact.linearize(q, x, FRICTIONLESS)
+        motions = contact.model.project(probe, q, pressed.modes)[:, [0, 2]].reshape(len(keypoints), 8)
+        places = contact.model.positions(probe, q)[:, [0, 2]]
+        rows.append(np.r_[np.hstack([motions, places]).ravel(), pressed.force_modes.ravel()])
+        forces.append(pressed.force)
+    ends = {"bounds_error": False, "fill_value": (rows[0], rows[-1])}
+    return depths, interp1d(depths, np.array(rows), axis=0, **ends), np.array(forces)
 
 
 def compare(recordings: Iterable[Recording], setup: EvaluationSetup) -> Figures:
     """Return the force error of the estimator over the bound, for each jaw of recordings with truth.
 
     Raises:
-        FinforceError: a recording has no truth, does not state its friction, or cannot be evaluated.
+        FinforceError: a recording has no truth, or cannot be evaluated.
     """
-    recordings = list(recordings)
-    rows, unknown = [], [each.name for each in recordings if read_friction(each) is None]
-    if unknown:  # where a contact sticks or slides, nothing is linear in a coefficient that nobody knows
-        raise RecordingError(f"{', '.join(unknown)}: no friction in case.json, expected recordings that state it")
+    rows, recordings = [], list(recordings)
     with progress_bar(len(recordings), "recording", "bound") as bar:
         for recording in recordings:
             sides = truth_sides(recording)
             for side, series in zip(sides, evaluate_jaws(recording, setup), strict=True):
                 images, counted = read_truth(recording, side, setup), series.counted
                 error = (series.column("force") - series.column("true_force"))[counted]
-                exact = replace(images, friction=Coefficient(0.0, 0.0))
+                exact = images if read_friction(recording) is None else replace(images, friction=Coefficient(0.0, 0.0))
                 row = {"recording": series.name, "error/N": float(np.sqrt((error**2).sum(axis=1).mean()))}
                 limits = {"as stated": (images, Stated()), "friction known": (exact, Stated())}
                 for name, (own, stated) in (limits | {"noise alone": (exact, NOISE_ALONE)}).items():

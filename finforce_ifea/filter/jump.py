@@ -56,6 +56,8 @@ OFFSET = Jump(np.array([HEIGHT]), np.array([15e-3]), 1e-4)
 # Log odds against a jump since the first image, its prior left out, after which the test begins anew.
 _UNLIKELY = -3.0
 NO_JUMP = -1
+# Error of the linearisation about the last state, as a share of the object's motion since.
+_NONLINEAR = 0.2
 
 
 @njit(**_OPTIONS)
@@ -147,7 +149,7 @@ def _weigh_innovations(measured, nu, S, depth_variance):
     """
     H, R = measured.H, measured.R
     deeper, variance = find_depth_jump(H, R, nu)
-    moved, spread = nu - H[:, DEPTH] * deeper, variance - depth_variance
+    moved, spread = nu - H[:, DEPTH] * deeper, variance + (_NONLINEAR * deeper) ** 2 - depth_variance
     blocks = np.empty_like(R)
     for i in range(len(R)):
         h = H[2 * i : 2 * i + 2, DEPTH]

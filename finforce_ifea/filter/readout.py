@@ -11,6 +11,8 @@ from finforce_ifea.filter.state import DEPTH, HEIGHT, SHARED, TRACTION
 from finforce_ifea.tracking.contact_state import LEAST_DEPTH, LOADED_DEPTH, TOUCH_DEPTH
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
+# Error of the force's direction [-]: it is considered and never estimated.
+_MISDIRECTED = 0.03
 # The largest force that is read out, over that of the linearisation [-].
 _LARGEST_GROWTH = 10.0
 # The largest traction ratio that the mechanics is asked for [-].
@@ -57,7 +59,7 @@ def read_out(state, force, modes, x, log_weights, P, shift, smoothing, at, ratio
     grown = min(max((found**2).sum() / max((force**2).sum(), 1e-300), 1.0), _LARGEST_GROWTH**2)
     for a in range(3):
         for b in range(3):
-            covariance[a, b] += spread * grown * modes[a, 3] * modes[b, 3]
+            covariance[a, b] += (spread + _MISDIRECTED**2) * grown * modes[a, 3] * modes[b, 3]
             for i in range(count):
                 covariance[a, b] += w[i] * (forces[i, a] - found[a]) * (forces[i, b] - found[b])
     continued, size, along = min(1.0, max(0.0, state.depth / LEAST_DEPTH)), 0.0, 0.0
