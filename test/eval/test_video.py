@@ -284,7 +284,12 @@ def flip_byte(packet, at):
     av, data = pytest.importorskip("av"), bytearray(bytes(packet))
     data[at if at >= 0 else len(data) + at] ^= 0x55
     changed = av.Packet(bytes(data))
-    changed.pts, changed.dts, changed.time_base, changed.stream = packet.pts, packet.dts, packet.time_base, packet.stream
+    changed.pts, changed.dts, changed.time_base, changed.stream = (
+        packet.pts,
+        packet.dts,
+        packet.time_base,
+        packet.stream,
+    )
     changed.is_keyframe = packet.is_keyframe
     return changed
 
