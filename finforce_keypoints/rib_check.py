@@ -22,9 +22,13 @@ OPENING_STEP = 1.5e-3  # [m] between the openings at which jaws are looked for
 PLACES, PLACES_HERE = 8, 4  # of a finger that are compared, and more of them within half a rib
 APART = 0.35  # [pitches] between two of them, root mean square of the ribs to be seen
 HERE = 0.5  # [pitches] within which a place is the one that a rig has
+SAME = 0.6  # [pitches] from the best place here within which another is its flank, unless it is clearly likelier
 # Evidence, see `RibPlace`, by which a place has to be likelier than others, and least correlation of a jaw that tells.
-LEAST_MARGIN, LEAST_RIBS = 0.1, 0.4
-LEAST_EVIDENCE = 0.7  # of a jaw that shows at all: 2.0 to 3.4 of those that are right
+LEAST_MARGIN, LEAST_RIBS = 0.1, 0.25
+LEAST_EVIDENCE = 0.7  # of the jaws in the mean, if they show at all: 1.0 to 2.6 of those that are right
+# [rad] standard deviation of a jaw's turn in its plane: two ribs moved apart turn jaws and camera. Independent pixels
+# that the evidence is of.
+MOUNT_STDDEV, INDEPENDENT = 0.03, 10.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -52,21 +56,21 @@ class RibComparison:
 
     Attributes:
         here: the best place within half a rib of the rig's.
-        other: the best of all others.
+        other: the best of all others that a camera and mounts can realise together with a place of the other jaw.
+        mate: evidence that the other jaw loses by that.
     """
 
     here: RibPlace
     other: RibPlace
+    mate: float = 0.0
 
     @property
     def margin(self) -> float:
         """Evidence for the rig's place over that for any other."""
-        return self.here.evidence - self.other.evidence
+        return self.here.evidence - self.other.evidence + self.mate
 
     def describe(self, side: str) -> str:
         """Return in words what speaks against the rig's place; empty if nothing does."""
-        if max(self.here.evidence, self.other.evidence) < LEAST_EVIDENCE:
-            return f"{side} jaw: neither ribs nor tip show where it should be"
         shift = f"{1e3 * abs(self.other.shift):.1f} mm towards the {'tip' if self.other.shift > 0.0 else 'base'}"
         fits = f"(ribs {self.other.ribs:.2f}, here {self.here.ribs:.2f}; evidence {self.margin:+.2f})"
         if self.margin < 0.0:
@@ -91,13 +95,35 @@ def compare_ribs(
         camera: intrinsics.
     """
     nothing = RibPlace(evidence=0.0, ribs=0.0, shift=0.0, distance=0.0, warps=np.zeros((0, 2, 3)))
-
-    def choose(places: Sequence[RibPlace], is_here: bool) -> RibPlace:
-        chosen = [each for each in places if (each.distance < HERE) == is_here]
-        return max(chosen, key=lambda each: each.evidence, default=nothing)
-
     found = find_places(patterns, images, poses, camera)
-    return {side: RibComparison(here=choose(each, True), other=choose(each, False)) for side, each in found.items()}
+    here, rivals = {}, {}
+    for side, places in found.items():
+        near = [each for each in places if each.distance < HERE]
+        best = here[side] = max(near, key=lambda each: each.evidence, default=nothing)
+        rivals[side] = [
+            each
+            for each in places
+            if each.distance >= HERE
+            and (
+                abs(each.shift - best.shift) > SAME * patterns[side].pitch
+                or each.evidence > best.evidence + LEAST_MARGIN
+            )
+        ]
+    apart = np.linalg.norm(np.subtract(*[each[0][:3, 3] for each in poses.values()])) if len(poses) > 1 else np.inf
+    compared = {}
+    for side in found:
+        mate = next((other for other in found if other != side), None)
+
+        def lose(place: RibPlace, mate: str | None = mate) -> float:
+            """Return what evidence the other jaw loses if this one is at a place."""
+            if mate is None:
+                return 0.0
+            turns = {each: (each.shift - place.shift) / (apart * MOUNT_STDDEV) for each in [here[mate], *rivals[mate]]}
+            return here[mate].evidence - max(each.evidence - turns[each] ** 2 / INDEPENDENT for each in turns)
+
+        other = max(rivals[side], key=lambda each, lose=lose: each.evidence - lose(each), default=nothing)
+        compared[side] = RibComparison(here=here[side], other=other, mate=lose(other) if rivals[side] else 0.0)
+    return compared
 
 
 def compare_rig(
@@ -133,8 +159,10 @@ def compare_rig(
 
 def describe_ribs(compared: dict[str, RibComparison]) -> list[str]:
     """Return in words what speaks against the places of jaws, by side; empty if nothing does."""
-    here = max(each.here.ribs for each in compared.values())
+    if np.mean([max(each.here.evidence, each.other.evidence) for each in compared.values()]) < LEAST_EVIDENCE:
+        return ["neither ribs nor tips show where the jaws should be"]
     said = [words for side, each in compared.items() if (words := each.describe(side))]
+    here = max(each.here.ribs for each in compared.values())
     if not said and here < LEAST_RIBS:
         return [f"no ribs show where the jaws are (correlation {here:.2f}, expected {LEAST_RIBS:g})"]
     return said

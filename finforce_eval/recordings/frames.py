@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -21,6 +22,7 @@ from finforce.optional import import_library
 from finforce.typed_yaml import Number
 from finforce_eval.errors import DamagedError, OptionError, RecordingError
 from finforce_eval.recordings.bags import list_pictures
+from finforce_eval.recordings.block_edges import BlockWatch
 from finforce_eval.recordings.image_files import read_intrinsics
 from finforce_eval.recordings.images import ImageChoice, StampedImage
 from finforce_eval.recordings.tracks import JawTrack, KeypointTrack, Recording, Timed, WrenchTrack
@@ -29,6 +31,7 @@ from finforce_keypoints.images import RgbdImage, check_image
 LEAST_RATE = 1e-2  # [Hz] of frames
 MOST_RATE = 1e4  # [Hz] of frames
 Rate = Annotated[Number, Field(ge=LEAST_RATE, le=MOST_RATE)]
+DELAY = 16  # frames from one to those that it may be predicted from: codecs reorder no more
 STILL_RATE = 1.0  # Hz of pictures that say nothing of their times
 LARGEST_PICTURE = 1 << 27  # bytes
 # What FFmpeg may take a file for: nothing that names other files, as its lists and playlists do.
@@ -44,7 +47,7 @@ class FrameImages(Timed):
         fps: frames per second.
         camera: intrinsics.
         count: of all frames.
-        read: begins anew to yield all frames, (h, w, 3) RGB.
+        read: begins anew to yield all frames, (h, w, 3) RGB, None for those that are broken and left out.
         times: (count,) of the frames [ns]; None where they follow each other at `fps` from zero on.
         is_video: True if they are those of a camera that ran, compressed, whose still pictures are alike.
         ends_at_damage: True if the frames before the first damaged one are read, if there are any.
@@ -56,7 +59,7 @@ class FrameImages(Timed):
     fps: float
     camera: CameraIntrinsics
     count: int
-    read: Callable[[], Iterable[NDArray[np.uint8]]]
+    read: Callable[[], Iterable[NDArray[np.uint8] | None]]
     times: NDArray[np.int64] | None = None
     is_video: bool = True
     ends_at_damage: bool = False
@@ -111,6 +114,7 @@ class FrameImages(Timed):
             for frame, color in enumerate(self.read()):
                 if frame in wanted:
                     stamp, count = wanted[frame], count + 1
+                if frame in wanted and color is not None:
                     image = RgbdImage(stamp=stamp / NANOSECONDS, color=color, depth=None, camera=self.camera)
                     try:
                         check_image(image)
@@ -144,16 +148,21 @@ def _open_video(path: Path, name: str) -> Iterator[tuple[Any, Any]]:
     except (FileError, av.FFmpegError, IndexError) as error:
         raise RecordingError(f"{where}: {error}; expected a video") from error
     with container:
-        # decoders else paint over what is damaged
-        stream.codec_context.options = {"err_detect": "explode"}
+        # decoders else paint over what is damaged, and several threads tell less of it
+        stream.codec_context.options = {"err_detect": "crccheck+bitstream+buffer+explode"}
+        stream.codec_context.thread_count = 1
         try:
             yield container, stream
         except av.FFmpegError as error:
             raise DamagedError(f"{where}: damaged: {error}") from error
 
 
-def decode_video(path: Path, name: str, begin: float = 0.0, count: int | None = None) -> Iterator[NDArray[np.uint8]]:
+def decode_video(
+    path: Path, name: str, begin: float = 0.0, count: int | None = None, shown: Sequence[int] = ()
+) -> Iterator[NDArray[np.uint8] | None]:
     """Yield the frames (h, w, 3) RGB of a video from a time [s] on, upright; see `_open_video`.
+
+    In place of frames that are broken or that the decoder leaves out, of those to be `shown` (n,) [ticks], comes None.
 
     A video that says of itself that it has another number of frames than `count` is refused, too.
     """
@@ -162,21 +171,53 @@ def decode_video(path: Path, name: str, begin: float = 0.0, count: int | None = 
             raise RecordingError(f"{name}: {path.name} has {stream.frames} frames; expected {count}, one for each row")
         if begin > 0.0:
             container.seek(int(begin / stream.time_base), stream=stream)
-        for frame in container.decode(stream):
-            if frame.time is None or frame.time >= begin:
+        for frame, is_broken in _decode_checked(container, stream, shown, f"{name}: {path.name}"):
+            if frame is not None and frame.time is not None and frame.time < begin:
+                continue
+            if is_broken:
+                yield None
+            else:
                 color = frame.to_ndarray(format="rgb24")
                 turns = round(frame.rotation / 90.0) % 4
                 yield np.ascontiguousarray(np.rot90(color, turns)) if turns else color
 
 
-def _list_times(container: Any, stream: Any) -> NDArray[np.int64] | None:
-    """Return when the frames of a video are shown, from the first one on (n,) [ns]; None where it does not say so."""
+def _decode_checked(container: Any, stream: Any, shown: Sequence[int], where: str) -> Iterator[tuple[Any, bool]]:
+    """Yield the frames of a video and whether each is broken: near one that shows blocks, up to the next key frame.
+
+    A frame of those to be `shown` (n,) [ticks] that does not come is None, and broken. Frames are shown before others
+    that they are predicted from, and show late that data is not what it was: those shortly before a broken one are
+    taken for broken, too.
+
+    Raises:
+        DamagedError: the decoder finds a frame damaged.
+    """
+    waiting: deque[tuple[Any, bool]] = deque()
+    watch, is_broken, expected = BlockWatch(), False, deque(shown)
+    for number, frame in enumerate(container.decode(stream)):
+        is_key, left_out = bool(frame.key_frame), 0
+        if frame.is_corrupt:
+            raise DamagedError(f"{where}: damaged: a frame is made of what others left")
+        while expected and expected.popleft() < frame.pts:
+            left_out += 1
+        has_blocks = watch.is_broken(frame.to_ndarray(format="gray"), is_key=is_key)
+        if has_blocks or (number and left_out):
+            waiting = deque((each, True) for each, _ in waiting)
+        is_broken = not is_key and (is_broken or has_blocks or (number > 0 and left_out > 0))
+        waiting += [(None, True)] * left_out + [(frame, is_broken)]
+        while len(waiting) > DELAY:
+            yield waiting.popleft()
+    yield from waiting
+    yield from ((None, True) for _ in expected)
+
+
+def _list_shown(container: Any, stream: Any) -> NDArray[np.int64] | None:
+    """Return when the frames of a video are shown (n,) [ticks], rising; None where it does not say so."""
     packets = [each for each in container.demux(stream) if each.size and not each.is_discard and not each.is_corrupt]
     if not packets or any(each.pts is None for each in packets):
         return None
     shown = np.sort([each.pts for each in packets])
-    times = np.rint((shown - shown[0]) * float(stream.time_base) * NANOSECONDS).astype(np.int64)
-    return times if (np.diff(times) > 0).all() else None
+    return shown if (np.diff(shown) > 0).all() else None
 
 
 def read_picture(path: Path) -> NDArray[np.uint8]:
@@ -202,12 +243,15 @@ def read_frames(path: Path, choice: ImageChoice, sides: Sequence[str] = ()) -> R
         read = partial(map, read_picture, paths)
     else:
         with _open_video(path, name) as (container, stream):
-            fps, times = float(stream.average_rate or 0.0), _list_times(container, stream)
-            count = stream.frames if times is None else len(times)
+            fps, shown = float(stream.average_rate or 0.0), _list_shown(container, stream)
+            tick = float(stream.time_base) * NANOSECONDS
+            count = stream.frames if shown is None else len(shown)
         if not (count and LEAST_RATE <= fps <= MOST_RATE):
             raise RecordingError(f"{name}: {path.name}: {count} frames at {fps:g} Hz; expected a video")
-        read = partial(decode_video, path, name)
-        shape = next(read()).shape[:2]
+        if shown is not None:
+            times = np.rint((shown - shown[0]) * tick).astype(np.int64)
+        read = partial(decode_video, path, name, shown=() if shown is None else shown.tolist())
+        shape = next(color for color in read() if color is not None).shape[:2]
     camera = choose_camera(choice, shape, name)
     images = FrameImages(
         name=name, fps=fps, camera=camera, count=count, read=read, times=times, ends_at_damage=not path.is_dir()

@@ -32,7 +32,7 @@ HIDDEN = 0.35  # share of the face, from the base, whose ribs holders usually hi
 LEAST_SHOWN = 0.35  # share of the side that has to have the finger's colour
 # Other places of a finger: stretched along itself, slanted by so much along its width, shifted along it [pitches] and
 # across [lengths].
-STRETCHES, SLANTS = np.linspace(-0.15, 0.15, 11), np.linspace(-0.32, 0.32, 9)
+STRETCHES, SLANTS = np.linspace(-0.15, 0.15, 11), np.linspace(-0.48, 0.48, 13)
 ALONG, ACROSS = 2.6, 0.03
 TIP, AROUND = 0.3, 0.08  # [lengths] of the finger that counts as its tip, and of what surrounds it
 BEYOND = 0.3  # share of the compared pixels outside the image, from which on nothing is said

@@ -20,6 +20,7 @@ from finforce_eval.evaluation import unseen
 from finforce_eval.evaluation.forces import STILL_UPDATES, find_forces, share_reached
 from finforce_eval.evaluation.keypoint_source import detect_keypoints
 from finforce_eval.evaluation.setup import EvaluationSetup
+from finforce_eval.recordings.block_edges import BlockWatch
 from finforce_eval.recordings.frames import FrameImages, read_picture
 from finforce_eval.recordings.images import ImageChoice
 from finforce_eval.recordings.recording import read_recording
@@ -255,6 +256,74 @@ def test_a_video_that_a_decoder_finds_damaged_ends_before_the_damage():
     assert [int(image.color.mean()) for _, image in images] == list(LEVELS[:3])
     with pytest.raises(DamagedError):
         list(replace(images, ends_at_damage=False))
+
+
+def draw_moving(count=60):
+    """Frames (96, 128, 3) of a soft pattern that moves two pixels from one to the next."""
+    rows, columns = np.mgrid[0:96, 0:400]
+    wide = 128 + 50 * np.sin(columns / 9.0) * np.cos(rows / 7.0) + 40 * np.sin((rows + columns) / 23.0)
+    return [np.repeat(wide[:, 2 * n : 2 * n + 128, None], 3, axis=2).astype(np.uint8) for n in range(count)]
+
+
+def write_packets(path, change, codec="libx264"):
+    """Write a video of `draw_moving` whose packets were changed; return its path."""
+    av = pytest.importorskip("av")
+    with av.open(str(path), "w") as container:
+        options = {"g": "30", "keyint_min": "30", "sc_threshold": "0"} if codec == "libx264" else {}
+        stream = container.add_stream(codec, rate=30, options=options)
+        stream.width, stream.height, stream.pix_fmt = 128, 96, "yuv420p"
+        packets = []
+        for image in draw_moving():
+            packets += stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24"))
+        for packet in change(packets + stream.encode()):
+            container.mux(packet)
+    return path
+
+
+def flip_byte(packet, at):
+    av, data = pytest.importorskip("av"), bytearray(bytes(packet))
+    data[at if at >= 0 else len(data) + at] ^= 0x55
+    changed = av.Packet(bytes(data))
+    changed.pts, changed.dts, changed.time_base, changed.stream = (
+        packet.pts,
+        packet.dts,
+        packet.time_base,
+        packet.stream,
+    )
+    changed.is_keyframe = packet.is_keyframe
+    return changed
+
+
+def flip_every(packets):
+    return [flip_byte(packet, len(bytes(packet)) // 2) if n == 40 else packet for n, packet in enumerate(packets)]
+
+
+def read_levels(path):
+    camera = replace_camera(RIG.camera.model_copy(update={"width": 128, "height": 96, "cx": 64.0, "cy": 48.0}))
+    return {stamp: image.color for stamp, image in read_recording(path, ImageChoice(camera=camera)).images}
+
+
+@pytest.mark.parametrize("codec", ["libx264", "mpeg4"])
+def test_no_frame_is_made_of_damaged_data_and_none_is_lost_without(tmp_path, codec):
+    intact = read_levels(write_packets(tmp_path / "intact.mp4", lambda packets: packets, codec))
+    assert len(intact) == 60
+    damaged = read_levels(write_packets(tmp_path / "damaged.mp4", flip_every, codec))
+    assert 10 <= len(damaged) < 60  # the second group of pictures, or all before the damage
+    for stamp, color in damaged.items():
+        np.testing.assert_allclose(color.astype(int), intact[stamp], atol=2)
+
+
+def test_frames_of_a_missing_picture_are_told_by_their_blocks():
+    images, watch = [image[..., 0] for image in draw_moving(20)], BlockWatch()
+    assert not any(map(watch.is_broken, images))
+    assert not watch.is_broken(255 - images[0])  # a cut to something else
+    noise = np.random.default_rng(0).integers(0, 255, (96, 128), dtype=np.uint8)
+    assert not watch.is_broken(noise)
+    broken = images[-1].copy()
+    broken[16:64, 16:96] = np.kron(noise[:6, :10], np.ones((8, 8), np.uint8))
+    assert watch.is_broken(broken)
+    blocks = BlockWatch()  # of a codec that shows them always
+    assert not any(blocks.is_broken(broken, is_key=n == 0) for n in range(20))
 
 
 def test_turns_in_the_metadata_of_a_video_are_applied(tmp_path):

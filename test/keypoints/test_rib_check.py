@@ -10,6 +10,7 @@ import pytest
 from finforce.gripper_frames import ROBOT_CAMERA, OpeningRange, jaw_in_camera
 from finforce_eval.cli.camera import refuse_doubts
 from finforce_ifea.jaw.jaw import load_jaw
+from finforce_keypoints import rib_check
 from finforce_keypoints.errors import GeometryError
 from finforce_keypoints.geometry.rib_pattern import RibPattern
 from finforce_keypoints.geometry.side_picture import find_side, project_plane
@@ -29,10 +30,12 @@ def shift_along(T, distance):
     return moved
 
 
-def paint(poses, jaws, finger=(240, 120, 20), cells=(120, 55, 8), blur=0.7):
+def paint(poses, jaws, finger=(240, 120, 20), cells=(120, 55, 8), blur=0.7, slant=0.0):
     color = np.random.default_rng(1).normal((150, 150, 145), 4.0, (480, 640, 3)).clip(0, 255).astype(np.uint8)
     for side, T in poses.items():
         rings, plane = find_shape(jaws[side]).rings, find_side(jaws[side])
+        face = max(ring[:, 0].max() for ring in rings)
+        rings = [ring + slant * (ring[:, :1] - face) * (0.0, 1.0) for ring in rings]
         lines = [np.round(project_plane(ring, plane, T, CAMERA)).astype(np.int32) for ring in rings]
         for line in lines:
             cv2.fillPoly(color, [line], cells)
@@ -53,10 +56,10 @@ def test_ribs_tell_a_rig_that_is_some_ribs_off_from_one_that_is_right(name, ribs
     if ribs == 0:
         assert not said and all(each.margin > LEAST_MARGIN for each in compared.values())
         return
-    assert len(said) == 2  # of both jaws
+    assert said
     for each in compared.values():
         if abs(ribs) == 1:  # the ribs are told to be where they are
-            assert each.margin < LEAST_MARGIN
+            assert len(said) == 2 and each.margin < LEAST_MARGIN
             assert each.other.shift == pytest.approx(-ribs * pitch, abs=0.4 * pitch)
 
 
@@ -66,7 +69,49 @@ def test_ribs_that_cannot_be_seen_are_no_reason_to_trust_a_rig():
     pattern = {"left": RibPattern(jaw)}
     assert describe_ribs(compare_ribs(pattern, [plain], {"left": [T]}, CAMERA))
     empty = compare_ribs(pattern, [np.zeros_like(plain)], {"left": [T]}, CAMERA)
-    assert "neither ribs nor tip show" in describe_ribs(empty)[0]
+    assert "neither ribs nor tips show" in describe_ribs(empty)[0]
+
+
+@pytest.mark.parametrize("slant", [-0.4, 0.4])
+def test_ribs_that_slant_otherwise_than_in_the_jaw_file_are_where_they_meet_the_face(slant):
+    jaws = {side: load_jaw("umi", side) for side in ("left", "right")}
+    poses = {side: jaw_in_camera(ROBOT_CAMERA, side, x) for side, x in (("left", -0.045), ("right", 0.045))}
+    color, pitch = paint(poses, jaws, slant=slant), RibPattern(jaws["left"]).pitch
+    patterns = {side: RibPattern(jaw) for side, jaw in jaws.items()}
+    compared = compare_ribs(patterns, [color], {side: [T] for side, T in poses.items()}, CAMERA)
+    assert not describe_ribs(compared)
+    assert all(abs(each.here.shift) < 0.2 * pitch for each in compared.values())
+    moved = {side: [shift_along(T, pitch)] for side, T in poses.items()}
+    assert describe_ribs(compare_ribs(patterns, [color], moved, CAMERA))
+
+
+def place_of(evidence, shift=0.0):
+    return RibPlace(evidence=evidence, ribs=0.6, shift=shift, distance=abs(shift) / 6e-3, warps=np.zeros((1, 2, 3)))
+
+
+def test_a_jaw_that_hardly_shows_is_where_its_mate_says(monkeypatch):
+    jaws = {side: load_jaw("umi", side) for side in ("left", "right")}
+    patterns = {side: RibPattern(jaw) for side, jaw in jaws.items()}
+    poses = {side: [jaw_in_camera(ROBOT_CAMERA, side, x)] for side, x in (("left", -0.045), ("right", 0.045))}
+    pitch = patterns["left"].pitch
+    places = {"left": [place_of(2.5), place_of(1.0, -pitch)], "right": [place_of(0.5), place_of(0.55, -pitch)]}
+    monkeypatch.setattr(rib_check, "find_places", lambda *arguments: places)
+    assert not describe_ribs(compare_ribs(patterns, [], poses, CAMERA))
+    places["left"][1] = place_of(2.48, -pitch)  # both jaws may be a rib further
+    assert len(describe_ribs(compare_ribs(patterns, [], poses, CAMERA))) == 2
+    places.pop("left")
+    alone = compare_ribs(patterns, [], {"right": poses["right"]}, CAMERA)["right"]
+    assert alone.margin < 0.0 and alone.other.shift == -pitch
+
+
+def test_the_flank_of_a_place_is_no_other_place(monkeypatch):
+    jaw, T = load_jaw("umi", "left"), jaw_in_camera(ROBOT_CAMERA, "left", -0.045)
+    patterns = {"left": RibPattern(jaw)}
+    found = [place_of(1.5, -0.4 * 6e-3), place_of(1.45, -0.55 * 6e-3), place_of(1.0, 6e-3)]
+    monkeypatch.setattr(rib_check, "find_places", lambda *arguments: {"left": found})
+    assert not describe_ribs(compare_ribs(patterns, [], {"left": [T]}, CAMERA))
+    found[1] = place_of(1.7, -0.55 * 6e-3)
+    assert describe_ribs(compare_ribs(patterns, [], {"left": [T]}, CAMERA))
 
 
 def test_a_rig_is_judged_by_pictures_at_openings_that_nobody_states():
