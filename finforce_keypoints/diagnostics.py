@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from finforce.health import Level, Outcome, Report
 from finforce.optional import import_cv2
+from finforce_keypoints.images import COLOR
 
 if TYPE_CHECKING:
     from finforce_keypoints.detector import KeypointDetector
@@ -48,7 +49,8 @@ def describe(feed: RgbdFeed, method: str, found: JawKeypoints | None) -> dict[st
         "detection_method": method,
         "colour images": feed.topic or "none yet",
         "camera": "no camera_info yet" if camera is None else f"{camera.width} x {camera.height}",
-        "stamps of colour images": feed.rhythm,
+        "stamps of colour images": feed.arrivals[COLOR].rhythm,
+        **{f"missing {name} images": str(arrivals.count_losses()) for name, arrivals in feed.arrivals.items()},
         "overtaken while waiting for depth": str(feed.passed),
         "taken without depth": str(feed.alone),
     }

@@ -23,6 +23,7 @@ from finforce.messages import (
     pairing_tolerance,
     stamp_of,
 )
+from finforce_keypoints.arrivals import Arrivals
 from finforce_keypoints.errors import BlackImageError, EmptyDepthError, FrozenImageError, SyncError
 from finforce_keypoints.parameters import ALIGNED, AUTO, NO_DEPTH, DetectorParameters
 
@@ -40,8 +41,7 @@ _DELAYS = 15  # depth images over which their delay is learnt
 _MOST_WAITING = 32  # colour images in memory
 _FIRST_TOLERANCE = 8_000_000  # [ns] while the camera's period is not known
 _KNOWN, _PERIODS = 2, 15  # periods from which on it is, and over which it is learnt
-_HASTY, _BURSTS = 0.3, 0.15  # of the mean period, closer than a camera takes images; share of them that tells
-_COLOR, _DEPTH = "color", "depth"
+COLOR, DEPTH = "colour", "depth"
 _LIVELY = 0.2  # share of a part's pixels between these, from which on it has to change
 
 
@@ -239,6 +239,7 @@ class RgbdFeed:
         alone: colour images that were taken without depth.
         max_age: greatest age of an image that is answered [s], which bounds the wait.
         topic: the colour topic that is listened to, None before the first image.
+        arrivals: of colour and depth images, by which of them got lost is known.
 
     Args:
         parameters: frame, topics, unit of depth and maximum difference of stamps.
@@ -250,6 +251,7 @@ class RgbdFeed:
         self.stream = CameraStream(parameters.camera_frame, parameters.depth_scale)
         self.passed = self.alone = 0
         self.max_age = parameters.max_age
+        self.arrivals = {COLOR: Arrivals(), DEPTH: Arrivals()}
         self.topic: str | None = None
         self._heard = clock()
         self.reset()
@@ -262,46 +264,52 @@ class RgbdFeed:
     @property
     def waiting(self) -> Stamped | None:
         """The newest `RgbdImage` without depth that waits for it."""
-        waiting = self._images.entries(_COLOR)
+        waiting = self._images.entries(COLOR)
         return waiting[-1] if waiting else None
-
-    @property
-    def rhythm(self) -> str:
-        """How far apart the stamps of colour images are, and whether they come in bursts, as those of arrivals do."""
-        if len(self._stamps) <= _KNOWN:
-            return "not known yet"
-        gaps = np.diff(self._stamps)
-        mean = float(gaps.mean())
-        hasty = int((gaps < _HASTY * mean).sum())
-        apart, near = f"{1e3 * SECOND * mean:.1f} ms apart", f"{1e3 * SECOND * _HASTY * mean:.1f} ms"
-        if hasty < _BURSTS * len(gaps):
-            return apart
-        return (
-            f"{apart} on average, {hasty} of {len(gaps)} within {near} of the one before: stamped on arrival, not at "
-            "capture? Forces lag by the delay that the stamps hide"
-        )
 
     def reset(self) -> None:
         """Forget all images; intrinsics, frame and topic stay."""
+        self.pause()
         given = self._parameters.sync_tolerance
         self._tolerance = _FIRST_TOLERANCE if math.isnan(given) else round(given / SECOND)
-        self._images = Synchronizer({_COLOR: None, _DEPTH: _MOST_WAITING}, self._tolerance)
+        self._images = Synchronizer({COLOR: None, DEPTH: _MOST_WAITING}, self._tolerance)
         self._stamps: deque[int] = deque(maxlen=_PERIODS + 1)
         self._delays: deque[int] = deque(maxlen=_DELAYS)
         self._alone = self._parameters.depth == NO_DEPTH
+
+    def pause(self) -> None:
+        """Note that nobody asks for images, which are none that got lost."""
+        for arrivals in self.arrivals.values():
+            arrivals.reset()
+
+    def take_info(self, message: Any) -> None:
+        """Take the camera's intrinsics, which tell of an image, too.
+
+        Raises:
+            ObservationError: the frame is another one.
+            IntrinsicsError: the numbers are no camera's.
+        """
+        self.stream.take_info(message)
+        for arrivals in self.arrivals.values():
+            arrivals.announce(stamp_of(message))
 
     def listens(self, topic: str) -> bool:
         """Say whether an image that has come on a colour topic is to be taken; after a silence another topic may be."""
         now = self._clock()
         if self.topic != topic and (self.topic is None or now - self._heard > SILENCE):
             self.topic = topic
-            self._images.reset(_COLOR)
+            self._images.reset(COLOR)
         if self.topic == topic:
             self._heard = now
         return self.topic == topic
 
-    def take_color(self, topic: str, message: Any) -> list[Stamped]:
+    def take_color(self, topic: str, message: Any, spare: float = math.inf) -> list[Stamped]:
         """Take a colour image; return the whole ones, each an `RgbdImage`, none while its depth has not come.
+
+        Args:
+            topic: of the image.
+            message: a sensor_msgs/Image or CompressedImage.
+            spare: time for which the process had nothing to do before it took the message [s].
 
         Raises:
             SyncError: no depth image came for an earlier image, and every one needs its own.
@@ -310,15 +318,17 @@ class RgbdFeed:
         """
         if not self.listens(topic):
             return []
-        camera, stamp = self.stream.known_camera(self._parameters.info_topic), stamp_of(message)
+        stamp = stamp_of(message)
+        self.arrivals[COLOR].take(stamp, spare)
+        camera = self.stream.known_camera(self._parameters.info_topic)
         color = self.stream.read_color(message)
         taken = Stamped(stamp, RgbdImage(stamp=SECOND * stamp, color=color, depth=None, camera=camera))
         self._learn_period(taken.stamp)
         if self._alone:
             self.alone += 1
             return [taken]
-        self._images.add(_COLOR, taken.stamp, taken.value)
-        found, waiting = self._match(), self._images.entries(_COLOR)
+        self._images.add(COLOR, taken.stamp, taken.value)
+        found, waiting = self._match(), self._images.entries(COLOR)
         if found or not self._has_waited(waiting[0].stamp, taken.stamp):
             return found
         if self._parameters.depth == ALIGNED:
@@ -326,10 +336,10 @@ class RgbdFeed:
         self._alone = True
         self.alone += 1
         self.passed += len(waiting) - 1
-        self._images.reset(_COLOR)
+        self._images.reset(COLOR)
         return [taken]
 
-    def take_depth(self, message: Any) -> list[Stamped]:
+    def take_depth(self, message: Any, spare: float = math.inf) -> list[Stamped]:
         """Take a depth image; return the images that are whole with it, as `take_color`.
 
         Raises:
@@ -337,11 +347,12 @@ class RgbdFeed:
             ImageError: it cannot be used.
         """
         stamp = stamp_of(message)
+        self.arrivals[DEPTH].take(stamp, spare)
         depth = self.stream.read_depth(message)
         is_empty = self._parameters.depth == AUTO and not np.isfinite(depth).any()
         self._delays.append(max(0, max(self._stamps, default=stamp) - stamp))
         self._alone &= self._is_late
-        self._images.add(_DEPTH, stamp, None if is_empty else depth)
+        self._images.add(DEPTH, stamp, None if is_empty else depth)
         return self._match()
 
     def _learn_period(self, stamp: int) -> None:
@@ -355,7 +366,7 @@ class RgbdFeed:
 
     def _has_waited(self, first: int, newest: int) -> bool:
         """Say whether the first colour image that waits has waited long enough, given the newest [ns]."""
-        if len(self._images.entries(_COLOR)) > _MOST_WAITING:
+        if len(self._images.entries(COLOR)) > _MOST_WAITING:
             return True
         own = _WAITING * median_period(self._stamps) if len(self._stamps) > _KNOWN else self._longest_wait
         return newest - first > min(own + max(self._delays, default=0), self._longest_wait)
@@ -382,11 +393,11 @@ class RgbdFeed:
 
     def _match(self) -> list[Stamped]:
         """Return the newest colour image that has its depth, after the one before whose depth must have been lost."""
-        pair = self._images.newest_pair(_COLOR, _DEPTH)
+        pair = self._images.newest_pair(COLOR, DEPTH)
         if pair is None:
             return []
         color, depth = pair
-        waiting, lost = self._images.entries(_COLOR), []
+        waiting, lost = self._images.entries(COLOR), []
         while (first := waiting.popleft()) is not color:
             lost.append(first)
         # more of them, and images come faster than they are looked at
@@ -400,7 +411,7 @@ class RgbdFeed:
         """Return the error of a colour image [ns] that has waited long enough."""
         if self._is_late:
             return SyncError(self.delay_of_depth)
-        nearest = self._images.nearest(_DEPTH, stamp)
+        nearest = self._images.nearest(DEPTH, stamp)
         if nearest is None:
             return SyncError(
                 f"colour images come, but no depth image on {self._parameters.depth_topic}; "

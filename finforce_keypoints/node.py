@@ -31,7 +31,7 @@ from finforce_keypoints.diagnostics import (
     report_of_rest,
 )
 from finforce_keypoints.geometry.jaw_localizer import REASONS
-from finforce_keypoints.images import RgbdFeed
+from finforce_keypoints.images import COLOR, DEPTH, RgbdFeed
 from finforce_keypoints.parameters import (
     NO_DEPTH,
     DetectorParameters,
@@ -194,11 +194,14 @@ class KeypointDetectorNode(ros.ImageNode):
     def _on_info(self, message: CameraInfo) -> None:
         """Keep the camera's intrinsics."""
         with self.rejections():
-            self.feed.stream.take_info(message)
+            self.feed.take_info(message)
 
     def _is_wanted(self) -> bool:
-        """Say whether key points are to be found."""
-        return self.out.are_heard or not self.skips.allows(UNHEARD)
+        """Say whether key points are to be found; while they are not, no images come."""
+        is_wanted = self.out.are_heard or not self.skips.allows(UNHEARD)
+        if not is_wanted:
+            self.feed.pause()
+        return is_wanted
 
     def _on_wrench(self, _: ros.WrenchStamped) -> None:
         """Keep that solvers rely on the camera's pose."""
@@ -214,7 +217,7 @@ class KeypointDetectorNode(ros.ImageNode):
             self.skips.count(UNHEARD)
             return
         with self.rejections():
-            whole = self.feed.take_color(topic, message)
+            whole = self.feed.take_color(topic, message, self.stage.pipeline.spare)
             waiting = self.feed.waiting
             if not whole and waiting is not None:  # its pixels are found while its depth is on its way
                 with suppress(FinforceError):  # what is wrong with it is said after that
@@ -225,7 +228,7 @@ class KeypointDetectorNode(ros.ImageNode):
     def _on_depth(self, _topic: str, message: Any) -> None:
         """Take a depth image."""
         with self.rejections():
-            self._answer(self.feed.take_depth(message))
+            self._answer(self.feed.take_depth(message, self.stage.pipeline.spare))
         if delay := self.feed.delay_of_depth:
             self.get_logger().warning(delay, throttle_duration_sec=10.0)
 
@@ -319,10 +322,20 @@ class KeypointDetectorNode(ros.ImageNode):
         self.get_logger().warning(f"{reason}; images and jaws are cleared")
         return reason
 
+    def _find_losses(self) -> list[str]:
+        """Return what is wrong with images that do not arrive; log it the first time."""
+        warnings, topics = [], {COLOR: self.feed.topic, DEPTH: self.parameters.depth_topic}
+        for name, topic in topics.items():
+            if topic and (losses := self.feed.arrivals[name].count_losses()).are_many:
+                warnings.append(losses.warn(name, ros.remedy_for_losses(topic, ros.is_published_here(self, topic))))
+        for warning in warnings:
+            self.get_logger().warning(warning, once=True)
+        return warnings
+
     def _report(self, side: str, alarms: list[Outcome]) -> Report:
         """Return how one jaw is seen."""
         known = describe(self.feed, self.detector.name, self.found.get(side)) | self.skips.describe()
-        troubles = filter(None, (self.feed.delay_of_depth, self._mount_trouble))
+        troubles = filter(None, (self.feed.delay_of_depth, self._mount_trouble, *self._find_losses()))
         alarms = [*alarms, *(Outcome(level=Level.WARN, reason=text, text=text) for text in troubles)]
         report = self.health[side].report(alarms, known)
         return report if self._is_wanted() else report_of_rest(alarms, report.values)

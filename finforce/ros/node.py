@@ -67,11 +67,18 @@ from finforce.ros.topics import (  # noqa: F401 - for those with topics
     Pipeline,
     Stage,
     describe_rivals,
+    is_published_here,
     is_wanted,
     send_cloud,
 )
 from finforce.ros.tracing import write_trace
-from finforce.ros.transport import CHOICES, PROFILES, TRANSPORT, provide_transport  # noqa: F401 - for tests
+from finforce.ros.transport import (  # noqa: F401 - for those with topics
+    CHOICES,
+    PROFILES,
+    TRANSPORT,
+    provide_transport,
+    remedy_for_losses,
+)
 from finforce.settings import ParameterError, RecordT, bounds_of, check_value, constraints, describe, is_parameter
 
 _POLL_PERIOD = 0.1  # [s] of asking whether a node that is being built is still wanted

@@ -55,6 +55,9 @@ class Pipeline:
 
     Args:
         is_shared: whether there are several nodes; they are connected by `open`, and a fault stops one of them alone.
+
+    Attributes:
+        spare: time between the callback before and the one at work, for which the process had nothing to do [s].
     """
 
     def __init__(self, is_shared: bool = True) -> None:
@@ -64,7 +67,7 @@ class Pipeline:
         self._waiting: dict[Port, Any] = {}
         self._left: deque[Callable[[], None]] = deque()
         self._delayed: list[Callable[[], None]] = []
-        self._depth = 0
+        self._depth, self._ended, self.spare = 0, perf_counter(), 0.0
 
     def publishes(self, topic: str) -> bool:
         """Say whether a stage publishes a topic."""
@@ -114,12 +117,15 @@ class Pipeline:
             return callback
 
         def call(message: Any) -> None:
+            if not self._depth:
+                self.spare = perf_counter() - self._ended
             self._depth += 1
             try:
                 callback(message)
             finally:
                 self._depth -= 1
                 self._catch_up()
+                self._ended = perf_counter()
 
         return call
 
@@ -417,6 +423,16 @@ def describe_rivals(node: Node, topic: str) -> str:
     nodes = {(f"{end.node_namespace.rstrip('/')}/{end.node_name}", *end.endpoint_gid[:_PARTICIPANT]) for end in ends}
     names = sorted(name for name, *_ in nodes)
     return f"{topic} is published by {' and '.join(names)}; expected one: stop the others" if len(names) > 1 else ""
+
+
+_HOST = 4  # bytes of an endpoint's id that name its machine, of Fast DDS
+
+
+def is_published_here(node: Node, topic: str) -> bool:
+    """Say whether a node of this machine publishes a topic."""
+    own, ends = (node.get_publishers_info_by_topic(name) for name in ("/parameter_events", topic))
+    here = {(*end.endpoint_gid[:_HOST],) for end in own if end.node_name == node.get_name()}
+    return any((*end.endpoint_gid[:_HOST],) in here for end in ends)
 
 
 def is_wanted(publisher: Outlet, skips: Skips) -> bool:

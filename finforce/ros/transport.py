@@ -7,16 +7,32 @@ import random
 import socket
 from pathlib import Path
 
+from finforce.camera_topics import ENDS
+
 TRANSPORT = Path(__file__).with_name("fastdds.xml")
 PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"
 CHOICES = (PROFILES, "FASTDDS_DEFAULT_PROFILES_FILE", "FASTDDS_BUILTIN_TRANSPORTS")
 DOMAINS = range(1, 100)
+RECEIVE_BUFFER = 2147483647  # bytes, net.core.rmem_max as the DDS tuning page of the ROS 2 documentation sets it
 
 
 def provide_transport() -> None:
     """Have Fast DDS carry images, which its default loses, unless somebody has chosen how it works already."""
     if TRANSPORT.is_file() and not any(os.environ.get(name) for name in CHOICES):
         os.environ[PROFILES] = str(TRANSPORT)
+
+
+def remedy_for_losses(topic: str, is_here: bool) -> str:
+    """Return what to do where images of a topic get lost on the way.
+
+    Args:
+        topic: of the images.
+        is_here: whether they are published on this machine.
+    """
+    if is_here:
+        return f"start the camera's process with {PROFILES}={TRANSPORT}"
+    other = "" if topic.endswith(ENDS) else ", or use image_transport:=compressed"
+    return f"raise the receive buffers of both machines (sudo sysctl -w net.core.rmem_max={RECEIVE_BUFFER}){other}"
 
 
 def free_domain() -> int:

@@ -10,6 +10,7 @@ from finforce.camera import ImageError
 from finforce.errors import ObservationError
 from finforce.health import StampError, StampGate
 from finforce_keypoints.errors import SyncError
+from finforce_keypoints.images import COLOR as COLORS
 from finforce_keypoints.images import RgbdFeed, check_image
 from finforce_keypoints.parameters import DetectorParameters
 
@@ -65,7 +66,7 @@ def test_late_images_under_fresh_stamps_are_told_by_their_bursts(times, words):
     feed = feed_of(depth="none")
     for number in times:
         feed.take_color(COLOR, color(1 + number))
-    assert re.search(words, feed.rhythm)
+    assert re.search(words, feed.arrivals[COLORS].rhythm)
 
 
 def test_depth_that_is_zero_everywhere_counts_as_none():

@@ -11,6 +11,7 @@ from keypoint_node_fakes import COLOR, HEIGHT, OLD_COLOR, TOPICS, WIDTH, camera_
 from finforce.camera import ImageError
 from finforce.errors import ObservationError
 from finforce_keypoints.errors import SyncError
+from finforce_keypoints.images import COLOR as COLORS
 from finforce_keypoints.images import SILENCE, RgbdFeed, check_image
 from finforce_keypoints.parameters import DetectorParameters
 
@@ -138,7 +139,7 @@ def test_late_depth_is_waited_for_while_its_images_are_fresh(depth, late):
     camera = Camera(depth=depth)
     answered = [number for number, has, _ in pair_late(camera, late) if has]
     assert answered[-100:] == list(range(120 - late - 100, 120 - late))
-    assert len(camera.feed._images.entries("color")) <= late + 1 and not camera.feed.delay_of_depth
+    assert len(camera.feed._images.entries(COLORS)) <= late + 1 and not camera.feed.delay_of_depth
 
 
 @pytest.mark.parametrize("late", [5, 8, 17])

@@ -370,3 +370,21 @@ def test_depth_that_comes_too_late_is_said_and_the_images_are_answered(probe):
             bench.depth(stamp - 800 * MILLISECOND)
     bench.wait_for_clouds(12)
     bench.diagnosis(level=Level.WARN, word="depth images come 800 ms after their colour image, which waits 500 ms")
+
+
+def test_images_that_get_lost_are_reported_with_a_remedy(probe):
+    bench = CameraBench(probe)
+    began, arrivals = bench.shoot(), bench.node.feed.arrivals["colour"]
+    for number in filter(lambda number: number % 4 != 3, range(1, 120)):  # as they would arrive in four seconds
+        arrivals.take(began + number * 33 * MILLISECOND, 1.0)
+    status = bench.diagnosis(level=Level.WARN, word="do not arrive")
+    assert "24 % (29 of 119) of the colour images" in status.message and ros.PROFILES in status.message
+    values = {entry.key: entry.value for entry in status.values}
+    assert "lost on the way" in values["missing colour images"] and values["missing depth images"] == "none"
+
+
+def test_images_that_nobody_asked_for_are_not_missed(probe):
+    arrivals = start_detector(probe).feed.arrivals["colour"]
+    for number in filter(lambda number: number % 4, range(120)):
+        arrivals.take(number * 33 * MILLISECOND, 1.0)
+    probe.wait_for(lambda: not arrivals.count_losses().arrived)
