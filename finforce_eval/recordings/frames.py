@@ -22,7 +22,6 @@ from finforce.optional import import_library
 from finforce.typed_yaml import Number
 from finforce_eval.errors import DamagedError, OptionError, RecordingError
 from finforce_eval.recordings.bags import list_pictures
-from finforce_eval.recordings.block_edges import BlockWatch
 from finforce_eval.recordings.image_files import read_intrinsics
 from finforce_eval.recordings.images import ImageChoice, StampedImage
 from finforce_eval.recordings.tracks import JawTrack, KeypointTrack, Recording, Timed, WrenchTrack
@@ -183,7 +182,7 @@ def decode_video(
 
 
 def _decode_checked(container: Any, stream: Any, shown: Sequence[int], where: str) -> Iterator[tuple[Any, bool]]:
-    """Yield the frames of a video and whether each is broken: near one that shows blocks, up to the next key frame.
+    """Yield the frames of a video and whether each is broken: near one that is left out, up to the next key frame.
 
     A frame of those to be `shown` (n,) [ticks] that does not come is None, and broken. Frames are shown before others
     that they are predicted from, and show late that data is not what it was: those shortly before a broken one are
@@ -193,17 +192,16 @@ def _decode_checked(container: Any, stream: Any, shown: Sequence[int], where: st
         DamagedError: the decoder finds a frame damaged.
     """
     waiting: deque[tuple[Any, bool]] = deque()
-    watch, is_broken, expected = BlockWatch(), False, deque(shown)
+    is_broken, expected = False, deque(shown)
     for number, frame in enumerate(container.decode(stream)):
         is_key, left_out = bool(frame.key_frame), 0
         if frame.is_corrupt:
             raise DamagedError(f"{where}: damaged: a frame is made of what others left")
         while expected and expected.popleft() < frame.pts:
             left_out += 1
-        has_blocks = watch.is_broken(frame.to_ndarray(format="gray"), is_key=is_key)
-        if has_blocks or (number and left_out):
+        if number and left_out:
             waiting = deque((each, True) for each, _ in waiting)
-        is_broken = not is_key and (is_broken or has_blocks or (number > 0 and left_out > 0))
+        is_broken = not is_key and (is_broken or (number > 0 and left_out > 0))
         waiting += [(None, True)] * left_out + [(frame, is_broken)]
         while len(waiting) > DELAY:
             yield waiting.popleft()

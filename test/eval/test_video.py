@@ -20,7 +20,6 @@ from finforce_eval.evaluation import unseen
 from finforce_eval.evaluation.forces import STILL_UPDATES, find_forces, share_reached
 from finforce_eval.evaluation.keypoint_source import detect_keypoints
 from finforce_eval.evaluation.setup import EvaluationSetup
-from finforce_eval.recordings.block_edges import BlockWatch
 from finforce_eval.recordings.frames import FrameImages, read_picture
 from finforce_eval.recordings.images import ImageChoice
 from finforce_eval.recordings.recording import read_recording
@@ -311,19 +310,6 @@ def test_no_frame_is_made_of_damaged_data_and_none_is_lost_without(tmp_path, cod
     assert 10 <= len(damaged) < 60  # the second group of pictures, or all before the damage
     for stamp, color in damaged.items():
         np.testing.assert_allclose(color.astype(int), intact[stamp], atol=2)
-
-
-def test_frames_of_a_missing_picture_are_told_by_their_blocks():
-    images, watch = [image[..., 0] for image in draw_moving(20)], BlockWatch()
-    assert not any(map(watch.is_broken, images))
-    assert not watch.is_broken(255 - images[0])  # a cut to something else
-    noise = np.random.default_rng(0).integers(0, 255, (96, 128), dtype=np.uint8)
-    assert not watch.is_broken(noise)
-    broken = images[-1].copy()
-    broken[16:64, 16:96] = np.kron(noise[:6, :10], np.ones((8, 8), np.uint8))
-    assert watch.is_broken(broken)
-    blocks = BlockWatch()  # of a codec that shows them always
-    assert not any(blocks.is_broken(broken, is_key=n == 0) for n in range(20))
 
 
 def test_turns_in_the_metadata_of_a_video_are_applied(tmp_path):
