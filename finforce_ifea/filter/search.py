@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from finforce.kalman import MotionNoise, Track
 from finforce_ifea.contact_mechanics.friction import Coefficient, constant_traction
+from finforce_ifea.contact_mechanics.indenter import CELL
 from finforce_ifea.contact_mechanics.pressed_jaw import PressedState, RigidContact, limit_step
 from finforce_ifea.filter.filter import Posterior, reduce_covariance
 from finforce_ifea.filter.friction_path import TractionHypotheses
@@ -90,6 +91,10 @@ _SETTLED_CORRECTION = 0.05
 _UNDECIDED = 0.2
 # Change of a traction ratio that does not matter [-].
 _SAME_RATIO = 0.02
+# 1 sigma of the inclination of a force by an edge that hardly touches [-].
+_INCLINED = 0.5
+# Depth up to which an edge is rounded [m]: half a cell of its field.
+_EDGE = 0.5 * CELL
 # Least force at which the inclination of the faces is asked for [N].
 _LEAST_FORCE = 0.1
 _LEAST_VARIANCE = 1e-14
@@ -390,7 +395,9 @@ class ContactSearch:
         s["mistaken"] = self._misplaced
         force, modes, (ratios, ratio) = pressed.force, np.ascontiguousarray(pressed.force_modes), traction
         shift = self._smooth + x_model[0] - x[0]
-        spread = self.hypotheses.doubt**2
+        # an edge is rounded by more than it sinks in at first
+        inclined = _INCLINED * max(1.0 - s["depth"] / _EDGE, 0.0) if self.expectation["has_corners"] else 0.0
+        spread = self.hypotheses.doubt**2 + inclined**2
         smoothing = posterior.own, lessened
         read_out(s, force, modes, self.x, self.log_weights, self.P, shift, smoothing, at.x, ratios, ratio, spread)
         self.state = s
