@@ -22,8 +22,8 @@ _HASTY, _BURSTS = 0.3, 0.15  # of the mean gap, closer than a camera takes image
 
 
 @dataclass(frozen=True, kw_only=True)
-class Losses:
-    """What became of the images of some seconds.
+class ImageLosses:
+    """Numbers of images that arrived and of those that did not, over some seconds.
 
     Attributes:
         arrived: number of images.
@@ -50,7 +50,7 @@ class Losses:
 
     @property
     def are_many(self) -> bool:
-        """Whether the images that were lost, or not sent, are worth a warning."""
+        """True if the images that were lost, or not sent, are worth a warning."""
         return max(self.lost, self.unsent) >= self._least
 
     @property
@@ -131,11 +131,11 @@ class Arrivals:
             "capture? Forces lag by the delay that the stamps hide"
         )
 
-    def count_losses(self) -> Losses:
-        """Return what became of the images of the last seconds."""
+    def count_losses(self) -> ImageLosses:
+        """Return the losses of the last seconds."""
         images = np.array(self._stamps, dtype=np.int64)
         if len(images) <= _FEWEST:
-            return Losses(arrived=len(images))
+            return ImageLosses(arrived=len(images))
         infos = self._announced(images)
         sent = np.union1d(images, infos)
         period, missing = find_missing(np.diff(sent))
@@ -148,7 +148,7 @@ class Arrivals:
         seen = np.floor(np.array(self._spares)[1:] / (SECOND * period) + 0.5) if period else np.inf
         overtaken = np.maximum(lost + unsent - seen, 0.0)
         from_lost = np.minimum(lost, overtaken)
-        return Losses(
+        return ImageLosses(
             arrived=len(images),
             lost=int((lost - from_lost).sum()),
             unsent=int((unsent - (overtaken - from_lost)).sum()),

@@ -27,7 +27,7 @@ def remedy_for_losses(topic: str, is_here: bool) -> str:
 
     Args:
         topic: of the images.
-        is_here: whether they are published on this machine.
+        is_here: True if they are published on this machine.
     """
     if is_here:
         return f"start the camera's process with {PROFILES}={TRANSPORT}"

@@ -156,9 +156,9 @@ class ContactSearch:
         """Continue from another shape of the jaw (size,), whose motions are not known yet."""
         self.q, self._modes = q, np.zeros((len(q), 3))
 
-    def forget(self, mean: NDArray) -> None:
-        """Expect an object of any shape and height about the mean (2,) again; key points and friction stay."""
-        self.state["x"][1:] = mean
+    def forget(self, expected_mean: NDArray) -> None:
+        """Expect an object of any shape and height about a mean (2,) again; key points and friction stay."""
+        self.state["x"][1:] = expected_mean
         self._misplaced = False
         self.hypotheses.leave()
         if self.x is None:
@@ -166,10 +166,16 @@ class ContactSearch:
         expected = self._expect()
         means, variances = np.r_[expected.mean, 0.0], np.r_[expected.variance, expected.traction_variance]
         self.x[:] = self.mean
-        for i, own, variance in zip((SHAPE, HEIGHT, TRACTION), means, variances, strict=True):
-            self.x[:, i] = own
-            self.P[i, :] = self.P[:, i] = 0.0
-            self.P[i, i] = variance
+        for i, mean, variance in zip((SHAPE, HEIGHT, TRACTION), means, variances, strict=True):
+            self._return_entry(i, mean, variance, 1.0)
+
+    def _return_entry(self, i: int, mean: float, variance: float, share: float) -> None:
+        """Let an entry of the state lose a share of what is known of it beyond its prior, in variance."""
+        kept = sqrt(1.0 - share)
+        self.x[:, i] = mean + kept * (self.x[:, i] - mean)
+        self.P[i, :] *= kept
+        self.P[:, i] *= kept
+        self.P[i, i] += share * variance
 
     def restart(self) -> None:
         """Start anew where the contact is now, as after another tare; what is known of friction stays."""
@@ -201,12 +207,8 @@ class ContactSearch:
             return
         expected = self._expect()
         for i, each, mean, variance in zip((SHAPE, HEIGHT), change, expected.mean, expected.variance, strict=True):
-            lost = min((_SLIDE * each) ** 2 / variance, 1.0)
-            kept = sqrt(1.0 - lost)
-            self.x[:, i] = mean + kept * (self.x[:, i] + each - mean)
-            self.P[i, :] *= kept
-            self.P[:, i] *= kept
-            self.P[i, i] += lost * variance
+            self.x[:, i] += each
+            self._return_entry(i, mean, variance, min((_SLIDE * each) ** 2 / variance, 1.0))
 
     def shift(self, change: float) -> None:
         """Count the depth `change` [m] more, as of an object that was cut anew."""
