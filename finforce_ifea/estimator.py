@@ -106,7 +106,10 @@ class ForceEstimator:
         self._modulus_error = 0.0 if calibration else self.jaw.material.spread
         self._force_error = calibration.expect_error(self.jaw, self.settings.solver) if calibration else _UNCALIBRATED
         self._taring = TareKeeper(
-            self.jaw.keypoints, self.settings, lambda *chance: self._tracker.significance(*chance)
+            self.jaw.keypoints,
+            self.settings,
+            lambda *chance: self._tracker.significance(*chance),
+            self._tracked.rest_modes,
         )
         self._reach = ReachWatch(self.jaw.keypoints, self.jaw.inner_face_x, self._tracked.rest_modes)
         self.reset()

@@ -4,6 +4,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
@@ -249,17 +250,64 @@ _LEAST_NEAR = 0.75
 _NEARER = 0.75
 _REST_FRAMES = 10
 _REST_REACH, _REST_REACH_MEAN = 1e-3, 0.45e-3
+# An image shows a load if it is deeper by so many standard deviations than the least deep one but one, and by this [m].
+_DEEPER_SIGMAS = 7.0
+_LEAST_LOADED_DEPTH = 0.1e-3
+# Standard deviation over the median of absolute differences of two draws [-]: 1.4826 / sqrt(2).
+_STDDEV_BY_DIFFERENCES = 1.05
+# Share of the images of a tare that must be without load [-]; the others are left out.
+_LEAST_UNLOADED = 1.0 / 3.0
+
+
+def find_unloaded(deviations: NDArray, modes: NDArray) -> NDArray[np.bool_]:
+    """Return which images show the jaw with the least load among them (n,).
+
+    A load moves all key points alike, and one way. The depth that an image shows is the median over its key points,
+    weighted by how far they move; its noise is that of the differences between successive images.
+
+    Args:
+        deviations: of the key points from the drawing, x and z (n, K, 2) [m], NaN where unused.
+        modes: motion of the key points by the depth (K, 2) [m/m].
+    """
+    square = (modes**2).sum(axis=1)
+    asked = (deviations * modes).sum(axis=2) / np.maximum(square, 1e-12)
+    depths = np.array([_find_weighted_median(row, square) for row in asked])
+    seen = depths[np.isfinite(depths)]
+    if len(seen) < _FEWEST_FRAMES:
+        return np.isfinite(depths)
+    noise = _STDDEV_BY_DIFFERENCES * float(np.median(np.abs(np.diff(seen))))
+    return depths <= np.partition(seen, 1)[1] + max(_DEEPER_SIGMAS * noise, _LEAST_LOADED_DEPTH)
+
+
+def _find_weighted_median(values: NDArray, weights: NDArray) -> float:
+    """Return the weighted median of values (K,), some of which may be NaN; NaN if all are."""
+    values, weights = values[(known := np.isfinite(values))], weights[known]
+    order = np.argsort(values)
+    passed = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(passed, 0.5 * passed[-1])]) if len(values) else np.nan
 
 
 class TareKeeper:
     """Collects unloaded frames, tares once there are enough, and goes on averaging until the first load."""
 
-    def __init__(self, keypoints: NDArray, settings: EstimatorSettings, significance: Significance) -> None:
-        """Keep the drawn key points (K, 3) [m] and `significance`.
+    def __init__(
+        self,
+        keypoints: NDArray,
+        settings: EstimatorSettings,
+        significance: Significance,
+        modes: Callable[[], NDArray],
+    ) -> None:
+        """Begin without frames.
 
-        It says by how many standard deviations a force explains a tare whose points are off by chance by so much [m].
+        Args:
+            keypoints: drawn (K, 3) [m].
+            settings: of the estimator.
+            significance: by how many standard deviations a force explains a tare whose points are off by chance by so
+                much [m].
+            modes: motion of the key points in x and z by the depth (K, 2) [m/m].
         """
         self._keypoints, self._settings, self._significance = keypoints, settings, significance
+        self._find_modes = modes
         self.reset()
 
     def reset(self) -> None:
@@ -340,6 +388,8 @@ class TareKeeper:
             raise UnderLoadError("cannot tare: something presses on the jaw")
         if count < _FEWEST_FRAMES:
             raise NotEnoughDataError(f"cannot tare: {count} unloaded frames, expected at least {_FEWEST_FRAMES}")
+        if not self.tared:
+            count = self._keep_unloaded(count)
         frames = list(self._frames)[-count:]
         tare = compute_tare(frames, self._keypoints, list(self._stddevs)[-count:])
         seen = np.isfinite(np.stack(frames)[..., 0]).mean(0) >= _LEAST_SEEN
@@ -357,6 +407,24 @@ class TareKeeper:
             f"tared {int((tare.counts > 0).sum())} key points over {count} frames: largest offset "
             f"{1e3 * largest:.2f} mm, noise {1e3 * noise:.2f} mm"
         )
+
+    def _keep_unloaded(self, count: int) -> int:
+        """Keep those of the last frames that show no load; return their number.
+
+        Raises:
+            UnderLoadError: Most of them show one.
+        """
+        frames, stddevs = list(self._frames)[-count:], list(self._stddevs)[-count:]
+        unloaded = find_unloaded((np.stack(frames) - self._keypoints)[..., ::2], self._find_modes())
+        left = int(unloaded.sum())
+        if left < max(_FEWEST_FRAMES, _LEAST_UNLOADED * count):
+            raise UnderLoadError(f"cannot tare: the jaw was loaded in {count - left} of {count} frames")
+        if left < count:
+            self._frames.clear()
+            self._stddevs.clear()
+            self._frames.extend(compress(frames, unloaded))
+            self._stddevs.extend(compress(stddevs, unloaded))
+        return left
 
     def _check_steady(self, frames: list[NDArray]) -> None:
         half = len(frames) // 2

@@ -103,6 +103,22 @@ def test_automatic_tare_does_not_take_a_rising_load_for_offsets(height):
     assert not estimator.tared or abs(np.nanmean(found)) < 0.10
 
 
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("height", [20, 40, 60])
+def test_automatic_tare_leaves_out_the_grasps_among_its_images(height, seed):
+    """Few images come before the first grasp, so that the tare has images of grasps, too."""
+    random, depths = np.random.default_rng([seed, height]), []
+    while len(depths) < 60:
+        depths += [0.0] * int(random.integers(6, 20)) + [random.uniform(0.5e-3, 5e-3)] * int(random.integers(3, 15))
+    recording = record(np.r_[depths, np.zeros(15), np.full(40, 3e-3)], height=height)
+    estimator = make_estimator()
+    solutions = run(recording, estimator)
+    assert estimator.tared
+    for solution, force in zip(solutions[-30:], recording.forces[-30:], strict=True):
+        assert solution.trusted
+        assert np.abs(solution.force - force)[0] < 3.0 * solution.force_stddev[0]
+
+
 def test_estimator_without_automatic_tare_gives_forces_at_once():
     solution = run(pressed(), solver="frame", automatic_tare=False)[0]
     assert solution.trusted

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from mechanics_fakes import BENCH
 
-from finforce_ifea.tare import StatedNoise, blank_tare, compute_point_noise, compute_tare
+from finforce_ifea.tare import StatedNoise, blank_tare, compute_point_noise, compute_tare, find_unloaded
 from finforce_ifea.tracking.influence import explain_offsets
 
 REST = BENCH.keypoints
@@ -61,6 +61,19 @@ def test_point_that_is_seldom_seen_has_no_offset():
     assert tare.counts[5] == 0
     assert not tare.offsets[5].any()
     assert tare.counts[6] == 40
+
+
+def test_images_of_a_load_are_found_among_those_without():
+    """Gross errors of one key point, and key points that are hidden now and then, look like no load."""
+    random = np.random.default_rng(5)
+    modes = np.outer((REST[:, 2] / 0.08) ** 2, [-1.0, 0.3])
+    seen = np.stack(frames(45)[0])[..., ::2] - REST[:, ::2]
+    seen[random.random(seen.shape[:2]) < 0.2] = np.nan
+    seen[np.arange(45), random.integers(len(REST), size=45)] += 8e-3
+    assert find_unloaded(seen, modes).all()
+    loaded = random.random(45) < 0.5
+    seen[loaded] += 1e-3 * modes
+    np.testing.assert_array_equal(find_unloaded(seen, modes), ~loaded)
 
 
 def test_fewer_than_three_points_are_no_tare():
