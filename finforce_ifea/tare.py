@@ -269,14 +269,16 @@ def find_unloaded(deviations: NDArray, modes: NDArray) -> NDArray[np.bool_]:
         deviations: of the key points from the drawing, x and z (n, K, 2) [m], NaN where unused.
         modes: motion of the key points by the depth (K, 2) [m/m].
     """
+    seen = np.isfinite(deviations[..., 0]).any(axis=0)
+    moved, modes = deviations[:, seen] - np.nanmedian(deviations[:, seen], axis=0), modes[seen]
     square = (modes**2).sum(axis=1)
-    asked = (deviations * modes).sum(axis=2) / np.maximum(square, 1e-12)
+    asked = (moved * modes).sum(axis=2) / np.maximum(square, 1e-12)
     depths = np.array([_find_weighted_median(row, square) for row in asked])
-    seen = depths[np.isfinite(depths)]
-    if len(seen) < _FEWEST_FRAMES:
+    known = depths[np.isfinite(depths)]
+    if len(known) < _FEWEST_FRAMES:
         return np.isfinite(depths)
-    noise = _STDDEV_BY_DIFFERENCES * float(np.median(np.abs(np.diff(seen))))
-    return depths <= np.partition(seen, 1)[1] + max(_DEEPER_SIGMAS * noise, _LEAST_LOADED_DEPTH)
+    noise = _STDDEV_BY_DIFFERENCES * float(np.median(np.abs(np.diff(known))))
+    return depths <= np.partition(known, 1)[1] + max(_DEEPER_SIGMAS * noise, _LEAST_LOADED_DEPTH)
 
 
 def _find_weighted_median(values: NDArray, weights: NDArray) -> float:
