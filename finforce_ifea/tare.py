@@ -251,7 +251,7 @@ _NEARER = 0.75
 _REST_FRAMES = 10
 _REST_REACH, _REST_REACH_MEAN = 1e-3, 0.45e-3
 # An image shows a load if it is deeper by so many standard deviations than the least deep one but one, and by this [m].
-_DEEPER_SIGMAS = 7.0
+_DEEPER_SIGMAS = 6.0
 _LEAST_LOADED_DEPTH = 0.1e-3
 # Standard deviation over the median of absolute differences of two draws [-]: 1.4826 / sqrt(2).
 _STDDEV_BY_DIFFERENCES = 1.05
@@ -262,8 +262,8 @@ _LEAST_UNLOADED = 1.0 / 3.0
 def find_unloaded(deviations: NDArray, modes: NDArray) -> NDArray[np.bool_]:
     """Return which images show the jaw with the least load among them (n,).
 
-    A load moves all key points alike, and one way. The depth that an image shows is the median over its key points,
-    weighted by how far they move; its noise is that of the differences between successive images.
+    A load moves all key points alike, and one way. The depth that an image shows is that of least squares, without the
+    key points far from the median; its noise is that of the differences between successive images.
 
     Args:
         deviations: of the key points from the drawing, x and z (n, K, 2) [m], NaN where unused.
@@ -274,6 +274,9 @@ def find_unloaded(deviations: NDArray, modes: NDArray) -> NDArray[np.bool_]:
     square = (modes**2).sum(axis=1)
     asked = (moved * modes).sum(axis=2) / np.maximum(square, 1e-12)
     depths = np.array([_find_weighted_median(row, square) for row in asked])
+    near = np.linalg.norm(moved - depths[:, None, None] * modes, axis=2) < _FARTHEST_FROM_MEDIAN
+    weight = (near * square).sum(axis=1)
+    depths = np.where(near, asked * square, 0.0).sum(axis=1) / np.where(weight > 0.0, weight, np.nan)
     known = depths[np.isfinite(depths)]
     if len(known) < _FEWEST_FRAMES:
         return np.isfinite(depths)

@@ -72,7 +72,7 @@ def test_images_of_a_load_are_found_among_those_without():
     seen[np.arange(45), random.integers(len(REST), size=45)] += 8e-3
     assert find_unloaded(seen, modes).all()
     loaded = np.arange(45) // 8 % 2 == 1
-    seen[loaded] += 1e-3 * modes
+    seen[loaded] += 1.5e-3 * modes
     np.testing.assert_array_equal(find_unloaded(seen, modes), ~loaded)
 
 
