@@ -92,9 +92,10 @@ def compute_point_noise(usual: StatedNoise, stddev: NDArray | None) -> PointNois
     A detector errs in the same way while it sees the same: what is stated and does not scatter in the tare stands still
     there, is taken off with the offsets, and comes back in another shape with the next sight. No averaging removes it,
 
-        bias_k = max(0, (s_kx^2 + s_kz^2) / 2 - tr N_k), zero when nothing is stated;
+        b_k = max(0, (s_kx^2 + s_kz^2) / 2 - tr N_k),    bias_k = sqrt(b_k median(b)), zero when nothing is stated;
 
-    up to twice the variance of the scatter is taken for chance.
+    up to twice the variance of the scatter is taken for chance. What a detector sees badly, it states badly, too: in
+    drawn scenes the errors follow the geometric mean of what is stated of a point and of most of its jaw.
 
     Args:
         usual: of each key point in the tare.
@@ -105,7 +106,10 @@ def compute_point_noise(usual: StatedNoise, stddev: NDArray | None) -> PointNois
         before = now = np.sqrt(np.diagonal(usual.covariance, axis1=1, axis2=2))
     before, now = (np.ascontiguousarray(each, float) for each in (before, now))
     noise = PointNoise(*_enlarge_noise(np.ascontiguousarray(usual.covariance), before, now))
-    return noise if stddev is not None else noise._replace(bias=np.zeros(len(before)))
+    seen = np.isfinite(now[:, 0])
+    if stddev is None or not seen.any():
+        return noise._replace(bias=np.zeros(len(before)))
+    return noise._replace(bias=np.sqrt(noise.bias * np.median(noise.bias[seen])))
 
 
 @njit(cache=True)

@@ -179,12 +179,13 @@ def test_what_is_stated_far_beyond_the_scatter_stands_still():
     usual = match_stated(scatter_of(STATED), stated_by(4.0 * STATED, 4000), FLOOR)
     bias = compute_point_noise(usual, 4.0 * STATED).bias
     # twice 16 - 1 times the variance in plane, of which the tare's 4000 images tell the scatter within a few per cent
-    np.testing.assert_allclose(bias, 30.0 * STATED[:, 0] ** 2, rtol=0.05)
+    own = 30.0 * STATED[:, 0] ** 2
+    np.testing.assert_allclose(bias, np.sqrt(own * np.median(own)), rtol=0.05)
     assert not compute_point_noise(usual, None).bias.any()
     later = STATED * np.where(np.arange(len(STATED)) == 2, 5.0, 4.0)[:, None]
     doubtful = compute_point_noise(usual, later).bias
-    np.testing.assert_allclose(np.delete(doubtful, 2), np.delete(bias, 2))
-    assert doubtful[2] == pytest.approx(48.0 * STATED[2, 0] ** 2, rel=0.05)
+    own[2] *= 48.0 / 30.0
+    np.testing.assert_allclose(doubtful, np.sqrt(own * np.median(own)), rtol=0.05)
     modest = match_stated(scatter_of(STATED), stated_by(0.9 * STATED, 4000), FLOOR)
     assert not compute_point_noise(modest, 0.9 * STATED).bias.any()
 
