@@ -37,12 +37,12 @@ def write_overview(
     Raises:
         MissingDependencyError: matplotlib is not installed.
     """
-    from finforce_eval.figures.figures import draw_unity
+    from finforce_eval.figures.figures import draw_errors
 
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    draw_unity(list(evaluation.results.values())).savefig(folder / "unity.png")
-    pictures = [folder / name for name in (picture, "unity.png") if name]
+    draw_errors(list(evaluation.results.values())).savefig(folder / "errors.png")
+    pictures = [folder / name for name in (picture, "errors.png") if name]
     return write_page(evaluation, folder / PAGE, about=about, title=TITLE, headline=headline, pictures=pictures)
 
 
