@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from finforce_eval.evaluation.scoring import LEAST_FORCE
 from finforce_eval.figures.figures import BLACK, BLUE, GREEN, GREY, ORANGE, draw_errors, new_figure, style_axes
 from finforce_eval.table import read_table
 from lab.experiments.grasp_world import WIDTH, GraspCase, NoisySensor, Plant, World
@@ -18,7 +19,6 @@ from lab.experiments.grasp_world import WIDTH, GraspCase, NoisySensor, Plant, Wo
 IMAGES = Path(__file__).parents[1] / "docs" / "images"
 SHOWN = "mooney_cyl25_middle"  # of the recordings
 STIFFNESS = 1300.0  # [N/m] of fingers about the object that is grasped
-LEAST_FORCE = 0.2  # [N] above which the pressure centre is known, as in the scores
 
 
 def draw_over_time(time: NDArray, found: NDArray, truth: NDArray, quantity: str, unit: str) -> tuple[Figure, Any]:

@@ -92,7 +92,7 @@ def evaluate(
     if extrinsics is not None:
         parameters["T_gripper_camera"] = list(pose_numbers(read_extrinsics(extrinsics)))
     choice = ImageChoice(
-        intrinsics=() if camera is None else _words_of(camera),
+        intrinsics=_words_of(camera),
         camera=found.intrinsics if found else None,
         T_gripper_camera=pose_of(parameters),
         episode=episode,
@@ -116,11 +116,10 @@ def evaluate(
     return table
 
 
-def _words_of(camera: str | Path | ArrayLike) -> tuple[str, ...]:
+def _words_of(camera: str | Path | ArrayLike | None) -> tuple[str, ...]:
     """Return intrinsics, a file or numbers, as words of `--intrinsics`."""
-    if isinstance(camera, str | Path):
-        return (str(camera),)
-    return tuple(str(number) for number in np.asarray(camera, dtype=float).ravel())
+    given = [camera] if isinstance(camera, str | Path) else np.ravel(() if camera is None else camera)
+    return tuple(map(str, given))
 
 
 def _tabulate(name: str, path: Path, keypoints: KeypointSource, setup: EvaluationSetup) -> pd.DataFrame:
