@@ -74,7 +74,8 @@ def read_evaluation(path: str | Path) -> dict[str, Any]:
         for case in cases.values():
             case["all"]["rmse_N"], case["record_frames"], case["record_skipped"]
     except (FileError, KeyError, TypeError, AttributeError) as error:
-        raise OptionError(f"{path}: expected what finforce evaluate --json writes: {error!r}") from error
+        why = error if isinstance(error, FileError) else "holds no scores"
+        raise OptionError(f"{path}: {why}; expected what finforce evaluate --json writes") from error
     return content
 
 
