@@ -68,9 +68,9 @@ def read_recording(
 ) -> Recording:
     """Read a bag with its `case.json`, an episode of a dataset or of a buffer of UMI, a video, or pictures.
 
-    Unknown topics are not decoded; `notes` name those of unexpected type. Images are read later. A recording with images
-    may lack key points; its tracks of them are then empty. A damaged recording is read as far as it is intact, and
-    `notes` state how much was lost.
+    Unknown topics are not decoded; `notes` name those of unexpected type. Images are read later. A recording with
+    images may lack key points; its tracks of them are then empty. A damaged recording is read as far as it is intact,
+    and `notes` state how much was lost.
 
     Args:
         path: rosbag2 folder, .mcap, .db3, folder of a dataset or of pictures, .zarr, .zarr.zip, or video.
