@@ -5,7 +5,6 @@ python -m tools.draw_pictures FOLDER
 
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -21,19 +20,21 @@ SHOWN = "mooney_cyl25_middle"  # of the recordings
 STIFFNESS = 1300.0  # [N/m] of fingers about the object that is grasped
 
 
-def draw_over_time(time: NDArray, found: NDArray, truth: NDArray, quantity: str, unit: str) -> tuple[Figure, Any]:
-    """Draw estimate and truth over time [s], and the error below; return the axes of the former, too."""
+def draw_over_time(time: NDArray, found: NDArray, truth: NDArray, deviation: NDArray, quantity: str) -> Figure:
+    """Draw an estimate within two standard deviations, and the truth, over time [s], and the error below."""
     figure = new_figure(11.0, 5.0)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
+    band = np.maximum(found - 2.0 * deviation, 0.0), found + 2.0 * deviation
+    upper.fill_between(time, *band, color=GREEN, alpha=0.3, linewidth=0.0)
     upper.plot(time, found, color=GREEN, linewidth=1.2, label="estimate")
     upper.plot(time, truth, color=BLACK, linewidth=0.9, dashes=(4, 2), label="truth")
     lower.plot(time, found - truth, color=BLUE, linewidth=0.7)
-    for axes, label in ((upper, quantity), (lower, "error")):
+    upper.set(ylabel=quantity)
+    lower.set(xlabel="time [s]", ylabel=f"error {quantity[quantity.index('[') :]}")
+    for axes in (upper, lower):
         style_axes(axes)
-        axes.set(ylabel=f"{label} [{unit}]")
-    lower.set(xlabel="time [s]")
     figure.legend(loc="outside upper right", ncols=2, frameon=False, fontsize=9)
-    return figure, upper
+    return figure
 
 
 def draw_grasps() -> Figure:
@@ -57,12 +58,11 @@ def main(folder: Path) -> None:
     """Draw all of them."""
     series = [one for path in sorted(folder.glob("*.parquet")) for one in read_table(path)[0]]
     (shown,) = [one for one in series if one.name == SHOWN]
-    band = shown.magnitude + np.multiply.outer((-2.0, 2.0), shown.column("magnitude_stddev"))
-    force, axes = draw_over_time(shown.seconds, shown.magnitude, shown.true_magnitude, "force on the jaw", "N")
-    axes.fill_between(shown.seconds, *np.maximum(band, 0.0), color=GREEN, alpha=0.3, linewidth=0.0)
+    deviation, found = shown.column("magnitude_stddev"), shown.column("contact_location")[:, 2]
+    force = draw_over_time(shown.seconds, shown.magnitude, shown.true_magnitude, deviation, "force on the jaw [N]")
     known = np.where(shown.solved & (shown.true_magnitude > LEAST_FORCE), 1e3, np.nan)  # [mm/m]
-    found, truth = known * shown.column("contact_location")[:, 2], known * shown.column("true_height")
-    place, _ = draw_over_time(shown.seconds, found, truth, "height", "mm")
+    heights = known * found, known * shown.column("true_height"), 0.0 * found
+    place = draw_over_time(shown.seconds, *heights, "height [mm]")
     drawn = {"errors": draw_errors(series), "force": force, "contact_place": place, "grasp_force": draw_grasps()}
     for name, figure in drawn.items():
         figure.savefig(IMAGES / f"{name}.png")

@@ -174,15 +174,14 @@ def weigh(holds: Sequence[Hold], grams: Sequence[float], name: str = "the record
         name: of the recording, for messages.
 
     Raises:
-        RecordingError: another number of holds than of readings, readings of other holds, or that no scale shows.
+        RecordingError: the numbers of holds and readings differ, or the readings do not fit the holds.
     """
     weights = np.asarray(grams, dtype=float) * 1e-3 * GRAVITY
     if not len(weights) or not np.isfinite(weights).all() or (weights <= 0.0).any():
         raise RecordingError(f"{name}: readings {list(grams)}: expected grams above zero, one for each hold")
     if len(weights) != len(holds):
-        raise RecordingError(
-            f"{name}: {len(weights)} readings for {len(holds)} holds; holds found: {list_holds(holds)}"
-        )
+        counts = f"{len(weights)} readings for {len(holds)} holds"
+        raise RecordingError(f"{name}: {counts}; holds found: {list_holds(holds)}")
     weighing = _fit_factor(tuple(holds), weights)
     if weighing.misfit > _WORST_MISFIT:
         raise RecordingError(

@@ -350,12 +350,7 @@ def _share(chosen: NDArray[np.bool_]) -> float | None:
 
 
 def match_truth(truth: WrenchTrack, stamps: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the true force at the given stamps (n, 3) [N], matched as by `match_samples`.
-
-    Args:
-        truth: measured wrenches.
-        stamps: (n,) image times [ns].
-    """
+    """Return the true force (n, 3) [N] at image times (n,) [ns], matched as by `match_samples`."""
     return match_samples(truth.stamps_ns, truth.force, stamps)
 
 
