@@ -214,7 +214,7 @@ def _suspect_shift(weighing: Weighing) -> str:
         shifted[f"reading {1 + shift} fits hold 1: does reading 1 belong to a hold that was not found?"] = _fit_factor(
             holds[:-shift], weights[shift:]
         )
-        shifted[f"reading 1 fits hold {1 + shift}: is a hold without a reading?"] = _fit_factor(
+        shifted[f"reading 1 fits hold {1 + shift}: does a hold lack a reading?"] = _fit_factor(
             holds[shift:], weights[:-shift]
         )
     best = min(shifted, key=lambda hint: shifted[hint].misfit, default=None)
