@@ -15,7 +15,6 @@ import numpy as np
 from numba import njit
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
-REST, MOTION = 0, 1
 
 
 class MotionNoise(NamedTuple):

@@ -114,20 +114,20 @@ def calibrate_with_scale(
     solver: str = "default",
     force: bool = False,
 ) -> Calibration:
-    """Return the calibration of a finger by a kitchen scale, read at the end of each of some steady presses.
+    """Return the calibration of a finger from readings of a kitchen scale, one at the end of each steady press.
 
     Args:
         times: (n,) of the images [s], rising.
         forces: (n,) estimated along the closing direction [N], either sign, or vectors (n, 3); NaN where unknown.
-        grams: readings of the scale at the end of each press, zeroed before; in their order.
-        jaw: that the forces were estimated with, its file or its name.
-        calibration: that they were estimated with; None for the material of the jaw file.
-        solver: that they were estimated with.
-        force: take a modulus, too, that the material of the jaw file has not got.
+        grams: reading of the zeroed scale at the end of each press [g], in order.
+        jaw: jaw, jaw file or name of the jaw that the forces were estimated with.
+        calibration: calibration that they were estimated with; None for the material of the jaw file.
+        solver: solver that they were estimated with.
+        force: True to accept a modulus that the material of the jaw file cannot have.
 
     Raises:
-        RecordingError: another number of presses than of readings, readings of other presses, or that no scale shows.
-        CalibrationError: the modulus found cannot be that of the finger.
+        RecordingError: the numbers of presses and readings differ, or the readings do not fit the presses.
+        CalibrationError: the material of the jaw file cannot have the modulus found.
     """
     jaw, forces = load_jaw(jaw), np.asarray(forces, dtype=float)
     holds = find_holds(np.asarray(times, dtype=float), np.abs(forces if forces.ndim == 1 else forces[:, 0]))
@@ -174,15 +174,14 @@ def weigh(holds: Sequence[Hold], grams: Sequence[float], name: str = "the record
         name: of the recording, for messages.
 
     Raises:
-        RecordingError: another number of holds than of readings, readings of other holds, or that no scale shows.
+        RecordingError: the numbers of holds and readings differ, or the readings do not fit the holds.
     """
     weights = np.asarray(grams, dtype=float) * 1e-3 * GRAVITY
     if not len(weights) or not np.isfinite(weights).all() or (weights <= 0.0).any():
         raise RecordingError(f"{name}: readings {list(grams)}: expected grams above zero, one for each hold")
     if len(weights) != len(holds):
-        raise RecordingError(
-            f"{name}: {len(weights)} readings for {len(holds)} holds; holds found: {list_holds(holds)}"
-        )
+        counts = f"{len(weights)} readings for {len(holds)} holds"
+        raise RecordingError(f"{name}: {counts}; holds found: {list_holds(holds)}")
     weighing = _fit_factor(tuple(holds), weights)
     if weighing.misfit > _WORST_MISFIT:
         raise RecordingError(
@@ -215,7 +214,7 @@ def _suspect_shift(weighing: Weighing) -> str:
         shifted[f"reading {1 + shift} fits hold 1: does reading 1 belong to a hold that was not found?"] = _fit_factor(
             holds[:-shift], weights[shift:]
         )
-        shifted[f"reading 1 fits hold {1 + shift}: is a hold without a reading?"] = _fit_factor(
+        shifted[f"reading 1 fits hold {1 + shift}: does a hold lack a reading?"] = _fit_factor(
             holds[shift:], weights[:-shift]
         )
     best = min(shifted, key=lambda hint: shifted[hint].misfit, default=None)

@@ -87,14 +87,8 @@ def run(options: argparse.Namespace) -> CommandResult:
 
         Path(options.report).mkdir(parents=True, exist_ok=True)
         picture = GRASP if draw_grasp(result, Path(options.report, GRASP)) else ""
-        page = write_overview(
-            result.evaluation,
-            options.report,
-            about=setup.about,
-            headline=summary[0] if summary else "",
-            picture=picture,
-        )
-        print(f"Report: {page}")
+        words = {"about": setup.about, "headline": summary[0] if summary else "", "picture": picture}
+        print(f"Report: {write_overview(result.evaluation, options.report, **words)}")
     score = result.grasp_score
     grasp = {"grasp": asdict(score.error), "grasp_frames": score.frames, "grasp_delay": score.delay}
     return CommandResult(evaluation_json(result.evaluation, **grasp, **setup.about))

@@ -46,7 +46,8 @@ def run(options: argparse.Namespace) -> CommandResult:
     if options.output and not readings:
         raise OptionError("-o needs --grams: the readings of the scale, one for each hold")
     setup = make_setup(options).side(options.side)
-    (recording,) = read_keypoints(options, (options.side,))
+    options.jaws = options.side
+    (recording,) = read_keypoints(options)
     stamps = recording.jaw(options.side).keypoints.stamps
     with progress_bar(len(stamps), "frame", recording.name) as bar:
         forces = estimate_forces(recording, setup, [options.side], strict=True, progress=bar.update)[options.side]

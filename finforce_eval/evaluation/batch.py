@@ -59,27 +59,27 @@ def evaluate(
 ) -> pd.DataFrame:
     """Estimate the forces in recordings and return them as a table with a row for each image and jaw.
 
-    The same estimators as `finforce evaluate` uses. The columns, all in SI units, are those of its Parquet files;
-    `attrs["units"]` of the table has their units. An image without a force has NaN there, and says why in `message`.
+    The estimators and columns are those of `finforce evaluate` and its Parquet files, in SI units, which
+    `attrs["units"]` of the table lists. In an image without a force, the force is NaN and `message` states the reason.
 
     Args:
         recordings: rosbag2 folders, .mcap or .db3 files, LeRobot datasets, UMI's .zarr, videos, folders of pictures, or
             folders that hold some of these; one or several.
         jaw: jaw file, or name of an included jaw; None for that of the rig or of the `case.json`, else "bench".
-        rig: file by `finforce camera`, in place of jaw, camera and extrinsics.
-        camera: intrinsics for images without camera_info, as of `ForceSensor`.
-        extrinsics: the camera in `gripper_base`, as of `ForceSensor`; None for that of the `case.json`, else "robot".
-        contact_height: of first touch above the clamped base [m].
-        object_mesh: file of the object's mesh [m], whose recorded poses then give the contact. Without these two, the
-            mesh or the height in the `case.json` counts.
-        calibration: of the finger, its file or an included name; None for the material of the jaw file.
-        source: of the key points: "images", "keypoints" as recorded, or "truth" of a simulation; "" for recorded ones
-            where there are some, else images.
-        sides: jaws in the images, where no topic tells.
-        stills: True if every image is a photograph by itself, without a tare.
-        episode: of a dataset.
+        rig: file written by `finforce camera`, instead of jaw, camera and extrinsics.
+        camera: intrinsics for images without camera_info, as for `ForceSensor`.
+        extrinsics: camera pose in `gripper_base`, as for `ForceSensor`; None for that of the `case.json`, else "robot".
+        contact_height: height of first touch above the clamped base [m].
+        object_mesh: file of the object's mesh [m], which gives the contact together with the recorded poses. Without
+            height and mesh, those of the `case.json` are used.
+        calibration: calibration of the finger, its file or an included name; None for the material of the jaw file.
+        source: source of the key points: "images", "keypoints" as recorded, "truth" of a simulation, or "" for recorded
+            ones if there are any, else images.
+        sides: jaws in the images, if no topic names them.
+        stills: True if every image is a separate photograph, without a tare.
+        episode: number of the episode of a dataset.
         detector: parameters of the detector that differ from their defaults.
-        settings: of the estimator, whole or those that differ from their defaults.
+        settings: settings of the estimator, or only those that differ from the defaults, by name.
 
     Raises:
         FinforceError: a recording cannot be read or evaluated, or an argument cannot be used.
@@ -92,7 +92,7 @@ def evaluate(
     if extrinsics is not None:
         parameters["T_gripper_camera"] = list(pose_numbers(read_extrinsics(extrinsics)))
     choice = ImageChoice(
-        intrinsics=() if camera is None else _words_of(camera),
+        intrinsics=_words_of(camera),
         camera=found.intrinsics if found else None,
         T_gripper_camera=pose_of(parameters),
         episode=episode,
@@ -116,11 +116,10 @@ def evaluate(
     return table
 
 
-def _words_of(camera: str | Path | ArrayLike) -> tuple[str, ...]:
+def _words_of(camera: str | Path | ArrayLike | None) -> tuple[str, ...]:
     """Return intrinsics, a file or numbers, as words of `--intrinsics`."""
-    if isinstance(camera, str | Path):
-        return (str(camera),)
-    return tuple(str(number) for number in np.asarray(camera, dtype=float).ravel())
+    given = [camera] if isinstance(camera, str | Path) else np.ravel(() if camera is None else camera)
+    return tuple(map(str, given))
 
 
 def _tabulate(name: str, path: Path, keypoints: KeypointSource, setup: EvaluationSetup) -> pd.DataFrame:

@@ -74,7 +74,8 @@ def read_evaluation(path: str | Path) -> dict[str, Any]:
         for case in cases.values():
             case["all"]["rmse_N"], case["record_frames"], case["record_skipped"]
     except (FileError, KeyError, TypeError, AttributeError) as error:
-        raise OptionError(f"{path}: expected what finforce evaluate --json writes: {error!r}") from error
+        why = error if isinstance(error, FileError) else "holds no scores"
+        raise OptionError(f"{path}: {why}; expected what finforce evaluate --json writes") from error
     return content
 
 
@@ -93,14 +94,8 @@ def total_change(changes: Sequence[Change]) -> Change:
     before, after = (float(np.mean([getattr(change, side) for change in both])) for side in ("before", "after"))
     stddev = sqrt(sum(change.stddev**2 for change in both)) / len(both)
     answered = tuple(float(np.mean([change.answered[side] for change in both])) for side in (0, 1))
-    return Change(
-        name="mean",
-        before=before,
-        after=after,
-        stddev=stddev,
-        answered=answered,
-        outcome=_judge(after - before, stddev),
-    )
+    outcome = _judge(after - before, stddev)
+    return Change(name="mean", before=before, after=after, stddev=stddev, answered=answered, outcome=outcome)
 
 
 def differing_settings(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, tuple[str, str]]:
@@ -112,14 +107,14 @@ def differing_settings(before: Mapping[str, Any], after: Mapping[str, Any]) -> d
 
 def _compare(name: str, before: Mapping[str, Any] | None, after: Mapping[str, Any] | None) -> Change:
     """Return what became of one recording."""
-    errors = [_error(case) for case in (before, after)]
-    answered = (_answered(before), _answered(after))
+    old, new = _error(before), _error(after)
+    answered, stddev = (_answered(before), _answered(after)), inf
     if before is None or after is None:
         outcome = GAINED if before is None else LOST
-        return Change(name=name, before=errors[0], after=errors[1], stddev=inf, answered=answered, outcome=outcome)
-    stddev = _find_stddev(before, after, *errors)
-    outcome = WORSE if answered[1] < answered[0] - LEAST_ANSWERS else _judge(errors[1] - errors[0], stddev)
-    return Change(name=name, before=errors[0], after=errors[1], stddev=stddev, answered=answered, outcome=outcome)
+    else:
+        stddev = _find_stddev(before, after, old, new)
+        outcome = WORSE if answered[1] < answered[0] - LEAST_ANSWERS else _judge(new - old, stddev)
+    return Change(name=name, before=old, after=new, stddev=stddev, answered=answered, outcome=outcome)
 
 
 def _error(case: Mapping[str, Any] | None) -> float:

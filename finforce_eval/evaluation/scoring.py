@@ -196,8 +196,8 @@ def score_case(cases: Sequence[ForceSeries], span: float) -> CaseScore:
         cycles={phase: _cycle_stats(cases, phase, span) for phase in PHASES},
         mean_rmse_N=_spread([compute_stats(case.error[case.counted], span).rmse_N for case in cases])["mean"],
         contact_ms=_times(case.column("contact_ms") for case in cases),
-        place=distances([given_distance(case) for case in cases]),
-        solved_place=distances([solved_distance(case) for case in cases]),
+        place=distances([loaded_distance(case, case.column("contact_height")) for case in cases]),
+        solved_place=distances([loaded_distance(case, case.column("contact_location")[:, 2]) for case in cases]),
         onset=onset_stats(cases),
         delay=delay_stats([force_delays(case.stamps, case.true_magnitude, case.magnitude, case.lag) for case in cases]),
         sight=detection_stats([case.table for case in cases]),
@@ -350,12 +350,7 @@ def _share(chosen: NDArray[np.bool_]) -> float | None:
 
 
 def match_truth(truth: WrenchTrack, stamps: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the true force at the given stamps (n, 3) [N], matched as by `match_samples`.
-
-    Args:
-        truth: measured wrenches.
-        stamps: (n,) image times [ns].
-    """
+    """Return the true force (n, 3) [N] at image times (n,) [ns], matched as by `match_samples`."""
     return match_samples(truth.stamps_ns, truth.force, stamps)
 
 
@@ -396,18 +391,8 @@ def distances(parts: Sequence[NDArray[np.float64]]) -> Numbers:
     return {"n": count, **_percentiles(parts, 1e3, median_mm=50, p95_mm=95, max_mm=100)}
 
 
-def given_distance(result: ForceSeries) -> NDArray[np.float64]:
-    """Return how far from the pressure centre the contact was that each loaded image was solved with (n,) [m]."""
-    return _loaded_distance(result, result.column("contact_height"))
-
-
-def solved_distance(result: ForceSeries) -> NDArray[np.float64]:
-    """Return how far from the pressure centre the estimator's own location was on each loaded image (n,) [m]."""
-    return _loaded_distance(result, result.column("contact_location")[:, 2])
-
-
-def _loaded_distance(result: ForceSeries, heights: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the distance of heights (n,) from the truth, NaN where it is unknown or hardly anything presses."""
+def loaded_distance(result: ForceSeries, heights: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return how far heights (n,) [m] are from the pressure centre, NaN where it is unknown or little presses."""
     return np.where(result.true_magnitude > LEAST_FORCE, np.abs(heights - result.column("true_height")), np.nan)
 
 

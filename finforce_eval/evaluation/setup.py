@@ -118,15 +118,8 @@ def make_setup(options: argparse.Namespace) -> EvaluationSetup:
         "images": "each by itself" if stills else "those that the live chain answers" if as_live else "all",
         "version": version(),
     }
-    return EvaluationSetup(
-        jaw=jaw,
-        settings=settings,
-        calibration=calibration,
-        contacts=contacts,
-        about=about,
-        as_live=as_live,
-        stills=stills,
-    )
+    given = {"contacts": contacts, "about": about, "as_live": as_live, "stills": stills}
+    return EvaluationSetup(jaw=jaw, settings=settings, calibration=calibration, **given)
 
 
 @cache
@@ -215,19 +208,13 @@ def print_notes(name: str, notes: Iterable[str]) -> None:
         print(f"note: {name}: {note}", file=sys.stderr)
 
 
-def read_keypoints(options: argparse.Namespace, sides: Sequence[str] = ()) -> list[Recording]:
+def read_keypoints(options: argparse.Namespace) -> list[Recording]:
     """Read the recordings with the key points that were asked for.
-
-    Args:
-        options: of the command line.
-        sides: jaws that are in the images; those that the options name without.
 
     Raises:
         FinforceError: one of them cannot be read, or has no such key points.
     """
     source, recordings = parse_source(options), []
-    if sides:
-        source = replace(source, sides=tuple(sides))
     for read in read_recordings(options.bags, source):
         recording = source.apply(read)
         print_notes(recording.name, recording.notes[len(read.notes) :])

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-
 from finforce.errors import MissingDependencyError
 from finforce_eval.table import ForceSeries
 
@@ -37,28 +35,18 @@ def style_axes(axes: Any) -> None:
     axes.set_axisbelow(True)
 
 
-def draw_unity(results: Sequence[ForceSeries]) -> Figure:
-    """Draw estimate against truth, one panel per case, loading and unloading apart."""
-    columns = min(len(results), 3)
-    rows = -(-len(results) // columns)
-    figure = new_figure(3.4 * columns + 0.8, 3.4 * rows + 0.6)
-    panels = figure.subplots(rows, columns, squeeze=False).ravel()
-    for axes, result in zip(panels, results, strict=False):
-        style_axes(axes)
-        counted = np.r_[result.true_magnitude[result.counted], result.magnitude[result.counted]]
-        limit = 1.06 * float(counted.max(initial=0.1))
-        axes.plot([0, limit], [0, limit], color=GREY, linewidth=1.0, dashes=(4, 2))
+def draw_errors(results: Sequence[ForceSeries]) -> Figure:
+    """Draw error against true force, all cases in one panel, loading and unloading apart."""
+    figure = new_figure(8.0, 3.6)
+    axes = figure.subplots()
+    style_axes(axes)
+    axes.axhline(0.0, color=BLACK, linewidth=0.9)
+    for result in results:
         for direction, colour in [*COLOURS.items(), ("", BLUE)]:
             chosen = result.counted & (result.column("direction") == direction)
             style = {"color": colour, "alpha": 0.35, "markersize": 3, "markeredgewidth": 0}
-            axes.plot(result.true_magnitude[chosen], result.magnitude[chosen], "o", **style)
-        axes.set(xlim=(0, limit), ylim=(0, limit), aspect="equal")
-        axes.locator_params(nbins=6)
-        axes.set_title(result.name, fontsize=10)
-    for axes in panels[len(results) :]:
-        axes.set_visible(False)
-    figure.supxlabel("true force [N]", fontsize=10)
-    figure.supylabel("estimated force [N]", fontsize=10)
+            axes.plot(result.true_magnitude[chosen], result.error[chosen], "o", **style)
+    axes.set(xlabel="true force [N]", ylabel="error of the force [N]")
     if any((result.column("direction") != "").any() for result in results):
         patches = [Patch(color=colour, label=LABELS[key]) for key, colour in COLOURS.items()]
         figure.legend(handles=patches, loc="outside upper right", ncols=2, frameon=False, fontsize=9)

@@ -22,27 +22,24 @@ TITLE, PAGE = "Force from key points", "report.html"
 def write_overview(
     evaluation: Evaluation, folder: str | Path, *, about: Mapping[str, str], headline: str = "", picture: str = ""
 ) -> Path:
-    """Write the page of a report, with the picture of all cases together.
+    """Write the page of a report with a picture of all errors, and return it; see `write_html`.
 
     Args:
         evaluation: scores and time series.
-        folder: of the report; made when missing.
-        about: settings of the run: solver, jaw, contact, ...
-        headline: its first sentence; the mean RMSE of the cases without.
+        folder: folder of the report, made if missing.
+        about: settings of the run, by name.
+        headline: first sentence; by default, the mean RMSE of the cases.
         picture: PNG file in the folder that stands on top; empty for none.
-
-    Returns:
-        The page.
 
     Raises:
         MissingDependencyError: matplotlib is not installed.
     """
-    from finforce_eval.figures.figures import draw_unity
+    from finforce_eval.figures.figures import draw_errors
 
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    draw_unity(list(evaluation.results.values())).savefig(folder / "unity.png")
-    pictures = [folder / name for name in (picture, "unity.png") if name]
+    draw_errors(list(evaluation.results.values())).savefig(folder / "errors.png")
+    pictures = [folder / name for name in (picture, "errors.png") if name]
     return write_page(evaluation, folder / PAGE, about=about, title=TITLE, headline=headline, pictures=pictures)
 
 
@@ -55,19 +52,7 @@ def write_page(
     headline: str = "",
     pictures: Sequence[Path] = (),
 ) -> Path:
-    """Write one HTML page with the scores and plots that zoom; it needs no other file.
-
-    Args:
-        evaluation: scores and time series.
-        path: of the page.
-        about: settings of the run: solver, jaw, contact, ...
-        title: heading of the page.
-        headline: its first sentence; the mean RMSE of the cases without.
-        pictures: PNG files.
-
-    Raises:
-        OSError: it cannot be written.
-    """
+    """Write the scores of an evaluation, and its series, as one page; see `write_html`."""
     table, results = score_table(evaluation), list(evaluation.results.values())
     columns = ["case", *(" ".join(filter(None, names)) for names in table.columns)]
     rows = [[name, *row] for name, row in zip(table.index, table.to_numpy().tolist(), strict=True)]
@@ -93,7 +78,7 @@ def write_html(
     headline: str = "",
     pictures: Sequence[Path] = (),
 ) -> Path:
-    """Write the page.
+    """Write the page and return its path.
 
     Args:
         series: one plot each.
@@ -104,9 +89,6 @@ def write_html(
         rows: of the table: one for each series, in their order, and any after them; without one, images and answers.
         headline: its first sentence; errors, forces and answers of the series without.
         pictures: PNG files.
-
-    Returns:
-        The page.
 
     Raises:
         OSError: it cannot be written.

@@ -68,19 +68,19 @@ def read_recording(
 ) -> Recording:
     """Read a bag with its `case.json`, an episode of a dataset or of a buffer of UMI, a video, or pictures.
 
-    Topics that are not ours are not decoded; those of unknown type are named in `notes`. Images are not read yet; a
-    recording with images may do without key points, its tracks of them are empty then. One that is damaged is read as
-    far as it is good; how much was lost stands in `notes`.
+    Unknown topics are not decoded; `notes` name those of unexpected type. Images are read later. A recording with
+    images may lack key points; its tracks of them are then empty. A damaged recording is read as far as it is intact,
+    and `notes` state how much was lost.
 
     Args:
         path: rosbag2 folder, .mcap, .db3, folder of a dataset or of pictures, .zarr, .zarr.zip, or video.
         choice: images to read.
-        sides: jaws that are in the images, whether or not a topic tells of them; both where none tells of any.
-        strict: refuse a recording that is damaged.
+        sides: jaws in the images, whether or not a topic names them; both if no topic names any.
+        strict: True to reject a damaged recording.
 
     Raises:
-        RecordingError: nothing there, nothing in it that is whole, out of bounds, empty, without key points and images,
-            or with malformed content.
+        RecordingError: the recording is missing, empty, malformed or out of bounds, or holds neither key points nor
+            images.
     """
     choice = choice or ImageChoice()
     if is_dataset(Path(path)):

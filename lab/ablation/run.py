@@ -35,7 +35,6 @@ from lab.harness import Figures
 from lab.stress.session import FORCE_ERROR, Bench
 from lab.stress.stress import Plan
 
-AS_IT_IS = "as it is"
 SIGMAS = 3.0
 # What counts as moved: forces [N], shares [%].
 MOVED_FORCE, MOVED_SHARE = 0.01, 1.0

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from test_scoring import make_result
 
-from finforce_eval.evaluation.scoring import distances, given_distance, onset_delays, onset_stats, solved_distance
+from finforce_eval.evaluation.scoring import distances, loaded_distance, onset_delays, onset_stats
 
 
 def contact_result(truth, *, touching=None, given=None, place=None, cycle=None, pressure=0.040):
@@ -23,6 +23,14 @@ def contact_result(truth, *, touching=None, given=None, place=None, cycle=None, 
         contact_location=places,
         cycle=cycles,
     )
+
+
+def given_distance(result):
+    return loaded_distance(result, result.column("contact_height"))
+
+
+def solved_distance(result):
+    return loaded_distance(result, result.column("contact_location")[:, 2])
 
 
 def test_places_are_compared_where_something_presses():

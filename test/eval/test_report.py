@@ -38,7 +38,7 @@ def test_the_page_shows_the_picture_of_all_cases(tmp_path):
     evaluation = score_results(results, recordings)
     folder = tmp_path / "new" / "report"
     page = write_overview(evaluation, folder, about={"solver": "fake"})
-    picture = folder / "unity.png"
+    picture = folder / "errors.png"
     assert shown_in(page) == picture.read_bytes() and drawn_hues(picture)
     assert '"solver": "fake"' in page.read_text()
 
@@ -46,7 +46,7 @@ def test_the_page_shows_the_picture_of_all_cases(tmp_path):
 def test_an_exact_estimate_still_draws_and_html_in_the_name_of_a_recording_stays_text(tmp_path):
     result, recording = evaluate("<img src=x onerror=alert(1)>", gain=1.0)
     page = write_overview(score_results([result], [recording]), tmp_path, about={})
-    assert drawn_hues(tmp_path / "unity.png")
+    assert drawn_hues(tmp_path / "errors.png")
     assert "<img src=x" not in page.read_text() and "u003cimg src=x" in page.read_text()
 
 

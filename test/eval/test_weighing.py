@@ -81,7 +81,7 @@ READ = [1e3 * 1.1 * force / GRAVITY for force in [0.4, *RISING, 0.9]]
     ("grams", "hint"),
     [
         (READ[:6], "reading 2 fits hold 1: does reading 1 belong to a hold that was not found"),
-        (READ[2:], "reading 1 fits hold 2: is a hold without a reading"),
+        (READ[2:], "reading 1 fits hold 2: does a hold lack a reading"),
         (READ[1:6] + [10 * READ[6]], r"left over, expected at most 15 %; holds found: 0.0-4.0 s \(0.80 N\)"),
     ],
 )
