@@ -7,12 +7,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_closing, binary_erosion, distance_transform_edt, gaussian_filter, label, median_filter
+from scipy.spatial import ConvexHull
 
 from finforce.camera import compute_rays
 from finforce_contact.errors import ReconstructionError
 from finforce_contact.mesh.object_mesh import ObjectMesh, prepare_object_mesh
 from finforce_contact.mesh.views import MeshView
 from finforce_contact.reconstruction.evidence import (
+    DEPTH_UNITS,
     EDGE_BAND,
     HIDING_STEP,
     GeneratedMesh,
@@ -173,6 +175,7 @@ def _join_sheets(grid: _DepthGrid, back: NDArray) -> tuple[NDArray, NDArray]:
 
 METHODS = ("robust", "paper", "primitive", "completion")
 FROM_GENERATED = ("robust", "paper")
+WIDEST = 0.15  # [m], least width of an object that parallel grippers grasp
 PRIMITIVE_MISFIT = 2e-3  # [m] above which an object is no primitive: true ones reach 0.7 to 1.6 mm, others 2.7 and more
 # generators get proportions wrong by some per cent; what the image does not show keeps them
 STRETCHABLE = SearchFreedom(late=ScaleFreedom(basis=np.eye(3), stiffness=0.03))
@@ -207,10 +210,24 @@ def reconstruct(
     if method in FROM_GENERATED and generated is None:
         raise ReconstructionError(f"method '{method}' needs a generated mesh; without one use primitive or completion")
     if method not in FROM_GENERATED:
-        return _reconstruct_alone(evidence, method, report)
-    mesh, affine = prepare_generated(generated, evidence)
-    report("mesh prepared", 1.0)
-    return (_fit_robustly if method == "robust" else _fit_as_paper)(mesh, affine, evidence, report)
+        found = _reconstruct_alone(evidence, method, report)
+    else:
+        mesh, affine = prepare_generated(generated, evidence)
+        report("mesh prepared", 1.0)
+        found = (_fit_robustly if method == "robust" else _fit_as_paper)(mesh, affine, evidence, report)
+    if (thinnest := measure_width(found.mesh)) > WIDEST:
+        raise ReconstructionError(
+            f"the object is {1e3 * thinnest:.0f} mm wide at its narrowest; expected at most {1e3 * WIDEST:.0f} mm, which "
+            f"jaws can grasp: {DEPTH_UNITS}"
+        )
+    return found
+
+
+def measure_width(mesh: ObjectMesh) -> float:
+    """Return the least distance of two parallel planes that a mesh fits between, one of them on a facet [m]."""
+    hull = ConvexHull(mesh.vertices)
+    corners = mesh.vertices[hull.vertices]
+    return float(min((-(corners @ plane[:3]) - plane[3]).max() for plane in hull.equations))
 
 
 def _reconstruct_alone(evidence: ImageEvidence, method: str, report: Report) -> Reconstruction:
