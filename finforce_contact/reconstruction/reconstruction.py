@@ -38,6 +38,9 @@ GRID_POINTS = 4000
 DEPTH_SMOOTHING = 2.0  # [px] standard deviation
 PIT = 2  # [px] half width of the pits in the object's region that are filled
 TAPER = 0.995  # of the back's breadth against the front's, so that the walls are not exactly along the rays
+# [-], 1-sigma of the thickness of a completed object: as a whole within 3 % for a mug and a bottle, 8 to 35 % too thin for a
+# leaning block with a shoulder, in three rendered views each.
+UNSEEN_ERROR = 0.2
 LEAST_THICKNESS = 0.02  # of the lateral extent
 
 
@@ -72,7 +75,12 @@ def complete_surface(evidence: ImageEvidence, shape: Reconstruction, report: Rep
     vertices, triangles = _join_sheets(grid, back)
     centre = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
     mesh = prepare_object_mesh(vertices - centre, triangles, name="completed object")
-    mesh = replace(mesh, notes=(*mesh.notes, "The back was not seen and is that of the likeliest simple shape."))
+    thickness = float(np.median(back[grid.region] - grid.front[grid.region]))
+    note = (
+        "The back was not seen and is that of the likeliest simple shape: "
+        f"{1e3 * thickness:.0f} ± {1e3 * UNSEEN_ERROR * thickness:.0f} mm behind the front."
+    )
+    mesh = replace(mesh, notes=(*mesh.notes, note), unseen_stddev=0.5 * UNSEEN_ERROR * thickness)
     report("closed", 1.0)
     T = np.eye(4)
     T[:3, 3] = centre
