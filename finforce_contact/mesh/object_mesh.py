@@ -112,10 +112,8 @@ def _read_unseen(path: Path) -> float:
     Raises:
         ObjectMeshError: the file is damaged, or states no length.
     """
-    if not path.is_file():
-        return 0.0
     try:
-        content = read_json(path)
+        content = read_json(path) if path.is_file() else None
         stated = float(content.get("unseen_stddev_m", 0.0)) if isinstance(content, dict) else 0.0
     except (FileError, TypeError, ValueError) as error:
         raise ObjectMeshError(f"{path.name}: {error}; expected what finforce reconstruct writes, or no file") from error

@@ -153,22 +153,17 @@ def try_rig(rig: Rig, recording: Recording, source: KeypointSource, count: int) 
         FinforceError: the detector cannot be built, or an image is damaged.
     """
     source = replace(source, jaw_file=rig.jaw, parameters={**source.parameters, **rig.detector_parameters()})
-    parameters = build_records(source.node_parameters(recording)).parameters
-    images = choose_images(recording, parameters.depth)
-    stamps = images.stamps_ns[: min(count, len(images))]
-    stamps = stamps[np.unique(np.linspace(0, len(stamps) - 1, TRIED).round().astype(int))]
-    recording = replace(recording, images=replace(images, depth_scale=parameters.depth_scale).at(stamps))
+    images = choose_images(recording, build_records(source.node_parameters(recording)).parameters.depth)
+    recording = replace(recording, images=images.at(spread(images.stamps_ns[:count], TRIED)))
     try:
-        with progress_bar(len(stamps), "image") as bar:
+        with progress_bar(len(recording.images), "image") as bar:
             found = detect_keypoints(recording, source.build(recording), stills=True, progress=bar.update)
     except UnseenError as error:
         return [f"with this rig the detector finds no jaw in these pictures: {error}"]
     seen = {side: track.detection.accepted.sum(axis=1) >= LEAST_SEEN for side, track in found.jaws.items()}
-    return [
-        f"with this rig the detector finds the {side} jaw in {images.sum()} of {len(images)} of these pictures"
-        for side, images in seen.items()
-        if images.mean() < OFTEN
-    ]
+    few = {side: images for side, images in seen.items() if images.mean() < OFTEN}
+    words = "with this rig the detector finds the {} jaw in {} of {} of these pictures"
+    return [words.format(side, images.sum(), len(images)) for side, images in few.items()]
 
 
 def choose_pictures(recording: Recording, count: int) -> list[NDArray]:
@@ -181,9 +176,12 @@ def choose_pictures(recording: Recording, count: int) -> list[NDArray]:
     images = choose_images(recording, NO_DEPTH) if recording.images is not None else []
     if not len(images):
         raise OptionError(f"{recording.name}: no images; expected pictures of jaws that are open and unloaded")
-    first = images.stamps_ns[: min(count, len(images))]
-    chosen = np.unique(np.linspace(0, len(first) - 1, PICTURES).round().astype(int))
-    return [image.color for _, image in images.at(first[chosen])]
+    return [image.color for _, image in images.at(spread(images.stamps_ns[:count], PICTURES))]
+
+
+def spread(stamps: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+    """Return at most `count` of stamps (n,) [ns], evenly chosen."""
+    return stamps[np.unique(np.linspace(0, len(stamps) - 1, count).round().astype(int))]
 
 
 def find_tags(colors: list[NDArray], options: argparse.Namespace) -> list[dict[int, NDArray]]:

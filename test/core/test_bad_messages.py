@@ -127,7 +127,9 @@ def test_memory_of_giant_images_is_released(probe):
     probe.connected(publisher)
     before = memory()
     for _ in range(4):
-        publisher.publish(Image(height=4000, width=4000, encoding="rgb8", step=12_000, data=array("B", bytes(48_000_000))))
+        publisher.publish(
+            Image(height=4000, width=4000, encoding="rgb8", step=12_000, data=array("B", bytes(48_000_000)))
+        )
         probe.spin(0.3)
     probe.wait_for(lambda: memory() - before < 40e6)
 
