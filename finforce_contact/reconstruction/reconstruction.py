@@ -38,8 +38,8 @@ GRID_POINTS = 4000
 DEPTH_SMOOTHING = 2.0  # [px] standard deviation
 PIT = 2  # [px] half width of the pits in the object's region that are filled
 TAPER = 0.995  # of the back's breadth against the front's, so that the walls are not exactly along the rays
-# [-], 1-sigma of the thickness of a completed object: as a whole within 3 % for a mug and a bottle, 8 to 35 % too thin for a
-# leaning block with a shoulder, in three rendered views each.
+# [-], 1-sigma of the thickness of a completed object: as a whole within 3 % for a mug and a bottle, 8 to 35 % too thin
+# for a leaning block with a shoulder, in three rendered views each.
 UNSEEN_ERROR = 0.2
 LEAST_THICKNESS = 0.02  # of the lateral extent
 
@@ -225,7 +225,7 @@ def reconstruct(
         found = (_fit_robustly if method == "robust" else _fit_as_paper)(mesh, affine, evidence, report)
     if (thinnest := measure_width(found.mesh)) > WIDEST:
         raise ReconstructionError(
-            f"the object is {1e3 * thinnest:.0f} mm wide at its narrowest; expected at most {1e3 * WIDEST:.0f} mm, which "
+            f"the object is {1e3 * thinnest:.0f} mm wide at its narrowest; expected at most {1e3 * WIDEST:.0f} mm, as "
             f"jaws can grasp: {DEPTH_UNITS}"
         )
     return found

@@ -190,9 +190,8 @@ def read_evaluations(paths: Iterable[Path]) -> tuple[Evaluation, dict[str, Any]]
     """
     tables = [read_table(path) for path in paths]
     try:
-        ranges = [
-            (float(low), float(high)) for _, about in tables for low, high in [about["true_range_N"] or (0.0, 0.0)]
-        ]
+        found = [about["true_range_N"] for _, about in tables]
+        ranges = [(float(low), float(high)) for low, high in filter(None, found)]
         first = dict(tables[0][1]["about"])
     except (KeyError, TypeError, ValueError) as error:
         raise RecordingError(f"a table says nothing of its run: {error!r}; expected those of evaluate --out") from error
