@@ -130,7 +130,9 @@ def test_a_pose_of_the_image_itself_is_used_with_it_whatever_the_date():
 @pytest.mark.parametrize(("words", "compared"), [([], 1), (["--no-compare-mesh"], 0)])
 def test_the_mesh_is_compared_with_the_images_unless_that_is_switched_off(words, compared, monkeypatch):
     calls = []
-    monkeypatch.setattr(contact_source, "build_estimator", lambda *arguments: FakeContactEstimator())
+    estimator = FakeContactEstimator()
+    estimator.mesh = None
+    monkeypatch.setattr(contact_source, "build_estimator", lambda *arguments: estimator)
     monkeypatch.setattr(contact_source, "check_mesh", lambda *arguments: calls.append(arguments))
     choice = read_contacts(parse(["evaluate", "bag", "--contact", "estimate", *words]))
     build_source(choice, make_recording(), FakeJaw())
