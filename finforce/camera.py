@@ -323,6 +323,7 @@ _SENT = ("JPEG", "PNG")  # formats of a compressed image
 LARGEST_PICTURE = 50_000_000  # px, of a picture that is unpacked: no camera here makes more
 
 
+PACKET = (b"\0\0\0\1", b"\0\0\1")  # how the packets of H.264 and H.265 begin
 HEIC = (b"ftypheic", b"ftypheix", b"ftyphevc", b"ftypmif1", b"ftypmsf1")  # how files of phones begin, from byte 4 on
 
 
@@ -336,6 +337,11 @@ def open_picture(data: bytes, what: str, formats: tuple[str, ...] | None = _SENT
 
     if data[4:12] in HEIC:
         raise ImageError(f"{what}: an HEIC picture; expected JPEG or PNG: export it as one of these")
+    if data.startswith(PACKET):
+        raise ImageError(
+            f"{what}: a packet of a video (H.264 or H.265), no picture by itself; expected JPEG or PNG: record raw or "
+            "compressed images, or unpack the packets to a video file"
+        )
     expected = f"at most {LARGEST_PICTURE} pixels"
     try:
         picture = Image.open(io.BytesIO(data), formats=formats)

@@ -234,10 +234,11 @@ class ContactEstimator:
 
     def _outline(self, pose: FilteredPose, section: ObjectSection) -> ObjectOutline:
         """Return the outline for the solver, with the errors of the pose that no average removes."""
-        bias = np.array([self.settings.pose_bias, self.settings.pose_bias, self.settings.rotation_bias])
+        shift = float(np.hypot(self.settings.pose_bias, self.mesh.unseen_stddev))
+        bias = np.array([shift, shift, self.settings.rotation_bias])
         stddev = np.hypot(pose.stddev[[0, 2, 4]], bias)
         middle, spread = section.across
-        across = np.array([middle, float(np.sqrt(spread**2 + pose.stddev[1] ** 2 + self.settings.pose_bias**2))])
+        across = np.array([middle, float(np.sqrt(spread**2 + pose.stddev[1] ** 2 + shift**2))])
         return ObjectOutline(
             polygons=section.polygons, origin=section.origin, tilt=section.tilt, stddev=stddev, across=across
         )

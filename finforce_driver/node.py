@@ -180,7 +180,7 @@ class GripperDriverNode(Node):
         self._subscribe()
         self.forget = self.gripper.listen(self._take_state)
         self.gripper.start()
-        self.get_logger().info(f"gripper on {parameters.port} ({parameters.interface}), ready")
+        self.get_logger().info(f"node started, gripper on {parameters.port} ({parameters.interface})")
 
     def _serve(self) -> None:
         """Offer services, whose waiting holds up nothing else, and diagnostics."""

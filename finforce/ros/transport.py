@@ -11,6 +11,7 @@ from finforce.camera_topics import ENDS
 
 TRANSPORT = Path(__file__).with_name("fastdds.xml")
 PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"
+FROM_FILE = "RMW_FASTRTPS_USE_QOS_FROM_XML"  # by which rmw_fastrtps takes how memory is kept from the file, too
 CHOICES = (PROFILES, "FASTDDS_DEFAULT_PROFILES_FILE", "FASTDDS_BUILTIN_TRANSPORTS")
 DOMAINS = range(1, 100)
 RECEIVE_BUFFER = 2147483647  # bytes, net.core.rmem_max as the DDS tuning page of the ROS 2 documentation sets it
@@ -20,6 +21,7 @@ def provide_transport() -> None:
     """Have Fast DDS carry images, which its default loses, unless somebody has chosen how it works already."""
     if TRANSPORT.is_file() and not any(os.environ.get(name) for name in CHOICES):
         os.environ[PROFILES] = str(TRANSPORT)
+        os.environ.setdefault(FROM_FILE, "1")
 
 
 def remedy_for_losses(topic: str, is_here: bool) -> str:

@@ -28,6 +28,8 @@ def parameters_of(file: str, node: str) -> Mapping[str, Any]:
 def check_sections(file: str, namespace: str, names: Iterable[str]) -> None:
     """Refuse a file with a section that ROS would ignore, as no node of a system has its name.
 
+    Sections of nodes in other namespaces, those of other robots, may stand beside sections of nodes in this one.
+
     Args:
         file: with the parameters.
         namespace: of the nodes.
@@ -37,9 +39,11 @@ def check_sections(file: str, namespace: str, names: Iterable[str]) -> None:
         ValueError: there is one, or the file cannot be read, or is none of parameters.
     """
     names, space = list(names), f"/{namespace.strip('/')}".rstrip("/")
-    for key, _ in _read_sections(file):
-        if not any(_is_for(key, f"{space}/{name}") for name in names):
-            name = key.rpartition("/")[2]
+    ends = {key: key.rpartition("/")[2] for key, _ in _read_sections(file)}
+    has_own = any(name in names and _is_for(key, f"{space}/{name}") for key, name in ends.items())
+    for key, name in ends.items():
+        is_elsewhere = has_own and name in names and "/" in key.lstrip("/")
+        if not is_elsewhere and not any(_is_for(key, f"{space}/{each}") for each in names):
             right = f"write /**/{name}" if name in names else suggest(name, names)
             where = f"in the namespace {space}" if space else "without a namespace"
             raise ValueError(f"{file}: '{key}' is no node of this system {where}, and would be ignored; {right}")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from finforce.files import FileError
+from finforce.files import FileError, read_json
 from finforce.optional import import_manifold3d, import_open3d
 from finforce.surfaces import read_surface
 from finforce.triangle_surface import Surface, solid_from_triangles, triangles_of_solid
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "inch": 0.0254}
 FORMATS = (".stl", ".obj", ".ply", ".off", ".glb", ".3mf", ".step", ".stp")
+POSE_ENDING = ".pose.json"  # of the file beside a reconstructed mesh
 SMALLEST = 0.005  # [m], least largest extent of an object
 LARGEST = 0.6  # [m], largest extent of an object that a gripper of 50 mm stroke holds by some part
 THINNEST = 1e-4  # [m], a mesh that is thinner is a sheet, and has no inside
@@ -45,10 +46,12 @@ class ObjectMesh(Surface):
     Attributes:
         watertight: the triangles bound solids without a gap.
         name: name of the object in messages.
+        unseen_stddev: standard deviation of the middle's position, of an object of which one side was seen [m].
     """
 
     watertight: bool
     name: str
+    unseen_stddev: float = 0.0
 
 
 def to_manifold(mesh: ObjectMesh) -> Manifold | None:
@@ -99,7 +102,24 @@ def load_object_mesh(path: Path | str | ObjectMesh, *, unit: str = "m", triangle
     path = Path(path)
     if unit not in UNITS:
         raise ObjectMeshError(f"{path.name}: got unit {unit!r}, expected one of {', '.join(UNITS)}")
-    return prepare_object_mesh(*read_triangles(path), name=path.name, unit=unit, triangle_limit=triangle_limit)
+    mesh = prepare_object_mesh(*read_triangles(path), name=path.name, unit=unit, triangle_limit=triangle_limit)
+    return replace(mesh, unseen_stddev=_read_unseen(path.with_suffix(POSE_ENDING)))
+
+
+def _read_unseen(path: Path) -> float:
+    """Return the deviation that a reconstruction states beside its mesh [m]; 0 where it states none.
+
+    Raises:
+        ObjectMeshError: the file is damaged, or states no length.
+    """
+    try:
+        content = read_json(path) if path.is_file() else None
+        stated = float(content.get("unseen_stddev_m", 0.0)) if isinstance(content, dict) else 0.0
+    except (FileError, TypeError, ValueError) as error:
+        raise ObjectMeshError(f"{path.name}: {error}; expected what finforce reconstruct writes, or no file") from error
+    if not 0.0 <= stated <= LARGEST:
+        raise ObjectMeshError(f"{path.name}: unseen_stddev_m is {stated:g}; expected 0 to {LARGEST:g}")
+    return stated
 
 
 def read_triangles(path: Path | str) -> tuple[NDArray, NDArray]:

@@ -21,6 +21,10 @@ ROUGHNESS = 6e-3  # [m] of depth within a window, above which it holds a step
 STEEPEST = 3.0  # tangent of the angle between ray and normal up to which a slope is no step
 LEAST_POINTS = 50
 FARTHEST_OBJECT = 0.6  # [m], of an object in reach of jaws that the camera sees, too
+DEPTH_UNITS = (
+    "does a step of its depth mean so much? TUM's is 0.2 mm (--depth-scale 0.0002), that of many BOP sets 0.1 mm; are "
+    "mask and intrinsics of this image?"
+)
 POINT_COUNT = 2000
 OCCLUSION_STEP = 6e-3  # [m] by which what lies beyond the outline is nearer when it hides the object
 OUTSIDE_REACH = 4  # [px] beyond the outline where that is looked for
@@ -74,8 +78,7 @@ def collect_evidence(depth: NDArray, mask: NDArray, camera: CameraIntrinsics) ->
     if away > FARTHEST_OBJECT or across > LARGEST:
         raise ReconstructionError(
             f"the object is {away:.2f} m away and {across:.2f} m across; expected at most {FARTHEST_OBJECT:g} m and "
-            f"{LARGEST:g} m: does a step of its depth mean so much? TUM's is 0.2 mm (--depth-scale 0.0002), that of "
-            "many BOP sets 0.1 mm; are mask and intrinsics of this image?"
+            f"{LARGEST:g} m: {DEPTH_UNITS}"
         )
     inside, outside = distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1], distance_transform_edt(~mask)
     distance = np.where(mask, 0.5 - inside, outside - 0.5)

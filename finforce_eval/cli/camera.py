@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,9 +14,16 @@ from finforce.camera import CameraIntrinsics, project
 from finforce.gripper_frames import SIDES, read_extrinsics
 from finforce.transforms import pose_numbers
 from finforce_eval.cli.parser import BAG_HELP, CommandResult, add_rest_options, length_mm
-from finforce_eval.errors import OptionError
+from finforce_eval.errors import OptionError, UnseenError
+from finforce_eval.evaluation.at_rest import OFTEN
 from finforce_eval.evaluation.check import FITTED, SEEN, draw_jaw, draw_points
-from finforce_eval.evaluation.keypoint_source import choose_images, parse_source
+from finforce_eval.evaluation.keypoint_source import (
+    KeypointSource,
+    build_records,
+    choose_images,
+    detect_keypoints,
+    parse_source,
+)
 from finforce_eval.evaluation.setup import read_recordings
 from finforce_eval.recordings.tracks import Recording
 from finforce_eval.tasks import progress_bar
@@ -27,6 +35,7 @@ from finforce_keypoints.networks.side_network import SideNetwork
 from finforce_keypoints.parameters import NO_DEPTH
 from finforce_keypoints.placement import (
     KEPT,
+    LEAST_SEEN,
     POLISHED,
     ROUNDS,
     STARTS,
@@ -40,6 +49,7 @@ from finforce_keypoints.rig import Rig, RigCamera, describe_mount, write_rig
 from finforce_keypoints.tags import FAMILIES, TagFinder, find_tag
 
 PICTURES = 4  # of the images, which are compared
+TRIED = 10  # of the images, in which the detector has to find the jaws with the rig
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -99,8 +109,9 @@ def run(options: argparse.Namespace) -> CommandResult:
     picture = output.with_suffix(".png")
     import_cv2().imwrite(str(picture), draw_placement(found, colors[0], recording, jaws)[..., ::-1])
     print(describe_placement(found, jaws))
-    doubts = refuse_doubts(found, options, picture)
     rig = build_rig(found, recording, options.jaw, options.tag_family)
+    doubts = describe_ribs(found.ribs) + try_rig(rig, recording, source, options.images)
+    refuse_doubts(doubts, options, picture)
     write_rig(rig, output)
     for doubt in doubts:
         print(f"WARNING: {doubt}")
@@ -116,19 +127,43 @@ def run(options: argparse.Namespace) -> CommandResult:
     )
 
 
-def refuse_doubts(found: CameraPlacement, options: argparse.Namespace, picture: Path) -> list[str]:
-    """Return in words what speaks against a placement that is to be written all the same.
+def refuse_doubts(doubts: Sequence[str], options: argparse.Namespace, picture: Path) -> None:
+    """Refuse a placement that something speaks against, unless the options force it.
 
     Raises:
-        GeometryError: something does, and the options do not force it.
+        GeometryError: something does.
     """
-    doubts = describe_ribs(found.ribs)
     if doubts and not options.force:
         raise GeometryError(
             f"{'; '.join(doubts)}. No rig is written, see {picture}: give sharper pictures, at several openings, a "
             "better --extrinsics, or --force"
         )
-    return doubts
+
+
+def try_rig(rig: Rig, recording: Recording, source: KeypointSource, count: int) -> list[str]:
+    """Return which jaws the detector does not find with a rig in most of the pictures that it was made from, in words.
+
+    Args:
+        rig: just made.
+        recording: with these pictures.
+        source: the detector's other parameters.
+        count: the first so many images show open, unloaded jaws.
+
+    Raises:
+        FinforceError: the detector cannot be built, or an image is damaged.
+    """
+    source = replace(source, jaw_file=rig.jaw, parameters={**source.parameters, **rig.detector_parameters()})
+    images = choose_images(recording, build_records(source.node_parameters(recording)).parameters.depth)
+    recording = replace(recording, images=images.at(spread(images.stamps_ns[:count], TRIED)))
+    try:
+        with progress_bar(len(recording.images), "image") as bar:
+            found = detect_keypoints(recording, source.build(recording), stills=True, progress=bar.update)
+    except UnseenError as error:
+        return [f"with this rig the detector finds no jaw in these pictures: {error}"]
+    seen = {side: track.detection.accepted.sum(axis=1) >= LEAST_SEEN for side, track in found.jaws.items()}
+    few = {side: images for side, images in seen.items() if images.mean() < OFTEN}
+    words = "with this rig the detector finds the {} jaw in {} of {} of these pictures"
+    return [words.format(side, images.sum(), len(images)) for side, images in few.items()]
 
 
 def choose_pictures(recording: Recording, count: int) -> list[NDArray]:
@@ -141,9 +176,12 @@ def choose_pictures(recording: Recording, count: int) -> list[NDArray]:
     images = choose_images(recording, NO_DEPTH) if recording.images is not None else []
     if not len(images):
         raise OptionError(f"{recording.name}: no images; expected pictures of jaws that are open and unloaded")
-    first = images.stamps_ns[: min(count, len(images))]
-    chosen = np.unique(np.linspace(0, len(first) - 1, PICTURES).round().astype(int))
-    return [image.color for _, image in images.at(first[chosen])]
+    return [image.color for _, image in images.at(spread(images.stamps_ns[:count], PICTURES))]
+
+
+def spread(stamps: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+    """Return at most `count` of stamps (n,) [ns], evenly chosen."""
+    return stamps[np.unique(np.linspace(0, len(stamps) - 1, count).round().astype(int))]
 
 
 def find_tags(colors: list[NDArray], options: argparse.Namespace) -> list[dict[int, NDArray]]:

@@ -80,6 +80,8 @@ def add_run_options(parser: argparse.ArgumentParser, *, calibration: bool = True
     contact.add_argument("--contact", action="append", default=[], metavar="CONTACT", help=CONTACT_HELP)
     contact.add_argument("--object", metavar="MESH", help="mesh file of the object (that of the case.json)")
     contact.add_argument("--object-unit", default="m", choices=UNITS, help="unit of the mesh (m)")
+    text = "compare the mesh with the depth images (compared); off for objects that depth cameras see through"
+    contact.add_argument("--compare-mesh", action=argparse.BooleanOptionalAction, default=True, help=text)
     images = parser.add_argument_group("key points and camera")
     text = "key points: from images, keypoints as recorded, or truth of a simulated recording "
     text += "(keypoints if recorded, else images)"

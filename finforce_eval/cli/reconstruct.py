@@ -17,6 +17,7 @@ from finforce.camera import MILLIMETRE
 from finforce.errors import PoseError
 from finforce.files import read_json
 from finforce.optional import import_trimesh
+from finforce_contact.mesh.object_mesh import POSE_ENDING
 from finforce_contact.mesh.views import MeshView
 from finforce_contact.reconstruction.evidence import GeneratedMesh, ImageEvidence, Reconstruction, collect_evidence
 from finforce_contact.reconstruction.generated import affine_from_generator
@@ -166,7 +167,7 @@ def write_result(result: Reconstruction, output: Path) -> None:
 
 def pose_path(output: Path) -> Path:
     """Return where the pose of a mesh file goes."""
-    return output.with_suffix(".pose.json")
+    return output.with_suffix(POSE_ENDING)
 
 
 def _as_json(result: Reconstruction) -> dict[str, Any]:
@@ -179,6 +180,7 @@ def _as_json(result: Reconstruction) -> dict[str, Any]:
         "triangles": len(result.mesh.triangles),
         "extent_m": np.ptp(result.mesh.vertices, axis=0).tolist(),
         "score": asdict(result.score),
+        "unseen_stddev_m": result.mesh.unseen_stddev,
         "notes": list(result.mesh.notes),
     }
 

@@ -188,8 +188,13 @@ def read_evaluations(paths: Iterable[Path]) -> tuple[Evaluation, dict[str, Any]]
         FinforceError: a file is damaged or another program's, or two have the same name.
     """
     tables = [read_table(path) for path in paths]
-    ranges = [about["true_range_N"] for _, about in tables if about["true_range_N"]]
-    return score_series([each for series, _ in tables for each in series], ranges), tables[0][1]["about"]
+    try:
+        found = [about["true_range_N"] for _, about in tables]
+        ranges = [(float(low), float(high)) for low, high in filter(None, found)]
+        first = dict(tables[0][1]["about"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise RecordingError(f"a table says nothing of its run: {error!r}; expected those of evaluate --out") from error
+    return score_series([each for series, _ in tables for each in series], ranges), first
 
 
 def evaluate_task(name: str, path: str, target: str, options: argparse.Namespace, settings: str) -> dict[str, Any]:

@@ -169,7 +169,8 @@ def build_source(
         return GivenContact(Contact.fixed(jaw, height), f"fixed:{1e3 * height:g}")
     estimator = build_estimator(choice, mode, recording, jaw, mesh)
     track, idling = track_object(recording, jaw.side), Idling() if as_live else None
-    return RecordedContact(estimator, track, mode, idling, check_mesh(recording, estimator.mesh))
+    check = check_mesh(recording, estimator.mesh) if choice.compare_mesh else None
+    return RecordedContact(estimator, track, mode, idling, check)
 
 
 def build_estimator(choice: ContactChoice, mode: str, recording: Recording, jaw: Jaw, mesh: str = "default") -> Any:
@@ -267,6 +268,7 @@ class ContactChoice:
         by_name: recording name -> height [mm], before everything else.
         object_file: mesh for every recording; None takes it from each recording's `case.json`.
         object_unit: unit of the mesh.
+        compare_mesh: whether the mesh is compared with the depth images.
     """
 
     mode: str = AUTOMATIC
@@ -274,6 +276,7 @@ class ContactChoice:
     by_name: Mapping[str, float] = field(default_factory=dict)
     object_file: str | None = None
     object_unit: str = "m"
+    compare_mesh: bool = True
 
     def mode_for(self, recording: Recording, side: str) -> str:
         """Return "estimate", "closest", "paper" or "fixed" for one jaw of a recording."""
@@ -330,13 +333,12 @@ def choose_contact(height: float | None, object_file: str | Path | None) -> Cont
     return ContactChoice(object_file=None if object_file is None else str(object_file))
 
 
-def parse_contacts(texts: Sequence[str], *, object_file: str | None = None, object_unit: str = "m") -> ContactChoice:
+def parse_contacts(texts: Sequence[str], **chosen: Any) -> ContactChoice:
     """Read `--contact` values: an estimator, `fixed:Z_MM`, `fixed:case`, or `NAME=Z_MM`, the last repeatable.
 
     Args:
         texts: the values; of those for every recording the last one counts.
-        object_file: object mesh for every recording.
-        object_unit: its unit.
+        **chosen: other fields of the choice.
 
     Raises:
         OptionError: another value.
@@ -354,7 +356,7 @@ def parse_contacts(texts: Sequence[str], *, object_file: str | None = None, obje
             mode = text
         else:
             raise OptionError(f"--contact {text}: {EXPECTED}")
-    return ContactChoice(mode=mode, height_mm=height, by_name=by_name, object_file=object_file, object_unit=object_unit)
+    return ContactChoice(mode=mode, height_mm=height, by_name=by_name, **chosen)
 
 
 def _height(value: str, text: str) -> float:

@@ -151,7 +151,11 @@ class KeypointSource:
         return build_detector(load_jaws(parameters), parameters, settings, dots, self.as_live, watched)
 
     def _detect(self, recording: Recording) -> Recording:
-        detector, parameters = self.build(recording), build_records(self.node_parameters(recording)).parameters
+        given = self.node_parameters(recording)
+        detector, parameters = self.build(recording), build_records(given).parameters
+        if "T_gripper_camera" not in given:
+            note = "the camera is taken to be on the mount 'robot'; elsewhere give --extrinsics, or --rig"
+            recording = replace(recording, notes=(*recording.notes, note))
         images = choose_images(recording, parameters.depth)
         recording = replace(recording, images=replace(images, depth_scale=parameters.depth_scale))
         with progress_bar(len(recording.images), "image", recording.name) as bar:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from finforce_eval.evaluation.comparison import error_blocks
@@ -32,6 +33,12 @@ _SIGHT = (
     "accepted; visible-: visible points lost; detector: time from image to key points of all jaws. Force: time from "
     "0.02 N of true force to an estimate above 0.1 N, with computation; rise: rise time of the true force."
 )
+
+UNITS_PER_NEWTON = {"gram-force": 101.97, "kilogram-force": 0.10197, "pound-force": 0.22481, "millinewtons": 1000.0}
+UNIT_TOLERANCE = 0.15  # [-], of the ratio of true and estimated forces, by which a unit is told
+IDLE_FORCE, LOADED_FORCE = 0.05, 0.5  # [N], estimates below which nothing presses, and above which much does
+FEWEST = 15  # images by which true forces are doubted
+BIAS = 0.3  # [N], of a sensor at rest, above which it is doubted
 
 
 def build_table(head: Sequence[tuple[str, str]], rows: Sequence[Sequence[str]]) -> pd.DataFrame:
@@ -150,7 +157,24 @@ def summary_lines(evaluation: Evaluation) -> list[str]:
         f"{total.cycles['all']['n']} in all; NRMSD: over the force range {evaluation.span:.2f} N.",
         f"{total.frames} frames, {total.solved} solved, {total.skipped} skipped; in the record phases "
         f"{total.record_frames - total.record_skipped} of {total.record_frames} solved. Step: {times} ms.",
+        *(said for result in evaluation.results.values() if (said := doubt_truth(result))),
     ]
+
+
+def doubt_truth(case: ForceSeries) -> str:
+    """Return what the true forces of a case look like, where that is not newtons of a tared sensor; else ""."""
+    known = case.solved & np.isfinite(case.true_magnitude)
+    found, true = case.magnitude[known], case.true_magnitude[known]
+    idle, loaded = found < IDLE_FORCE, found > LOADED_FORCE
+    at_rest = float(np.median(true[idle])) if idle.sum() >= FEWEST else 0.0
+    if loaded.sum() >= FEWEST:
+        factor = float(np.median((true[loaded] - at_rest) / found[loaded]))
+        unit = min(UNITS_PER_NEWTON, key=lambda name: abs(np.log(max(factor, 1e-9) / UNITS_PER_NEWTON[name])))
+        if abs(factor / UNITS_PER_NEWTON[unit] - 1.0) < UNIT_TOLERANCE:
+            return f"{case.name}: the true forces are {factor:.3g} times the estimated ones: {unit}? expected newtons"
+    if at_rest > BIAS:
+        return f"{case.name}: the true force is {at_rest:.2f} N where no force is estimated: is the sensor tared?"
+    return ""
 
 
 def mean_rmse(evaluation: Evaluation) -> str:

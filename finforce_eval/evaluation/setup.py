@@ -131,8 +131,9 @@ def announce_compilation() -> None:
 
 def read_contacts(options: argparse.Namespace) -> ContactChoice:
     """Return where the contact comes from; raises OptionError where the words of --contact say nothing."""
-    unit = getattr(options, "object_unit", "m")
-    return parse_contacts(options.contact, object_file=getattr(options, "object", None), object_unit=unit)
+    given = {"object_file": "object", "object_unit": "object_unit", "compare_mesh": "compare_mesh"}
+    chosen = {name: getattr(options, option) for name, option in given.items() if hasattr(options, option)}
+    return parse_contacts(options.contact, **chosen)
 
 
 _last: dict[str, EvaluationSetup] = {}

@@ -135,10 +135,16 @@ def _check_times(episode: Episode, fps: float, name: str) -> None:
 
     LeRobot pairs both by time, and forces go by their numbers.
     """
-    if not episode.data.exists() or "timestamp" not in pq.read_schema(episode.data).names:
+    if not episode.data.exists():
         return
-    rows = rows_of(read_parquet(episode.data, ("timestamp", "episode_index")), episode, name)
-    steps = np.diff(rows["timestamp"].to_numpy())
+    rows = read_parquet(episode.data, ("timestamp", "episode_index"))
+    if "timestamp" not in rows.column_names:
+        return
+    times = rows_of(rows, episode, name)["timestamp"]
+    try:
+        steps = np.diff(times.to_numpy().astype(float))
+    except (TypeError, ValueError) as error:
+        raise RecordingError(f"{name}: its column timestamp: {one_line(error)}; expected seconds") from error
     worst = int(np.abs(steps - 1.0 / fps).argmax()) if len(steps) else 0
     if len(steps) and not abs(steps[worst] - 1.0 / fps) < 0.5 / fps:
         raise RecordingError(

@@ -201,7 +201,11 @@ def _for_scores(
         more["ifea_solver"] |= {"estimator.friction": friction.mean, "estimator.friction_stddev": friction.stddev}
     if (mode := _contact_mode(recording, setup.contacts)) != FIXED:
         density = {} if setup.settings.solver == "paper" else {"contact.mesh": setup.settings.mesh}
-        more["contact_estimator"] |= {"contact.mode": mode, **density}
+        more["contact_estimator"] |= {
+            "contact.mode": mode,
+            "compare_mesh": setup.contacts.compare_mesh,
+            **density,
+        }
     if any(each.executable == "keypoint_detector" for each in processes):
         more["keypoint_detector"] |= keypoints.node_parameters(recording)
     return [replace(each, parameters={**each.parameters, **more.get(each.executable, {})}) for each in processes]

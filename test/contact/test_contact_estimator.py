@@ -1,3 +1,4 @@
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -180,6 +181,9 @@ class TestEstimate:
         placed = np.concatenate(outline.placed())
         assert np.linalg.norm(placed - corner[[0, 2]], axis=1).min() < 0.05 * MM
         assert (outline.stddev >= [SETTINGS.pose_bias, SETTINGS.pose_bias, SETTINGS.rotation_bias]).all()
+        estimator.set_object(replace(estimator.mesh, unseen_stddev=0.004))
+        estimator.take_pose(3.0, pose(0.051, 0.041, tilt=tilt))
+        assert (estimator.update(3.0).contact.outline.stddev[:2] >= 0.004).all()
 
     def test_outline_keeps_its_polygons_while_it_need_not_be_cut(self):
         estimator = estimator_of()

@@ -363,3 +363,17 @@ def test_a_glb_of_any_scale_is_not_said_to_be_in_inches(tmp_path):
             load_object_mesh(path)
         assert ('unit="inch"' in str(raised.value)) == expected
         assert ("scale it to the object's size" in str(raised.value)) != expected
+
+
+def test_what_was_not_seen_of_a_reconstructed_object_is_stated_beside_its_mesh(tmp_path):
+    trimesh.creation.box((0.03, 0.04, 0.05)).export(tmp_path / "box.stl")
+    assert load_object_mesh(tmp_path / "box.stl").unseen_stddev == 0.0
+    stated = tmp_path / "box.pose.json"
+    stated.write_text('{"unseen_stddev_m": 0.004}')
+    assert load_object_mesh(tmp_path / "box.stl").unseen_stddev == 0.004
+    stated.write_text("[[1, 0], [0, 1]]")  # another program's
+    assert load_object_mesh(tmp_path / "box.stl").unseen_stddev == 0.0
+    for wrong in ('{"unseen_stddev_m": -1}', '{"unseen_stddev_m": NaN}', '{"unseen_stddev_m": "x"}', "{"):
+        stated.write_text(wrong)
+        with pytest.raises(ObjectMeshError, match="box.pose.json"):
+            load_object_mesh(tmp_path / "box.stl")

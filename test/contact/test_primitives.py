@@ -106,6 +106,8 @@ def test_completion_of_a_cylinder_has_the_back_of_a_cylinder():
     case = make_case("cylinder")
     result = complete_surface(case.evidence, fit_once("cylinder")[0])
     assert result.mesh.watertight
+    assert 0.003 < result.mesh.unseen_stddev < 0.006
+    assert "± " in result.mesh.notes[-1]
     # pixels of 1.2 mm here; the outline is half of one short on each side
     assert distance_mm(case, result.mesh, result.T_camera_object) < 0.8
 

@@ -12,9 +12,10 @@ from finforce.camera import ImageError, compute_rays
 from finforce.errors import PoseError
 from finforce_contact.errors import ReconstructionError
 from finforce_contact.mesh.views import MeshView
-from finforce_contact.reconstruction import generated
+from finforce_contact.reconstruction import generated, reconstruction
 from finforce_contact.reconstruction.evidence import (
     GeneratedMesh,
+    Reconstruction,
     ShapeScore,
     check_agreement,
     collect_evidence,
@@ -26,7 +27,7 @@ from finforce_contact.reconstruction.generated import (
     close_mesh,
     scale_coarsely,
 )
-from finforce_contact.reconstruction.reconstruction import reconstruct
+from finforce_contact.reconstruction.reconstruction import measure_width, reconstruct
 from finforce_contact.reconstruction.shape_search import Placement
 from finforce_sim.objects import build_object
 
@@ -173,6 +174,23 @@ def test_images_with_nothing_in_them_are_refused():
         collect_evidence(np.zeros_like(scene.depth), scene.mask, scene.camera)
     with pytest.raises(ImageError, match="shape"):
         collect_evidence(scene.depth, scene.mask[:-1], scene.camera)
+
+
+def test_the_width_is_that_between_the_nearest_parallel_planes():
+    turn = Rotation.from_rotvec([0.3, -0.8, 0.5]).as_matrix()
+    corners = np.array([(x, y, z) for x in (0.0, 0.3) for y in (0.0, 0.02) for z in (0.0, 0.1)]) @ turn.T
+    assert measure_width(bare_mesh(corners, np.array([[0, 1, 2]]))) == pytest.approx(0.02)
+
+
+def test_an_object_that_no_gripper_grasps_is_refused_with_the_units_of_depth(monkeypatch):
+    case, mesh = make_case("cylinder"), build_object("cylinder")  # 50 mm wide
+    shape = Reconstruction(mesh=mesh, T_camera_object=np.eye(4), scale=np.ones(3), score=None, method="primitive")
+    monkeypatch.setattr(reconstruction, "_reconstruct_alone", lambda *arguments: shape)
+    assert reconstruct(case.evidence) is shape
+    grown = replace(shape, mesh=replace(mesh, vertices=5.0 * mesh.vertices))  # as by steps of 0.2 mm taken for 1 mm
+    monkeypatch.setattr(reconstruction, "_reconstruct_alone", lambda *arguments: grown)
+    with pytest.raises(ReconstructionError, match="250 mm wide at its narrowest; expected at most 150.*--depth-scale"):
+        reconstruct(case.evidence)
 
 
 def test_outline_counts_less_where_something_hides_the_object():

@@ -212,7 +212,7 @@ def stop_when_ready(command, number):
         said = []
         for line in node.stderr:
             said.append(line)
-            if " ready" in line:
+            if " ready" in line or "node started" in line:  # a driver is, whether or not its gripper is there
                 node.send_signal(number)
         guard.cancel()
         return node.wait(10), "".join(said)

@@ -3,6 +3,7 @@
 import os
 import random
 import struct
+from array import array
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -18,6 +19,7 @@ from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from std_msgs.msg import Header
 
 from finforce.health import UNHEARD, Level
+from finforce.ros.topics import STEADY
 
 CAMERA = "/camera/camera"
 TOPICS = {
@@ -117,6 +119,19 @@ def feed(callback, data, kind):
 def memory():
     """Resident memory of this process [bytes]."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
+
+
+def test_memory_of_giant_images_is_released(probe):
+    start_detector(probe, skip_off=[UNHEARD])
+    publisher = probe.create_publisher(Image, f"{CAMERA}/color/image_raw", STEADY)
+    probe.connected(publisher)
+    before = memory()
+    for _ in range(4):
+        publisher.publish(
+            Image(height=4000, width=4000, encoding="rgb8", step=12_000, data=array("B", bytes(48_000_000)))
+        )
+        probe.spin(0.3)
+    probe.wait_for(lambda: memory() - before < 40e6)
 
 
 @pytest.mark.parametrize("sides", ["left"])

@@ -299,6 +299,17 @@ def test_a_section_of_a_parameter_file_that_no_node_would_read_is_refused(tmp_pa
             processes(record(parameter_file=file, namespace=namespace), ROOT)
 
 
+@pytest.mark.parametrize("own", ["/r2/keypoint_detector", "r2/keypoint_detector", "/**/keypoint_detector"])
+def test_one_parameter_file_may_serve_several_robots(tmp_path, own):
+    file = Path(parameter_file(tmp_path, own))
+    file.write_text(f"{file.read_text()}\n/r1/keypoint_detector: {{ros__parameters: {{T_gripper_camera: [0.0]}}}}\n")
+    options = RobotOptions(parameter_file=str(file), namespace="r2")
+    assert robot_processes(options, ROOT) and camera_pose(options)[2] == 0.5
+    file.write_text(f"{file.read_text()}/r1/ifea_solver: {{ros__parameters: {{jaw: left}}}}\n")
+    with pytest.raises(ValueError, match="'/r1/ifea_solver' is no node of this system in the namespace /r2"):
+        robot_processes(options, ROOT)
+
+
 def parameter_file(folder, key):
     file = folder / "lab.yaml"
     file.write_text(f"{key}: {{ros__parameters: {{T_gripper_camera: [0.0, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0]}}}}")

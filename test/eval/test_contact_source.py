@@ -8,8 +8,11 @@ from eval_fakes import PERIOD, START, FakeContactEstimator, FakeEstimator, FakeJ
 
 from finforce.errors import PoseError
 from finforce_contact.loop import ForceLoop
+from finforce_eval.cli.main import parse
 from finforce_eval.errors import RecordingError
-from finforce_eval.evaluation.contact_source import RecordedContact
+from finforce_eval.evaluation import contact_source
+from finforce_eval.evaluation.contact_source import RecordedContact, build_source
+from finforce_eval.evaluation.setup import read_contacts
 from finforce_eval.recordings.objects import ObjectTrack, track_object
 
 
@@ -122,3 +125,15 @@ def test_a_pose_of_the_image_itself_is_used_with_it_whatever_the_date():
         observation = recording.jaws["left"].keypoints.observation(count)
         loop.update(replace(observation, stamp=1e-9 * (START + shift + PERIOD * count)))
         assert kinds(fake.calls).count("pose") == count + 1
+
+
+@pytest.mark.parametrize(("words", "compared"), [([], 1), (["--no-compare-mesh"], 0)])
+def test_the_mesh_is_compared_with_the_images_unless_that_is_switched_off(words, compared, monkeypatch):
+    calls = []
+    estimator = FakeContactEstimator()
+    estimator.mesh = None
+    monkeypatch.setattr(contact_source, "build_estimator", lambda *arguments: estimator)
+    monkeypatch.setattr(contact_source, "check_mesh", lambda *arguments: calls.append(arguments))
+    choice = read_contacts(parse(["evaluate", "bag", "--contact", "estimate", *words]))
+    build_source(choice, make_recording(), FakeJaw())
+    assert len(calls) == compared

@@ -184,6 +184,9 @@ def test_a_table_comes_back_as_it_was_written(tmp_path):
     assert about["about"] == {"jaw": "x"} and again.name == result.name and again.side == "left"
     for name in ("force", "true_force", "used", "status", "stamp", "scored", "contact_source"):
         assert np.array_equal(again.column(name), result.column(name), equal_nan=name.endswith("force")), name
+    write_table(tmp_path / "bare.parquet", [result], {"jaw": "x"})
+    with pytest.raises(RecordingError, match="says nothing of its run"):
+        read_evaluations([tmp_path / "bare.parquet"])
     evaluation, _ = read_evaluations([tmp_path / "pressed.parquet"])
     assert evaluation.total == score_results([result], [recording]).total
 

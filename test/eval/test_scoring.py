@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from eval_fakes import make_recording
 
+from finforce_eval.evaluation.score_tables import doubt_truth
 from finforce_eval.evaluation.scoring import compute_stats, match_truth, score_case, score_series, true_range
 from finforce_eval.recordings.tracks import WrenchTrack
 from finforce_eval.table import ForceSeries
@@ -237,3 +238,20 @@ def test_answered_is_the_share_of_what_was_to_be_answered():
     score = score_case([result], span=1.0)
     assert score.all.answered_pct == pytest.approx(200.0 / 3.0)
     assert (score.load.answered_pct, score.unload.answered_pct) == (50.0, 100.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda force: force, ""),
+        (lambda force: 1.3 * force + 0.1, ""),
+        (lambda force: 102.0 * force, "gram-force"),
+        (lambda force: 102.0 * (force + 0.5), "gram-force"),
+        (lambda force: 0.225 * force, "pound-force"),
+        (lambda force: force + 0.6, "is the sensor tared"),
+    ],
+)
+def test_true_forces_in_other_units_or_of_an_untared_sensor_are_doubted(change, words):
+    force = np.concatenate((np.zeros(30), np.linspace(0.1, 3.0, 60)))
+    said = doubt_truth(make_result(truth=change(force), force=force))
+    assert (words in said) if words else not said

@@ -244,9 +244,25 @@ def delay_row(folder):
     parquet.write_table(table.set_column(table.schema.get_field_index("timestamp"), "timestamp", times), path)
 
 
+def cut_table(folder):
+    path = next((folder / "data").rglob("episode_000000.parquet"))
+    path.write_bytes(path.read_bytes()[:-9])
+
+
+def write_times_as_text(folder):
+    import pyarrow
+
+    path = next((folder / "data").rglob("episode_000000.parquet"))
+    table = parquet.read_table(path)
+    times = pyarrow.array(["soon"] * len(table))
+    parquet.write_table(table.set_column(table.schema.get_field_index("timestamp"), "timestamp", times), path)
+
+
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
+        (cut_table, "episode_000000.parquet: Parquet"),
+        (write_times_as_text, "column timestamp: could not convert"),
         (lengthen_video, "has 8 frames; expected 3, one for each row"),
         (delay_row, "times jump by 0.433 s after row 1; expected 0.033 s"),
         (change_info(fps=1e-300), "fps: got 1e-300, expected"),

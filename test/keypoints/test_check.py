@@ -13,16 +13,19 @@ from node_fakes import ros_domain
 from sensor_msgs.msg import CameraInfo, CompressedImage
 
 from finforce.camera_topics import COLOR_TOPIC, INFO_TOPIC
-from finforce.gripper_frames import ROBOT_CAMERA
+from finforce.gripper_frames import ROBOT_CAMERA, SIDES
 from finforce.ros import node as ros
 from finforce.transforms import invert_pose, pose_numbers
+from finforce_eval.cli.camera import try_rig
 from finforce_eval.cli.check import record_camera
 from finforce_eval.cli.main import main
 from finforce_eval.cli.twin import write_footage
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.check import FAULT, OK, WARNING, judge_picture
+from finforce_eval.evaluation.keypoint_source import KeypointSource
 from finforce_eval.recordings.bags import open_bag
 from finforce_eval.recordings.images import CAMERA_INFO, COMPRESSED
+from finforce_keypoints.rig import Rig, RigCamera, RigJaw
 from finforce_sim.footage import build_footage
 from finforce_sim.scenarios import build_scenario
 
@@ -94,6 +97,25 @@ def test_what_fits_passes_with_depth_and_without(still, capsys, tmp_path):
 def test_depth_of_another_unit_is_named(still, capsys, tmp_path):
     status, said = check(still, capsys, tmp_path, "--detector", "depth_scale=0.01")
     assert status == 1 and "the depth at the jaw is 10 times that of its place" in said and "depth_scale" in said
+
+
+@pytest.mark.parametrize(("off", "words"), [(0.0, []), (0.05, ["finds no jaw"])])
+def test_a_rig_is_tried_on_the_pictures_that_it_was_made_from(still, off, words):
+    source = KeypointSource(source="images", jaw_file="bench", sides=SIDES)
+    recording = source.read(still)
+    camera, pose = recording.images.camera, ROBOT_CAMERA.copy()
+    pose[1, 3] += off
+    intrinsics = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy", "model")}
+    rig = Rig(
+        jaw="bench",
+        camera=RigCamera(**intrinsics, distortion=tuple(camera.distortion)),
+        T_gripper_camera=tuple(pose_numbers(pose)),
+        left=RigJaw(),
+        right=RigJaw(),
+    )
+    doubts = try_rig(rig, recording, source, IMAGES)
+    assert len(doubts) == len(words)
+    assert all(word in doubt for word, doubt in zip(words, doubts, strict=True))
 
 
 def test_a_mesh_that_is_not_what_the_camera_sees_is_named(footage, capsys, tmp_path):

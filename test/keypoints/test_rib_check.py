@@ -16,7 +16,6 @@ from finforce_keypoints.geometry.rib_pattern import RibPattern
 from finforce_keypoints.geometry.side_picture import find_side, project_plane
 from finforce_keypoints.geometry.template import find_shape
 from finforce_keypoints.parameters import JawMount
-from finforce_keypoints.placement import CameraPlacement
 from finforce_keypoints.rib_check import LEAST_MARGIN, RibComparison, RibPlace, compare_ribs, compare_rig, describe_ribs
 from finforce_sim.sensor import build_d405_vga
 
@@ -133,17 +132,11 @@ def test_a_rig_is_judged_by_pictures_at_openings_that_nobody_states():
 def test_a_doubtful_place_writes_no_rig_unless_forced(margin, words, tmp_path):
     place = RibPlace(evidence=2.0, ribs=0.7, shift=0.0, distance=0.0, warps=np.zeros((1, 2, 3)))
     other = replace(place, evidence=2.0 - margin, shift=9.5e-3, distance=1.0)
-    found = CameraPlacement(
-        T_gripper_camera=ROBOT_CAMERA,
-        mounts={"left": JawMount()},
-        origins={"left": np.array([-0.04])},
-        contrast=0.9,
-        residual=0.5,
-        seen={},
-        ribs={"left": RibComparison(here=place, other=other)},
-    )
+    doubts = describe_ribs({"left": RibComparison(here=place, other=other)})
+    assert words in doubts[0]
     with pytest.raises(GeometryError, match=f"{words}.* No rig is written"):
-        refuse_doubts(found, Namespace(force=False), tmp_path / "rig.png")
-    assert words in refuse_doubts(found, Namespace(force=True), tmp_path / "rig.png")[0]
-    sure = replace(found, ribs={"left": RibComparison(here=place, other=replace(other, evidence=1.5))})
-    assert not refuse_doubts(sure, Namespace(force=False), tmp_path / "rig.png")
+        refuse_doubts(doubts, Namespace(force=False), tmp_path / "rig.png")
+    refuse_doubts(doubts, Namespace(force=True), tmp_path / "rig.png")
+    sure = describe_ribs({"left": RibComparison(here=place, other=replace(other, evidence=1.5))})
+    assert not sure
+    refuse_doubts(sure, Namespace(force=False), tmp_path / "rig.png")
