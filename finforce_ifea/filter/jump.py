@@ -56,6 +56,9 @@ OFFSET = Jump(np.array([HEIGHT]), np.array([15e-3]), 1e-4)
 # Log odds against a jump since the first image, its prior left out, after which the test begins anew.
 _UNLIKELY = -3.0
 NO_JUMP = -1
+# Correlation between the errors by which a detector misplaces two key points of one shape [-]: that of the shipped
+# network in drawn scenes.
+_ALIKE = 0.2
 # Error of the linearisation about the last state, as a share of the object's motion since.
 _NONLINEAR = 0.2
 
@@ -181,11 +184,15 @@ class JumpWatch:
         """Take the transition of the state, a factor for each entry (n,)."""
         self._F *= f[:, None]
 
-    def update(self, measured: Measurement, posterior: Posterior) -> tuple[NDArray, NDArray] | None:
-        """Take an image; once it has jumped, return the change of the mean (n,) and of P (n, n)."""
-        jump = self._jump
+    def update(self, measured: Measurement, posterior: Posterior, sight: float) -> tuple[NDArray, NDArray] | None:
+        """Take an image; once it has jumped, return the change of the mean (n,) and of P (n, n).
+
+        `sight` is the share of the offsets' variance by which a detector errs in the sight of one shape. Its errors are
+        alike and tell less than independent ones of the same size.
+        """
+        jump, independence = self._jump, 1.0 / (1.0 + _ALIKE * sight * (len(measured.R) - 1))
         given = measured.H, measured.rows, measured.u, posterior.L, posterior.A, posterior.white
-        odds = _watch(given, jump, self._F, self._information, self._score)
+        odds = _watch(given, jump, self._F, self._information, self._score, independence)
         if odds <= 0.0:
             if odds - np.log(jump.probability) < _UNLIKELY:
                 self.reset()
@@ -200,7 +207,7 @@ class JumpWatch:
 
 
 @njit(**_OPTIONS)
-def _watch(given, jump, F, information, score):
+def _watch(given, jump, F, information, score, independence):
     """Return the log odds of a jump by one more image; F (n, j), information (j, j) and score (j,) are updated.
 
     Args:
@@ -209,6 +216,7 @@ def _watch(given, jump, F, information, score):
         F: see `JumpWatch`.
         information: I of the module.
         score: y of the module.
+        independence: share of what independent errors would tell.
     """
     H, rows, u, L, A, white = given
     count = F.shape[1]
@@ -218,9 +226,9 @@ def _watch(given, jump, F, information, score):
     G = solve_lower(L, G)
     for i in range(len(G)):
         for j in range(count):
-            score[j] += G[i, j] * white[i]
+            score[j] += independence * G[i, j] * white[i]
             for k in range(count):
-                information[j, k] += G[i, j] * G[i, k]
+                information[j, k] += independence * G[i, j] * G[i, k]
             for k in range(len(F)):
                 F[k, j] += A[i, k] * G[i, j]
     return weigh_jump(jump, information, score)

@@ -355,8 +355,9 @@ class ContactSearch:
 
     def _watch(self, measured: Measurement, posterior: Posterior) -> None:
         """Look for jumps that show over several images only."""
+        sight = float(self.points["sight"].sum() / self.points["offset_variance"].sum())
         for watch, is_possible in zip(self._watches, (True, not self._misplaced), strict=True):
-            change = watch.update(measured, posterior) if is_possible else None
+            change = watch.update(measured, posterior, sight) if is_possible else None
             if change is not None:
                 self.x, self.P = self.x + change[0], self.P + change[1]
                 self._bumped |= watch is self._watches[0]

@@ -18,7 +18,7 @@ from finforce_ifea.contact_mechanics.pressed_jaw import limit_step
 from finforce_ifea.estimator import ForceEstimator
 from finforce_ifea.filter.filter import expect_innovations, innovate, reduce_covariance, update
 from finforce_ifea.filter.friction_path import NODES, TractionHypotheses
-from finforce_ifea.filter.jump import BUMPED, MISPLACED, weigh_jump
+from finforce_ifea.filter.jump import BUMPED, MISPLACED, NUDGED, JumpWatch, weigh_jump
 from finforce_ifea.filter.measurement import FREEDOM, NO_WEIGHT, Measurement, measure_distances, weigh
 from finforce_ifea.filter.process import CAMERA_TIME, FREE_DEPTH, Expectation, expect_state, find_decay, predict
 from finforce_ifea.filter.slip_path import SlipPath
@@ -116,6 +116,20 @@ class TestJump:
         score = information @ (0.1 * jump.stddev)
         assert weigh_jump(jump, information, score) < 0.0
         assert weigh_jump(jump, information, 10.0 * score) > 0.0
+
+
+    def test_errors_that_are_alike_tell_less_of_one(self):
+        """Three key points whose errors correlate by 0.2 tell of what moves all of them as 3 / 1.4 do."""
+        measured, _, P, x = draw()
+        HP, S = innovate(measured.H, measured.rows, measured.u, P, measured.R)
+        posterior = update(measured, np.ones(3), np.zeros(2), x, np.log([0.5, 0.5]), HP, S)
+        told = {}
+        for sight in (0.0, 1.0):
+            watch = JumpWatch(NUDGED, SIZE)
+            watch.update(measured, posterior, sight)
+            told[sight] = np.r_[watch._information.ravel(), watch._score]
+        assert told[0.0].any()
+        np.testing.assert_allclose(told[1.0], told[0.0] / 1.4)
 
 
 class TestWeights:
