@@ -105,8 +105,9 @@ def draw_pieces(
     firsts = np.concatenate([np.arange(a, b + 1) for a, b in zip(begins, ends, strict=True)])
     while True:
         chosen = [slice(first, first + PIECE) for first in rng.choice(firsts, count)]
-        yield np.stack([change_piece(grasps.images[rows], rng) for rows in chosen]), np.stack(
-            [grasps.force[rows] for rows in chosen]
+        yield (
+            np.stack([change_piece(grasps.images[rows], rng) for rows in chosen]),
+            np.stack([grasps.force[rows] for rows in chosen]),
         )
 
 

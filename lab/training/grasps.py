@@ -1,4 +1,4 @@
-"""Render grasps for the paper's baseline network, small images and grasp forces: `python -m lab.training.grasps FOLDER`.
+"""Render grasps for the paper's baseline network, images and forces: `python -m lab.training.grasps FOLDER`.
 
 The objects are those that the paper trains on, a cylinder and a cube, at 14 heights with five speeds, in bright light.
 """
@@ -27,12 +27,12 @@ from lab.training.pictures import make_all
 
 SCENES = ("grasp_cylinder", "grasp_cube")
 HEIGHTS = np.linspace(0.022, 0.060, 14)  # [m] of the object's middle, as many as the paper's
-SPEEDS = (0.003, 0.006, 0.012, 0.020, 0.030)  # [m/s] of each jaw, as many as the paper's
+SPEEDS = (0.004, 0.008, 0.012, 0.020, 0.030)  # [m/s] of each jaw, as many as the paper's
 FORCES = (1.0, 4.6)  # [N], range of the elastic force at the end of closing
-CLEARANCE = (0.0005, 0.004)  # [m], range of each open jaw's distance from first touch
-HELD = (0.2, 0.8)  # [s], range of the time for which an object is held
-OPEN = 0.2  # [s] for which the jaws stand open before and after
-SIZE = "192x144"  # of the rendered images
+CLEARANCE = (0.0005, 0.003)  # [m], range of each open jaw's distance from first touch
+HELD = (0.1, 0.4)  # [s], range of the time for which an object is held
+OPEN = 0.15  # [s] for which the jaws stand open before and after
+SIZE = "144x108"  # of the rendered images
 EDGE = 96  # [px] of the network's square images
 STEP = 1e-3  # [m] of each jaw between two solved grasps
 
@@ -116,7 +116,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Render a data set; what is there already stays."""
     parser = argparse.ArgumentParser(prog="python -m lab.training.grasps", description=__doc__)
     parser.add_argument("folder", type=Path, help="where the files are written")
-    text = "of each object at each height (10), some 80 images each"
+    text = "of each object at each height (10), some 50 images each"
     parser.add_argument("--grasps", type=whole_number(1, 10**6), default=10, help=text)
     parser.add_argument("--seed", type=whole_number(0, 10**9), default=50_000, help="of the first grasp (50000)")
     add_engine_options(parser)
