@@ -62,7 +62,7 @@ def find(options: RunOptions, figures: Mapping[str, Mapping[str, Any]], folder: 
         "Mean and standard deviation over the grasps of each one's RMSE of min(|F_left|, |F_right|) while the true "
         "force is above 0.02 N. Every estimator is new: it has seen no other grasp."
     )
-    return Figures(tables={"By contact": average(grasps, ("contact",), COLUMNS), "Each grasp": each}, notes=[note])
+    return Figures(tables={"contacts": average(grasps, ("contact",), COLUMNS), "Each grasp": each}, notes=[note])
 
 
 FRICTION = Experiment(
@@ -71,8 +71,8 @@ FRICTION = Experiment(
     about=(
         "The objects, heights and forces of `grasp`, with Coulomb friction between fingers and object as they close "
         "and open. Something else keeps the object's height, as a table does. The probe is the driver's: at half of "
-        "the way the jaws go back and keep about 40 % of their force, then go on. The estimator is not told that "
-        "there is friction, nor how much."
+        "the way each jaw goes back by up to 1 mm and keeps at least about 40 % of its force, then closes on. The "
+        "estimator is not told that there is friction, nor how much."
     ),
     list_cases=list_cases,
     run=run,

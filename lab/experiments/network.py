@@ -84,7 +84,7 @@ def find(options: RunOptions, figures: Mapping[str, Mapping[str, Any]], folder: 
         "finger's model and calibration, the object's mesh and its poses."
     )
     drawn = {"True grasp force (dashed), finforce (blue), network (orange)": "network.png"}
-    return Figures(tables={"By what the network has seen": table, "Each grasp": each}, notes=[note], drawn=drawn)
+    return Figures(tables={"conditions": table, "Each grasp": each}, notes=[note], drawn=drawn)
 
 
 def name_condition(row: Mapping[str, Any]) -> str:

@@ -72,7 +72,7 @@ def find(options: RunOptions, figures: Mapping[str, Mapping[str, Any]], folder: 
     rows = [{"poses": poses, **score} for row in figures.values() for poses, score in row["poses"].items()]
     table = average(pd.json_normalize(rows, sep=" "), ("poses",), COLUMNS)
     note = "Mean and standard deviation over the grasps of each one's RMSE while the true force is above 0.02 N."
-    return Figures(tables={"By poses": table}, notes=[note])
+    return Figures(tables={"poses": table}, notes=[note])
 
 
 POSE = Experiment(

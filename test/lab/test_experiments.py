@@ -333,7 +333,7 @@ def test_errors_of_both_methods_are_over_the_images_for_which_both_have_a_force(
         "two": row | {"light": "bright", "compared": 2, "square_N2": 0.02, "network_square_N2": 0.5},
     }
     (found,) = (
-        NETWORK.find(RunOptions(network="n"), rows, tmp_path).tables["By what the network has seen"].to_dict("records")
+        NETWORK.find(RunOptions(network="n"), rows, tmp_path).tables["conditions"].to_dict("records")
     )
     assert (found["seen"], found["grasps"], found["images"]) == ("trained object, trained light", 2, 20)
     assert found["compared"] == 10
