@@ -118,7 +118,6 @@ class PressedJaw:
         self._indenter: OutlineIndenter | None = None
         self._origin: NDArray | None = None
         self._traction = FRICTIONLESS
-        self.keep(np.zeros(self.model.size), None)
 
     def keep(self, q: NDArray, load: Load | None) -> None:
         """Keep what the next equilibrium has to know of friction in this one at unknowns q (size,); None: no load."""
@@ -284,6 +283,8 @@ class HeldObject:
         self._jaws, self._guided, self._is_free = jaws, guided, len(jaws) > 1
         self._friction, self._drag, self.creep = friction, drag, 0.0
         rest = {side: np.zeros(jaw.model.size) for side, jaw in jaws.items()}
+        for side, jaw in jaws.items():
+            jaw.keep(rest[side], None)
         self._balance = _Balance(q=rest, loads=dict.fromkeys(jaws), x=x if self._is_free else 0.0)
         self._setting: GraspSetting | None = None
         self._before: _Balance | None = None

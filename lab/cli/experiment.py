@@ -20,8 +20,8 @@ EXPERIMENTS = {
     "places": ("Table II: value of knowing the contact location", "paper_tables"),
     "grasp": ("27 grasps: three objects, places and forces, both jaws", "grasp"),
     "manipulation": ("a held weight of 100 g that is turned, in two lights", "manipulation"),
-    "friction": ("27 first grasps without friction, and with 0.5, with and without a probe", "friction"),
-    "pose": ("nine grasps whose object's poses come slowly, late or not at all", "pose"),
+    "friction": ("27 first grasps without friction, and with 0.5, with and without a probe", "conditions"),
+    "pose": ("nine grasps whose object's poses come slowly or late", "conditions"),
     "network": ("nine grasps in two lights against the paper's baseline network", "network"),
     "chip": ("an object that breaks at 5.43 N, grasped to 5 N by force, position and current", "chip"),
 }

@@ -29,6 +29,7 @@ torch = import_torch()
 nn = torch.nn
 
 SHOWN = 10  # images that the network is given at a time
+HEADS, LAYERS = 4, 2  # of the transformer
 PIECE = 16  # images in a row that share their features: seven windows of ten
 JUDGED = 14  # of so many grasps one is held back to judge the others' network
 SHIFT = 4  # [px], largest shift of the images of a piece
@@ -44,14 +45,10 @@ class BaselineShape:
     Attributes:
         channels: of the encoder at strides 2, 4, 8 and 16.
         features: of an image.
-        heads: of the transformer.
-        layers: of the transformer.
     """
 
     channels: tuple[int, int, int, int] = (16, 32, 64, 96)
     features: int = 128
-    heads: int = 4
-    layers: int = 2
 
 
 class BaselineNetwork(nn.Module):
@@ -72,9 +69,9 @@ class BaselineNetwork(nn.Module):
         )
         self.order = nn.Parameter(0.02 * torch.randn(SHOWN, shape.features))
         layer = nn.TransformerEncoderLayer(
-            shape.features, shape.heads, 2 * shape.features, dropout=0.1, batch_first=True, norm_first=True
+            shape.features, HEADS, 2 * shape.features, dropout=0.1, batch_first=True, norm_first=True
         )
-        self.transformer = nn.TransformerEncoder(layer, shape.layers, enable_nested_tensor=False)
+        self.transformer = nn.TransformerEncoder(layer, LAYERS, enable_nested_tensor=False)
         self.head = nn.Sequential(nn.LayerNorm(shape.features), nn.Linear(shape.features, 1))
 
     def encode(self, images: torch.Tensor) -> torch.Tensor:
@@ -93,22 +90,13 @@ class BaselineNetwork(nn.Module):
 def draw_pieces(
     grasps: GraspImages, rows: Sequence[int], count: int, rng: np.random.Generator
 ) -> Iterator[tuple[NDArray, NDArray]]:
-    """Yield batches without end: images (count, PIECE, EDGE, EDGE, 3) uint8 and forces (count, PIECE) [N].
-
-    Args:
-        grasps: to draw from.
-        rows: numbers of the grasps that may be drawn.
-        count: pieces in a batch.
-        rng: source of chance.
-    """
+    """Yield batches of some grasps: images (count, PIECE, EDGE, EDGE, 3) uint8 and forces (count, PIECE) [N]."""
     begins, ends = grasps.starts[:-1][rows], grasps.starts[1:][rows] - PIECE
     firsts = np.concatenate([np.arange(a, b + 1) for a, b in zip(begins, ends, strict=True)])
     while True:
         chosen = [slice(first, first + PIECE) for first in rng.choice(firsts, count)]
-        yield (
-            np.stack([change_piece(grasps.images[rows], rng) for rows in chosen]),
-            np.stack([grasps.force[rows] for rows in chosen]),
-        )
+        images = np.stack([change_piece(grasps.images[piece], rng) for piece in chosen])
+        yield images, np.stack([grasps.force[piece] for piece in chosen])
 
 
 def change_piece(images: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
@@ -118,14 +106,6 @@ def change_piece(images: NDArray[np.uint8], rng: np.random.Generator) -> NDArray
         moved = moved[:, :, ::-1]  # the smaller of two forces is the same
     strip = np.ascontiguousarray(np.concatenate(list(moved), axis=1))
     return np.stack(np.split(change_light(strip, LIGHT, rng), len(images), axis=1))
-
-
-@dataclass(frozen=True, kw_only=True)
-class BaselineScore:
-    """RMSE [N] of the grasps held back: over all images, and while the true force is above 0.02 N."""
-
-    rmse_N: float
-    held_N: float
 
 
 class BaselineTraining(Training):
@@ -145,8 +125,8 @@ class BaselineTraining(Training):
         return {"force": nn.functional.smooth_l1_loss(self.network.judge(windows), true, beta=ROUNDING)}
 
     @torch.no_grad()
-    def score(self, grasps: GraspImages, rows: Sequence[int]) -> BaselineScore:
-        """Return the errors of the averaged network on the grasps of some numbers."""
+    def score(self, grasps: GraspImages, rows: Sequence[int]) -> dict[str, float]:
+        """Return the RMSE [N] on the grasps of some numbers: of all images, and of those with a force above 0.02 N."""
         network, errors, true = self.averaged.eval(), [], []
         for first, last in zip(grasps.starts[:-1][rows], grasps.starts[1:][rows], strict=True):
             images = torch.from_numpy(grasps.images[first:last]).to(self.device)
@@ -154,16 +134,16 @@ class BaselineTraining(Training):
             true.append(grasps.force[first + SHOWN - 1 : last])
             errors.append(found.cpu().numpy() - true[-1])
         error, force = np.concatenate(errors), np.concatenate(true)
-        return BaselineScore(rmse_N=rms(error), held_N=rms(error[force > ONSET_FORCE]))
+        return {"rmse_N": rms(error), "held_N": rms(error[force > ONSET_FORCE])}
 
-    def train(self, grasps: GraspImages, folder: Path) -> BaselineScore:
-        """Train on most grasps and return the errors on those held back."""
+    def train(self, grasps: GraspImages, folder: Path) -> None:
+        """Train on most grasps; those held back judge it."""
         numbers, long_enough = np.arange(len(grasps.starts) - 1), np.diff(grasps.starts) >= PIECE
         is_judged = numbers % JUDGED == 0
         learnt, judged = (np.flatnonzero(part & long_enough) for part in (~is_judged, is_judged))
         rng = np.random.default_rng((self.recipe.seed, self.step))
         batches = draw_pieces(grasps, learnt, self.recipe.batch, rng)
-        return self.run(batches, lambda: self.score(grasps, judged), folder)
+        self.run(batches, lambda: self.score(grasps, judged), folder)
 
 
 def load_baseline(path: str | Path) -> BaselineNetwork:

@@ -34,6 +34,7 @@ HELD = (0.1, 0.4)  # [s], range of the time for which an object is held
 OPEN = 0.15  # [s] for which the jaws stand open before and after
 SIZE = "144x108"  # of the rendered images
 EDGE = 96  # [px] of the network's square images
+FIRST_SEED = 50_000  # of the grasps; the experiments' are from 100 on
 STEP = 1e-3  # [m] of each jaw between two solved grasps
 
 
@@ -118,14 +119,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("folder", type=Path, help="where the files are written")
     text = "of each object at each height (10), some 50 images each"
     parser.add_argument("--grasps", type=whole_number(1, 10**6), default=10, help=text)
-    parser.add_argument("--seed", type=whole_number(0, 10**9), default=50_000, help="of the first grasp (50000)")
     add_engine_options(parser)
     options = parser.parse_args(arguments)
     tasks = []
     for number, (height, scene) in enumerate(product(HEIGHTS, SCENES)):
         name = f"{scene}_{1e3 * height:.0f}"
         given = {"scene": scene, "height": float(height), "count": options.grasps}
-        given |= {"seed": options.seed + number * options.grasps, "path": str(options.folder / f"{name}.npz")}
+        given |= {"seed": FIRST_SEED + number * options.grasps, "path": str(options.folder / f"{name}.npz")}
         tasks.append(Task(name=name, key=f"{SIZE} {given}", work=write_grasps, given=given, output=given["path"]))
     with one_line_errors():
         lines = make_all(tasks, read_engine(options), options.folder, "file")

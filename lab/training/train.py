@@ -221,16 +221,13 @@ class Training:
         self.step, self.elapsed = int(checkpoint["step"]), float(checkpoint["elapsed"])
         self._averaging.n_averaged.fill_(self.step)
 
-    def run(self, batches: Iterator[Any], judge: Callable[[], Any], folder: Path) -> Any:
+    def run(self, batches: Iterator[Any], judge: Callable[[], Mapping[str, float]], folder: Path) -> None:
         """Train until the recipe's end, with a log of losses and scores and a checkpoint beside it.
 
         Args:
             batches: to learn from, without end.
-            judge: returns a record of scores of the averaged network.
+            judge: returns scores of the averaged network by name.
             folder: of log and checkpoint.
-
-        Returns:
-            The scores at the end.
         """
         folder.mkdir(parents=True, exist_ok=True)
         every = 60.0 * self.recipe.evaluate_every
@@ -246,14 +243,12 @@ class Training:
                 if self.elapsed >= due and self.progress < 1.0:
                     due += every
                     self._report(shown, judge(), folder)
-        final = judge()
-        self._report(shown, final, folder)
-        return final
+        self._report(shown, judge(), folder)
 
-    def _report(self, shown: Mapping[str, float], score: Any, folder: Path) -> None:
+    def _report(self, shown: Mapping[str, float], scores: Mapping[str, float], folder: Path) -> None:
         """Add a line to the log, write the checkpoint."""
         line: dict[str, float] = {"step": self.step, "minutes": round(self.elapsed / 60.0, 2)}
-        line |= {name: round(float(value), 5) for name, value in {**shown, **asdict(score)}.items()}
+        line |= {name: round(float(value), 5) for name, value in {**shown, **scores}.items()}
         with (folder / LOG).open("a", encoding="utf-8") as log:
             log.write(json.dumps(line) + "\n")
         tqdm.write(json.dumps(line))
@@ -284,13 +279,13 @@ class FingerTraining(Training):
 
     def train(
         self, pictures: FingerPictures, judging: FingerPictures, augmentation: AugmentSettings, folder: Path
-    ) -> Score:
-        """Train on augmented pictures; return how well it does on those of other fingers, by which it is judged."""
+    ) -> None:
+        """Train on augmented pictures; those of other fingers judge it."""
         recipe = self.recipe
         batches = load_batches(
             pictures, augmentation, recipe.batch, workers=recipe.workers, seed=recipe.seed, first=self.step
         )
-        return self.run(batches, lambda: self.score(judging), folder)
+        self.run(batches, lambda: asdict(self.score(judging)), folder)
 
 
 @torch.no_grad()
