@@ -340,7 +340,7 @@ def test_errors_of_both_methods_are_over_the_images_for_which_both_have_a_force(
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        (["network"], "expected --network RUN/checkpoint.pt"),
+        (["network"], "--network RUN/checkpoint.pt"),
         (["pose", "--on", "some_bag"], "expected twin"),
         (["friction", "--on", "some_bag"], "expected twin"),
         (["nothing"], "got 'nothing', expected one of"),
