@@ -471,7 +471,9 @@ def draw_tiers(tiers: pd.DataFrame, path: Path) -> None:
         if tier["tier"] == PAPER:
             tuned = tier["step p50/ms"], tier["a factor per height/N"]
             axes.plot(*tuned, "o", color="tab:orange")
-            axes.annotate(f"{PAPER}, ε tuned per height", tuned, xytext=(6, 3), textcoords="offset points", fontsize=8)
+            axes.annotate(
+                f"{PAPER}, ε tuned per height", tuned, xytext=(6, -11), textcoords="offset points", fontsize=8
+            )
     axes.set(xscale="log", yscale="log", xlabel="Time of a step (median) [ms]", ylabel="RMSE of the force [N]")
     for axis in (axes.xaxis, axes.yaxis):
         axis.set(major_formatter="{x:g}", minor_formatter=LogFormatter(minor_thresholds=(2, 0.4)))
