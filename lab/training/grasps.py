@@ -117,7 +117,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Render a data set; what is there already stays."""
     parser = argparse.ArgumentParser(prog="python -m lab.training.grasps", description=__doc__)
     parser.add_argument("folder", type=Path, help="where the files are written")
-    text = "of each object at each height (10), some 50 images each"
+    text = "of each object at each height (10), some 70 images each"
     parser.add_argument("--grasps", type=whole_number(1, 10**6), default=10, help=text)
     add_engine_options(parser)
     options = parser.parse_args(arguments)
