@@ -10,7 +10,7 @@ STRESS_JAWS ?= bench umi ssg48_fin_ray_1 xlerobot
 DESCRIBED := setup.py setup.cfg pyproject.toml $(SET_UP)
 ROS := $(if $(AMENT_PREFIX_PATH),ament,plain)
 
-.PHONY: demo test lint bench stress docs pages build dist clean
+.PHONY: demo test lint bench figures stress docs pages build dist clean
 
 demo: .venv/.$(ROS)-run
 	$(PYTHON) -m finforce_eval.cli.main demo --report report
@@ -28,6 +28,10 @@ lint: .venv/.$(ROS)-lint
 
 bench: .venv/.$(ROS)-run
 	$(PYTHON) -m finforce_eval.cli.main bench --json report/bench.json
+
+# Every table of README and docs/ at this commit, part by part; a stopped run goes on. ARGS: parts, --recordings, --network.
+figures: .venv/.$(ROS)-run
+	$(PYTHON) -m tools.measure_pages $(ARGS)
 
 # Every finger with the fixed seed and with one that is drawn anew and printed, two at a time.
 stress: .venv/.$(ROS)-run

@@ -353,9 +353,10 @@ class ForceEstimator:
             self._tracker.reset()
             self._contact = None
             return self._fail("diverged", "the shape cannot be reached by the jaw", used, iterations)
-        is_far = state["residual"] > LARGEST_RESIDUAL  # the bound is no less
+        settles = self.settings.solver != "paper"  # whose linear tetrahedra lock, and follow no bent jaw to 1 mm
+        is_far = settles and state["residual"] > LARGEST_RESIDUAL  # the bound is no less
         most = bound_residual(self.jaw.keypoints, self._taring.tare.noise) if is_far else np.inf
-        reason = find_rejection_reason(state, largest_residual=most, settles=self.settings.solver != "paper")
+        reason = find_rejection_reason(state, largest_residual=most, settles=settles)
         if reason:
             if state["magnitude"] <= state["bearable"]:
                 self._relax(state["force"])

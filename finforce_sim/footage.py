@@ -24,7 +24,6 @@ from finforce_sim.scenarios import Scenario, ScenarioError
 from finforce_sim.sensor import D405, LENSES, build_d405_vga
 
 START = 1_000 * NANOSECONDS  # [ns] stamp of the first image
-TRACKING_PERIOD = 0.1  # [s]; in the first image of each the object is tracked
 POSITION_STDDEV = 0.3e-3  # [m] of a tracked pose, along each axis
 ANGLE_STDDEV = np.radians(0.3)  # about each axis
 LEAST_SIZE = 16  # [px]
@@ -75,7 +74,7 @@ class Footage:
         T_camera_gripper = invert_pose(self.T_gripper_camera)
         last = -1
         for state, shot in self._shoot_ahead():
-            period = int(state.stamp / TRACKING_PERIOD + 1e-5)
+            period = int(state.stamp * self._gripper.scenario.tracking + 1e-5)
             tracked = state.T_gripper_object is not None and period > last
             last = period if tracked else last
             yield TwinFrame(

@@ -11,8 +11,15 @@ from numpy.typing import NDArray
 
 from finforce.gripper_frames import BENCH_ORIGIN_X
 from finforce_contact.section import cut_outline
+from finforce_ifea.contact_mechanics.friction import FRICTIONLESS, Traction, measure_shear
 from finforce_ifea.contact_mechanics.indenter import OutlineIndenter, PenaltyContact, flat_profile
-from finforce_ifea.contact_mechanics.pressed_jaw import build_contact_surface, limit_step, profile_surface
+from finforce_ifea.contact_mechanics.pressed_jaw import (
+    build_contact_surface,
+    limit_step,
+    load_columns,
+    profile_surface,
+    solve_contact,
+)
 from finforce_ifea.fem.model import JawModel
 from finforce_ifea.fem.solid import SolidModel
 from finforce_ifea.grasp_force import R_GRIPPER_JAW, Wrench
@@ -82,9 +89,17 @@ class JawShape:
 
 
 class PressedJaw:
-    """The mechanics of one jaw, and the outline that is pressed into it without friction."""
+    """The mechanics of one jaw, and the outline that is pressed into it, which its surface may stick to."""
 
-    def __init__(self, jaw: Jaw, material: Material, density: MeshDensity | str | None, *, lateral: bool) -> None:
+    def __init__(
+        self,
+        jaw: Jaw,
+        material: Material,
+        density: MeshDensity | str | None,
+        *,
+        lateral: bool,
+        roughness: float = 0.0,
+    ) -> None:
         """Build mesh, model and contact surface.
 
         Args:
@@ -92,14 +107,28 @@ class PressedJaw:
             material: material of this jaw.
             density: of the mesh of a drawing.
             lateral: True if loads along y will come; else a mesh that mirrors itself is halved.
+            roughness: Coulomb coefficient [-] between surface and object while these move; 0: none.
         """
-        self.jaw = jaw
+        self.jaw, self._roughness = jaw, roughness
         self.mesh = jaw.build_mesh(density if jaw.drawing is not None else None)
         self.model = _build_model(jaw, self.mesh, material, lateral=lateral)
         self.surface = build_contact_surface(jaw, self.mesh, self.model, across=self.model.across)
         self.half_width = float(np.abs(self.mesh.nodes[:, 1]).max())
         self._keypoints = self.model.attach(jaw.keypoints, KEYPOINT_DISTANCE)
         self._indenter: OutlineIndenter | None = None
+        self._origin: NDArray | None = None
+        self._traction = FRICTIONLESS
+
+    def keep(self, q: NDArray, load: Load | None) -> None:
+        """Keep what the next equilibrium has to know of friction in this one at unknowns q (size,); None: no load."""
+        if not self._roughness:
+            return
+        points = self.model.positions(self.surface.probe, q)
+        shear = np.zeros(len(points))
+        if load is not None:
+            shear = measure_shear(self._press(q, load).forces, self._press(q, load, FRICTIONLESS).forces)
+        self._traction = Traction(0.0, self._roughness, shear, points, np.zeros(2))
+        self._origin = None if load is None else load.origin
 
     def meet(self, polygons: tuple[NDArray, ...]) -> None:
         """Take the outline of the object, polygons (n, 2) [m] about its origin; raises ContactError if too small."""
@@ -122,25 +151,25 @@ class PressedJaw:
     def linearize(self, q: NDArray, load: Load) -> JawStep:
         """Return the Newton step of f_int(q) = J^T (p(J q, origin) + pull shares) at unknowns q (size,).
 
-        With S the springs of the points, the load by the object's x is J^T S e_x; as S is symmetric, the same load
-        tells the push that the jaw's motion takes away.
+        With S the springs of the points, the load by the object's x is J^T S e_x, and J^T S^T e_x tells the push that
+        the jaw's motion takes away; friction makes S unsymmetric.
         """
         model, probe = self.model, self.surface.probe
         contact = self._press(q, load)
         state = model.linearize(q)
-        model.stiffen(state.tangent, probe, q, contact.springs)
-        along_x = np.ascontiguousarray(contact.springs[:, :, 0])
-        by_x = model.load(probe, q, along_x)
+        model.stiffen(state.tangent, probe, q, 0.5 * (contact.springs + contact.springs.transpose(0, 2, 1)))
         forces = contact.forces + _share_pull(contact.forces, load.pull)
-        imbalance = model.load(probe, q, forces) - state.force
-        steps = model.factorise(state.tangent).solve(np.stack([imbalance, by_x], axis=1))
+        columns = np.stack([forces, contact.springs[:, :, 0], contact.springs[:, 0]], axis=2)
+        loads = load_columns(model, probe, q, columns)
+        loads[:, 0] -= state.force
+        steps = solve_contact(model, probe, q, model.factorise(state.tangent), loads[:, :2], contact.springs)
         force = contact.forces.sum(0)
         return JawStep(
             correction=steps[:, 0],
             mode=steps[:, 1],
             force=force,
-            push=float(force[0] - by_x @ steps[:, 0]),
-            slope=float(along_x[:, 0].sum() - by_x @ steps[:, 1]),
+            push=float(force[0] - loads[:, 2] @ steps[:, 0]),
+            slope=float(contact.springs[:, 0, 0].sum() - loads[:, 2] @ steps[:, 1]),
             smallest_det=state.smallest_det,
         )
 
@@ -161,10 +190,14 @@ class PressedJaw:
             torque=np.cross(points, forces).sum(0),
         )
 
-    def _press(self, q: NDArray, load: Load) -> PenaltyContact:
+    def _press(self, q: NDArray, load: Load, traction: Traction | None = None) -> PenaltyContact:
         points = self.model.positions(self.surface.probe, q)
         pose = np.array([self._indenter.pressed.front - load.origin[0], load.tilt, load.origin[1]])
-        return self._indenter.press(points, self.surface.stiffness, 0.0, pose)
+        if traction is None:
+            traction = self._traction
+            if self._origin is not None:
+                traction = traction._replace(moved=load.origin - self._origin)
+        return self._indenter.press(points, self.surface.stiffness, 0.0, pose, traction)
 
 
 def _share_pull(forces: NDArray, pull: NDArray) -> NDArray:
@@ -188,6 +221,8 @@ def _build_model(jaw: Jaw, mesh: Any, material: Material, *, lateral: bool) -> J
 _SETTLED = 1e-6  # [m] of the last Newton step, a hundredth of what a camera sees
 _LEAST_PULL = 0.02  # [N] that sticks anyhow
 _ITERATIONS = 40
+_FULL_STEPS = 12  # iterations before steps are shortened ...
+_LATER_STEPS = 0.3  # [-], to this share
 _SHORTEST = 1.0 / 128.0  # of the way from one image to the next
 _LARGEST_SHIFT = 1e-3  # [m] of the object in one Newton step
 _SOFTEST = 1e-3  # [N/m] of both jaws together, below which a balance tells nothing of the object's position
@@ -248,6 +283,8 @@ class HeldObject:
         self._jaws, self._guided, self._is_free = jaws, guided, len(jaws) > 1
         self._friction, self._drag, self.creep = friction, drag, 0.0
         rest = {side: np.zeros(jaw.model.size) for side, jaw in jaws.items()}
+        for side, jaw in jaws.items():
+            jaw.keep(rest[side], None)
         self._balance = _Balance(q=rest, loads=dict.fromkeys(jaws), x=x if self._is_free else 0.0)
         self._setting: GraspSetting | None = None
         self._before: _Balance | None = None
@@ -270,6 +307,8 @@ class HeldObject:
             if balance is not None:
                 self._before = self._balance if step == 1.0 else None
                 self._balance, reached = balance, share
+                for side, jaw in self._jaws.items():
+                    jaw.keep(balance.q[side], balance.loads[side])
                 continue
             self._before, step = None, 0.5 * step
             if step < _SHORTEST:
@@ -287,7 +326,7 @@ class HeldObject:
         if sum(gaps.values()) >= 0.0:
             return self._release(setting, gaps)
         q, x = self._predict(gaps)
-        for _ in range(_ITERATIONS):
+        for iteration in range(_ITERATIONS):
             loads = self._find_loads(q, x, setting)
             steps = {side: jaw.linearize(q[side], loads[side]) for side, jaw in self._jaws.items()}
             if not all(step.smallest_det > 0.0 for step in steps.values()):
@@ -295,6 +334,8 @@ class HeldObject:
             dx = self._find_shift(steps, setting)
             moves = {side: step.correction + _along(side) * dx * step.mode for side, step in steps.items()}
             cut = min(_cut(self._jaws[side], move) for side, move in moves.items())
+            # points that stick and slide in turn keep full steps from settling
+            cut *= 1.0 if iteration < _FULL_STEPS else _LATER_STEPS
             q, x = {side: q[side] + cut * move for side, move in moves.items()}, x + cut * dx
             change = max(np.abs(move).max() for move in moves.values())
             if not np.isfinite(change):
@@ -419,8 +460,9 @@ class Assembly:
         # always of both jaws: the bench's is the same left one
         self.material: PrintedMaterial = draw_material(material, ("left", "right"), np.random.default_rng(seed))
         lateral = bool(scenario.mass and (scenario.turn_angle or scenario.pitch))
+        told = {"lateral": lateral, "roughness": scenario.roughness}
         self.pressed = {
-            side: PressedJaw(jaw, self.material.elastic[side], density, lateral=lateral) for side, jaw in jaws.items()
+            side: PressedJaw(jaw, self.material.elastic[side], density, **told) for side, jaw in jaws.items()
         }
         self._object = place_object(scenario) if scenario.object else None
         self.object_mesh = self._object.mesh if self._object else None

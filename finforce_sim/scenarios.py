@@ -68,6 +68,9 @@ class Scenario:
     record: float = setting(0.7, "Recorded time at each step", "s", 0.1, 60.0)
     mass: float = setting(0.0, "Mass of the object that is lifted", "kg", 0.0, 2.0)
     friction: float = setting(0.9, "Friction coefficient, up to which the object does not slip", "", 0.05, 2.0)
+    roughness: float = setting(0.0, "Coulomb coefficient at an object whose height is kept; 0: none", "", 0.0, 1.5)
+    tracking: float = setting(10.0, "Rate of the object's measured poses", "Hz", 0.5, 240.0)
+    probe: float = setting(0.0, "Way back of each jaw at half the displacement, before it goes on", "m", 0.0, 0.01)
     drag: float = setting(0.0, "Drag of an object that slips; 0: slipping is an error", "N s/m", 0.0, 1e4)
     turn_angle: float = setting(0.0, "Rotation of the wrist with the object", "rad", -2.0 * np.pi, 2.0 * np.pi)
     turn_rate: float = setting(0.8, "Rate of that rotation", "rad/s", 0.05, 10.0)
@@ -91,10 +94,10 @@ class Scenario:
         """
         check_bounds(self, ScenarioError)
         lifted = self.mass > HELD
-        if lifted and (self.slide or self.rock or self.camera == "bench" or not self.object):
+        if lifted and (self.is_guided or not self.object):
             raise ScenarioError(
-                f"{self.name}: got a mass of {self.mass:g} kg to lift together with a slide, a rock, the bench or no "
-                "object; set mass to 0, or slide and rock to 0 with the robot's camera and an object"
+                f"{self.name}: got a mass of {self.mass:g} kg to lift together with a slide, a rock, a roughness, the "
+                "bench or no object; set mass to 0, or the others to 0 with the robot's camera and an object"
             )
         if self.readout * self.rate > 1.0:
             raise ScenarioError(
@@ -111,8 +114,8 @@ class Scenario:
 
     @property
     def is_guided(self) -> bool:
-        """True if the object is held by something else than the jaws."""
-        return bool(self.camera == "bench" or self.slide or self.rock)
+        """True if something else than the jaws keeps the object's height."""
+        return bool(self.camera == "bench" or self.slide or self.rock or self.roughness)
 
 
 _BENCH = {"camera": "bench", "closing_speed": 0.002, "clearance": 0.001, "levels": 3, "height": 0.040}
@@ -258,6 +261,13 @@ def _plan_steps(scenario: Scenario, start: Posture) -> Iterator[_ScriptStep]:
         closed = Posture(closing=0.0)
         approach = scenario.clearance / scenario.closing_speed
         yield _ScriptStep(phase=f"{cycle}:load:0:ramp", duration=approach, end=closed)
+        if scenario.probe:
+            half = 0.5 * float(levels[-1])
+            for way in (half, max(half - scenario.probe, 0.0)):
+                probed = replace(closed, closing=way)
+                duration = abs(way - closed.closing) / scenario.closing_speed
+                yield _ScriptStep(phase=f"{cycle}:load:{_millimetres(way)}:ramp", duration=duration, end=probed)
+                closed = probed
         for level in levels[1:]:
             yield from _hold_level(scenario, f"{cycle}:load", level, closed)
             closed = replace(closed, closing=float(level))

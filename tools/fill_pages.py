@@ -167,11 +167,20 @@ def describe_machine(machine: Mapping[str, Any]) -> str:
 
 
 def fill(page: str, texts: Mapping[str, str]) -> str:
-    """Return a page with the texts that are known in their places; a table keeps the columns that the page shows."""
+    """Return a page with the texts that are known in their places; a table keeps the columns that the page shows.
+
+    Of what is not known, only the head of a table stays.
+    """
     return _BLOCK.sub(
         lambda match: f"{match[1]}{select_columns(texts[match['name']], match[0])}\n{match[3]}"
-        if match["name"] in texts else match[0], page
+        if match["name"] in texts else f"{match[1]}{_empty(match[0])}{match[3]}", page
     )  # fmt: skip
+
+
+def _empty(block: str) -> str:
+    """Return a block's lines without figures."""
+    lines = block.splitlines(keepends=True)[1:-1]
+    return "".join(lines[:2]) if len(lines) > 1 and lines[1].startswith("|---") else ""
 
 
 def select_columns(text: str, block: str) -> str:
@@ -196,14 +205,19 @@ def main() -> None:
             known = take_figures(known, {name: found, "machine": found["machine"]} if name else found, places)
         except LookupError as missing:
             sys.exit(f"{file}: no {missing} in it; expected the output of a whole run of the command on the page")
+    fill_pages(known)
+
+
+def fill_pages(known: Mapping[str, Any]) -> None:
+    """Keep the figures of all sources, and fill the pages with them; say which tables stay empty."""
     FIGURES.write_text(json.dumps(known, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-    texts = list_parameters() | write_texts(known, templates)
+    texts = list_parameters() | write_texts(known, yaml.safe_load(TEMPLATES.read_text(encoding="utf-8")))
     for path in PAGES:
         page = path.read_text(encoding="utf-8")
         path.write_text(fill(page, texts), encoding="utf-8")
         for match in _BLOCK.finditer(page):
             if match["name"] not in texts:
-                print(f"{path.name}: {match['name']} is not in the figures, left as it was")
+                print(f"{path.name}: {match['name']} is not in the figures, left empty")
 
 
 if __name__ == "__main__":

@@ -46,6 +46,7 @@ class RecordedContact(ContactLoop):
         name: for reports.
         idling: passes images over as the contact estimator's node does; None for none.
         check: compares the mesh with the images of the recording; None where there are none.
+        delay: from a pose's stamp to its arrival [ns].
     """
 
     def __init__(
@@ -55,9 +56,10 @@ class RecordedContact(ContactLoop):
         name: str = "estimate",
         idling: Idling | None = None,
         check: RecordedCheck | None = None,
+        delay: int = 0,
     ) -> None:
         super().__init__(estimator)
-        self._check = check
+        self._check, self._arrivals = check, track.stamps_ns + delay
         self._idling = idling
         self.name, self._track, self._next = name, track, 0
 
@@ -67,7 +69,7 @@ class RecordedContact(ContactLoop):
         Raises:
             RecordingError: the estimator refuses a pose.
         """
-        while self._next < len(self._track.stamps_ns) and self._track.stamps_ns[self._next] <= stamp + ROUNDING:
+        while self._next < len(self._arrivals) and self._arrivals[self._next] <= stamp + ROUNDING:
             self._take_recorded(self._next)
             self._next += 1
         if self._check is not None:
@@ -170,7 +172,7 @@ def build_source(
     estimator = build_estimator(choice, mode, recording, jaw, mesh)
     track, idling = track_object(recording, jaw.side), Idling() if as_live else None
     check = check_mesh(recording, estimator.mesh) if choice.compare_mesh else None
-    return RecordedContact(estimator, track, mode, idling, check)
+    return RecordedContact(estimator, track, mode, idling, check, choice.pose_delay)
 
 
 def build_estimator(choice: ContactChoice, mode: str, recording: Recording, jaw: Jaw, mesh: str = "default") -> Any:
@@ -269,6 +271,7 @@ class ContactChoice:
         object_file: mesh for every recording; None takes it from each recording's `case.json`.
         object_unit: unit of the mesh.
         compare_mesh: whether the mesh is compared with the depth images.
+        pose_delay: from the stamp of a pose to its arrival [ns].
     """
 
     mode: str = AUTOMATIC
@@ -277,6 +280,7 @@ class ContactChoice:
     object_file: str | None = None
     object_unit: str = "m"
     compare_mesh: bool = True
+    pose_delay: int = 0
 
     def mode_for(self, recording: Recording, side: str) -> str:
         """Return "estimate", "closest", "paper" or "fixed" for one jaw of a recording."""

@@ -133,9 +133,9 @@ class RigidContact:
         contact = self.press(points, x, traction)
         state = model.linearize(q)
         model.stiffen(state.tangent, probe, q, 0.5 * (contact.springs + contact.springs.transpose(0, 2, 1)))
-        loads = self._load(q, np.concatenate([contact.forces[:, :, None], contact.changes], axis=2))
+        loads = load_columns(model, probe, q, np.concatenate([contact.forces[:, :, None], contact.changes], axis=2))
         loads[:, 0] -= state.force
-        steps = self._solve(model.factorise(state.tangent), q, loads, contact.springs)
+        steps = solve_contact(model, probe, q, model.factorise(state.tangent), loads, contact.springs)
         relief = np.einsum("pab,pbk->ak", contact.springs, model.project(probe, q, steps))
         size = np.hypot(contact.forces[:, 0], contact.forces[:, 2])
         total = size.sum()
@@ -153,31 +153,6 @@ class RigidContact:
             size=reached,
         )
 
-    def _solve(self, factor: Factor, q: NDArray, loads: NDArray, springs: NDArray) -> NDArray:
-        """Return the steps (size, k) under loads (size, k), with springs (p, 3, 3) that friction makes unsymmetric.
-
-        The factor of K holds their symmetric part. With the rest B, (K + B)^-1 b is sought among the combinations of
-        (-K^-1 B)^i K^-1 b, the one that leaves the least (GMRES).
-        """
-        steps = factor.solve(loads)
-        rest = 0.5 * (springs - springs.transpose(0, 2, 1))
-        if not rest.any():
-            return steps
-        terms = [steps]
-        for _ in range(_TERMS):
-            moved = rest @ self.model.project(self.surface.probe, q, terms[-1])
-            terms.append(-factor.solve(self._load(q, moved)))
-        left = np.stack([one - other for one, other in pairwise(terms)])
-        for k in range(steps.shape[1]):
-            share = np.linalg.lstsq(left[:, :, k].T, steps[:, k], rcond=None)[0]
-            steps[:, k] = sum(w * term[:, k] for w, term in zip(share, terms[:-1], strict=True))
-        return steps
-
-    def _load(self, q: NDArray, forces: NDArray) -> NDArray:
-        """Return the loads (size, k) of forces (p, 3, k) [N] on the surface points."""
-        columns = (np.ascontiguousarray(column) for column in np.moveaxis(forces, 2, 0))
-        return np.stack([self.model.load(self.surface.probe, q, column) for column in columns], axis=1)
-
     def approach(self, q: NDArray, step: NDArray, x: NDArray) -> NDArray:
         """Return the step of a jaw that has lost contact, cut where its surface meets the object again."""
         low, high = 0.0, 1.0
@@ -188,6 +163,33 @@ class RigidContact:
             else:
                 low = share
         return high * step
+
+
+def solve_contact(model: JawModel, probe: Any, q: NDArray, factor: Factor, loads: NDArray, springs: NDArray) -> NDArray:
+    """Return the steps (size, k) under loads (size, k), with springs (p, 3, 3) that friction makes unsymmetric.
+
+    The factor of K holds their symmetric part. With the rest B, (K + B)^-1 b is sought among the combinations of
+    (-K^-1 B)^i K^-1 b, the one that leaves the least (GMRES).
+    """
+    steps = factor.solve(loads)
+    rest = 0.5 * (springs - springs.transpose(0, 2, 1))
+    if not rest.any():
+        return steps
+    terms = [steps]
+    for _ in range(_TERMS):
+        moved = rest @ model.project(probe, q, terms[-1])
+        terms.append(-factor.solve(load_columns(model, probe, q, moved)))
+    left = np.stack([one - other for one, other in pairwise(terms)])
+    for k in range(steps.shape[1]):
+        share = np.linalg.lstsq(left[:, :, k].T, steps[:, k], rcond=None)[0]
+        steps[:, k] = sum(w * term[:, k] for w, term in zip(share, terms[:-1], strict=True))
+    return steps
+
+
+def load_columns(model: JawModel, probe: Any, q: NDArray, forces: NDArray) -> NDArray:
+    """Return the loads (size, k) of forces (p, 3, k) [N] on the points of a probe, at unknowns q (size,)."""
+    columns = (np.ascontiguousarray(column) for column in np.moveaxis(forces, 2, 0))
+    return np.stack([model.load(probe, q, column) for column in columns], axis=1)
 
 
 def measure_step(model: JawModel, step: NDArray) -> float:

@@ -20,6 +20,9 @@ EXPERIMENTS = {
     "places": ("Table II: value of knowing the contact location", "paper_tables"),
     "grasp": ("27 grasps: three objects, places and forces, both jaws", "grasp"),
     "manipulation": ("a held weight of 100 g that is turned, in two lights", "manipulation"),
+    "friction": ("27 first grasps without friction, and with 0.5, with and without a probe", "conditions"),
+    "pose": ("nine grasps whose object's poses come slowly or late", "conditions"),
+    "network": ("nine grasps in two lights against the paper's baseline network", "network"),
     "chip": ("an object that breaks at 5.43 N, grasped to 5 N by force, position and current", "chip"),
 }
 
@@ -39,6 +42,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--calibration", metavar="FILE", help=text)
     parser.add_argument("--seed", type=int, default=100, help="seed of the first scene (100)")
     parser.add_argument("--size", metavar="WxH", help="size of the rendered images (640x480; 320x240 with --quick)")
+    text = "checkpoint that lab.training.baseline wrote, for network"
+    parser.add_argument("--network", default="", metavar="FILE", help=text)
     add_engine_options(parser)
 
 
@@ -62,6 +67,7 @@ def read_options(options: argparse.Namespace) -> RunOptions:
         seed=options.seed,
         size=options.size or (QUICK_SIZE if options.quick else RunOptions.size),
         quick=options.quick,
+        network=options.network,
     )
 
 

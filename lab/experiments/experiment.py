@@ -64,6 +64,7 @@ class RunOptions:
         seed: of the first scene.
         size: of the twin's images, WIDTHxHEIGHT.
         quick: few and small cases.
+        network: checkpoint of the baseline network.
     """
 
     bags: Sequence[str] = ()
@@ -73,11 +74,12 @@ class RunOptions:
     seed: int = 100
     size: str = "640x480"
     quick: bool = False
+    network: str = ""
 
     @property
     def shared(self) -> dict[str, Any]:
         """The settings that every case has."""
-        files = hash_files((self.jaw, self.calibration))
+        files = hash_files((self.jaw, self.calibration, self.network))
         return {"jaw": self.jaw, "calibration": self.calibration, "source": self.source, "files": files}
 
     def scene_case(self, name: str, scene: str, changes: Mapping[str, Any], number: int, **more: Any) -> Case:

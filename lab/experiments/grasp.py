@@ -99,19 +99,24 @@ def list_cases(options: RunOptions) -> Sequence[Case]:
     """Return the grasps."""
     if options.bags:
         return options.bag_cases()
+    return list_grasps(options)
+
+
+def list_grasps(options: RunOptions, levels: Sequence[str] = tuple(LEVELS), **more: Any) -> list[Case]:
+    """Return the grasps of some levels of force on the twin, with more changes of the scene."""
     cases = []
     for number, (shape, place, level) in enumerate(product(SCENES, PLACES, LEVELS)):
         force, speed = LEVELS[level]
         words = {"object": shape, "place": place, "level": level, "force": force}
-        changes = {"height": PLACES[place], "closing_speed": speed, **(QUICK if options.quick else HOLD)}
-        if not options.quick or (shape, place, level) in QUICK_CASES:
+        changes = {"height": PLACES[place], "closing_speed": speed, **(QUICK if options.quick else HOLD), **more}
+        if level in levels and (not options.quick or (shape, place, level) in QUICK_CASES):
             cases.append(options.scene_case(f"{shape}_{place}_{level}", SCENES[shape], changes, number, words=words))
     return cases
 
 
 def run(options: RunOptions, case: Case, folder: Path) -> dict[str, Any]:
     """Return the figures of a grasp."""
-    with options.open_case(_with_displacement(case), folder) as recording:
+    with options.open_case(with_displacement(case), folder) as recording:
         setup = build_setup(case.settings)
         evaluation = evaluate_all([recording], setup)
         grasp = join_jaws(evaluation, recording.name)
@@ -162,7 +167,7 @@ NOTE = (
 )
 
 
-def _with_displacement(case: Case) -> Case:
+def with_displacement(case: Case) -> Case:
     """Return a scene with each jaw's way beyond first touch that makes the force of its level."""
     settings = case.settings
     if "bag" in settings:
@@ -170,7 +175,8 @@ def _with_displacement(case: Case) -> Case:
     from finforce_sim.gripper import PressedGrasp
     from finforce_sim.scenarios import build_scenario
 
-    grasp = PressedGrasp(build_scenario(settings["scene"], **settings["changes"]), step=5e-4)
+    smooth = {**settings["changes"], "roughness": 0.0}  # friction needs a finer step, and changes the way by little
+    grasp = PressedGrasp(build_scenario(settings["scene"], **smooth), step=5e-4)
     way = grasp.find_closing(settings["words"]["force"])
     return replace(case, settings={**settings, "changes": {**settings["changes"], "displacement": way}})
 

@@ -61,9 +61,9 @@ class _CoarsePart(nn.Module):
         finest, fine, middle, coarse = shape.coarse
         folded = shape.folded
         self.stem = build_convolution(6, finest, stride=2, folded=folded)
-        self.down8 = _build_stage(finest, fine, 2, folded)
-        self.down16 = _build_stage(fine, middle, 2, folded)
-        self.down32 = _build_stage(middle, coarse, 2, folded)
+        self.down8 = build_stage(finest, fine, 2, folded)
+        self.down16 = build_stage(fine, middle, 2, folded)
+        self.down32 = build_stage(middle, coarse, 2, folded)
         rows, columns = shape.height // 32, -(-shape.width // 32)
         self.places = nn.Parameter(torch.zeros(1, coarse, rows, columns))
         self.up16 = build_convolution(coarse, middle, kernel=1, folded=folded, activate=False)
@@ -91,7 +91,7 @@ class _FinePart(nn.Module):
         folded = shape.folded
         self.stem = build_convolution(6, finest, stride=2, folded=folded)
         self.level2 = _ResidualBlock(finest, folded)
-        self.down4 = _build_stage(finest, fine, 2, folded)
+        self.down4 = build_stage(finest, fine, 2, folded)
         self.votes = nn.Conv2d(fine, 3, 1)
         self.judge = nn.Sequential(nn.Linear(2 * fine + shape.coarse[1], 32), nn.ReLU(), nn.Linear(32, 2))
         steps = (torch.arange(PIECE // 4) + 0.5) * 4.0 - 0.5 * PIECE
@@ -266,7 +266,7 @@ def fold_batch_norm(network: FingerNetwork) -> FingerNetwork:
     return folded.eval()
 
 
-def _build_stage(inputs: int, outputs: int, blocks: int, folded: bool) -> nn.Sequential:
+def build_stage(inputs: int, outputs: int, blocks: int, folded: bool) -> nn.Sequential:
     """Return a halving of the resolution and the residual blocks after it."""
     return nn.Sequential(
         build_convolution(inputs, outputs, stride=2, folded=folded),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from math import cos, pi
 from pathlib import Path
@@ -56,11 +56,6 @@ class Losses:
     fine: torch.Tensor
     likely: torch.Tensor
     seen: torch.Tensor
-
-    @property
-    def total(self) -> torch.Tensor:
-        """The sum that is minimised."""
-        return self.coarse + self.fine + self.likely + self.seen
 
 
 def compute_losses(network: FingerNetwork, batch: Batch, *, low: bool) -> Losses:
@@ -169,20 +164,19 @@ def has_bfloat16(device: torch.device) -> bool:
     return bool(getattr(torch.cpu, "_is_amx_tile_supported", lambda: False)())
 
 
-class FingerTraining:
+class Training:
     """A network, its optimiser, its averaged weights, which are those that are kept, and how far they are.
 
     Args:
         recipe: duration and learning rate.
-        network: to begin with; random weights when absent.
+        network: to begin with; its `shape` is a record of its sizes.
     """
 
-    def __init__(self, recipe: Recipe, network: FingerNetwork | None = None) -> None:
-        torch.manual_seed(recipe.seed)
+    def __init__(self, recipe: Recipe, network: torch.nn.Module) -> None:
         torch.set_num_threads(recipe.threads)
         self.recipe = recipe
         self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-        self.network = (network or FingerNetwork()).to(self.device, memory_format=torch.channels_last)
+        self.network = network.to(self.device, memory_format=torch.channels_last)
         self.optimizer = torch.optim.AdamW(self.network.parameters(), lr=recipe.rate, weight_decay=recipe.decay)
         averaging = torch.optim.swa_utils
         self._averaging = averaging.AveragedModel(self.network, avg_fn=self._average, use_buffers=True)
@@ -196,19 +190,23 @@ class FingerTraining:
         recipe = self.recipe
         return min(self.step / recipe.steps if recipe.steps else self.elapsed / (60.0 * recipe.minutes), 1.0)
 
-    def learn(self, batch: Batch) -> dict[str, float]:
+    def measure(self, batch: Any) -> Mapping[str, torch.Tensor]:
+        """Return the losses of a batch by name; their sum is minimised."""
+        raise NotImplementedError
+
+    def learn(self, batch: Any) -> dict[str, float]:
         """Take one step on a batch and return its losses by name."""
         self.network.train()
         for group in self.optimizer.param_groups:
             group["lr"] = compute_rate(self.progress, self.recipe)
-        losses = compute_losses(self.network, batch.to(self.device), low=has_bfloat16(self.device))
+        losses = self.measure(batch)
         self.optimizer.zero_grad(set_to_none=True)
-        losses.total.backward()
+        sum(losses.values()).backward()
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.recipe.clip)
         self.optimizer.step()
         self._averaging.update_parameters(self.network)
         self.step += 1
-        return {name: float(getattr(losses, name).detach()) for name in losses.__dataclass_fields__}
+        return {name: float(loss.detach()) for name, loss in losses.items()}
 
     def resume(self, checkpoint: Mapping[str, Any]) -> None:
         """Go on from a checkpoint.
@@ -216,38 +214,23 @@ class FingerTraining:
         Raises:
             TrainingError: it is of another network.
         """
-        told = shape_from(checkpoint["shape"])
-        if told != self.network.shape:
-            raise TrainingError(f"got a checkpoint of {told}, expected one of {self.network.shape}")
+        if checkpoint["shape"] != asdict(self.network.shape):
+            raise TrainingError(f"got a checkpoint of {checkpoint['shape']}, expected one of {self.network.shape}")
         for name, part in self.parts.items():
             part.load_state_dict(checkpoint[name])
         self.step, self.elapsed = int(checkpoint["step"]), float(checkpoint["elapsed"])
         self._averaging.n_averaged.fill_(self.step)
 
-    def score(self, pictures: FingerPictures) -> Score:
-        """Return how well the averaged network finds the key points of pictures."""
-        return score_detections(detect(self.averaged.eval(), pictures))
-
-    def train(
-        self, pictures: FingerPictures, judging: FingerPictures, augmentation: AugmentSettings, folder: Path
-    ) -> Score:
+    def run(self, batches: Iterator[Any], judge: Callable[[], Mapping[str, float]], folder: Path) -> None:
         """Train until the recipe's end, with a log of losses and scores and a checkpoint beside it.
 
         Args:
-            pictures: to learn from.
-            judging: by which it is judged; no finger is in both.
-            augmentation: of the pictures.
+            batches: to learn from, without end.
+            judge: returns scores of the averaged network by name.
             folder: of log and checkpoint.
-
-        Returns:
-            The score at the end.
         """
         folder.mkdir(parents=True, exist_ok=True)
-        recipe = self.recipe
-        batches = load_batches(
-            pictures, augmentation, recipe.batch, workers=recipe.workers, seed=recipe.seed, first=self.step
-        )
-        every = 60.0 * recipe.evaluate_every
+        every = 60.0 * self.recipe.evaluate_every
         began, due = time.monotonic() - self.elapsed, self.elapsed + every
         shown: dict[str, float] = {}
         with tqdm(total=100.0, desc="train", unit="%", bar_format="{l_bar}{bar}|{postfix}", disable=None) as bar:
@@ -259,15 +242,13 @@ class FingerTraining:
                 bar.set_postfix({"step": self.step, **{name: f"{value:.3f}" for name, value in shown.items()}})
                 if self.elapsed >= due and self.progress < 1.0:
                     due += every
-                    self._report(shown, self.score(judging), folder)
-        final = self.score(judging)
-        self._report(shown, final, folder)
-        return final
+                    self._report(shown, judge(), folder)
+        self._report(shown, judge(), folder)
 
-    def _report(self, shown: Mapping[str, float], score: Score, folder: Path) -> None:
+    def _report(self, shown: Mapping[str, float], scores: Mapping[str, float], folder: Path) -> None:
         """Add a line to the log, write the checkpoint."""
         line: dict[str, float] = {"step": self.step, "minutes": round(self.elapsed / 60.0, 2)}
-        line |= {name: round(float(value), 5) for name, value in {**shown, **asdict(score)}.items()}
+        line |= {name: round(float(value), 5) for name, value in {**shown, **scores}.items()}
         with (folder / LOG).open("a", encoding="utf-8") as log:
             log.write(json.dumps(line) + "\n")
         tqdm.write(json.dumps(line))
@@ -279,6 +260,32 @@ class FingerTraining:
         """Return the running average of a tensor; the first steps, of hardly trained weights, are forgotten fast."""
         stay = min(self.recipe.average, (1.0 + int(count)) / (10.0 + int(count)))
         return torch.lerp(new, kept, stay) if new.is_floating_point() else new
+
+
+class FingerTraining(Training):
+    """The training of the key point network, from random weights when none are given."""
+
+    def __init__(self, recipe: Recipe, network: FingerNetwork | None = None) -> None:
+        torch.manual_seed(recipe.seed)
+        super().__init__(recipe, network or FingerNetwork())
+
+    def measure(self, batch: Batch) -> Mapping[str, torch.Tensor]:
+        """Return the losses of a batch by name."""
+        return vars(compute_losses(self.network, batch.to(self.device), low=has_bfloat16(self.device)))
+
+    def score(self, pictures: FingerPictures) -> Score:
+        """Return how well the averaged network finds the key points of pictures."""
+        return score_detections(detect(self.averaged.eval(), pictures))
+
+    def train(
+        self, pictures: FingerPictures, judging: FingerPictures, augmentation: AugmentSettings, folder: Path
+    ) -> None:
+        """Train on augmented pictures; those of other fingers judge it."""
+        recipe = self.recipe
+        batches = load_batches(
+            pictures, augmentation, recipe.batch, workers=recipe.workers, seed=recipe.seed, first=self.step
+        )
+        self.run(batches, lambda: asdict(self.score(judging)), folder)
 
 
 @torch.no_grad()

@@ -23,12 +23,12 @@ def make_track(*frames):
     return ObjectTrack(stamps_ns=START + PERIOD * np.array(frames), poses=poses)
 
 
-def run(track, *, lost=(), touching=lambda update: True):
+def run(track, *, lost=(), touching=lambda update: True, delay=0):
     recording = make_recording()
     forces = [None if k in lost else force for k, force in enumerate(recording.jaws["left"].truth.force)]
     solver, fake = FakeEstimator(forces), FakeContactEstimator(touching)
     jaw = FakeJaw(keypoints=np.zeros((4, 3)))
-    source = RecordedContact(fake, track)
+    source = RecordedContact(fake, track, delay=delay)
     result = evaluate_recording(recording, jaw, source, solver)
     return result, solver, fake
 
@@ -41,6 +41,13 @@ def test_poses_up_to_an_image_come_before_its_contact_and_later_ones_wait():
     _, _, fake = run(make_track(-2, 0, 2))
     assert kinds(fake.calls)[:6] == ["pose", "pose", "update", "update", "pose", "update"]
     assert len(fake.calls) == 3 + 60
+
+
+def test_late_poses_come_with_their_own_stamps():
+    _, _, fake = run(make_track(-2, 0, 2), delay=2 * PERIOD)
+    assert kinds(fake.calls)[:7] == ["pose", "update", "update", "pose", "update", "update", "pose"]
+    poses = [call[1] for call in fake.calls if call[0] == "pose"]
+    assert poses == pytest.approx([1e-9 * (START + PERIOD * frame) for frame in (-2, 0, 2)], abs=1e-6)
 
 
 def test_update_is_given_the_surface_of_the_image_before():

@@ -170,7 +170,12 @@ def test_a_template_is_filled_with_the_numbers_at_their_places(fill_pages):
     page = "x\n<!-- begin {0} -->\nold\n<!-- end {0} -->\n"
     assert fill_pages.fill(page.format("t") + page.format("nodes"), texts) == page.format("t").replace(
         "old", texts["t"]
-    ) + page.format("nodes")
+    ) + page.format("nodes").replace("old\n", "")
+
+
+def test_a_table_without_figures_keeps_its_head_alone(fill_pages):
+    head, row, end = "<!-- begin a.tables.t -->\n| tier |\n|---|\n", "| a |\n", "<!-- end a.tables.t -->\n"
+    assert fill_pages.fill(head + row + end, {}) == head + end
 
 
 @pytest.mark.parametrize(
@@ -181,7 +186,7 @@ def test_a_file_without_a_number_that_a_page_needs_changes_nothing(fill_pages, p
         fill_pages.take_figures({}, FOUND, [place])
 
 
-def test_every_table_of_the_pages_is_what_the_kept_figures_say(fill_pages):
+def test_every_table_of_the_pages_is_what_the_kept_figures_say(fill_pages, measure_pages):
     templates = fill_pages.yaml.safe_load(fill_pages.TEMPLATES.read_text(encoding="utf-8"))
     known = json.loads(fill_pages.FIGURES.read_text(encoding="utf-8"))
     texts, shown = fill_pages.list_parameters() | fill_pages.write_texts(known, templates), set()
@@ -189,7 +194,61 @@ def test_every_table_of_the_pages_is_what_the_kept_figures_say(fill_pages):
         page = path.read_text(encoding="utf-8")
         shown |= {match["name"] for match in fill_pages._BLOCK.finditer(page)}
         assert fill_pages.fill(page, texts) == page, path.name
-    assert templates.keys() <= shown <= texts.keys()
+    assert templates.keys() <= shown
+    assert {name.split(".")[0] for name in shown - texts.keys()} <= measure_pages.PARTS.keys()  # not measured yet
+
+
+@pytest.fixture
+def measure_pages(monkeypatch, tmp_path):
+    monkeypatch.syspath_prepend(str(ROOT))
+    module = __import__("tools.measure_pages", fromlist=["main"])
+    monkeypatch.setattr(module, "REPORT", tmp_path)
+    return module
+
+
+def test_a_figure_from_before_the_last_release_is_stale(measure_pages, tmp_path):
+    def git(*words):
+        who = ("git", "-c", "user.name=A", "-c", "user.email=a@b.c")
+        done = subprocess.run((*who, *words), cwd=tmp_path, check=True, capture_output=True, text=True)
+        return done.stdout.strip()
+
+    git("init", "-q")
+    git("commit", "-q", "--allow-empty", "-m", "One")
+    old = git("rev-parse", "HEAD")
+    known = {"old": {"machine": f"Measured at commit {old} on P."}, "unnamed": {"machine": ""}}
+    assert measure_pages.list_stale(known, tmp_path) == []
+    git("commit", "-q", "--allow-empty", "-m", "Two")
+    git("tag", "-a", "v1", "-m", "v1")
+    new = git("rev-parse", "HEAD")
+    known["new"] = {"machine": f"Measured at commit {new}-dirty-1a2b on P."}
+    assert measure_pages.list_stale(known, tmp_path) == ["old", "unnamed"]
+
+
+def test_no_page_shows_figures_from_before_the_last_release(measure_pages):
+    assert measure_pages.list_stale(json.loads(measure_pages.FIGURES.read_text(encoding="utf-8"))) == []
+
+
+def test_a_part_of_this_commit_is_not_measured_again_and_one_that_fails_is_dropped(measure_pages, monkeypatch):
+    ran, filled = [], []
+
+    def run(words, **options):
+        ran.append(words[3:])
+        if "solvers" in words:
+            found = {"machine": MACHINE | {"commit": measure_pages.commit()}, "solvers": {"rows": {}}}
+            Path(words[words.index("--json") + 1]).write_text(json.dumps(found))
+        return SimpleNamespace(returncode=0 if "solvers" in words else 1)
+
+    monkeypatch.setattr(measure_pages.subprocess, "run", run)
+    monkeypatch.setattr(measure_pages, "commit", lambda: "abc")
+    monkeypatch.setattr(measure_pages, "list_places", lambda templates: ["solvers.rows"])
+    monkeypatch.setattr(measure_pages, "fill_pages", filled.append)
+    measure_pages.main(["solvers", "grasp"])
+    assert [words[:2] for words in ran] == [["bench", "--parts"], ["experiment", "grasp"]]
+    assert filled[0]["solvers"]["values"] == {"solvers.rows": {}} and "grasp" not in filled[0]
+    measure_pages.main(["solvers"])
+    assert len(ran) == 2
+    with pytest.raises(SystemExit):
+        measure_pages.main(["nothing"])
 
 
 def test_page_chooses_the_columns_of_its_tables(fill_pages):

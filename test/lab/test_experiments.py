@@ -21,6 +21,7 @@ from finforce_eval.tasks import Manifest
 from finforce_ifea.grasp_force import R_GRIPPER_JAW
 from lab.experiments import grasp_world
 from lab.experiments.chip import CHIP
+from lab.experiments.conditions import CONTACTS, FRICTION, POSE, thin_poses
 from lab.experiments.experiment import (
     Case,
     Experiment,
@@ -33,6 +34,7 @@ from lab.experiments.experiment import (
 )
 from lab.experiments.grasp import GRASP, find_phases, score_grasp
 from lab.experiments.manipulation import MANIPULATION, score_weight, tell_gravity, true_gravity
+from lab.experiments.network import NETWORK, name_condition
 from lab.experiments.paper_tables import PLACES
 from lab.harness import Figures, format_figures
 
@@ -293,9 +295,54 @@ def test_an_object_that_is_hidden_has_no_poses_any_more():
     assert len(one.object_pose.stamps_ns) > 5
 
 
+def test_poses_at_a_lower_rate_are_some_of_those_that_there_are():
+    one = make_recording("one")
+    track, count = one.object_pose, 90
+    stamps = track.stamps_ns[0] + np.round(np.arange(count) * 1e9 / 30.0).astype(int)
+    many = replace(
+        track, stamps_ns=stamps, position=np.zeros((count, 3)), quaternion=np.tile([0.0, 0, 0, 1], (count, 1))
+    )
+    recording = replace(one, object_pose=many)
+    assert [len(thin_poses(recording, rate).object_pose.stamps_ns) for rate in (30.0, 10.0, 3.0)] == [90, 30, 9]
+    gaps = np.diff(thin_poses(recording, 10.0).object_pose.stamps_ns)
+    np.testing.assert_allclose(gaps, 1e8, atol=2)
+
+
+def test_every_grasp_of_the_paper_is_repeated_under_each_contact_and_light():
+    contacts = pd.Series([case.settings["contact"] for case in FRICTION.list_cases(RunOptions())])
+    assert contacts.value_counts().to_dict() == dict.fromkeys(CONTACTS, 27)
+    changes = FRICTION.list_cases(RunOptions())[-1].settings["changes"]
+    assert changes["roughness"] == 0.5
+    assert len(POSE.list_cases(RunOptions())) == 9
+    words = [case.settings["words"] for case in NETWORK.list_cases(RunOptions(network="checkpoint.pt"))]
+    assert pd.Series([name_condition(one) for one in words]).value_counts().to_dict() == {
+        "trained object, trained light": 6,
+        "trained object, unseen light": 6,
+        "unseen object, trained light": 3,
+        "unseen object, unseen light": 3,
+    }
+
+
+def test_errors_of_both_methods_are_over_the_images_for_which_both_have_a_force(tmp_path):
+    row = {"images": 10, "object": "cube", "light": "bright"}
+    rows = {
+        "one": row | {"compared": 8, "found": 0.08, "network": 2.0},
+        "two": row | {"compared": 2, "found": 0.02, "network": 0.5},
+    }
+    tables = NETWORK.find(RunOptions(network="n"), rows, tmp_path).tables
+    (found,) = tables["conditions"].to_dict("records")
+    assert (found["seen"], found["grasps"], found["images"]) == ("trained object, trained light", 2, 20)
+    assert found["compared"] == 10
+    assert found["finforce: RMSE/N"] == pytest.approx(0.1) and found["network: RMSE/N"] == pytest.approx(0.5)
+    assert found["network : finforce"] == pytest.approx(5.0)
+
+
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
+        (["network"], "--network RUN/checkpoint.pt"),
+        (["pose", "--on", "some_bag"], "expected twin"),
+        (["friction", "--on", "some_bag"], "expected twin"),
         (["nothing"], "got 'nothing', expected one of"),
         (["chip", "--on", "some_bag"], "expected twin"),
         (["grasp", "--on", "twin", "a_bag"], "not both"),

@@ -19,6 +19,7 @@ from finforce_sim.scenarios import (
     RATE,
     SCENARIOS,
     BalanceError,
+    Posture,
     Scenario,
     ScenarioError,
     build_scenario,
@@ -321,6 +322,40 @@ def test_images_come_at_the_rate_that_was_asked_for_of_the_same_course():
     assert [posture.closing for posture in fast.postures[::3]] == pytest.approx([p.closing for p in slow.postures])
     with pytest.raises(ScenarioError, match="readout of 0.02 s at 90 Hz"):
         build_scenario("grasp_cylinder", rate=90.0, readout=0.02)
+
+
+def press_along(roughness, closings):
+    gripper = TwinGripper(build_scenario("grasp_cylinder", roughness=roughness), 3, "coarse")
+    before = gripper.hold_object()
+    for closing in (0.0, 1e-3):  # which the next object knows nothing of
+        before.follow(gripper.setting_of(Posture(closing=closing)))
+    held = gripper.hold_object()
+    shapes = [held.follow(gripper.setting_of(Posture(closing=float(closing)))) for closing in closings]
+    return {side: np.array([one[side].force for one in shapes]) for side in SIDES}
+
+
+def test_a_rough_object_pulls_along_the_surface_and_remembers_its_way_while_the_jaws_balance():
+    way = np.linspace(0.0, 3e-3, 31)
+    there_and_back = np.concatenate([way, way[-2:-12:-1]])
+    smooth, rough = press_along(0.0, there_and_back), press_along(0.5, there_and_back)
+    np.testing.assert_allclose(rough["left"][:, 0], rough["right"][:, 0], atol=1e-3)
+    ratio = np.abs(rough["left"][5:31, 2] / rough["left"][5:31, 0])
+    assert 0.1 < ratio.max() <= 0.6  # the coefficient, and the inclination of the bent face
+    assert np.abs(smooth["left"][:, 2]).max() < 0.05 * np.abs(smooth["left"][:, 0]).max()
+    same = slice(20, 29), slice(-1, -10, -1)  # the same closings on the way there and back
+    np.testing.assert_allclose(smooth["left"][same[0]], smooth["left"][same[1]], atol=1e-3)
+    assert np.abs(rough["left"][same[0], 2] - rough["left"][same[1], 2]).max() > 0.1
+    assert not rough["left"][0].any()
+
+
+def test_a_probed_object_is_let_go_by_a_little_at_half_the_way():
+    scene = build_scenario("grasp_cylinder", probe=1e-3, closing_speed=0.003, clearance=0.001)
+    closings = np.array([posture.closing for posture in write_script(scene).postures])
+    loading = closings[: int(np.argmax(closings)) + 1]
+    back = np.diff(loading) < -1e-9
+    assert loading[-1] == 6e-3
+    assert loading[:-1][back].max() == pytest.approx(3e-3, abs=1.1e-4)
+    assert loading[1:][back].min() == pytest.approx(2e-3, abs=1.1e-4)
 
 
 def test_every_field_of_a_scenario_is_read():

@@ -1,0 +1,124 @@
+"""Measure the figures of README and docs/ at one commit, part by part, and fill the pages: `make figures`.
+
+A part whose JSON is of this commit is not repeated, so that a stopped run goes on. Tables of what no part has at this
+commit are emptied: nothing is kept from an older one. With parts named, the others stay.
+"""
+
+import argparse
+import json
+import shlex
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from finforce_eval.machine import commit
+from tools.fill_pages import DOCS, FIGURES, TEMPLATES, fill_pages, list_places, take_figures
+
+REPORT = DOCS.parent / "report"
+BENCH, STEEL = "finforce_eval/data/bench_cyl25_middle", "finforce_eval/data/steel_r20"
+SCENES = {  # of the recordings of docs/results.md
+    **{name: f"grasp_{name}" for name in ("cylinder", "cube", "asymmetric")},
+    **{name: name for name in ("shifting", "fast_close")},
+    **{"bench_middle": "bench_cylinder", "bench_lower": "bench_cylinder_lower"},
+    **{"weight": "weight_turn", "weight_dim": "weight_turn_dim"},
+    "bottle": "grasp_cylinder --object bottle --set scale=0.45 --set turn_x=1.5708",
+}
+RENDER = "; ".join(f"twin record {scene} --seed 101 -o {{report}}/bags/{name}" for name, scene in SCENES.items())
+BAGS = " ".join(f"{{report}}/bags/{name}" for name in SCENES)
+# Commands of each part, one after the other; the last one writes the JSON.
+PARTS = {
+    "solvers": "bench --parts solvers --figure docs/images/pareto.png --json {json}",
+    "chain": "bench --parts chain --json {json}",
+    "ablation": "ablation --json {json}",
+    "stress": "stress --count 12 --json {json}",
+    **{
+        name: f"experiment {name} --report {{report}}"
+        for name in ("grasp", "friction", "pose", "manipulation", "chip", "places")
+    },
+    "network": "experiment network --network {network} --report {report}",
+    "bound": f"bound {BENCH} --calibration bench --json {{json}}",
+    **{
+        f"contact_{mode}": f"evaluate {BENCH} --calibration bench --contact {mode} --json {{json}}"
+        for mode in ("estimate", "closest", "paper")
+    },
+    "datasheet": f"evaluate {BENCH} --contact fixed:case --json {{json}}",
+    "sensor": f"evaluate {BENCH} --contact fixed:case --calibration bench --json {{json}}",
+    "steel": f"evaluate {STEEL} --jaw steel --json {{json}}",
+    "scenes_images": f"{RENDER}; evaluate {BAGS} --calibration twin --from images --json {{json}}",
+    "scenes_truth": f"evaluate {BAGS} --calibration twin --from truth --json {{json}}",
+    "recordings": "evaluate {recordings} --contact estimate --calibration bench --json {json}",
+}
+
+
+def read_measured(part: str) -> dict[str, Any] | None:
+    """Return the JSON of a part where it is of this commit, as sources with their machine; else None."""
+    path = _find_json(part)
+    found = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    if found.get("machine", {}).get("commit") != commit():
+        return None
+    return found if part in found else {part: found, "machine": found["machine"]}
+
+
+def _find_json(part: str) -> Path:
+    return REPORT / part / f"{part}.json" if PARTS[part].startswith("experiment") else REPORT / f"{part}.json"
+
+
+def measure(part: str, given: Mapping[str, str]) -> None:
+    """Run the commands of a part, until one fails."""
+    for command in PARTS[part].format(json=_find_json(part), report=REPORT, **given).split("; "):
+        print(f"finforce {command}", flush=True)
+        if subprocess.run([sys.executable, "-m", "finforce_eval.cli.main", *shlex.split(command)]).returncode:
+            return
+
+
+def list_stale(known: Mapping[str, Any], repository: Path = DOCS.parent) -> list[str]:
+    """Return the sources of kept figures that are not of the last release or later; none before the first release."""
+    tag = _ask_git(repository, "describe", "--tags", "--abbrev=0")
+    named = {source: figures["machine"].partition("at commit ")[2] for source, figures in known.items()}
+    commits = {source: text.partition(" ")[0].partition("-dirty")[0] for source, text in named.items()}
+    return [
+        source
+        for source, name in commits.items()
+        if tag and (not name or _ask_git(repository, "merge-base", "--is-ancestor", tag, name) is None)
+    ]
+
+
+def _ask_git(repository: Path, *words: str) -> str | None:
+    """Return what git says, None where it fails or is absent."""
+    try:
+        return subprocess.run(
+            ["git", *words], cwd=repository, capture_output=True, check=True, text=True
+        ).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Measure the parts that are not of this commit, and fill the pages with those that are."""
+    parser = argparse.ArgumentParser(prog="python -m tools.measure_pages", description=__doc__)
+    parser.add_argument("parts", nargs="*", choices=[[], *PARTS], metavar="PART", help=f"of {', '.join(PARTS)} (all)")
+    parser.add_argument("--recordings", default="", help="folder of bench recordings (none: without their tables)")
+    parser.add_argument("--network", default="", help="checkpoint of lab.training.baseline (none: without its table)")
+    options = parser.parse_args(arguments)
+    bags = sorted(Path(options.recordings).glob("*")) if options.recordings else []
+    given = {"recordings": shlex.join(map(str, bags)), "network": shlex.quote(options.network)}
+    kept = json.loads(FIGURES.read_text(encoding="utf-8")) if options.parts else {}
+    places = list_places(yaml.safe_load(TEMPLATES.read_text(encoding="utf-8")))
+    for part in options.parts or PARTS:
+        lacks = [name for name in given if f"{{{name}}}" in PARTS[part] and not getattr(options, name)]
+        if read_measured(part) is None and not lacks:
+            measure(part, given)
+        if found := read_measured(part):
+            kept = take_figures(kept, found, places)
+        else:
+            print(f"{part}: not measured at this commit, its tables are left empty", file=sys.stderr)
+            kept.pop(part, None)
+    fill_pages(kept)
+
+
+if __name__ == "__main__":
+    main()
