@@ -117,7 +117,6 @@ class TestJump:
         assert weigh_jump(jump, information, score) < 0.0
         assert weigh_jump(jump, information, 10.0 * score) > 0.0
 
-
     def test_errors_that_are_alike_tell_less_of_one(self):
         """Three key points whose errors correlate by 0.2 tell of what moves all of them as 3 / 1.4 do."""
         measured, _, P, x = draw()
