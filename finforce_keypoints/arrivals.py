@@ -181,7 +181,10 @@ def find_missing(gaps: NDArray[np.int64]) -> tuple[float, NDArray[np.int64]]:
     if len(short) < _FEWEST or count_hasty(short) >= _BURSTS * len(short):
         return 0.0, nothing
     period = float(np.median(short[short <= _LONG * np.quantile(short, 0.1)]))
-    period = float(np.median(short[(short > (2.0 - _LONG) * period) & (short < _LONG * period)]))
+    alike = short[(short > (2.0 - _LONG) * period) & (short < _LONG * period)]
+    if not len(alike):
+        return 0.0, nothing
+    period = float(np.median(alike))
     counts = np.maximum(np.rint(gaps / period).astype(int), 1)
     off, is_long = np.abs(gaps / period - counts), (counts > 1) & (gaps < PAUSE)
     if max(off[gaps < PAUSE].mean(), off[is_long].mean() if is_long.any() else 0.0) > _IRREGULAR:

@@ -263,7 +263,8 @@ def test_tare_of_the_opened_jaw_takes_a_bump_up():
         solutions.append(estimator.update(observation, apart if index < REST else recording.contact))
         if index == REST - 1:
             assert "tared 15 key points" in estimator.tare()
-    assert solutions[REST - 5].magnitude_stddev * 3.0 > np.linalg.norm(solutions[REST - 5].force)
+    before = solutions[REST - 5]  # without a tare yet, for the bump came among its images
+    assert before.status == "waiting" or before.magnitude_stddev * 3.0 > np.linalg.norm(before.force)
     assert rms(errors(recording, solutions)[REST + 5 :]) < 0.1
 
 

@@ -14,6 +14,7 @@ from finforce_keypoints.images import ImageWatch
 from finforce_sim.footage import Footage
 from finforce_sim.gripper import JawState, TwinState
 from finforce_sim.photographer import Shot, TrueJaw
+from finforce_sim.scenarios import Scenario
 
 CAMERA = CameraIntrinsics(width=64, height=48, fx=43.0, fy=43.0, cx=31.5, cy=23.5, distortion=np.full(5, 0.01))
 KEYPOINTS = 4
@@ -34,6 +35,7 @@ class FakeGripper:
     sides: tuple = ("left",)
     onset: int = 6
     has_object: bool = True
+    scenario: Scenario = field(default_factory=lambda: Scenario(name="fake"))
 
     def __len__(self):
         return self.count
