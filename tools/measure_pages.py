@@ -7,6 +7,7 @@ commit are emptied: nothing is kept from an older one. With parts named, the oth
 import argparse
 import json
 import shlex
+import shutil
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
@@ -29,9 +30,11 @@ SCENES = {  # of the recordings of docs/results.md
 }
 RENDER = "; ".join(f"twin record {scene} --seed 101 -o {{report}}/bags/{name}" for name, scene in SCENES.items())
 BAGS = " ".join(f"{{report}}/bags/{name}" for name in SCENES)
-# Commands of each part, one after the other; the last one writes the JSON.
+PICTURE = "pareto.png"  # of solvers
+# Commands of each part, one after the other; the last one writes the JSON. None changes a file of the repository, for
+# what follows would be of another commit.
 PARTS = {
-    "solvers": "bench --parts solvers --figure docs/images/pareto.png --json {json}",
+    "solvers": f"bench --parts solvers --figure {{report}}/{PICTURE} --json {{json}}",
     "chain": "bench --parts chain --json {json}",
     "ablation": "ablation --json {json}",
     "stress": "stress --count 12 --json {json}",
@@ -108,6 +111,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     given = {"recordings": shlex.join(map(str, bags)), "network": shlex.quote(options.network)}
     kept = json.loads(FIGURES.read_text(encoding="utf-8")) if options.parts else {}
     places = list_places(yaml.safe_load(TEMPLATES.read_text(encoding="utf-8")))
+    REPORT.mkdir(exist_ok=True)
     for part in options.parts or PARTS:
         lacks = [name for name in given if f"{{{name}}}" in PARTS[part] and not getattr(options, name)]
         if read_measured(part) is None and not lacks:
@@ -118,6 +122,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             print(f"{part}: not measured at this commit, its tables are left empty", file=sys.stderr)
             kept.pop(part, None)
     fill_pages(kept)
+    if read_measured("solvers") and (REPORT / PICTURE).exists():
+        shutil.copy(REPORT / PICTURE, DOCS / "images" / PICTURE)
 
 
 if __name__ == "__main__":

@@ -228,6 +228,12 @@ def test_no_page_shows_figures_from_before_the_last_release(measure_pages):
     assert measure_pages.list_stale(json.loads(measure_pages.FIGURES.read_text(encoding="utf-8"))) == []
 
 
+def test_no_part_changes_the_commit_of_the_next_one(measure_pages):
+    """Pictures are drawn into the report, and copied to the pages at the end."""
+    for part in measure_pages.PARTS:
+        assert "docs/" not in measure_pages.PARTS[part], part
+
+
 def test_a_part_of_this_commit_is_not_measured_again_and_one_that_fails_is_dropped(measure_pages, monkeypatch):
     ran, filled = [], []
 
