@@ -228,7 +228,9 @@ class ForceEstimator:
         if bits != self._bits:
             self._bits, self._changed = bits, self._stamp
         points = self._gate.accept(observation)
-        self._taring.add(points, observation.stddev, apart=contact is not None and contact.touching is False)
+        is_apart = contact is not None and contact.touching is False
+        dt = self._stamp - self._stamps[max(len(self._stamps) - 2, 0)]
+        self._taring.add(points, observation.stddev, apart=is_apart, dt=dt)
         used, self.is_idle = np.isfinite(points[:, 0]), False
         count = np.count_nonzero(used)
         if count < self.settings.minimum_keypoints:

@@ -41,7 +41,7 @@ class EstimatorSettings:
         "weighed by the key points; auto: either with two jaws, else no",
         choices=("auto", "yes", "no", "either"),
     )
-    tare_frames: int = setting(45, "number of unloaded images for the tare", "images", 5, 10000)
+    tare_frames: int = setting(45, "number of unloaded images for the tare; below 30 Hz, fewer", "images", 5, 10000)
     automatic_tare: bool = setting(True, "automatic tare at the start, while unloaded")
     height_stddev: float = setting(0.5e-3, "uncertainty of the stated height of first touch (1 sigma)", "m", 1e-6, 0.05)
     radius: float = setting(0.012, "expected radius of curvature of the object at the contact", "m", 0.002, 0.5)

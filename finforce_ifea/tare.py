@@ -248,6 +248,10 @@ _LOADED_SIGMA = 3.5
 _STEADY_STDDEV = 0.03e-3
 _DELAY_FRAMES = 15
 _FEWEST_FRAMES = 5
+# Time between images at which a tare takes all of its frames [s]; longest time that counts of a gap between two [s].
+_PERIOD, _LONGEST_PERIOD = 1.0 / 30.0, 0.25
+# Share of its frames that a tare takes at any rate [-].
+_LEAST_SHARE = 1.0 / 3.0
 _LEAST_SEEN = 0.5
 _LEAST_NEAR = 0.75
 # At rest the nearer three quarters of the key points are so near to their places [m]: in one frame, and on average.
@@ -325,7 +329,7 @@ class TareKeeper:
         self._frames: deque[NDArray] = deque(maxlen=_LONGEST_TARE + _DELAY_FRAMES)
         self._stddevs: deque[NDArray | None] = deque(maxlen=self._frames.maxlen)
         self._open = self._settings.automatic_tare
-        self._quiet = 0
+        self._quiet, self._passed = 0, 0.0
 
     @property
     def tared(self) -> bool:
@@ -339,21 +343,28 @@ class TareKeeper:
 
     @property
     def missing(self) -> int:
-        """Frames still to come before the first tare by itself; 0 when none is due."""
-        due = self._open and not self.tared
-        return max(0, self._settings.tare_frames - len(self._frames)) if due else 0
+        """Frames still to come before the first tare by itself; 0 when none is due.
 
-    def add(self, points: NDArray, stddev: NDArray | None = None, *, apart: bool) -> None:
+        A tare takes as long as `tare_frames` images at 30 Hz: fewer images where they are rarer, a third at least.
+        """
+        if not self._open or self.tared:
+            return 0
+        count, due = len(self._frames), self._settings.tare_frames
+        period = max(self._passed / max(count - 1, 1), _PERIOD)
+        return max(0, round(due * max(_PERIOD / period, _LEAST_SHARE)) - count)
+
+    def add(self, points: NDArray, stddev: NDArray | None = None, *, apart: bool, dt: float = _PERIOD) -> None:
         """Take the accepted key points (K, 3) [m] of a frame and their stated standard deviations (K, 3) [m].
 
-        `apart` when the object is known not to touch.
+        `apart` when the object is known not to touch; dt [s] since the frame before.
         """
+        self._passed += min(dt, _LONGEST_PERIOD) if self._frames else 0.0
         self._frames.append(points)
         self._stddevs.append(stddev)
         if apart and not self.tared and not self._open and self._settings.automatic_tare:
             self._frames.clear()
             self._stddevs.clear()
-            self._open = True
+            self._open, self._passed = True, 0.0
 
     def adopt(self, tare: Tare) -> None:
         """Take the offsets of other images; they are not averaged with what comes."""

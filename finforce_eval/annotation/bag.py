@@ -83,7 +83,6 @@ def annotate_bag(source: Path, target: Path, options: argparse.Namespace, settin
         return done
     setup, keypoints = share_setup(settings, options), parse_source(options)
     recording = keypoints.read(source)
-    setup = setup.at_rate(recording)
     setup.contacts.check(recording)
     recording = replace(recording, name=target.name)
     try:

@@ -19,15 +19,12 @@ from finforce_eval.evaluation.contact_source import ContactChoice, build_source,
 from finforce_eval.evaluation.keypoint_source import KeypointSource, parse_changes, parse_source
 from finforce_eval.machine import commit, version
 from finforce_eval.recordings.bags import name_recordings
-from finforce_eval.recordings.frames import FrameImages
 from finforce_eval.recordings.tracks import Recording
 from finforce_ifea.estimator import ForceEstimator
 from finforce_ifea.jaw.calibration import Calibration, load_calibration
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_ifea.settings import EstimatorSettings
 
-TARE_TIME = 1.5  # [s], of the tare of a video
-LEAST_TARE = 15  # images of the tare of a video, at least
 # Options that change nothing in the forces of a recording.
 _OUTSIDE = (
     "bags", "out", "workers", "memory", "scheduler", "run", "prefix", "into", "columns", "remove", "json", "report",
@@ -71,14 +68,6 @@ class EvaluationSetup:
         estimator.warm_up()
         self._estimators[held] = estimator
         return estimator
-
-    def at_rate(self, recording: Recording) -> EvaluationSetup:
-        """Return the setup for a recording's rate: the tare of slow videos takes as long as that of others."""
-        default = EstimatorSettings().tare_frames
-        if not isinstance(recording.images, FrameImages) or self.stills or self.settings.tare_frames != default:
-            return self
-        count = min(max(round(TARE_TIME * recording.images.fps), LEAST_TARE), default)
-        return self if count == default else replace(self, settings=replace(self.settings, tare_frames=count))
 
     @property
     def density(self) -> str:

@@ -101,14 +101,14 @@ def _tared_estimator(recording: Recording, side: str, setup: EvaluationSetup, st
     """Return the estimator of a jaw once it has seen the images from a time [s] on; see `_take_tares`."""
     track, count = recording.jaw(side).keypoints, setup.settings.tare_frames
     rows = np.flatnonzero(track.stamps_ns >= track.stamps_ns[0] + start * NANOSECONDS)[: count + _SPARE]
-    if len(rows) < count:
-        raise RecordingError(f"{recording.name}: {len(rows)} images from {start:g} s on; a tare takes {count}")
     estimator = setup.side(side).estimator(len(recording.jaws) == 2)
     try:
         for row in rows.tolist():
-            estimator.update(track.observation(row), None)
+            found = estimator.update(track.observation(row), None)
             if estimator.tared:
                 return estimator
+            if found.status == "waiting" and row == rows[-1]:
+                raise RecordingError(f"{recording.name}: {len(rows)} images from {start:g} s on, {found.message}")
         estimator.tare()
     except FinforceError as error:
         raise RecordingError(f"{recording.name}: {side} jaw, from {start:g} s on: {error}") from error

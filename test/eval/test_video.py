@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from fractions import Fraction
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -19,13 +18,11 @@ from finforce_eval.errors import DamagedError, OptionError, RecordingError
 from finforce_eval.evaluation import unseen
 from finforce_eval.evaluation.forces import STILL_UPDATES, find_forces, share_reached
 from finforce_eval.evaluation.keypoint_source import detect_keypoints
-from finforce_eval.evaluation.setup import EvaluationSetup
 from finforce_eval.recordings.frames import FrameImages, read_picture
 from finforce_eval.recordings.images import ImageChoice
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.tracks import DetectionTrack, PoseTrack
 from finforce_eval.table import ForceSeries
-from finforce_ifea.settings import EstimatorSettings
 from finforce_keypoints.rig import Rig, RigCamera, write_rig
 
 CAMERA = RigCamera(width=64, height=48, fx=50.0, fy=50.0, cx=32.0, cy=24.0, model="plumb_bob")
@@ -338,13 +335,3 @@ def test_turns_in_pictures_are_applied_and_heic_is_named(tmp_path):
     (folder / "b.jpg").write_bytes(b"\0\0\0\x24ftypheic" + bytes(40))
     with pytest.raises(RecordingError, match="HEIC picture; expected JPEG or PNG"):
         read_picture(folder / "b.jpg")
-
-
-@pytest.mark.parametrize(("fps", "count"), [(7.5, 15), (20.0, 30), (30.0, 45), (60.0, 45)])
-def test_the_tare_of_a_slow_video_is_a_time(fps, count):
-    images = FrameImages(name="demo", fps=fps, camera=RIG.intrinsics, count=100, read=list)
-    recording, settings = images.make_recording(Path("demo.mp4"), ()), EstimatorSettings()
-    setup = EvaluationSetup(jaw=FakeJaw, settings=settings, calibration=None, contacts=None, about={})
-    assert setup.at_rate(recording).settings.tare_frames == count
-    given = replace(setup, settings=replace(settings, tare_frames=60))
-    assert given.at_rate(recording) is given

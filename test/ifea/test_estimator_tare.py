@@ -20,7 +20,7 @@ from estimator_fakes import (
 from mechanics_fakes import BENCH
 
 from finforce_ifea.errors import UnderLoadError
-from finforce_ifea.observation import Contact
+from finforce_ifea.observation import Contact, Observation
 
 # --- tare
 
@@ -54,6 +54,20 @@ def test_first_frames_wait_for_the_tare():
     assert statuses(solutions[:44]) == {"waiting"}
     assert solutions[45].trusted
     assert "44 more" in solutions[0].message
+
+
+@pytest.mark.parametrize(
+    ("rate", "pause", "count"),
+    [(5.0, 0.0, 15), (7.5, 0.0, 15), (20.0, 0.0, 30), (30.0, 0.0, 45), (90.0, 0.0, 45), (30.0, 4.0, 38)],
+)
+def test_tare_takes_as_long_at_low_rates_but_not_for_a_pause(rate, pause, count):
+    estimator, random, found = make_estimator(solver="frame"), np.random.default_rng(3), []
+    for number in range(60):
+        stamp = 1.0 + number / rate + pause * (number > 0)
+        points = BENCH.keypoints + 0.1e-3 * random.normal(size=BENCH.keypoints.shape)
+        seen = Observation(stamp=stamp, points=points, likelihood=np.ones(len(points)))
+        found.append(estimator.update(seen, None).status)
+    assert found.index("unloaded") == count - 1
 
 
 def test_tare_is_refused_under_load_and_taken_when_unloaded():
