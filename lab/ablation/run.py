@@ -202,8 +202,8 @@ def ablate(rules: Iterable[Rule], bags: Iterable[str] = (), calibration: str = "
     table = pd.DataFrame(rows)
     best = table.loc[table.groupby("rule", sort=False)["moves"].idxmax()].drop(columns="moves")
     told = {rule.name: rule for rule in rules}
-    best.insert(1, "stands on", [told[name].stands_on for name in best.rule])
-    best.insert(2, "for", [told[name].purpose for name in best.rule])
+    best.insert(1, "constant or function", [told[name].implementation for name in best.rule])
+    best.insert(2, "purpose", [told[name].purpose for name in best.rule])
     still = [name for name, moved in table.groupby("rule", sort=False)["moves"].max().items() if moved < 1.0]
     notes = [f"Moves nothing: {', '.join(still) or 'none'}."]
     return Figures(tables={"rules": best, "scenes": table}, notes=notes)

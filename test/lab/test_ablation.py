@@ -28,14 +28,14 @@ def test_everything_that_a_rule_replaces_is_there_and_a_scene_reaches_it(rule):
 
 
 def test_a_value_that_is_compiled_in_asks_for_another_compilation_of_what_holds_it_and_of_its_callers():
-    assert set(find_compiled(BY_NAME["sight"])) == {"process.find_decay-", "process.advance-"}
-    assert {"readout.read_out-"} == {*find_compiled(BY_NAME["direction of the force"])}
+    assert set(find_compiled(BY_NAME["detector bias"])) == {"process.find_decay-", "process.advance-"}
+    assert {"readout.read_out-"} == {*find_compiled(BY_NAME["direction error"])}
     assert {"measurement.weigh-", "filter.update-"} <= {*find_compiled(BY_NAME["gross errors"])}
-    assert find_compiled(BY_NAME["forgetting after a release"]) == ()
+    assert find_compiled(BY_NAME["reset after a release"]) == ()
 
 
 def test_a_place_that_is_gone_is_an_error():
-    rule = BY_NAME["forgetting after a release"]
+    rule = BY_NAME["reset after a release"]
     gone = type(rule)(**{**vars(rule), "off": {"finforce_ifea.filter.tracker:_NO_SUCH_RULE": 0}})
     with pytest.raises(AttributeError, match="_NO_SUCH_RULE"), switch_off(gone):
         pass
@@ -73,6 +73,6 @@ def test_a_rule_that_is_off_moves_its_figure_and_no_other_run(scenes):
 
 
 def test_one_process_for_many_rules_restores_each(scenes):
-    rules = [BY_NAME["noise level"], BY_NAME["forgetting after a release"]]
+    rules = [BY_NAME["noise level"], BY_NAME["reset after a release"]]
     alone = next(run_child(rules[1:], scenes, names=["noisy"]))
     assert list(run_child(rules, scenes, names=["noisy"]))[1] == alone
