@@ -91,7 +91,8 @@ def test_peer_is_compared_on_this_machine_and_on_its_own():
 
 
 def test_tier_that_does_not_exist_is_noted_and_the_others_are_measured(monkeypatch):
-    tiers = (Tier(name="nothing", solver="nothing"), Tier(name="frame", solver="frame", contact="outline"))
+    slow = Tier(name="slow", solver="frame", slow=True)
+    tiers = (Tier(name="nothing", solver="nothing"), Tier(name="frame", solver="frame", contact="outline"), slow)
     monkeypatch.setattr(bench, "list_tiers", lambda slow: tiers)
     monkeypatch.setattr(bench, "load_cases", lambda: (PRESSES[1].case,))
     monkeypatch.setattr(bench, "time_factorisation", lambda: [3e-3])
@@ -102,7 +103,12 @@ def test_tier_that_does_not_exist_is_noted_and_the_others_are_measured(monkeypat
 
     monkeypatch.setattr(bench, "run_tier", run)
     figures = bench.measure(True)
-    assert set(figures.tables["tiers"]["tier"]) == {"frame"}
+    assert figures.tables["tiers"][["tier", "key points"]].to_numpy().tolist() == [
+        ["frame", "noise-free"],
+        ["frame", "noisy"],
+        ["slow", "noisy"],
+    ]
+    assert figures.tables["shapes"]["tier"].tolist() == ["frame", "SOFA, quoted"]
     assert figures.notes[0].startswith("nothing: not measured: solver: got 'nothing'")
     assert figures.tables["tiers"]["RMSE/N"].max() == 0.0
 
