@@ -1,5 +1,6 @@
 """Libraries that not everybody installs, imported where they are used; their absence says what to install."""
 
+import os
 from importlib import import_module
 from types import ModuleType
 
@@ -47,6 +48,7 @@ def import_trimesh() -> ModuleType:
 
 def import_onnxruntime() -> ModuleType:
     """Return onnxruntime, networks; raises MissingDependencyError where it is not installed."""
+    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # else it keeps a database of its uses, and sends it
     return import_library("onnxruntime", "running a key point network")
 
 

@@ -12,6 +12,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
 from finforce.errors import FinforceError, one_line
@@ -53,12 +54,13 @@ def run_limited(
     order = pickle.dumps((memory, seconds, raise_budget(disk))) + pickle.dumps((function, arguments))
     paths = os.pathsep.join(os.path.abspath(path) for path in sys.path)
     environment = os.environ | {"PYTHONPATH": paths, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    command, longest = [sys.executable, "-c", _CHILD], WAITS * seconds
     try:
-        done = subprocess.run(
-            [sys.executable, "-c", _CHILD], input=order, capture_output=True, timeout=WAITS * seconds, env=environment
-        )
+        with TemporaryDirectory(prefix="finforce_") as folder:  # a process that crashes does not tidy up
+            environment["TMPDIR"] = folder
+            done = subprocess.run(command, input=order, capture_output=True, timeout=longest, env=environment)
     except subprocess.TimeoutExpired:
-        raise SandboxError(f"waited more than {WAITS * seconds:g} s; expected an answer") from None
+        raise SandboxError(f"waited more than {longest:g} s; expected an answer") from None
     if not done.stdout:
         raise SandboxError(_say_how_it_ended(done.returncode, done.stderr.decode(errors="replace"), memory, seconds))
     result, error = pickle.loads(done.stdout)

@@ -3,7 +3,9 @@
 import itertools
 import operator
 import os
+import tempfile
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -48,3 +50,8 @@ def test_an_error_of_ours_is_raised_as_it_is():
 def test_a_budget_allows_more(monkeypatch):
     monkeypatch.setenv("FINFORCE_BUDGET", "10")
     assert run_limited(np.ones, 1 << 24, memory=1 << 26).nbytes == 1 << 27
+
+
+def test_files_of_a_process_that_did_not_remove_them_are_removed():
+    left = Path(run_limited(tempfile.mkdtemp))
+    assert left.parent.parent == Path(tempfile.gettempdir()) and not left.parent.exists()

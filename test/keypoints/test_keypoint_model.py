@@ -1,5 +1,9 @@
 """Networks and their metadata: what is understood, and what is refused."""
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import onnx
 import pytest
@@ -244,6 +248,23 @@ def test_without_onnxruntime_the_message_says_what_to_install(tmp_path, monkeypa
     monkeypatch.setattr("finforce.optional.import_module", refuse)
     with pytest.raises(MissingDependencyError, match="pip install onnxruntime"):
         KeypointModel(tmp_path)
+
+
+RUN_A_NETWORK = """
+import sys
+from finforce.optional import import_onnxruntime
+import_onnxruntime().InferenceSession(sys.argv[1])
+"""
+
+
+def test_a_network_runs_without_a_record_of_its_uses(tmp_path):
+    write_model(tmp_path / "model")
+    (home := tmp_path / "home").mkdir()
+    kept = {name: value for name, value in os.environ.items() if name not in ("ORT_DISABLE_TELEMETRY", "XDG_CACHE_HOME")}
+    environment = kept | {"HOME": str(home), "TMPDIR": str(home), "NUMBA_CACHE_DIR": str(tmp_path / "numba")}
+    order = [sys.executable, "-c", RUN_A_NETWORK, str(tmp_path / "model" / "network.onnx")]
+    subprocess.run(order, env=environment, check=True, timeout=120)
+    assert not list(home.iterdir())
 
 
 def test_defaults_of_absent_keys_are_those_of_deeplabcut():
