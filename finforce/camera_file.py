@@ -159,18 +159,19 @@ def _name_entries(entries: Mapping[str, Any]) -> dict[str, Any]:
     if len(size) == 2:
         named |= {"width": size[0], "height": size[1]}
     matrix = next((each for each in (_numbers(entries.get(name)) for name in _MATRICES) if len(each) == 9), None)
-    intrinsics, lens = entries.get("intrinsics"), None
+    intrinsics, kind = entries.get("intrinsics"), str(entries.get("camera_model") or "pinhole")
+    lens = None if kind == "pinhole" else kind  # fisheye, as ROS's camera_calibration writes it
     if matrix:
         named |= name_matrix(matrix)
     elif isinstance(intrinsics, Mapping):
         return named | _from_openicc(intrinsics, str(entries.get("intrinsic_type")))
     elif intrinsics is not None:
-        kind, _, lens = str(entries.get("camera_model", "pinhole")).partition("-")  # pinhole, or pinhole-equi
+        kind, _, lens = kind.partition("-")  # pinhole, or pinhole-equi
         if kind != "pinhole" or len(_numbers(intrinsics)) != 4:
             raise IntrinsicsError(f"camera_model {entries.get('camera_model')}: expected pinhole, with fu fv pu pv")
         named |= zip(_NAMES, intrinsics, strict=True)
     named["distortion"] = next(filter(None, (_numbers(entries.get(name)) for name in _LENSES)), [])
-    named["model"] = EQUIDISTANT if entries.get("fisheye_model") else entries.get("distortion_model", lens)
+    named["model"] = EQUIDISTANT if entries.get("fisheye_model") else entries.get("distortion_model") or lens
     return named
 
 

@@ -126,6 +126,15 @@ def test_kalibr_names_the_lens(model, expected, tmp_path):
     np.testing.assert_array_equal(camera.distortion[:4], [0.01, -0.02, 0.003, -0.004])
 
 
+def test_a_fisheye_of_ros_is_known_by_its_camera_model(tmp_path):
+    path = tmp_path / "ost.yaml"
+    fisheye = ROS.replace("distortion_model: plumb_bob", "camera_model: fisheye")
+    path.write_text(fisheye.replace("cols: 5, data: [0.1, -0.2, 1e-3, 2e-3, 0.05]", "cols: 4, data: [0.1, -0.2, 0, 0]"))
+    assert read_camera(path).model == "equidistant"
+    path.write_text(ROS.replace("distortion_model: plumb_bob", "camera_model: pinhole"))
+    assert read_camera(path).model == "plumb_bob"
+
+
 def test_a_fisheye_of_umi_is_the_equidistant_lens(tmp_path):
     camera = read_camera(write(tmp_path, GOPRO))
     assert camera.model == "equidistant" and camera.fy == pytest.approx(808.0)
