@@ -6,12 +6,14 @@ import argparse
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from finforce.files import FileError, check_inside, check_plain
+from finforce.typed_yaml import FileModel, parse_model
 from finforce_eval.annotation.dataset_copy import Column, describe, write_copy
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.forces import NOT_FOUND, estimate_forces, no_force_reasons, why_unanswered
@@ -143,6 +145,13 @@ def annotate_episode(
     return figures
 
 
+class _Mark(FileModel):
+    """What annotate keeps of a feature that it has extended."""
+
+    kept: Annotated[int, Field(strict=True, ge=0)] | None = Field(None, description="Numbers of its own")
+    names: Any = Field(None, description="Of these")
+
+
 def write_dataset(folder: Path, parts: Path, target: Path, options: argparse.Namespace) -> None:
     """Write a dataset with the forces of all of its episodes, in place of those that it may have already.
 
@@ -182,16 +191,16 @@ def plain_columns(dataset: Dataset) -> dict[str, Column]:
     """Return what a copy has to change so that nothing is left of what annotate has added to a dataset."""
     columns = {}
     for name, entry in dataset.info["features"].items():
-        mark = (entry.get("info") or {}).get(_MARK)
-        if mark is None:
+        if _MARK not in (entry.get("info") or {}):
             continue
+        mark = parse_model(entry["info"][_MARK], _Mark, RecordingError)
         columns[name] = Column(entry=None, rows={})
-        if "kept" in mark:
+        if mark.kept is not None:
             info = {key: value for key, value in entry["info"].items() if key != _MARK}
-            plain = {**entry, "shape": [mark["kept"]], "names": mark["names"], "info": info or None}
+            plain = {**entry, "shape": [mark.kept], "names": mark.names, "info": info or None}
             plain = {key: value for key, value in plain.items() if key != "info" or value}
             nothing = {each.index: np.zeros((each.length, 0)) for each in dataset.episodes}
-            columns[name] = Column(entry=plain, rows=nothing, kept=mark["kept"])
+            columns[name] = Column(entry=plain, rows=nothing, kept=mark.kept)
     return columns
 
 

@@ -45,10 +45,20 @@ _MOST_FRAMES = 1_000_000  # of an episode: nine hours at 30 Hz
 _NUMBER = re.compile(r"\{(episode_chunk|episode_index|chunk_index|file_index|video_key)(:0?[1-9]d)?\}")
 
 
-class _InfoNumbers(FileModel):
-    """The numbers of `meta/info.json`; an empty one stands for its default."""
+class _Feature(FileModel):
+    """An entry of `features`."""
 
     model_config = ConfigDict(extra="ignore")
+    dtype: str = Field(description="Type of its values")
+    shape: list[Annotated[int, Field(strict=True, ge=0)]] | None = Field(None, description="Sides of one value")
+    info: dict[str, Any] | None = Field(None, description="What programs keep there")
+
+
+class _Info(FileModel):
+    """What `meta/info.json` has to hold; an empty number stands for its default."""
+
+    model_config = ConfigDict(extra="ignore")
+    features: dict[str, _Feature] = Field(description="By name")
     fps: Rate = Field(description="Frames per second [Hz]")
     total_frames: int = Field(strict=True, ge=0, description="Of all episodes")
     chunks_size: Annotated[int, Field(strict=True, ge=1), BeforeValidator(lambda size: size or 1000)] = Field(
@@ -197,17 +207,17 @@ def _read_info(folder: Path) -> dict[str, Any]:
     try:
         info = read_json(check_inside(folder / INFO, folder))
         version, paths = info["codebase_version"], [info["data_path"], info.get("video_path") or ""]
-        is_sound = isinstance(info["features"], dict) and all(isinstance(path, str) for path in paths)
+        is_sound = all(isinstance(path, str) for path in paths)
     except (FileError, ValueError, KeyError, TypeError) as error:
         raise RecordingError(f"{folder.name}: {INFO}: {type(error).__name__}: {error}") from error
     try:
-        info |= parse_model(info, _InfoNumbers, RecordingError).model_dump()
+        info |= parse_model(info, _Info, RecordingError).model_dump(exclude={"features"})
     except RecordingError as error:
         raise RecordingError(f"{folder.name}: {INFO}: {error}") from error
     if version not in _VERSIONS:
         raise RecordingError(f"{folder.name}: layout {version}; expected {', '.join(_VERSIONS)}")
     if not is_sound:
-        raise RecordingError(f"{folder.name}: {INFO}: expected features, fps, total_frames and paths of the files")
+        raise RecordingError(f"{folder.name}: {INFO}: expected texts as the paths of its files")
     for path in paths:
         if Path(path).is_absolute() or ".." in Path(path).parts or set("{}") & set(_NUMBER.sub("", path)):
             raise RecordingError(
@@ -219,7 +229,7 @@ def _read_info(folder: Path) -> dict[str, Any]:
 
 def _choose_camera(info: Mapping[str, Any], camera: str, name: str) -> str:
     """Return the feature with the pictures."""
-    kinds = {key: feature.get("dtype") for key, feature in info["features"].items() if isinstance(feature, dict)}
+    kinds = {key: feature["dtype"] for key, feature in info["features"].items()}
     there = [key for key, kind in kinds.items() if kind in ("video", "image")]
     wrist = [key for key in there if "wrist" in key]
     found = [camera] if camera else (wrist if len(wrist) == 1 else there)

@@ -160,6 +160,13 @@ def test_a_command_in_the_text_is_one(path):
     assert named <= set(COMMANDS)
 
 
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.name)
+def test_a_detector_parameter_in_the_text_is_one(path):
+    stated = re.findall(r'--detector (?:"(.+?)"|([a-z][\w.]*=[^\s`)]+))', path.read_text(encoding="utf-8"))
+    for quoted, plain in stated:
+        parse_source(Namespace(detector=[quoted or plain], jaws=None, jaw=None))
+
+
 def as_example(code):
     """A program without its docstring and comments."""
     tree = ast.parse(code)

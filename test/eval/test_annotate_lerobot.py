@@ -342,6 +342,17 @@ def lengthen(folder):
     (folder / "meta/info.json").write_text(json.dumps(info | {"total_frames": info["total_frames"] + 1}))
 
 
+def mark_state(mark):
+    """Return what damages the mark that annotate leaves at the state."""
+
+    def change(folder):
+        entry = {"dtype": "float32", "shape": [2], "names": None, "info": {"finforce": mark}}
+        features = json.loads((folder / "meta/info.json").read_text())["features"]
+        change_info(features=features | {"observation.state": entry})(folder)
+
+    return change
+
+
 def cut_video(folder):
     path = next((folder / "videos").rglob("episode_000000.mp4"))
     path.write_bytes(path.read_bytes()[:500])
@@ -354,6 +365,11 @@ def cut_video(folder):
         (change_info(total_frames=7), "expected the 7 of"),
         (change_info(codebase_version="v1.6"), "layout v1.6; expected v2.0, v2.1, v3.0"),
         (change_info(fps=0), "fps: got 0, expected"),
+        (change_info(features={"a": {"dtype": "float32", "info": []}}), "features.a.info: got none, expected"),
+        (change_info(features={"a": {"dtype": "float32", "shape": [0.5]}}), "features.a.shape[0]: got 0.5, expected"),
+        (change_info(features={CAMERA: {"dtype": 3}}), f"features.{CAMERA}.dtype: got 3, expected"),
+        (mark_state({"kept": "x"}), "kept: got the text 'x', expected"),
+        (mark_state([]), "expected a mapping of kept"),
         (lambda folder: (folder / "meta/info.json").write_text("{"), "info.json"),
         (lambda folder: (folder / "meta/episodes.jsonl").unlink(), "episodes.jsonl"),
         (cut_video, "episode_000000"),
