@@ -131,7 +131,7 @@ def recording_of(dataset: Dataset, episode: Episode, camera: CameraIntrinsics, s
     _check_times(episode, fps, name)
     if episode.video is not None:
         own = episode.length if dataset.info["codebase_version"] != "v3.0" else None  # else a file of many episodes
-        read = partial(decode_video, episode.video, name, episode.begin - 0.5 / fps, own)
+        read = partial(decode_video, episode.video, name, episode.begin - 0.5 / fps, own, fps=fps)
     else:
         read = partial(_read_column, episode, dataset.camera, name)
     images = FrameImages(
@@ -152,14 +152,14 @@ def _check_times(episode: Episode, fps: float, name: str) -> None:
         return
     times = rows_of(rows, episode, name)["timestamp"]
     try:
-        steps = np.diff(times.to_numpy().astype(float))
+        late = times.to_numpy().astype(float) - np.arange(len(times)) / fps
     except (TypeError, ValueError) as error:
         raise RecordingError(f"{name}: its column timestamp: {one_line(error)}; expected seconds") from error
-    worst = int(np.abs(steps - 1.0 / fps).argmax()) if len(steps) else 0
-    if len(steps) and not abs(steps[worst] - 1.0 / fps) < 0.5 / fps:
+    off = np.flatnonzero(~(np.abs(late - late[0]) < 0.5 / fps))
+    if len(off):
         raise RecordingError(
-            f"{name}: its times jump by {steps[worst]:.3f} s after row {worst}; expected {1.0 / fps:.3f} s, as of the "
-            "pictures: row and picture would not be of one time"
+            f"{name}: the times of its rows and those of its pictures, at {fps:g} Hz, differ by "
+            f"{late[off[0]] - late[0]:.3f} s from row {off[0]} on"
         )
 
 

@@ -157,22 +157,37 @@ def _open_video(path: Path, name: str) -> Iterator[tuple[Any, Any]]:
 
 
 def decode_video(
-    path: Path, name: str, begin: float = 0.0, count: int | None = None, shown: Sequence[int] = ()
+    path: Path,
+    name: str,
+    begin: float = 0.0,
+    count: int | None = None,
+    shown: Sequence[int] = (),
+    fps: float | None = None,
 ) -> Iterator[NDArray[np.uint8] | None]:
     """Yield the frames (h, w, 3) RGB of a video from a time [s] on, upright; see `_open_video`.
 
     In place of frames that are broken or that the decoder leaves out, of those to be `shown` (n,) [ticks], comes None.
 
-    A video that says of itself that it has another number of frames than `count` is refused, too.
+    A video that says of itself that it has another number of frames than `count` is refused, too, and one with a frame
+    that does not begin in its own period of those at a rate `fps` [Hz].
     """
+    number = 0
     with _open_video(path, name) as (container, stream):
         if count is not None and stream.frames not in (0, count):
             raise RecordingError(f"{name}: {path.name} has {stream.frames} frames; expected {count}, one for each row")
         if begin > 0.0:
             container.seek(int(begin / stream.time_base), stream=stream)
         for frame, is_broken in _decode_checked(container, stream, shown, f"{name}: {path.name}"):
-            if frame is not None and frame.time is not None and frame.time < begin:
+            time = frame.time if frame is not None else None
+            if time is not None and time < begin:
                 continue
+            if fps and time is not None and not 0.0 <= time - begin - number / fps < 1.0 / fps:
+                due = begin + (number + 0.5) / fps
+                raise RecordingError(
+                    f"{name}: frame {number} of {path.name} is shown at {time:.3f} s; expected {due:.3f} s, the time of "
+                    "its row"
+                )
+            number += 1
             if is_broken:
                 yield None
             else:

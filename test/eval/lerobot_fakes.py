@@ -11,11 +11,11 @@ CAMERA = "observation.images.wrist"
 FPS = 30
 
 
-def write_video(path, pictures):
+def write_video(path, pictures, rate=FPS):
     """An H.264 video of pictures (h, w, 3)."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=FPS, options={"crf": "12", "g": "10"})
+        stream = container.add_stream("libx264", rate=rate, options={"crf": "12", "g": "10"})
         stream.height, stream.width, stream.pix_fmt = *pictures[0].shape[:2], "yuv420p"
         for picture in pictures:
             container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))

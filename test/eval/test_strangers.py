@@ -235,13 +235,24 @@ def lengthen_video(folder):
     write_video(next((folder / "videos").rglob("episode_000000.mp4")), pictures)
 
 
-def delay_row(folder):
+def delay_row(folder, times=(0.0, 1.0 / 30.0, 2.0 / 30.0 + 0.4)):
     import pyarrow
 
     path = next((folder / "data").rglob("episode_000000.parquet"))
     table = parquet.read_table(path)
-    times = pyarrow.array(table["timestamp"].to_numpy() + np.array([0.0, 0.0, 0.4], np.float32))
+    times = pyarrow.array(np.array(times, np.float32))
     parquet.write_table(table.set_column(table.schema.get_field_index("timestamp"), "timestamp", times), path)
+
+
+def slow_rows(folder):
+    delay_row(folder, (0.0, 1.6 / 30.0, 3.2 / 30.0))
+
+
+def slow_video(folder):
+    from lerobot_fakes import write_video
+
+    pictures = [frame.color for frame in make_footage(FakeGripper(count=3))]
+    write_video(next((folder / "videos").rglob("episode_000000.mp4")), pictures, rate=10)
 
 
 def cut_table(folder):
@@ -264,7 +275,9 @@ def write_times_as_text(folder):
         (cut_table, "episode_000000.parquet: Parquet"),
         (write_times_as_text, "column timestamp: could not convert"),
         (lengthen_video, "has 8 frames; expected 3, one for each row"),
-        (delay_row, "times jump by 0.433 s after row 1; expected 0.033 s"),
+        (delay_row, "its pictures, at 30 Hz, differ by 0.400 s from row 2 on"),
+        (slow_rows, "its pictures, at 30 Hz, differ by 0.020 s from row 1 on"),
+        (slow_video, "frame 1 of episode_000000.mp4 is shown at 0.100 s; expected 0.033 s"),
         (change_info(fps=1e-300), "fps: got 1e-300, expected"),
         (change_info(fps="fast"), "fps: got the text 'fast'"),
         (change_info(chunks_size=0.5), "chunks_size: got 0.5, expected"),
