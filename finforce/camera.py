@@ -33,6 +33,8 @@ class IntrinsicsError(FinforceError, ValueError):
 
 def name_matrix(matrix: Sequence[float]) -> dict[str, float]:
     """Return fx, fy, cx, cy of a camera's 3x3 matrix, row by row; raises IntrinsicsError where its axes are skew."""
+    if matrix[6] and matrix[7] and not matrix[2] and not matrix[5]:  # column by column, as Open3D writes it
+        matrix = [*matrix[0::3], *matrix[1::3], *matrix[2::3]]
     if any(matrix[index] for index in (1, 3, 6, 7)):
         raise IntrinsicsError(f"camera matrix {[*matrix]}: expected no skew, [fx 0 cx 0 fy cy 0 0 1]")
     return {"fx": matrix[0], "fy": matrix[4], "cx": matrix[2], "cy": matrix[5]}

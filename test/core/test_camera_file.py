@@ -91,6 +91,7 @@ def numbers_of(camera):
         {str(image): {"cam_K": [600, 0, 322, 0, 601, 243, 0, 0, 1], "depth_scale": 0.1 * image} for image in (1, 2)},
         {"cx": 322, "cy": 243, "fx": 600, "fy": 601, "width": 640, "height": 480, "depth_scale": 1.0},
         {"intrinsic_matrix": [[600, 0, 322], [0, 601, 243], [0, 0, 1]]},
+        {"intrinsic_matrix": [600, 0, 0, 0, 601, 0, 322, 243, 1], "width": 640, "height": 480},
         OPENCV.replace("0.1, -0.2, 1e-3, 2e-3, 0.05", "0., 0., 0., 0., 0."),
     ],
 )
