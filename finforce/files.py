@@ -90,7 +90,11 @@ def check_inside(path: Path, folder: Path) -> Path:
     roots = [folder.resolve()]
     if roots[0].parent.name == "snapshots":
         roots.append(roots[0].parents[1] / "blobs")
-    if not any(path.resolve().is_relative_to(root) for root in roots):
+    try:
+        place = path.resolve()
+    except (OSError, RuntimeError) as error:  # a link to itself, by the version of Python
+        raise FileError(f"{path.name} cannot be read: {one_line(error)}") from error
+    if not any(place.is_relative_to(root) for root in roots):
         raise FileError(
             f"{path.name} leads out of the folder {folder.name}; expected what lies in it, no link elsewhere"
         )

@@ -37,6 +37,7 @@ _NEAR = (0.01, 0.006)  # [m], gates of the alignment of a mesh that fits as pose
 _FAR = (0.02, 0.01, 0.006)  # [m], gates of the alignment of a mesh that does not
 FARTHEST = 0.045  # [m], of a shift that is named: farther off, a table may look like the object
 _REACH = 0.012 * np.arange(-2, 3)  # [m], shifts along each axis of the camera that are tried
+MOST_STARTS = 12  # of those, aligned: the nearest to the depth may slide to another place
 _UNITS = np.array([1e-3, 1e-2, 0.0254, 0.1, 10.0, 1.0 / 0.0254, 100.0, 1e3])
 _SCALES = np.concatenate((2.0 ** (np.arange(-8, 9) / 6.0), _UNITS))
 _FINER = np.linspace(0.92, 1.08, 9)  # [-], of the best scale
@@ -240,9 +241,10 @@ class MeshCheck:
             T = view.T_camera_object.copy()
             T[:3, 3] += shift
             starts.append(view._replace(T_camera_object=T))
-        best = max(starts, key=lambda start: self._compare(start).gain)
-        aligned = self._align(best, Effort(gates=_FAR, steps=3, points=PIXELS))
-        return invert_pose(view.T_camera_object) @ aligned
+        starts.sort(key=lambda start: self._compare(start).gain, reverse=True)
+        found = [self._align(start, Effort(gates=_FAR, steps=3, points=PIXELS)) for start in starts[:MOST_STARTS]]
+        best = max(found, key=lambda T: self._compare(view._replace(T_camera_object=T)).gain)
+        return invert_pose(view.T_camera_object) @ best
 
     def _describe_shift(self, change: NDArray) -> str:
         """Return a change of the mesh's frame (4, 4) in words."""

@@ -184,8 +184,8 @@ def decode_video(
             if fps and time is not None and not 0.0 <= time - begin - number / fps < 1.0 / fps:
                 due = begin + (number + 0.5) / fps
                 raise RecordingError(
-                    f"{name}: frame {number} of {path.name} is shown at {time:.3f} s; expected {due:.3f} s, the time of "
-                    "its row"
+                    f"{name}: frame {number} of {path.name} is shown at {time:.3f} s; expected {due:.3f} s, the time "
+                    "of its row"
                 )
             number += 1
             if is_broken:

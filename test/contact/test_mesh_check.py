@@ -56,6 +56,23 @@ def test_a_wrong_mesh_is_contradicted_and_what_would_fit_is_named(name, change, 
     assert f"the camera contradicts the mesh {name}" in found and f"fits when {words}" in found
 
 
+def test_a_start_that_slides_to_another_place_hides_no_shift_that_fits(monkeypatch):
+    find_shift, align, starts = MeshCheck._find_shift, MeshCheck._align, []
+
+    def find_anew(self):
+        starts[:] = ["slides"]
+        return find_shift(self)
+
+    def slide(self, view, effort):
+        found = align(self, view, effort)
+        return move_pose(found, np.array([0.03, 0.03, 0.0, 0.0, 0.0, 0.0])) if starts and starts.pop() else found
+
+    monkeypatch.setattr(MeshCheck, "_find_shift", find_anew)
+    monkeypatch.setattr(MeshCheck, "_align", slide)
+    found = compare(changed(lambda v: v + [0.012, 0.0, 0.0]), hidden=0.0)
+    assert "fits when shifted by (-12, 0, 0) mm" in found
+
+
 def test_another_object_is_contradicted_without_a_reading_that_fits():
     assert "is it the mesh of this object" in compare(build_object("bottle"), hidden=0.0)
 

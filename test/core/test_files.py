@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from eval_fakes import cut
 
-from finforce.files import FileError, read_bytes, read_json, read_yaml
+from finforce.files import FileError, check_inside, check_plain, read_bytes, read_json, read_yaml
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -91,6 +91,12 @@ def test_what_is_no_plain_file_is_not_waited_for(tmp_path):
     ):
         with pytest.raises(FileError, match=words):
             read_bytes(path)
+
+
+def test_a_link_to_itself_is_refused(tmp_path):
+    (tmp_path / "loop").symlink_to("loop")
+    with pytest.raises(FileError, match="loop cannot be read|Too many levels|not a plain file"):
+        check_plain(check_inside(tmp_path / "loop", tmp_path))
 
 
 def test_large_files_and_other_texts_are_refused(tmp_path):

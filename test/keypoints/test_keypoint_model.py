@@ -260,7 +260,9 @@ import_onnxruntime().InferenceSession(sys.argv[1])
 def test_a_network_runs_without_a_record_of_its_uses(tmp_path):
     write_model(tmp_path / "model")
     (home := tmp_path / "home").mkdir()
-    kept = {name: value for name, value in os.environ.items() if name not in ("ORT_DISABLE_TELEMETRY", "XDG_CACHE_HOME")}
+    kept = {
+        name: value for name, value in os.environ.items() if name not in ("ORT_DISABLE_TELEMETRY", "XDG_CACHE_HOME")
+    }
     environment = kept | {"HOME": str(home), "TMPDIR": str(home), "NUMBA_CACHE_DIR": str(tmp_path / "numba")}
     order = [sys.executable, "-c", RUN_A_NETWORK, str(tmp_path / "model" / "network.onnx")]
     subprocess.run(order, env=environment, check=True, timeout=120)
