@@ -43,69 +43,64 @@ class Track:
     """State of one coordinate.
 
     Attributes:
-        mu: probabilities of rest and motion (2,).
-        x: position at rest and in motion (2,).
-        v: speed in motion.
-        P: variances of the positions (2,).
-        cross: covariance of position and speed in motion.
-        speed_variance: of the speed in motion.
+        state: probability of rest; position at rest and in motion; speed in motion; variances of both positions; of
+            motion, the covariance of position and speed, and the variance of the speed (8,).
     """
 
     def __init__(self, noise: MotionNoise, x: float, variance: float) -> None:
         """Start at rest at x with a variance."""
         self.noise = noise
-        self._state = np.array([0.5, x, x, 0.0, variance, variance, 0.0, noise.start])
+        self.state = np.array([0.5, x, x, 0.0, variance, variance, 0.0, noise.start])
 
     @property
     def x(self) -> float:
         """Expected position."""
-        mu, a, b = self._state[:3]
-        return float(mu * a + (1.0 - mu) * b)
+        return find_mean(self.state)
 
     @property
     def variance(self) -> float:
         """Variance of the position, that between the models included."""
-        return float(_variance(self._state))
+        return find_variance(self.state)
 
     @property
     def speed(self) -> float:
         """Expected speed."""
-        return float((1.0 - self._state[0]) * self._state[3])
+        return float((1.0 - self.state[0]) * self.state[3])
 
     @property
     def rests(self) -> float:
         """Probability of rest."""
-        return float(self._state[0])
+        return float(self.state[0])
 
     def shift(self, change: float) -> None:
         """Count the position from another origin."""
-        self._state[1:3] += change
+        self.state[1:3] += change
 
     def widen(self, variance: float) -> None:
         """Add a variance to the position."""
-        self._state[4:6] += variance
+        self.state[4:6] += variance
 
     def predict(self, dt: float, rest_time: float | None = None) -> None:
         """Advance by a time [s]; a mean time of rest [s] goes before that of the noise."""
         starts, stops = 1.0 - exp(-dt / (rest_time or self.noise.rest_time)), 1.0 - exp(-dt / self.noise.motion_time)
-        _mix(self._state, starts, stops, self.noise.start)
-        _advance(self._state, dt, self.noise.drift, self.noise.acceleration)
-
-    def expect(self, z: float, R: float) -> float:
-        """Return the position that a measured one z of a variance R would leave."""
-        state = self._state.copy()
-        _correct(state, z, R, self.noise)
-        return float(state[0] * state[1] + (1.0 - state[0]) * state[2])
+        _mix(self.state, starts, stops, self.noise.start)
+        _advance(self.state, dt, self.noise.drift, self.noise.acceleration)
 
     def update(self, z: float, R: float) -> None:
         """Take a measured position z of a variance R."""
-        _correct(self._state, z, R, self.noise)
+        _correct(self.state, z, R, tuple(self.noise))
 
 
 @njit(**_OPTIONS)
-def _variance(s):
+def find_mean(s):
+    """Return the expected position of a state (8,)."""
+    return s[0] * s[1] + (1.0 - s[0]) * s[2]
+
+
+@njit(**_OPTIONS)
+def find_variance(s):
     """Return the variance of the position of a state (8,)."""
-    mean = s[0] * s[1] + (1.0 - s[0]) * s[2]
+    mean = find_mean(s)
     return s[0] * (s[4] + (s[1] - mean) ** 2) + (1.0 - s[0]) * (s[5] + (s[2] - mean) ** 2)
 
 
@@ -138,7 +133,8 @@ def _advance(s, dt, drift, acceleration):
 
 @njit(**_OPTIONS)
 def _correct(s, z, R, noise):
-    """Take a measured position z of a variance R into a state (8,)."""
+    """Take a measured position z of a variance R into a state (8,); `noise` is a plain tuple of `MotionNoise`."""
+    noise = MotionNoise(*noise)
     nu0, nu1, S0, S1 = z - s[1], z - s[2], s[4] + R, s[5] + R
     likely = s[0] * _density(nu0, S0) + (1.0 - s[0]) * _density(nu1, S1)
     if noise.jump_probability * _density(nu0, s[4] + noise.jump + R) > (1.0 - noise.jump_probability) * likely:
@@ -155,6 +151,14 @@ def _correct(s, z, R, noise):
     s[5] *= R / S1
     s[6] -= gain * cross
     s[7] -= speed_gain * cross
+
+
+@njit(**_OPTIONS)
+def expect_position(s, z, R, noise):
+    """Return the position that a measured one z of a variance R would leave of a state (8,)."""
+    s = s.copy()
+    _correct(s, z, R, noise)
+    return find_mean(s)
 
 
 @njit(**_OPTIONS)

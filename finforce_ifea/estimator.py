@@ -25,6 +25,7 @@ from finforce_ifea.observation import (
     Contact,
     Observation,
     Solution,
+    are_within,
     blank_solution,
     check_contact,
     check_observation,
@@ -279,10 +280,9 @@ class ForceEstimator:
         low, high = self.jaw.contact_range
         if contact.outline is not None:
             low, high = (-np.inf, np.inf) if contact.touching is False else self._surface_range[:, 1]
-        heights = contact.points[:, 2]
-        if ((heights >= low) & (heights <= high)).all():
+        if are_within(contact.points, 2, low, high):
             return ""
-        found = np.round(1e3 * heights, 1).tolist()
+        found = np.round(1e3 * contact.points[:, 2], 1).tolist()
         where = f"contact at heights {found} mm, expected {1e3 * low:g} to {1e3 * high:g} mm"
         return f"{where}: beyond, key points show no force"
 
@@ -304,11 +304,11 @@ class ForceEstimator:
         if not len(contact.points):
             return
         low, high = self._surface_range
-        places = contact.points[:, 1:]
-        off = (places < low) | (places > high)
-        if (off[:, 0] if contact.outline is not None else off).any():
+        axes = (1, 2) if contact.outline is None else (1,)
+        if not all(are_within(contact.points, axis, low[axis - 1], high[axis - 1]) for axis in axes):
+            places = np.round(1e3 * contact.points[:, 1:], 1).tolist()
             raise ContactError(
-                f"contact at y, z = {np.round(1e3 * places, 1).tolist()} mm, expected on the inner surface from "
+                f"contact at y, z = {places} mm, expected on the inner surface from "
                 f"{np.round(1e3 * low, 1).tolist()} to {np.round(1e3 * high, 1).tolist()} mm"
             )
         free = (contact.free or contact.outline is not None) and self.settings.solver != "paper"

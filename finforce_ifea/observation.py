@@ -196,14 +196,14 @@ def check_observation(observation: Observation, count: int, last_stamp: float | 
             f"key points of shape {points.shape} with likelihoods of shape {likelihood.shape}, "
             f"expected ({count}, 3) and ({count},)"
         )
-    if not _are_possible(points, likelihood):
+    possible, is_far = _are_possible(points, likelihood)
+    if not possible:
         if np.isinf(points).any():
             raise ObservationError(
                 f"key point {int(np.argwhere(np.isinf(points))[0, 0])} is infinite, expected metres or NaN"
             )
         raise ObservationError(f"likelihoods from {likelihood.min():g} to {likelihood.max():g}, expected 0 to 1")
-    far = (np.abs(points) > _FARTHEST).any(axis=1)  # one or two may be gross errors
-    if far.any() and 2 * np.count_nonzero(far) > np.count_nonzero(np.isfinite(points).all(axis=1)):
+    if is_far:
         raise ObservationError(
             f"key points up to {np.nanmax(np.abs(points)):.4g} m from the jaw's origin, expected metres in the jaw "
             "frame: millimetres are divided by 1000"
@@ -266,14 +266,21 @@ def check_periods(stamps: Sequence[float]) -> None:
 
 @njit(cache=True)
 def _are_possible(points, likelihood):
-    """Return True if no coordinate (K, 3) is infinite and all likelihoods (K,) are from 0 to 1."""
+    """Return whether no coordinate (K, 3) is infinite and all likelihoods (K,) are from 0 to 1; and if most are far.
+
+    One or two key points may be gross errors.
+    """
+    far = known = 0
     for k in range(len(points)):
+        is_far = False
         for a in range(3):
             if np.isinf(points[k, a]):
-                return False
+                return False, False
+            is_far = is_far or abs(points[k, a]) > _FARTHEST
         if not 0.0 <= likelihood[k] <= 1.0:
-            return False
-    return True
+            return False, False
+        known, far = known + np.isfinite(points[k].sum()), far + is_far
+    return True, 2 * far > known
 
 
 # Farthest that a stated contact point may be from the undeformed inner face along x [m].
@@ -301,6 +308,15 @@ def _are_near(points, face):
     off = 0
     for i in range(len(points)):
         off += not (np.isfinite(points[i].sum()) and abs(points[i, 0] - face[i]) <= _OFF_FACE)
+    return off == 0
+
+
+@njit(cache=True)
+def are_within(points, axis, low, high):
+    """Return True if points (n, 3) are from low to high along an axis, which those that are not finite are not."""
+    off = 0
+    for i in range(len(points)):
+        off += not low <= points[i, axis] <= high
     return off == 0
 
 

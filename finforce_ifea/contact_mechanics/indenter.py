@@ -33,6 +33,8 @@ _HALVINGS = 14
 _OTHER_SIZE = 3.0
 # Uncertainty of a known outline's tilt in addition to that of its pose [rad].
 _TILT_STDDEV = 0.02
+# What is so far outside of an outline has all coefficients of its cell there [m], the diagonal of two cells.
+_CLEAR = 3 * CELL
 # What leads by more [m] is outside of the heights.
 _OUTSIDE = 1.0
 _OPTIONS = {"cache": True, "error_model": "numpy"}
@@ -108,54 +110,55 @@ def _measure_depth(segments, low, cell, rows, columns, faces_away):
 
 
 @njit(**_OPTIONS)
-def _weigh(t, value, slope, bend):
-    """Fill the four weights of a uniform cubic B-spline and of its derivatives by t in [0, 1)."""
+def _weigh(t):
+    """Return the four weights of a uniform cubic B-spline at t in [0, 1)."""
     s = 1.0 - t
-    value[0], value[3] = s * s * s / 6.0, t * t * t / 6.0
-    value[1], value[2] = 2.0 / 3.0 - t * t + 0.5 * t * t * t, 2.0 / 3.0 - s * s + 0.5 * s * s * s
-    slope[0], slope[3] = -0.5 * s * s, 0.5 * t * t
-    slope[1], slope[2] = -2.0 * t + 1.5 * t * t, 2.0 * s - 1.5 * s * s
-    bend[0], bend[3] = s, t
-    bend[1], bend[2] = -2.0 + 3.0 * t, -2.0 + 3.0 * s
+    return s * s * s / 6.0, 2.0 / 3.0 - t * t + 0.5 * t * t * t, 2.0 / 3.0 - s * s + 0.5 * s * s * s, t * t * t / 6.0
 
 
 @njit(**_OPTIONS)
-def _read_value(coefficients, low, cell, x, z, weights):
-    """Return the depth [m] at one point, -1 mm beyond the grid, and fill in weights (6, 4) of x and z there."""
+def _weigh_slopes(t):
+    """Return the derivatives of these weights by t, and their second derivatives."""
+    s = 1.0 - t
+    slope = -0.5 * s * s, -2.0 * t + 1.5 * t * t, 2.0 * s - 1.5 * s * s, 0.5 * t * t
+    return slope, (s, -2.0 + 3.0 * t, -2.0 + 3.0 * s, t)
+
+
+@njit(**_OPTIONS)
+def _blend(c, i, j, u, v):
+    """Return the sum of the 4 x 4 coefficients about a cell with weights u along x and v along z."""
+    out = u[0] * (c[i - 1, j - 1] * v[0] + c[i - 1, j] * v[1] + c[i - 1, j + 1] * v[2] + c[i - 1, j + 2] * v[3])
+    out += u[1] * (c[i, j - 1] * v[0] + c[i, j] * v[1] + c[i, j + 1] * v[2] + c[i, j + 2] * v[3])
+    out += u[2] * (c[i + 1, j - 1] * v[0] + c[i + 1, j] * v[1] + c[i + 1, j + 1] * v[2] + c[i + 1, j + 2] * v[3])
+    return out + u[3] * (c[i + 2, j - 1] * v[0] + c[i + 2, j] * v[1] + c[i + 2, j + 1] * v[2] + c[i + 2, j + 2] * v[3])
+
+
+@njit(**_OPTIONS)
+def _read_value(coefficients, low, cell, x, z):
+    """Return the depth [m] at one point, -1 mm beyond the grid, and where it is there, in cells."""
     rows, columns = coefficients.shape
     a, b = (x - low[0]) / cell, (z - low[1]) / cell
     i, j = int(np.floor(a)), int(np.floor(b))
     if i < 1 or j < 1 or i > rows - 3 or j > columns - 3:
-        return -1e-3, i, j
-    _weigh(a - i, weights[0], weights[1], weights[2])
-    _weigh(b - j, weights[3], weights[4], weights[5])
-    depth = 0.0
-    for k in range(4):
-        for m in range(4):
-            depth += coefficients[i - 1 + k, j - 1 + m] * weights[0, k] * weights[3, m]
-    return depth, i, j
+        return -1e-3, a, b
+    return _blend(coefficients, i, j, _weigh(a - i), _weigh(b - j)), a, b
 
 
 @njit(**_OPTIONS)
-def _read_slopes(coefficients, cell, i, j, weights):
+def _read_slopes(coefficients, cell, a, b):
     """Return gradient (x, z) and second derivatives (xx, xz, zz) where `_read_value` has read the depth."""
-    gx, gz, gxx, gxz, gzz = 0.0, 0.0, 0.0, 0.0, 0.0
-    for k in range(4):
-        for m in range(4):
-            c = coefficients[i - 1 + k, j - 1 + m]
-            gx += c * weights[1, k] * weights[3, m] / cell
-            gz += c * weights[0, k] * weights[4, m] / cell
-            gxx += c * weights[2, k] * weights[3, m] / cell**2
-            gxz += c * weights[1, k] * weights[4, m] / cell**2
-            gzz += c * weights[0, k] * weights[5, m] / cell**2
-    return gx, gz, gxx, gxz, gzz
+    i, j = int(np.floor(a)), int(np.floor(b))
+    u, v = _weigh(a - i), _weigh(b - j)
+    (du, ddu), (dv, ddv) = _weigh_slopes(a - i), _weigh_slopes(b - j)
+    gx, gz = _blend(coefficients, i, j, du, v) / cell, _blend(coefficients, i, j, u, dv) / cell
+    gxx, gzz = _blend(coefficients, i, j, ddu, v) / cell**2, _blend(coefficients, i, j, u, ddv) / cell**2
+    return gx, gz, gxx, _blend(coefficients, i, j, du, dv) / cell**2, gzz
 
 
 @njit(**_OPTIONS)
 def _trace_front(coefficients, low, cell, steps):
     """Return the first x [m] of depth zero at each height (n, 2) [m]; NaN where the object is not met."""
     rows, columns = coefficients.shape
-    weights = np.zeros((6, 4))
     count = (columns - 4) * steps
     front = np.full((count, 2), np.nan)
     for n in range(count):
@@ -163,12 +166,12 @@ def _trace_front(coefficients, low, cell, steps):
         front[n, 1] = z
         for i in range(1, rows - 3):
             x = low[0] + cell * (i + 1)
-            if i + 1 > rows - 3 or _read_value(coefficients, low, cell, x, z, weights)[0] <= 0.0:
+            if i + 1 > rows - 3 or _read_value(coefficients, low, cell, x, z)[0] <= 0.0:
                 continue
             outside, inside = x - cell, x
             for _ in range(_HALVINGS):
                 middle = 0.5 * (outside + inside)
-                if _read_value(coefficients, low, cell, middle, z, weights)[0] > 0.0:
+                if _read_value(coefficients, low, cell, middle, z)[0] > 0.0:
                     inside = middle
                 else:
                     outside = middle
@@ -178,20 +181,30 @@ def _trace_front(coefficients, low, cell, steps):
 
 
 @njit(**_OPTIONS)
-def _find_leading(segments, c, s, low, high):
-    """Return the least x [m] of segments (s, 4) turned by (cos, sin) of the tilt, between two heights, else 1e9."""
-    least = 1e9
+def _find_leading(segments, c, s, low, high, least):
+    """Lessen `least` (m,) [m] to the least x of segments (s, 4) turned by (cos, sin) of the tilt, between two heights.
+
+    The heights are one `low`, and `high` (m,) [m].
+    """
     for k in range(len(segments)):
         ax, az = c * segments[k, 0] - s * segments[k, 1], s * segments[k, 0] + c * segments[k, 1]
         bx, bz = c * segments[k, 2] - s * segments[k, 3], s * segments[k, 2] + c * segments[k, 3]
-        if max(az, bz) < low or min(az, bz) > high:
-            continue
-        begin, end = 0.0, 1.0
-        if bz != az:
-            one, other = (low - az) / (bz - az), (high - az) / (bz - az)
-            begin, end = max(0.0, min(one, other)), min(1.0, max(one, other))
-        least = min(least, ax + begin * (bx - ax), ax + end * (bx - ax))
-    return least
+        for p in range(len(high)):
+            if max(az, bz) < low or min(az, bz) > high[p] or min(ax, bx) >= least[p]:
+                continue
+            begin, end = 0.0, 1.0
+            if bz != az:
+                one, other = (low - az) / (bz - az), (high[p] - az) / (bz - az)
+                begin, end = max(0.0, min(one, other)), min(1.0, max(one, other))
+            least[p] = min(least[p], ax + begin * (bx - ax), ax + end * (bx - ax))
+
+
+@njit(**_OPTIONS)
+def _find_lead(segments, c, s, low, high):
+    """Return the least x [m] between two heights [m], see `_find_leading`; 1e9 without any."""
+    least = np.full(1, 1e9)
+    _find_leading(segments, c, s, low, np.full(1, high), least)
+    return least[0]
 
 
 # The penalty rises quadratically over this depth [m] before it is linear, so that Newton's method sees no kink.
@@ -226,17 +239,17 @@ def _touch_cylinder(x, z, stiffness, centre_x, centre_z, radius):
 
 
 @njit(**_OPTIONS)
-def _touch_field(x, z, stiffness, coefficients, low, cell, origin_x, origin_z, c, s, weights):
-    """Return the `Touch` of an outline turned by (cos, sin) of its tilt; `weights` is (6, 4).
+def _touch_field(x, z, stiffness, coefficients, low, cell, origin_x, origin_z, c, s):
+    """Return the `Touch` of an outline turned by (cos, sin) of its tilt.
 
     With the depth d(p) below the outline the force is -stiffness d grad d, and its springs follow from d's second
     derivatives. A tilt is positive from x towards z.
     """
     rx, rz = x - origin_x, z - origin_z
-    depth, i, j = _read_value(coefficients, low, cell, c * rx + s * rz, c * rz - s * rx, weights)
+    depth, column, row = _read_value(coefficients, low, cell, c * rx + s * rz, c * rz - s * rx)
     if depth <= 0.0:
         return Touch(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    hx, hz, a, b, d = _read_slopes(coefficients, cell, i, j, weights)
+    hx, hz, a, b, d = _read_slopes(coefficients, cell, column, row)
     push, slope = resist(depth, stiffness)
     gx, gz = c * hx - s * hz, s * hx + c * hz
     hxx = c * c * a - 2.0 * c * s * b + s * s * d
@@ -298,38 +311,44 @@ def is_clear_of(pressed, pose, x, z):
     rows, columns = pressed.coefficients.shape
     a = (pose.c * dx + pose.s * dz - pressed.low[0]) / CELL
     b = (pose.c * dz - pose.s * dx - pressed.low[1]) / CELL
-    return a < 1.0 or b < 1.0 or a >= rows - 2 or b >= columns - 2
+    if a < 1.0 or b < 1.0 or a >= rows - 2 or b >= columns - 2:
+        return True
+    return pressed.coefficients[int(a), int(b)] < -_CLEAR  # then all coefficients about it are negative
 
 
 @njit(**_OPTIONS)
-def touch_object(pressed, pose, x, z, stiffness, weights):
-    """Return the `Touch` of one point at x and z [m], derivatives by its shape; `weights` is (6, 4)."""
+def touch_object(pressed, pose, x, z, stiffness):
+    """Return the `Touch` of one point at x and z [m], derivatives by its shape."""
     if pressed.is_round:
         touch = _touch_cylinder(x, z, stiffness, pose.x, pose.z, pose.radius)
         bx, bz = touch.bx + touch.kxx, touch.bz + touch.kxz
         return Touch(touch.fx, touch.fz, touch.kxx, touch.kxz, touch.kzz, bx, bz)
     field = pressed.coefficients, pressed.low, CELL
-    return _touch_field(x, z, stiffness, *field, pose.x, pose.z, pose.c, pose.s, weights)
+    return _touch_field(x, z, stiffness, *field, pose.x, pose.z, pose.c, pose.s)
 
 
 @njit(**_OPTIONS)
 def measure_gap(pressed, pose, points):
     """Return the least distance [m] of points (p, 3) [m] from an object, negative inside."""
-    least, weights = np.inf, np.zeros((6, 4))
+    least = np.inf
     for p in range(len(points)):
         dx, dz = points[p, 0] - pose.x, points[p, 2] - pose.z
         if pressed.is_round:
             gap = np.sqrt(dx * dx + dz * dz) - pose.radius
         else:
             x, z = pose.c * dx + pose.s * dz, pose.c * dz - pose.s * dx
-            gap = -_read_value(pressed.coefficients, pressed.low, CELL, x, z, weights)[0]
+            gap = -_read_value(pressed.coefficients, pressed.low, CELL, x, z)[0]
         least = min(least, gap)
     return least
 
 
 @njit(**_OPTIONS)
-def _find_first_touch(pressed, face, state):
-    """Return the depth [m] at which an object with a contact state (3,) first touches an undeformed `FaceProfile`."""
+def find_first_touch(pressed, face, state):
+    """Return the depth [m] at which an object with a contact state (3,) first touches an undeformed surface.
+
+    `PressedObject` and `FaceProfile` are plain tuples, as for `linearize_reduced`.
+    """
+    pressed, face = PressedObject(*pressed), FaceProfile(*face)
     points = face.points
     if pressed.is_round:
         radius = state[1]
@@ -342,25 +361,28 @@ def _find_first_touch(pressed, face, state):
     c, s = np.cos(state[1]), np.sin(state[1])
     if face.is_flat:
         low, high = points[0, 1] - state[2], points[-1, 1] - state[2]
-        least = _find_leading(pressed.segments, c, s, low, high)
+        least = _find_lead(pressed.segments, c, s, low, high)
         return least + pressed.front if least < _OUTSIDE else 0.0
     least = np.inf
     for p in range(len(points)):
         z = points[p, 1] - state[2]
-        lead = _find_leading(pressed.segments, c, s, z, z)
+        lead = _find_lead(pressed.segments, c, s, z, z)
         if lead < _OUTSIDE:
             least = min(least, face.x + lead - points[p, 0])
     return least + pressed.front if np.isfinite(least) else 0.0
 
 
 @njit(**_OPTIONS)
-def find_clearance(pressed, x, height):
-    """Return the distance [m] of an outline in a state (3,) from a plane undeformed surface below a height [m].
+def find_clearances(pressed, x, heights):
+    """Return the distances (m,) [m] of an outline in a state (3,) from a plane undeformed surface below heights (m,).
 
     It is negative behind the surface, and infinite where the outline is not at these heights.
     """
-    least = _find_leading(pressed.segments, np.cos(x[1]), np.sin(x[1]), -x[2], height - x[2])
-    return least + pressed.front - x[0] if least < _OUTSIDE else np.inf
+    least = np.full(len(heights), 1e9)
+    _find_leading(pressed.segments, np.cos(x[1]), np.sin(x[1]), -x[2], heights - x[2], least)
+    for p in range(len(heights)):
+        least[p] = least[p] + pressed.front - x[0] if least[p] < _OUTSIDE else np.inf
+    return least
 
 
 def flat_profile(low: float, high: float, x: float = 0.0) -> FaceProfile:
@@ -371,11 +393,11 @@ def flat_profile(low: float, high: float, x: float = 0.0) -> FaceProfile:
 @njit(**_OPTIONS)
 def _press_points(pressed, pose, traction, points, stiffness):
     """Return forces, springs and changes at points; see `PenaltyContact`."""
-    count, out, weights = len(points), np.zeros(POINT_SHAPE), np.zeros((6, 4))
+    count, out = len(points), np.zeros(POINT_SHAPE)
     forces, springs, changes = np.zeros((count, 3)), np.zeros((count, 3, 3)), np.zeros((count, 3, 4))
     for p in range(count):
         x, z = points[p, 0], points[p, 2]
-        touch = touch_object(pressed, pose, x, z, stiffness[p], weights)
+        touch = touch_object(pressed, pose, x, z, stiffness[p])
         add_traction(traction, touch, p, x, z, stiffness[p], out)
         for a in range(2):
             forces[p, 2 * a], springs[p, 2 * a, 0], springs[p, 2 * a, 2] = out[a, 0], out[a, 1], out[a, 2]
@@ -442,7 +464,7 @@ class Indenter:
 
         An outline beyond the ends of a plane surface touches with its leading point all the same.
         """
-        return _find_first_touch(self.pressed, face, x)
+        return find_first_touch(tuple(self.pressed), tuple(face), x)
 
 
 class RoundIndenter(Indenter):
@@ -533,4 +555,4 @@ def expect_object(contact: Contact, settings: EstimatorSettings, known: Indenter
     indenter = known if same else _build_outline(_Shape(outline.polygons))
     own = np.array([_TILT_STDDEV, settings.height_stddev])
     mean = np.array([outline.tilt, outline.origin[1]])
-    return ExpectedObject(indenter=indenter, mean=mean, variance=outline.stddev[[2, 1]] ** 2 + own**2)
+    return ExpectedObject(indenter=indenter, mean=mean, variance=outline.stddev[2:0:-1] ** 2 + own**2)

@@ -113,6 +113,11 @@ class RigidContact:
         """Return the depth [m] at which the object first touches the undeformed jaw, in a contact state x (3,)."""
         return self.indenter.find_touch(x, self.profile)
 
+    @property
+    def packed_object(self) -> tuple[tuple, tuple]:
+        """The object and the surface that it touches as plain tuples, see `find_first_touch`."""
+        return tuple(self.indenter.pressed), tuple(self.profile)
+
     @cached_property
     def profile(self) -> FaceProfile:
         """The undeformed surface, for objects to touch."""
@@ -152,6 +157,17 @@ class RigidContact:
             smallest_det=state.smallest_det,
             size=reached,
         )
+
+    def linearize_points(
+        self, probe: Any, q: NDArray, x: NDArray, traction: Traction
+    ) -> tuple[PressedState, NDArray, NDArray]:
+        """Linearise, see `linearize`; return that with positions (k, 3) [m] and motions (k, 3, 4) of a probe there."""
+        pressed = self.linearize(q, x, traction)
+        q = q + pressed.correction
+        # of one layout, so that nothing is compiled anew while a jaw waits
+        pressed = pressed._replace(modes=np.ascontiguousarray(pressed.modes))
+        placed, motions = self.model.positions(probe, q), self.model.project(probe, q, pressed.modes)
+        return pressed, np.ascontiguousarray(placed), np.ascontiguousarray(motions)
 
     def approach(self, q: NDArray, step: NDArray, x: NDArray) -> NDArray:
         """Return the step of a jaw that has lost contact, cut where its surface meets the object again."""

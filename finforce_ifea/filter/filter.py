@@ -128,7 +128,9 @@ def divide_noise(R, weight):
     """Return the noise (m, 2, 2) of key points with weights (m,)."""
     out = R.copy()
     for k in range(len(R)):
-        out[k] /= weight[k]
+        for a in range(2):
+            for b in range(2):
+                out[k, a, b] /= weight[k]
     return out
 
 
@@ -189,10 +191,15 @@ def normalize(log_weights):
 @njit(**_OPTIONS)
 def reduce_covariance(P, A):
     """Return P - A^T A, symmetric."""
-    out = P - np.dot(np.ascontiguousarray(A.T), A)
-    for i in range(len(out)):
+    out = P.copy()
+    for i in range(len(P)):
+        row = out[i]
+        for k in range(len(A)):
+            factor = A[k, i]
+            for j in range(i + 1):
+                row[j] -= factor * A[k, j]
         for j in range(i):
-            out[i, j] = out[j, i] = 0.5 * (out[i, j] + out[j, i])
+            out[j, i] = row[j]
     return out
 
 

@@ -6,14 +6,16 @@ from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from finforce.kalman import Track
+from finforce.kalman import Track, find_variance
 from finforce_ifea.contact_mechanics.friction import Coefficient
 from finforce_ifea.contact_mechanics.pressed_jaw import RigidContact
 from finforce_ifea.filter.readout import LARGEST_RATIO
-from finforce_ifea.filter.slip_path import SlipPath
+from finforce_ifea.filter.slip_path import SlipPath, find_turn, turn_path
 
+_OPTIONS = {"cache": True, "error_model": "numpy"}
 # Coefficients of friction that are weighed against each other, and the deviation of a coefficient up to which one is
 # enough: that is within what no friction explains.
 NODES = 9
@@ -117,45 +119,19 @@ class TractionHypotheses:
 
     def _bound(self, ratios: NDArray) -> NDArray:
         """Return the traction ratio of each hypothesis (N,) for those of the coefficients (M,)."""
-        parts = [ratios] if self._held < 1.0 else []
-        if self._held > 0.0:
-            parts.append(np.array([self.upright]))
-        return np.clip(np.concatenate(parts), -LARGEST_RATIO, LARGEST_RATIO)
+        return _bound(ratios, self._held, self.upright)
 
     def preview(self, places: NDArray, track: Track, weights: NDArray) -> NDArray:
         """Return the traction ratio of each hypothesis (N,) with the object in other places; see `follow`."""
         if not self.follows_path:
             return self.ratios
-        own = self._share(weights)
         if self._anchor is None:  # it may stick either way
-            self.doubt = float(own @ self.mu)
+            self.doubt = float(self._share(weights) @ self.mu)
             return self.ratios
-        motion = self._find_motion(places[: len(self.mu)])
-        deeper = float(own @ motion[:, 0])
-        if not motion[:, 1].any() and self._is_chance(deeper, track):
-            self.doubt = self._path.turn_at(float(own @ self._path.ratios)) * abs(deeper)
-            return self.ratios
-        ratios = self._path.preview(motion)
-        self.doubt = sqrt(max(self._find_stddev(ratios, own, track) ** 2 - self.stddev**2, 0.0))
+        known = self._direction, self._anchor_stddev, self.stddev
+        path = self.mu, self._path.ratios, self._path.turns, self._anchor
+        ratios, self.doubt = _preview(path, known, places, weights, track.state)
         return self._bound(ratios)
-
-    def _find_stddev(self, ratios: NDArray, own: NDArray, track: Track) -> float:
-        """Return the standard deviation of the traction ratio by that of the depth, at ratios of the path (M,)."""
-        slides = np.abs(np.abs(ratios) - self.mu) < _AT_CONE
-        share = _SLIDING if own @ slides > _MOST else 1.0
-        return share * self._path.turn_at(float(own @ ratios)) * sqrt(max(track.variance, 0.0))
-
-    def _find_motion(self, places: NDArray) -> NDArray:
-        """Return the motion (M, 2) [m] from where the path ends to places (M, 2) [m], less the play of the height."""
-        motion = places - self._anchor
-        motion[:, 1] -= np.clip(motion[:, 1], -_HEIGHT_PLAY, _HEIGHT_PLAY)
-        return motion
-
-    def _is_chance(self, deeper: float, track: Track) -> bool:
-        """Return whether a motion [m] may be one back by chance."""
-        sigmas = _REVERSAL if track.rests < _MOVES else _REVERSAL_AT_REST
-        stddev = np.sqrt(max(track.variance, 0.0))
-        return deeper * self._direction < 0.0 and abs(deeper) < sigmas * np.hypot(stddev, self._anchor_stddev)
 
     @property
     def follows_path(self) -> bool:
@@ -168,15 +144,11 @@ class TractionHypotheses:
             return Coefficient(0.0, np.inf)
         if len(self.mu) == 1:
             return Coefficient(float(self.mu[0]), self.unweighed)
-        own = self._share(weights)
-        mean = float(own @ self.mu)
-        between = max(float(own @ self.mu**2) - mean**2, 0.0)
-        return Coefficient(mean, float(np.sqrt(between + self._cell**2 / 12.0 + self.unweighed**2)))
+        return Coefficient(*_estimate(self.mu, weights, self._cell**2 / 12.0 + self.unweighed**2))
 
     def _share(self, weights: NDArray) -> NDArray:
         """Return the probabilities of the coefficients (M,) where one of them holds, for all weights (N,)."""
-        own = weights[: len(self.mu)]
-        return own / max(own.sum(), 1e-300)
+        return _share(weights, len(self.mu))
 
     def bound_held(self, log_weights: NDArray) -> NDArray:
         """Return the weights (N,), that of "held" less what friction does not bear: P(mu > |kappa|)."""
@@ -217,17 +189,16 @@ class TractionHypotheses:
             track: of the depth.
             weights: of the hypotheses (N,).
         """
-        places, own = places[: len(self.mu)], self._share(weights)
         if self._anchor is None:
-            self._anchor = places.copy()
+            self._anchor = places[: len(self.mu)].copy()
             self._path.begin(contact, q, x)
             self._begin_branch(self._direction)
-        motion = self._find_motion(places)
-        deeper, stddev = float(own @ motion[:, 0]), float(np.sqrt(max(track.variance, 0.0)))
-        if not motion[:, 1].any():
-            if self._is_chance(deeper, track):
+        own, motion, deeper, is_along = _find_motion(self._anchor, places, weights)
+        stddev = sqrt(max(track.variance, 0.0))
+        if not is_along:
+            if _is_chance(deeper, self._direction, stddev, self._anchor_stddev, track.rests):
                 if stddev < _STOPPED * self._anchor_stddev:
-                    self._take_back(contact, q, x, places, own)
+                    self._take_back(contact, q, x, places[: len(self.mu)], own)
                     self._anchor_stddev = stddev
                 return
             if abs(deeper) < _SHORTEST:
@@ -235,14 +206,14 @@ class TractionHypotheses:
         before, self._anchor_stddev, self._direction = self._direction, stddev, float(np.sign(deeper))
         if (
             self._direction != before
-            or motion[:, 1].any()
-            or own @ np.abs(self._anchor - self._branch.start)[:, 0] > _BRANCH
+            or is_along
+            or own @ np.abs(self._anchor[:, 0] - self._branch.start[:, 0]) > _BRANCH
         ):
             self._begin_branch(before)
         self._anchor = self._anchor + motion
         self.motion += abs(deeper)
         self._path.move(contact, q, x, motion)
-        self.stddev = self._find_stddev(self._path.ratios, own, track)
+        self.stddev = _find_stddev(self._path.ratios, self.mu, own, self._path.turns, stddev)
 
     def _begin_branch(self, before: float) -> None:
         """Keep the path up to here, where the object had the direction `before`."""
@@ -258,3 +229,78 @@ class TractionHypotheses:
             self._direction = before
         if own @ motion[:, 0] * self._direction > 0.0:
             self._path.move(contact, q, x, motion)
+
+
+@njit(**_OPTIONS)
+def _bound(ratios, held, upright):
+    """Return the traction ratio of each hypothesis (N,), see `TractionHypotheses`, for ratios of the path (M,)."""
+    count = len(ratios) if held < 1.0 else 0
+    out = np.full(count + 1 if held > 0.0 else count, upright)
+    out[:count] = ratios[:count]
+    return np.minimum(np.maximum(out, -LARGEST_RATIO), LARGEST_RATIO)
+
+
+@njit(**_OPTIONS)
+def _share(weights, count):
+    """Return the probabilities (M,) of the first `count` hypotheses where one of them holds, for all weights (N,)."""
+    own = weights[:count]
+    return own / max(own.sum(), 1e-300)
+
+
+@njit(**_OPTIONS)
+def _estimate(mu, weights, variance):
+    """Return mean and standard deviation of coefficients (M,) for weights (N,), each with a variance of its own."""
+    own = _share(weights, len(mu))
+    mean = (own * mu).sum()
+    return mean, np.sqrt(max((own * mu**2).sum() - mean**2, 0.0) + variance)
+
+
+@njit(**_OPTIONS)
+def _find_motion(anchor, places, weights):
+    """Return probabilities of the coefficients (M,), motion from the path's end (M, 2) [m], and its mean by depth [m].
+
+    The height has some play; last comes whether any motion is along the finger. Of the hypotheses are places, depth
+    and height (N, 2) [m], and weights (N,).
+    """
+    own, motion = _share(weights, len(anchor)), np.empty(anchor.shape)
+    deeper, is_along = 0.0, False
+    for i in range(len(anchor)):
+        motion[i, 0], along = places[i, 0] - anchor[i, 0], places[i, 1] - anchor[i, 1]
+        motion[i, 1] = along - min(max(along, -_HEIGHT_PLAY), _HEIGHT_PLAY)
+        deeper += own[i] * motion[i, 0]
+        is_along = is_along or motion[i, 1] != 0.0
+    return own, motion, deeper, is_along
+
+
+@njit(**_OPTIONS)
+def _is_chance(deeper, direction, stddev, anchor_stddev, rests):
+    """Return whether a motion [m] may be one back by chance; `rests` is the probability of rest."""
+    sigmas = _REVERSAL if rests < _MOVES else _REVERSAL_AT_REST
+    return deeper * direction < 0.0 and abs(deeper) < sigmas * np.hypot(stddev, anchor_stddev)
+
+
+@njit(**_OPTIONS)
+def _find_stddev(ratios, mu, own, turns, stddev):
+    """Return the standard deviation of the traction ratio by that of the depth [m], at ratios of the path (M,)."""
+    slides = ((np.abs(np.abs(ratios) - mu) < _AT_CONE) * own).sum()
+    return (_SLIDING if slides > _MOST else 1.0) * find_turn(turns, (own * ratios).sum()) * stddev
+
+
+@njit(**_OPTIONS)
+def _preview(path, known, places, weights, track):
+    """Return ratios of the path (M,) with the object in other places, and the doubt; see `TractionHypotheses`.
+
+    Args:
+        path: coefficients (M,), ratios (M,), turns, and the path's end (M, 2) [m].
+        known: direction of the path, standard deviation of its end [m], and of the traction ratio by its errors.
+        places: see `_find_motion`.
+        weights: see `_find_motion`.
+        track: state of the depth, see `Track`.
+    """
+    (mu, ratios, turns, anchor), (direction, anchor_stddev, before) = path, known
+    own, motion, deeper, is_along = _find_motion(anchor, places, weights)
+    stddev = np.sqrt(max(find_variance(track), 0.0))
+    if not is_along and _is_chance(deeper, direction, stddev, anchor_stddev, track[0]):
+        return ratios, find_turn(turns, (own * ratios).sum()) * abs(deeper)
+    ratios = turn_path(ratios, mu, turns, motion)
+    return ratios, np.sqrt(max(_find_stddev(ratios, mu, own, turns, stddev) ** 2 - before**2, 0.0))

@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, SHAPE, PressedObject, find_clearance
+from finforce_ifea.contact_mechanics.indenter import HEIGHT, SHAPE, PressedObject, find_clearances
 from finforce_ifea.contact_mechanics.pressed_jaw import ContactSurface
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
@@ -79,35 +79,29 @@ class HiddenForce:
         """
         if pressed.is_round:  # a cylinder, which is small and round
             return 0.0
-        clearance, stddev = _measure_clearances(pressed, x, covariance, self._places, self._clamped, centre)
-        near = np.flatnonzero(np.abs(clearance) < _WELL_CLEAR)
-        if not len(near):
+        clearance, stddev = _measure_clearances(tuple(pressed), x, covariance, self._places, self._clamped, centre)
+        if not np.isfinite(clearance).any():
             return 0.0
-        beyond = stddev[near] - np.abs(clearance[near] - move_surface()[self._rows[near]]) / APART_SIGMAS
-        return max(0.0, float(np.minimum(self._places[near, 1] * beyond, self._places[near, 2]).max()))
+        beyond = stddev - np.abs(clearance - move_surface()[self._rows]) / APART_SIGMAS
+        return max(0.0, float(np.minimum(self._places[:, 1] * beyond, self._places[:, 2]).max()))
 
 
 @njit(**_OPTIONS)
 def _measure_clearances(pressed, x, covariance, places, clamped, centre):
-    """Return clearance and its standard deviation (m,) [m] at each place, infinite where it is not elsewhere."""
-    count, slope, step = len(places), np.empty(3), np.zeros(3)
-    clearance, stddev = np.full(count, np.inf), np.zeros(count)
+    """Return clearance and its deviation (m,) [m] at each place, infinite where the object is elsewhere or clear."""
+    pressed, count, step = PressedObject(*pressed), len(places), np.zeros(3)
+    heights, slope, variance = places[:, 0].copy(), np.full((3, count), -1.0), np.zeros(count)
+    clearance = find_clearances(pressed, x, heights)
+    for i in (SHAPE, HEIGHT):
+        step[:] = 0.0
+        step[i] = np.sqrt(max(covariance[i, i], _LEAST_VARIANCE))
+        slope[i] = find_clearances(pressed, x + step, heights) - find_clearances(pressed, x - step, heights)
+        slope[i] *= 0.5 / step[i]
     for p in range(count):
-        height = places[p, 0]
-        if p >= clamped and abs(height - centre) <= _ELSEWHERE:
-            continue
-        clearance[p] = find_clearance(pressed, x, height)
-        if not abs(clearance[p]) < _WELL_CLEAR:
-            continue
-        slope[DEPTH] = -1.0
-        for i in (SHAPE, HEIGHT):
-            step[:] = 0.0
-            step[i] = np.sqrt(max(covariance[i, i], _LEAST_VARIANCE))
-            change = find_clearance(pressed, x + step, height) - find_clearance(pressed, x - step, height)
-            slope[i] = 0.5 * change / step[i] if np.isfinite(change) else 0.0
-        variance = 0.0
+        if (p >= clamped and abs(heights[p] - centre) <= _ELSEWHERE) or not abs(clearance[p]) < _WELL_CLEAR:
+            clearance[p] = np.inf
         for i in range(3):
             for j in range(3):
-                variance += slope[i] * covariance[i, j] * slope[j]
-        stddev[p] = np.sqrt(max(variance, 0.0))
-    return clearance, stddev
+                if np.isfinite(slope[i, p] + slope[j, p]):
+                    variance[p] += slope[i, p] * covariance[i, j] * slope[j, p]
+    return clearance, np.sqrt(np.maximum(variance, 0.0))

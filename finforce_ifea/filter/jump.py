@@ -53,6 +53,8 @@ MISPLACED = Jump(np.array([HEIGHT]), np.array([30e-3]), 1e-4)
 # The camera was bumped by less, and the object touches elsewhere, as they show over some images only.
 NUDGED = Jump(_SHIFT, np.array([0.4e-3, 0.4e-3, 4e-3]), 1e-4)
 OFFSET = Jump(np.array([HEIGHT]), np.array([15e-3]), 1e-4)
+# Jumps that one image may show.
+JUMPS = (BUMPED, MISPLACED)
 # Log odds against a jump since the first image, its prior left out, after which the test begins anew.
 _UNLIKELY = -3.0
 NO_JUMP = -1
@@ -90,7 +92,7 @@ def weigh_jump(jump, information, score):
 
 
 @njit(**_OPTIONS)
-def correct(measured, weight, ratios, x, log_weights, P, jumps, possible):
+def correct(measured, weight, ratios, x, log_weights, P, possible):
     """Return the posterior of one image, and which jump it shows, or `NO_JUMP`.
 
     Args:
@@ -100,17 +102,16 @@ def correct(measured, weight, ratios, x, log_weights, P, jumps, possible):
         x: see `update`.
         log_weights: see `update`.
         P: predicted covariance (n, n); widened where part of the state has jumped.
-        jumps: that may be (J,).
-        possible: mask of those possible now (J,).
+        possible: mask of those of `JUMPS` that are possible now (J,).
     """
     HP, S = innovate(measured.H, measured.rows, measured.u, P, measured.R)
     found = NO_JUMP
     if len(weight) == 0:
         nu = np.dot(np.exp(log_weights), expect_innovations(measured, ratios, x))
         weight = _weigh_innovations(measured, nu, S, P[DEPTH, DEPTH])
-        found = detect_jump(measured, weight, nu, S, jumps, possible)
+        found = detect_jump(measured, weight, nu, S, possible)
         if found != NO_JUMP:
-            for index, jump in enumerate(jumps):
+            for index, jump in enumerate(JUMPS):
                 if index == found:
                     for i in range(len(jump.entries)):
                         P[jump.entries[i], jump.entries[i]] += jump.stddev[i] ** 2
@@ -119,7 +120,7 @@ def correct(measured, weight, ratios, x, log_weights, P, jumps, possible):
 
 
 @njit(**_OPTIONS)
-def detect_jump(measured, weight, nu, S, jumps, possible):
+def detect_jump(measured, weight, nu, S, possible):
     """Return which part of the state has jumped, or `NO_JUMP`.
 
     Args:
@@ -127,15 +128,14 @@ def detect_jump(measured, weight, nu, S, jumps, possible):
         weight: of the key points (m,).
         nu: mean innovation (2 m,) [m].
         S: its covariance for key points without weights (2 m, 2 m).
-        jumps: that may be (J,).
-        possible: mask of those possible now (J,).
+        possible: see `correct`.
     """
     L = np.linalg.cholesky(widen(S, divide_noise(measured.R, weight), measured.R))
     white_H, white = solve_lower(L, measured.H), solve_lower(L, nu.reshape(-1, 1))
     rows_H = np.ascontiguousarray(white_H.T)
     information, score = np.dot(rows_H, white_H), np.dot(rows_H, white)[:, 0].copy()
     found, most = NO_JUMP, 0.0
-    for index, jump in enumerate(jumps):
+    for index, jump in enumerate(JUMPS):
         if possible[index]:
             own, part = select_entries(jump.entries, information, score)
             odds = weigh_jump(jump, own, part)
@@ -167,6 +167,9 @@ class JumpWatch:
 
     With F the response of the state's mean so far to a unit jump at the first image, the innovations have the mean
     G b, G = H (E - F), where E selects the entries that jump (Willsky and Jones, 1976).
+
+    Attributes:
+        F: see above (n, j); changes with the state, see `advance`.
     """
 
     def __init__(self, jump: Jump, size: int) -> None:
@@ -177,12 +180,8 @@ class JumpWatch:
     def reset(self) -> None:
         """Begin with the next image."""
         count = len(self._jump.entries)
-        self._F = np.zeros((self._size, count))
+        self.F = np.zeros((self._size, count))
         self._information, self._score = np.zeros((count, count)), np.zeros(count)
-
-    def predict(self, f: NDArray) -> None:
-        """Take the transition of the state, a factor for each entry (n,)."""
-        self._F *= f[:, None]
 
     def update(self, measured: Measurement, posterior: Posterior, sight: float) -> tuple[NDArray, NDArray] | None:
         """Take an image; once it has jumped, return the change of the mean (n,) and of P (n, n).
@@ -192,13 +191,13 @@ class JumpWatch:
         """
         jump, independence = self._jump, 1.0 / (1.0 + _ALIKE * sight * (len(measured.R) - 1))
         given = measured.H, measured.rows, measured.u, posterior.L, posterior.A, posterior.white
-        odds = _watch(given, jump, self._F, self._information, self._score, independence)
+        odds = _watch(given, tuple(jump), self.F, self._information, self._score, independence)
         if odds <= 0.0:
             if odds - np.log(jump.probability) < _UNLIKELY:
                 self.reset()
             return None
         V = np.linalg.inv(np.diag(jump.stddev**-2.0) + self._information)
-        D = -self._F
+        D = -self.F
         D[jump.entries, np.arange(len(jump.entries))] += 1.0
         D[DEPTH] = 0.0
         change = D @ (V @ self._score), D @ V @ D.T
@@ -212,13 +211,13 @@ def _watch(given, jump, F, information, score, independence):
 
     Args:
         given: H, rows and u of the `Measurement`; L, A and white of the `Posterior`.
-        jump: that is watched for.
+        jump: that is watched for, a plain tuple.
         F: see `JumpWatch`.
         information: I of the module.
         score: y of the module.
         independence: share of what independent errors would tell.
     """
-    H, rows, u, L, A, white = given
+    (H, rows, u, L, A, white), jump = given, Jump(*jump)
     count = F.shape[1]
     G = -project_columns(H, rows, u, np.ascontiguousarray(F.T)).T.copy()
     for j in range(count):

@@ -15,6 +15,7 @@ y_c is expected where the object's mesh is nearest.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from math import hypot, inf, isfinite, sqrt
 from typing import NamedTuple
 
@@ -56,17 +57,21 @@ class Torsion:
 
     def at(self, height: float) -> tuple[NDArray, NDArray, float]:
         """Return the motions by moment and by force (K, 3) each and the roll at a height [m]."""
-        return _interpolate(self.heights, (self.by_moment, self.by_force), self.roll, height)
+        return _interpolate(self.packed, height)
+
+    @cached_property
+    def packed(self) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+        """Heights, motions by moment and by force, and roll, for compiled code."""
+        return self.heights, self.by_moment, self.by_force, self.roll
 
 
 @njit(**_OPTIONS)
-def _interpolate(heights, motions, roll, height):
-    """Return both motions (m, K, 3) and the roll (m,) between rising heights (m,) [m], those at the ends beyond."""
-    low = 0
+def _interpolate(torsion, height):
+    """Return the motions by moment and by force (K, 3) each and the roll at a height [m]; see `Torsion.packed`."""
+    (heights, moment, force, roll), low = torsion, 0
     while low < len(heights) - 2 and height >= heights[low + 1]:
         low += 1
     share = min(max((height - heights[low]) / (heights[low + 1] - heights[low]), 0.0), 1.0)
-    moment, force = motions
     moment = (1.0 - share) * moment[low] + share * moment[low + 1]
     force = (1.0 - share) * force[low] + share * force[low + 1]
     return moment, force, (1.0 - share) * roll[low] + share * roll[low + 1]
@@ -249,10 +254,8 @@ class LateralLoad:
         if torsion is None or not normal > _LEAST_FORCE or not isfinite(height):
             self.reset()
             return
-        by_moment, by_force, roll = torsion.at(height)
-        rolled = float(force[0] ** 2 * roll * self.load[0])  # -F_x r, with r = roll (-y F_x)
-        place = normal, rolled, self.load[0]
-        measured = _observe(points, motions, bend, by_moment, by_force, place)
+        place = height, normal, force[0], self.load[0]
+        measured, (by_moment, by_force, rolled) = _observe(points, motions, bend, torsion.packed, place)
         moved, self._depth = abs(float(state["depth"]) - self._depth), float(state["depth"])
         self._follow(measured, points["offset_variance"], (moved, dt), weight)
         x, P, half = *self._known, torsion.half_width
@@ -279,13 +282,13 @@ class LateralLoad:
             self._odds = 0.0
         expected = (*self._expected, 0.0 if weight is None else weight)
         if self._is_lifted:
-            self._known = _step(self._known, expected, offsets, passed, measured)[0]
+            self._known = _step(tuple(self._known), expected, offsets, passed, measured)[0]
             return
         before, light = self._known, (*self._expected, 0.0)
-        self._known, likely = _step(before, light, offsets, passed, measured)
+        self._known, likely = _step(tuple(before), light, offsets, passed, measured)
         if weight is None:
             return
-        self._candidate, other = _step(self._candidate, expected, offsets, passed, measured)
+        self._candidate, other = _step(tuple(self._candidate), expected, offsets, passed, measured)
         self._odds += other - likely
         if self._odds < _UNLIKELY:
             self._candidate, self._odds = self._known, 0.0
@@ -294,22 +297,24 @@ class LateralLoad:
 
 
 @njit(**_OPTIONS)
-def _observe(points, motions, bend, by_moment, by_force, place):
+def _observe(points, motions, bend, torsion, place):
     """Return what the key points show across the finger.
 
     Args:
         points: see `KEYPOINT` (K,).
         motions: measured along y (K,) [m], NaN where unused.
         bend: of the model along x (K,) [m].
-        by_moment: see `Torsion`, at the height of the pressure (K, 3).
-        by_force: the same.
-        place: normal force [N], the force along y by the roll of the face [N], and the location so far [m].
+        torsion: see `Torsion.packed`.
+        place: height of the pressure [m], normal force [N], force along x [N], and the location so far [m].
 
     Returns:
         Numbers of the key points that are seen (m,), derivatives by location and ratio (m, 2), motions less that by the
-        roll (m,) [m], and their variances (m,) [m^2].
+        roll (m,) [m], and their variances (m,) [m^2]; with them the motions by moment and by force (K, 3) at that
+        height, and the force along y by the roll of the face [N].
     """
-    normal, rolled, location = place
+    height, normal, ahead, location = place
+    by_moment, by_force, roll = _interpolate(torsion, height)
+    rolled = ahead**2 * roll * location  # -F_x r, with r = roll (-y F_x)
     turns = turn_bent(by_moment[:, 0], points.rest, bend)
     aside = turn_bent(by_force[:, 0], points.rest, bend)
     count, m = len(points), 0
@@ -322,7 +327,7 @@ def _observe(points, motions, bend, by_moment, by_force, place):
             R[m] = points[k].width_variance / (points[k].trust * max(points[k].weight, 1e-9))
             R[m] += (_TURN_ERROR * turns[k] * location * normal) ** 2
             m += 1
-    return seen[:m], H[:m], z[:m], R[:m]
+    return (seen[:m], H[:m], z[:m], R[:m]), (by_moment, by_force, rolled)
 
 
 @njit(**_OPTIONS)
@@ -339,14 +344,13 @@ def _step(estimate, expected, offsets, passed, measured):
     """Return the estimate after an image, and the logarithm of its likelihood; see `LateralLoad`.
 
     Args:
-        estimate: before it.
+        estimate: before it, a plain tuple.
         expected: location [m], its standard deviation [m], and 1 sigma of the ratio by a weight, 0 for none.
         offsets: stationary variance of each key point's offset (K,) [m^2].
         passed: motion [m] and time [s] since the last image.
         measured: see `_observe`.
     """
-    moved, dt = passed
-    seen, H, z, R = measured
+    (moved, dt), (seen, H, z, R), estimate = passed, measured, _Estimate(*estimate)
     location, stddev, weight = expected
     n, m, kept = len(estimate.x), len(seen), np.exp(-moved / _OFFSET_LENGTH - dt / _OFFSET_TIME)
     rates = np.exp(-dt / _LOCATION_TIME), np.exp(-dt / (_WEIGHT_TIME if weight > 0.0 else _TRACTION_TIME))

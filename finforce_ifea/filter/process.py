@@ -146,19 +146,22 @@ def start(expected, points, x):
 
 
 @njit(**_OPTIONS)
-def advance(x, P, V, expected, points, positions, passed):
-    """Predict the state of an image in place; return its transition, a factor for each entry (n,).
+def advance(x, P, V, expected, points, positions, passed, depth, weights, responses):
+    """Predict the state of an image in place.
 
     Args:
         x: means of the hypotheses (N, n).
         P: covariance (n, n).
         V: stationary variance in the last image (n,); becomes that in this one.
-        expected: see `Expectation`.
+        expected: `Expectation` as a plain tuple.
         points: see `KEYPOINT` (K,).
         positions: of the key points in the model (K, 3) [m].
         passed: time [s] and motion of the object [m] since the last image.
+        depth: predicted [m].
+        weights: of the hypotheses (N,).
+        responses: of the state to a jump (n, j), see `JumpWatch`.
     """
-    dt, motion = passed
+    (dt, motion), expected = passed, Expectation(*expected)
     count = len(points)
     displacement, sight = np.empty(count), np.empty(count)
     for k in range(count):
@@ -170,7 +173,10 @@ def advance(x, P, V, expected, points, positions, passed):
     a = find_decay(sight, dt, motion, expected.camera_time)
     predict(x, P, a, m, after, growth)
     V[:] = after
-    return a * growth
+    x[:, DEPTH] += depth - (weights * x[:, DEPTH]).sum()
+    for response in responses:
+        for i in range(len(a)):
+            response[i] *= a[i] * growth[i]
 
 
 @njit(**_OPTIONS)

@@ -13,13 +13,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from finforce.kalman import MotionNoise, Track
+from finforce.kalman import MotionNoise, Track, expect_position
 from finforce_ifea.contact_mechanics.friction import Coefficient, constant_traction
-from finforce_ifea.contact_mechanics.indenter import CELL
-from finforce_ifea.contact_mechanics.pressed_jaw import PressedState, RigidContact, limit_step
+from finforce_ifea.contact_mechanics.indenter import CELL, find_first_touch
+from finforce_ifea.contact_mechanics.pressed_jaw import PressedState, RigidContact
 from finforce_ifea.filter.filter import Posterior, reduce_covariance
 from finforce_ifea.filter.friction_path import TractionHypotheses
-from finforce_ifea.filter.jump import BUMPED, MISPLACED, NO_JUMP, NUDGED, OFFSET, JumpWatch, correct
+from finforce_ifea.filter.jump import BUMPED, JUMPS, MISPLACED, NO_JUMP, NUDGED, OFFSET, JumpWatch, correct
 from finforce_ifea.filter.measurement import Measurement, find_seen, observe
 from finforce_ifea.filter.process import (
     BUMPED_SHIFT,
@@ -38,7 +38,7 @@ from finforce_ifea.filter.process import (
     start,
 )
 from finforce_ifea.filter.readout import AGREES, find_upright_ratio, judge_points, read_out
-from finforce_ifea.filter.state import CONTACT, DEPTH, HEIGHT, SHAPE, TRACTION, state_size
+from finforce_ifea.filter.state import DEPTH, HEIGHT, SHAPE, TRACTION, state_size
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tracking.contact_state import KEYPOINT, LEAST_DEPTH, LOADED_DEPTH, blank_contact_state
 
@@ -98,8 +98,6 @@ _EDGE = 0.5 * CELL
 # Least force at which the inclination of the faces is asked for [N].
 _LEAST_FORCE = 0.1
 _LEAST_VARIANCE = 1e-14
-# Jumps that one image may show.
-_JUMPS = (BUMPED, MISPLACED)
 # Share of the key points that has to agree, and the largest bump of a camera that is believed [sigma].
 _MAJORITY = 0.5
 _LARGEST_BUMP = 5.0
@@ -108,13 +106,12 @@ _STILL = np.array([CAMERA_SHIFT, CAMERA_SHIFT, CAMERA_TURN_STDDEV, 0.0]) ** 2
 _BUMPED = np.array([BUMPED_SHIFT, BUMPED_SHIFT, BUMPED_TURN, 0.0]) ** 2
 
 
-class _Linearized(NamedTuple):
-    """The mechanics at one state: where it stands (3,), its equilibrium, and the key points (K, 3) [m] with motions."""
+class _Place(NamedTuple):
+    """State of the contact (3,), where the mechanics stands for it (3,), and depth below first touch [m]."""
 
     x: NDArray
-    pressed: PressedState
-    positions: NDArray
-    motions: NDArray
+    x_model: NDArray
+    depth: float
 
 
 class ContactSearch:
@@ -266,10 +263,8 @@ class ContactSearch:
             self.track = Track(_DEPTH_NOISE, float(m[DEPTH]), _FIRST_DEPTH**2)
             positions, passed = np.ascontiguousarray(self.points["rest"]), (0.0, 0.0)
         self.track.predict(dt, _FREE_TIME if self.state["depth"] < LOADED_DEPTH else None)
-        self.x[:, DEPTH] += self.track.x - self.weights @ self.x[:, DEPTH]
-        transition = advance(self.x, self.P, self._V, expected, self.points, positions, passed)
-        for watch in self._watches:
-            watch.predict(transition)
+        known, responses = (self.track.x, self.weights), tuple(watch.F for watch in self._watches)
+        advance(self.x, self.P, self._V, tuple(expected), self.points, positions, passed, *known, responses)
 
     def find(self, contact: RigidContact, probe: Any, dt: float, *, iterations: int) -> bool:
         """Find the contact in the image of `points`; False, all as it was, where too few key points agree.
@@ -285,73 +280,59 @@ class ContactSearch:
         if len(seen) < max(self.settings.minimum_keypoints, 3):
             return False
         self.log_weights = self.hypotheses.bound_held(self.log_weights)
-        ratios = self._preview(self.x, 0.0)
-        ratio, x = float(self.weights @ ratios), self.mean[CONTACT]
+        ratios, x = self._preview(self.x, 0.0), self.mean[: HEIGHT + 1]
         x[0], x[1] = self.track.x, min(max(x[1], expectation["lowest"]), expectation["highest"])
-        q = self.q + self._modes @ (find_x_model(contact, x)[0] - self.state["x_model"])
-        settled, iteration, share, last = False, 0, 1.0, np.zeros(3)
-        at, weight, moved, jump, P = None, np.empty(0), np.zeros(3), NO_JUMP, self.P.copy()
-        possible = self._find_possible_jumps()
+        ratio, place = float(self.weights @ ratios), _Place(x, *find_x_model(contact, x))
+        q = self.q + self._modes @ (place.x_model - self.state["x_model"])
+        settled, iteration, last = False, 0, (np.zeros(3), 1.0)
+        posterior, weight, jump, P = None, np.empty(0), NO_JUMP, self.P.copy()
+        reach, possible = np.full(len(q), contact.model.reach), self._find_possible_jumps()
+        image, known = (points, seen, self._level, expectation), (contact.packed_object, reach, self.track.state)
+        prior = ratios, self.x, self.log_weights, P
         while iteration < iterations and not settled:
             iteration += 1
-            q, made = self._linearize(contact, probe, q, x, ratio)
-            if made is None:
+            at = place.x_model
+            pressed, positions, motions = contact.linearize_points(probe, q, at, constant_traction(ratio))
+            if not pressed.touches:
+                q = q + contact.approach(q, pressed.correction, at)
                 continue
-            at = made
-            measured = observe(points, seen, at.positions, at.motions, at.x, ratio, self._level)
-            posterior, found = correct(measured, weight, ratios, self.x, self.log_weights, P, _JUMPS, possible)
-            jump = max(jump, found)
-            weight, aim = posterior.weight, posterior.mean[CONTACT] - x
-            aim[0] = self.track.expect(posterior.mean[DEPTH], max(posterior.own[0, 0], _LEAST_VARIANCE)) - x[0]
-            x, last, share = _take_step(x, aim, last, share, expectation)
-            moved = find_x_model(contact, x)[0] - at.x
-            q = q + limit_step(contact.model, at.pressed.modes[:, :3] @ moved)
-            settled = at.pressed.size < _SETTLED_CORRECTION and _is_settled(moved, aim - last, share, expectation)
-        if at is None or not _is_believed(posterior, self._V):
+            q, mechanics = q + pressed.correction, (positions, motions, at, ratio, pressed.modes, pressed.size)
+            step = _iterate(image, mechanics, prior, weight, possible, known, place.x, last)
+            (measured, posterior, found), place, (moved, change), last, settled = step
+            jump, weight, q, place = max(jump, found), posterior.weight, q + change, _Place(*place)
+            made = pressed, positions, at
+        if posterior is None or not _is_believed(posterior.mean, weight, self._V):
             return False
-        before, ratios = ratios, self._preview(posterior.x, x[0] - posterior.mean[DEPTH])
+        before, ratios = ratios, self._preview(posterior.x, place.x[0] - posterior.mean[DEPTH])
         if np.abs(ratios - before).max() > _SAME_RATIO:
-            posterior, _ = correct(measured, weight, ratios, self.x, self.log_weights, P, _JUMPS, possible)
-        self.q, self._modes, self.positions = q, at.pressed.modes[:, :3], at.positions
+            posterior, _ = correct(measured, weight, ratios, *prior[1:], possible)
+        pressed, positions, at = made
+        self.q, self._modes, self.positions = q, pressed.modes[:, :3], positions
         self._take_jump(jump)
         self._level = _follow_level(self._level, posterior.distances)
         self.x, self.P, self.log_weights = posterior.x, reduce_covariance(P, posterior.A), posterior.log_weights
         if settled:
             self._watch(measured, posterior)
-        self._read_out(contact, at, x, posterior, (ratios, ratio))
+        self._read_out(pressed, at, place, posterior, (ratios, ratio))
         judge_points(self.state, points, seen, posterior.mean, self._V, posterior.left, weight, expectation["mean"][1])
         self.state["iterations"], self.state["converged"] = iteration, settled
-        self.state["ambiguity"] = 0.0 if settled else np.linalg.norm(at.pressed.force_modes[:, :3] @ moved)
+        self.state["ambiguity"] = 0.0 if settled else np.linalg.norm(pressed.force_modes[:, :3] @ moved)
         return True
 
     def _preview(self, x: NDArray, shift: float) -> NDArray:
         """Return the traction ratios (N,) with the object where hypotheses x (N, n) have it, `shift` [m] deeper."""
-        places = x[:, [DEPTH, HEIGHT]]
-        places[:, 0] += shift
-        return self.hypotheses.preview(places, self.track, self.weights)
-
-    def _linearize(
-        self, contact: RigidContact, probe: Any, q: NDArray, x: NDArray, ratio: float
-    ) -> tuple[NDArray, _Linearized | None]:
-        """Return the unknowns (size,) nearer to equilibrium at x (3,), and the mechanics there, None without touch."""
-        x_model, _ = find_x_model(contact, x)
-        pressed = contact.linearize(q, x_model, constant_traction(ratio))
-        if not pressed.touches:
-            return q + contact.approach(q, pressed.correction, x_model), None
-        q = q + pressed.correction
-        motions = contact.model.project(probe, q, pressed.modes)
-        return q, _Linearized(x_model, pressed, contact.model.positions(probe, q), motions)
+        return self.hypotheses.preview(_find_places(x, shift), self.track, self.weights)
 
     def _find_possible_jumps(self) -> tuple[bool, bool]:
-        """Return which of `_JUMPS` are possible now."""
+        """Return which of `JUMPS` are possible now."""
         return True, bool(self.state["depth"] > LOADED_DEPTH) and not self._misplaced
 
     def _take_jump(self, index: int) -> None:
-        """Remember which of `_JUMPS` was seen, or `NO_JUMP`."""
+        """Remember which of `JUMPS` was seen, or `NO_JUMP`."""
         if index != NO_JUMP:
             self._forget_innovations()
-            self._bumped |= _JUMPS[index] is BUMPED
-            self._misplaced |= _JUMPS[index] is MISPLACED
+            self._bumped |= JUMPS[index] is BUMPED
+            self._misplaced |= JUMPS[index] is MISPLACED
 
     def _watch(self, measured: Measurement, posterior: Posterior) -> None:
         """Look for jumps that show over several images only."""
@@ -373,36 +354,30 @@ class ContactSearch:
         return sqrt(min(self.track.variance / variance, 1.0))
 
     def _read_out(
-        self,
-        contact: RigidContact,
-        at: _Linearized,
-        x: NDArray,
-        posterior: Posterior,
-        traction: tuple[NDArray, float],
+        self, pressed: PressedState, at: NDArray, place: _Place, posterior: Posterior, traction: tuple[NDArray, float]
     ) -> None:
         """Fill in the contact state.
 
         Args:
-            contact: of the jaw.
-            at: where the mechanics was linearised.
-            x: state of the contact (3,).
+            pressed: the last linearisation.
+            at: where that was (3,).
+            place: of the contact.
             posterior: of the image.
             traction: ratio of each hypothesis (N,), and that of the linearisation.
         """
-        s, pressed = blank_contact_state(), at.pressed
+        s = blank_contact_state()
         lessened = self._smooth_depth(float(self.weights @ self.x[:, DEPTH]), float(posterior.own[0, 0]))
-        x_model, s["depth"] = find_x_model(contact, x)
-        s["x"], s["x_model"] = x, x_model
+        s["x"], s["x_model"], s["depth"] = place
         s["pressure_point"], s["pressure_location"] = pressed.pressure_point, pressed.pressure_location
         s["extrapolation"], s["sound"] = pressed.extrapolation, pressed.smallest_det > 0.0
         s["mistaken"] = self._misplaced
         force, modes, (ratios, ratio) = pressed.force, np.ascontiguousarray(pressed.force_modes), traction
-        shift = self._smooth + x_model[0] - x[0]
+        shift = self._smooth + place.x_model[0] - place.x[0]
         # an edge is rounded by more than it sinks in at first
-        inclined = _INCLINED * max(1.0 - s["depth"] / _EDGE, 0.0) if self.expectation["has_corners"] else 0.0
+        inclined = _INCLINED * max(1.0 - place.depth / _EDGE, 0.0) if self.expectation["has_corners"] else 0.0
         spread = self.hypotheses.doubt**2 + inclined**2
         smoothing = posterior.own, lessened
-        read_out(s, force, modes, self.x, self.log_weights, self.P, shift, smoothing, at.x, ratios, ratio, spread)
+        read_out(s, force, modes, self.x, self.log_weights, self.P, shift, smoothing, at, ratios, ratio, spread)
         self.state = s
         if s["magnitude"] > _LEAST_FORCE:
             self.hypotheses.upright = find_upright_ratio(force, ratio)
@@ -414,7 +389,7 @@ class ContactSearch:
         if self.state["depth"] <= 0.0:
             self.hypotheses.leave()
             return
-        places = self.x[:, [DEPTH, HEIGHT]] + np.array([self._smooth, 0.0])
+        places = _find_places(self.x, self._smooth)
         self.hypotheses.follow(contact, self.q, self.state["x_model"], places, self.track, self.weights)
 
     def contact_covariance(self) -> NDArray:
@@ -424,9 +399,57 @@ class ContactSearch:
 
 def find_x_model(contact: RigidContact, x: NDArray) -> tuple[NDArray, float]:
     """Return the state (3,) at which the mechanics stands for x, never above the surface, and the depth below [m]."""
-    x_model, touch = x.copy(), contact.find_touch(x)
+    return _find_x_model(contact.packed_object, x)
+
+
+@njit(**_OPTIONS)
+def _find_x_model(touching, x):
+    """See `find_x_model`; `touching` are object and surface, see `find_first_touch`."""
+    x_model, touch = x.copy(), find_first_touch(*touching, x)
     x_model[DEPTH] = max(x[DEPTH], touch + LEAST_DEPTH)
     return x_model, x[DEPTH] - touch
+
+
+@njit(**_OPTIONS)
+def _find_places(x, shift):
+    """Return depth and height (N, 2) [m] of hypotheses x (N, n), `shift` [m] deeper."""
+    places = np.empty((len(x), 2))
+    for i in range(len(x)):
+        places[i, 0], places[i, 1] = x[i, DEPTH] + shift, x[i, HEIGHT]
+    return places
+
+
+@njit(**_OPTIONS)
+def _iterate(image, at, prior, weight, possible, known, x, last):
+    """Return what one image makes of one linearisation: the step that it asks for.
+
+    Args:
+        image: `points`, `seen` and `level` of `observe`; see `EXPECTATION`.
+        at: `positions`, `motions`, `at` and `ratio` of `observe`; modes (size, 4) and size of the `PressedState`.
+        prior: `ratios`, `x`, `log_weights` and `P` of `correct`.
+        weight: see `correct`.
+        possible: see `correct`.
+        known: object and surface, see `find_first_touch`; reach of the model (size,); state of the depth's `Track`.
+        x: state of the contact (3,).
+        last: step (3,), and the share of a step that this one may have.
+
+    Returns:
+        Measurement, posterior and jump; the next `_Place`; the motion of the mechanics (3,) and of its unknowns
+        (size,); this step, and the next share; whether it changes nothing that matters.
+    """
+    (points, seen, level, expectation), (positions, motions, x_model, ratio, modes, size) = image, at
+    (touching, reach, track), (before, share) = known, last
+    measured = observe(points, seen, positions, motions, x_model, ratio, level)
+    posterior, found = correct(measured, weight, *prior, possible)
+    aim, variance = posterior.mean[: HEIGHT + 1] - x, max(posterior.own[0, 0], _LEAST_VARIANCE)
+    aim[0] = expect_position(track, posterior.mean[DEPTH], variance, _DEPTH_NOISE) - x[0]
+    x, step, share = _take_step(x, aim, before, share, expectation)
+    after, depth = _find_x_model(touching, x)
+    moved = after - x_model
+    change = modes[:, 0] * moved[0] + modes[:, 1] * moved[1] + modes[:, 2] * moved[2]
+    change /= max((np.abs(change) / reach).max(), 1.0)
+    is_settled = size < _SETTLED_CORRECTION and _is_settled(moved, aim - step, share, expectation)
+    return (measured, posterior, found), (x, after, depth), (moved, change), (step, share), is_settled
 
 
 @njit(**_OPTIONS)
@@ -465,10 +488,13 @@ def _is_settled(moved, missing, share, expectation):
 
 
 @njit(**_OPTIONS)
-def _is_believed(posterior, V):
-    """Return True if most key points agree, and the camera has moved no farther than a bump, or V (n,), allows."""
+def _is_believed(mean, weight, V):
+    """Return True if most key points, by their weight (m,), agree, and the camera has moved as far as a bump may do.
+
+    Where V (n,) allows more, it may have moved farther by the mean of the state (n,).
+    """
     for i in range(len(BUMPED.entries)):
         entry = BUMPED.entries[i]
-        if not abs(posterior.mean[entry]) < _LARGEST_BUMP * max(BUMPED.stddev[i], np.sqrt(V[entry])):
+        if not abs(mean[entry]) < _LARGEST_BUMP * max(BUMPED.stddev[i], np.sqrt(V[entry])):
             return False
-    return (posterior.weight > AGREES).mean() > _MAJORITY
+    return (weight > AGREES).mean() > _MAJORITY

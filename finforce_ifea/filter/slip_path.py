@@ -31,6 +31,7 @@ _UPRIGHT = 1
 _FRESH = 0.3e-3
 # Longest step of the path at once [m].
 _STEP = 0.1e-3
+_NO_TURNS, _NOWHERE = np.zeros((2, 3)), (np.inf, np.inf)
 
 
 class SlipPath:
@@ -39,6 +40,7 @@ class SlipPath:
     Attributes:
         coefficients: of friction (N,) [-].
         ratios: traction ratio of each (N,) [-].
+        turns: of the force by the motion, see `measure_turns`; zero before anything touches.
     """
 
     def __init__(self, coefficients: NDArray) -> None:
@@ -49,13 +51,7 @@ class SlipPath:
     def reset(self) -> None:
         """Forget the path."""
         self.ratios = np.zeros(len(self.coefficients))
-        self._turns: NDArray | None = None
-        self._stuck = 0.0
-        self._at = np.zeros(2)
-
-    def turn_at(self, ratio: float) -> float:
-        """Return the size of the turn by depth [1/m] at a traction ratio, 0 before anything touches."""
-        return 0.0 if self._turns is None else abs(float(np.interp(ratio, _RATIOS, self._turns[0])))
+        self.turns, self._stuck, self._at = _NO_TURNS, 0.0, _NOWHERE
 
     def move(self, contact: RigidContact, q: NDArray, x: NDArray, motion: NDArray) -> None:
         """Take the motion of the object.
@@ -76,19 +72,24 @@ class SlipPath:
 
     def _measure(self, contact: RigidContact, q: NDArray, x: NDArray) -> None:
         """Measure the turns anew where an object that may stick has moved."""
-        place = x[[0, 2]]
-        if self.coefficients.any() and (self._turns is None or np.abs(place - self._at).max() > _FRESH):
-            self._turns, self._stuck, self._at = *measure_turns(contact, q, x), place
+        if not max(abs(x[0] - self._at[0]), abs(x[2] - self._at[1])) > _FRESH or not self.coefficients.any():
+            return
+        turns, self._stuck = measure_turns(contact, q, x)
+        self.turns, self._at = (_NO_TURNS, _NOWHERE) if turns is None else (turns, (x[0], x[2]))
 
     def preview(self, motion: NDArray) -> NDArray:
         """Return the traction ratios (N,) after a motion in depth and height (N, 2) [m], by the last turn."""
-        if self._turns is None:
-            return self.ratios
-        return _turn_path(self.ratios, self.coefficients, self._turns, motion)
+        return turn_path(self.ratios, self.coefficients, self.turns, motion)
 
 
 @njit(**_OPTIONS)
-def _turn_path(ratios, coefficients, turns, motion):
+def find_turn(turns, ratio):
+    """Return the size of the turn by depth [1/m] at a traction ratio; see `measure_turns`."""
+    return abs(np.interp(ratio, _RATIOS, turns[0]))
+
+
+@njit(**_OPTIONS)
+def turn_path(ratios, coefficients, turns, motion):
     """Return the ratios (N,) after a motion (N, 2) [m]; see the module and `measure_turns`."""
     out, largest = ratios.copy(), 0.0
     for i in range(len(motion)):
@@ -124,7 +125,7 @@ def measure_turns(contact: RigidContact, q: NDArray, x: NDArray) -> tuple[NDArra
         by_depth.append(stuck.force_modes[:, 0])
     ahead, along = smooth.force[[0, 2]], smooth.force[[2, 0]] * [1.0, -1.0]
     gained = by_depth[_UPRIGHT][[0, 2]]
-    return np.array(turns).T, float(gained @ along / (gained @ ahead))
+    return np.array(turns).T.copy(), float(gained @ along / (gained @ ahead))
 
 
 def _measure_turn(force: NDArray, modes: NDArray) -> NDArray:

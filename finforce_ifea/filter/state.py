@@ -11,12 +11,9 @@ the point's displacement [-].
 
 from __future__ import annotations
 
-import numpy as np
-
 DEPTH, SHAPE, HEIGHT, TRACTION, CAMERA_X, CAMERA_Z, CAMERA_TURN, CAMERA_STRETCH, APPARENT = range(9)
 # Entries that no single key point owns.
 SHARED = 9
-CONTACT = np.array([DEPTH, SHAPE, HEIGHT])
 
 
 def state_size(keypoints: int) -> int:

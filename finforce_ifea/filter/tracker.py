@@ -315,7 +315,7 @@ class ContactTracker:
             self._lateral.expect(*contact.outline.across)
         expected = expect_object(contact, self.settings, self._outline)
         self._expect(expected.mean, expected.variance)
-        self._lead(contact.outline.stddev[[2, 1]])
+        self._lead(contact.outline.stddev[2:0:-1])
         self._outline = after = expected.indenter
         if after is not before:
             self._press(after)
@@ -335,7 +335,7 @@ class ContactTracker:
     def _lead(self, chance: NDArray) -> None:
         """Take the contact along where the object slides or tilts, beyond what its pose may be off by chance."""
         moved = self._mean - self._led
-        change = moved - np.clip(moved, -chance, chance)
+        change = moved - np.minimum(np.maximum(moved, -chance), chance)
         if change.any():
             self._led += change
             self._search.lead(change)

@@ -255,6 +255,8 @@ class ReducedContact(RigidContact):
             farthest=farthest,
         )
         self.packed = tuple(self._jaw)
+        shapes, compliance = model.manifold.shapes[:, :, :0], model.shape_compliance[:, :, :0]
+        self._no_points = np.zeros((0, 3)), shapes.copy(), compliance.copy()
 
     def place_points(self, q: NDArray) -> NDArray:
         """See `RigidContact`."""
@@ -268,7 +270,17 @@ class ReducedContact(RigidContact):
 
     def linearize(self, q: NDArray, x: NDArray, traction: Traction = FRICTIONLESS) -> PressedState:
         """Linearise the equilibrium with the object in a contact state x (depth, shape, height); see `RigidContact`."""
-        return linearize_reduced(self.packed, tuple(self.indenter.pressed), tuple(traction), q, x)
+        pressed = tuple(self.indenter.pressed)
+        return linearize_reduced(self.packed, pressed, tuple(traction), q, x, self._no_points)[0]
+
+    def linearize_points(
+        self, probe: _Probe | _FacePoints, q: NDArray, x: NDArray, traction: Traction
+    ) -> tuple[PressedState, NDArray, NDArray]:
+        """See `RigidContact`."""
+        if isinstance(probe, _FacePoints):
+            return super().linearize_points(probe, q, x, traction)
+        pressed, points = tuple(self.indenter.pressed), (probe.points, probe.shapes, probe.compliance)
+        return linearize_reduced(self.packed, pressed, tuple(traction), q, x, points)
 
     def approach(self, q: NDArray, step: NDArray, x: NDArray) -> NDArray:
         """See `RigidContact`."""
@@ -423,12 +435,12 @@ def _gather(jaw, pressed, pose, traction, points):
     count = jaw.loads.shape[2]
     loads, stiffness, held, grip = np.zeros((count, 5)), np.zeros((count, 7)), np.zeros((2, 5)), np.zeros((2, 2))
     total, point, location = 0.0, np.zeros(3), np.zeros(3)
-    out, weights = np.zeros(POINT_SHAPE), np.zeros((6, 4))
+    out = np.zeros(POINT_SHAPE)
     for p in range(len(points)):
         x, z = points[p, 0], points[p, 2]
         if is_clear_of(pressed, pose, x, z):
             continue
-        touch = touch_object(pressed, pose, x, z, jaw.stiffness[p], weights)
+        touch = touch_object(pressed, pose, x, z, jaw.stiffness[p])
         if touch.kxx == 0.0 and touch.kzz == 0.0:
             continue
         add_traction(traction, touch, p, x, z, jaw.stiffness[p], out)
@@ -495,12 +507,12 @@ def _solve_rows(q, compliance, loads, stiffness):
 @njit(**_OPTIONS)
 def _change_energy(jaw, pressed, pose, traction, points, motion, share, work):
     """Return by how much the energy changes along a step of which a share has been made; see `_find_share`."""
-    out, weights, change = np.zeros(POINT_SHAPE), np.zeros((6, 4)), work[0] + share * work[1]
+    out, change = np.zeros(POINT_SHAPE), work[0] + share * work[1]
     for p in range(len(points)):
         x, z = points[p, 0] + share * motion[p, 0], points[p, 2] + share * motion[p, 2]
         if is_clear_of(pressed, pose, x, z):
             continue
-        touch = touch_object(pressed, pose, x, z, jaw.stiffness[p], weights)
+        touch = touch_object(pressed, pose, x, z, jaw.stiffness[p])
         if touch.kxx != 0.0 or touch.kzz != 0.0:
             add_traction(traction, touch, p, x, z, jaw.stiffness[p], out)
             change -= out[0, 0] * motion[p, 0] + out[1, 0] * motion[p, 2]
@@ -575,8 +587,8 @@ def _read_grid(rods, height):
 
 
 @njit(**_OPTIONS)
-def linearize_reduced(jaw, pressed, traction, q, x):
-    """Return one linearised equilibrium as `PressedState`.
+def linearize_reduced(jaw, pressed, traction, q, x, probe):
+    """Return one linearised equilibrium as `PressedState`; there, places (p, 3) [m] and motions (p, 3, 4) of a probe.
 
     Plain tuples are handed over from Python several times as fast as named ones.
 
@@ -586,6 +598,7 @@ def linearize_reduced(jaw, pressed, traction, q, x):
         traction: `Traction` as a plain tuple.
         q: unknowns (2 n + 2,).
         x: depth [m], shape and height [m] of the object (3,).
+        probe: points, shapes and compliance of a `_Probe`.
     """
     jaw, pressed, traction = _Jaw(*jaw), PressedObject(*pressed), Traction(*traction)
     count = jaw.loads.shape[2]
@@ -620,7 +633,11 @@ def linearize_reduced(jaw, pressed, traction, q, x):
         for axis in range(0, 3, 2):
             force[axis] = share * force[axis] + (1.0 - share) * q[axis // 2 : count : 2].sum()
     far = max(nearest[2] / jaw.farthest, left / _LARGEST_LEFT)
-    return PressedState(touches, correction, modes, force, force_modes, contact.point, contact.location, 1.0, size, far)
+    where = contact.point, contact.location
+    state = PressedState(touches, correction, modes, force, force_modes, *where, 1.0, size, far)
+    (material, shapes, compliance), q = probe, q + correction
+    placed = _move_tables(material, shapes, compliance, jaw.loads, q)
+    return state, placed, _move_points(compliance, q, modes)
 
 
 @njit(**_OPTIONS)

@@ -135,6 +135,7 @@ def find_rejection_reason(state: ContactState, *, largest_residual: float, settl
         largest_residual: of key points of the jaw, see `bound_residual` [m].
         settles: True if the solver iterates until nothing changes, so that one that has not is rejected.
     """
+    state = state[()]
     magnitude, agreement = float(state["magnitude"]), int(state["agreed"]) / int(state["known"])
     if settles and not state["converged"] and state["ambiguity"] > _AMBIGUOUS:
         return f"the shape has not settled within {state['iterations']} iterations; is the contact location right?"

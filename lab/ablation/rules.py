@@ -60,7 +60,7 @@ def _nothing(*_: Any) -> None:
 def _without(name: str) -> tuple[Any, ...]:
     """Return the jumps of one image, one of them impossible."""
     own = getattr(jump, name)
-    return tuple(each._replace(probability=_NEVER) if each is own else each for each in search._JUMPS)
+    return tuple(each._replace(probability=_NEVER) if each is own else each for each in jump.JUMPS)
 
 
 def _rule(name: str, implementation: str, purpose: str, off: Mapping[str, Any], *scenes: str) -> Rule:
@@ -90,11 +90,11 @@ RULES = (
     _rule("short rest of open jaws", "`_FREE_TIME`", "detects the onset of contact early",
           {_SEARCH + "_FREE_TIME": _NOISE.rest_time}, "tapping", "fast", "press"),
     _rule("bumped camera", "`BUMPED`", "a bump that shows in one image",
-          {_SEARCH + "_JUMPS": _without("BUMPED")}, "bumped"),
+          {_FILTER + "jump:JUMPS": _without("BUMPED")}, "bumped"),
     _rule("nudged camera", "`NUDGED`", "a bump that shows only over several images",
           {_SEARCH + "NUDGED": jump.NUDGED._replace(probability=_NEVER)}, "nudged", "drifting"),
     _rule("misplaced contact", "`MISPLACED`", "a wrong height that shows in one image",
-          {_SEARCH + "_JUMPS": _without("MISPLACED")}, "slammed", "misplaced"),
+          {_FILTER + "jump:JUMPS": _without("MISPLACED")}, "slammed", "misplaced"),
     _rule("contact offset", "`OFFSET`", "a wrong height that shows only over several images",
           {_SEARCH + "OFFSET": jump.OFFSET._replace(probability=_NEVER)}, "offset", "misplaced"),
     _rule("model error, constant", "`MODEL_FLOOR`", "standard deviation", {_PROCESS + "MODEL_FLOOR": 0.0},
@@ -180,5 +180,5 @@ RULES = (
     _rule("rejection: tensile", "`_LEAST_PULL`", "no force",
           {_CONTACT + "_LEAST_PULL": np.inf, _CONTACT + "_MOST_PULL": np.inf}, "bumped", "misplaced"),
     _rule("rejection: disagreement", "`_is_believed`", "no force from key points that disagree",
-          {_SEARCH + "_is_believed": lambda posterior, V: True}, "cluster", "bumped", "unplaced"),
+          {_SEARCH + "_is_believed": lambda mean, weight, V: True}, "cluster", "bumped", "unplaced"),
 )  # fmt: skip

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from finforce.kalman import MotionNoise, Track
+from finforce.kalman import MotionNoise, Track, expect_position
 
 NOISE = MotionNoise(drift=1e-10, acceleration=1.6e-5, start=2.5e-5, rest_time=3.0, motion_time=1.0)
 PERIOD, SIGMA = 1.0 / 30.0, 0.1e-3
@@ -55,7 +55,7 @@ def test_a_coordinate_that_never_starts_is_a_random_walk():
 def test_an_expected_position_changes_nothing_until_it_is_measured():
     track = Track(NOISE, 0.0, SIGMA**2)
     track.predict(PERIOD)
-    expected = track.expect(1e-3, SIGMA**2)
+    expected = expect_position(track.state, 1e-3, SIGMA**2, NOISE)
     assert track.x == 0.0
     track.update(1e-3, SIGMA**2)
     assert track.x == expected

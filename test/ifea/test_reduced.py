@@ -7,8 +7,9 @@ import pytest
 from estimator_fakes import magnitudes, make_estimator, ramp, record, run
 from mechanics_fakes import BENCH, bench_mechanics, press, rounded_box, settle
 
+from finforce_ifea.contact_mechanics.friction import constant_traction
 from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, SHAPE, OutlineIndenter, RoundIndenter
-from finforce_ifea.contact_mechanics.pressed_jaw import limit_step
+from finforce_ifea.contact_mechanics.pressed_jaw import RigidContact, limit_step
 from finforce_ifea.errors import ContactError, JawFileError
 from finforce_ifea.fem.solid import SolidModel
 from finforce_ifea.jaw.jaw import load_jaw
@@ -93,6 +94,18 @@ def test_jaw_that_has_lost_contact_comes_back_to_touch():
     assert not state.touches
     back = q + contact.approach(q, state.correction, place)
     assert contact.linearize(back, place).touches
+
+
+def test_key_points_come_with_the_linearisation_as_after_it():
+    mechanics, place = reduced(), np.array([0.0041, 0.0125, 0.0302])
+    contact, probe = mechanics.contact, mechanics.model.attach(BENCH.keypoints, 1e-3)
+    [(q, _)] = press(contact, RoundIndenter(), 0.0125, 0.030, [0.004])
+    found = contact.linearize_points(probe, q, place, constant_traction(0.2))
+    expected = RigidContact.linearize_points(contact, probe, q, place, constant_traction(0.2))
+    np.testing.assert_array_equal(found[0].force, expected[0].force)
+    for one, other in zip(found[1:], expected[1:], strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-12)
+    assert np.abs(found[1] - mechanics.model.positions(probe, q)).max() > 0.03e-3  # after the correction, not before it
 
 
 def test_forces_are_in_proportion_to_the_modulus():
