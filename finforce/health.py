@@ -186,7 +186,9 @@ class Health:
         self._recent[outcome.level, outcome.reason] = outcome
         self._last = outcome
 
-    def report(self, alarms: Sequence[Outcome] = (), values: Mapping[str, str] | None = None) -> Report:
+    def report(
+        self, alarms: Sequence[Outcome] = (), values: Mapping[str, str] | None = None, unheard: str = ""
+    ) -> Report:
         """Return the state now, and what was refused since the last report.
 
         An error goes before the silence that may follow from it; a refusal turns OK into WARN.
@@ -194,9 +196,10 @@ class Health:
         Args:
             alarms: standing faults, beside the messages'.
             values: further values to be shown.
+            unheard: the answers that the node does not make because nobody subscribes to them.
         """
-        level, text = self._state()
-        troubles = [*alarms, *self._recent.values()]
+        level, text = (Level.OK, f"idle: no subscriber on the {unheard}") if unheard else self._state()
+        troubles = [*alarms, *(() if unheard else self._recent.values())]
         if any(trouble.level == Level.ERROR for trouble in troubles):
             level = Level.ERROR
         elif troubles:
@@ -222,19 +225,19 @@ class Health:
         latency, age = self.times
         return {
             "rate [Hz]": f"{rate:.1f}",
-            f"{latency} p50 [ms]": _percentile(self._latency, 50),
-            f"{latency} p95 [ms]": _percentile(self._latency, 95),
-            f"{age} p50 [ms]": _percentile(self._age, 50),
-            f"{age} p95 [ms]": _percentile(self._age, 95),
+            **_percentiles(latency, self._latency),
+            **_percentiles(age, self._age),
             "arrived": str(self._arrived),
             "published": str(self._published),
             "refused": ", ".join(f"{count} {reason}" for reason, count in self._refused.most_common()) or "none",
         }
 
 
-def _percentile(seconds: Sequence[float], percent: float) -> str:
-    """Return a percentile of times [s] as text in milliseconds."""
-    return f"{1e3 * float(np.percentile(seconds, percent)):.2f}" if len(seconds) else "-"
+def _percentiles(name: str, seconds: Sequence[float]) -> dict[str, str]:
+    """Return two percentiles of times [s] as text in milliseconds."""
+    percents = (50, 95)
+    found = [f"{1e3 * time:.2f}" for time in np.percentile(seconds, percents)] if seconds else ("-", "-")
+    return {f"{name} p{percent} [ms]": text for percent, text in zip(percents, found, strict=True)}
 
 
 class SkippingError(FinforceError):

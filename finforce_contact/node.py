@@ -151,8 +151,9 @@ class ContactEstimatorNode(ros.ImageNode):
     def _subscribe_to_check(self, check: MeshFeed) -> None:
         """Subscribe to depth images, while one is due, for the comparison with the mesh."""
         parameters, group = self.parameters, MutuallyExclusiveCallbackGroup()
-        info = partial(self._on_camera, check)
-        self.stage.subscription(ros.CameraInfo, parameters.info_topic, info, ros.SENSOR, callback_group=group)
+        info, stream = partial(self._on_camera, check), self.session.stream
+        options = {"is_wanted": lambda: stream.camera is None or check.is_due, "callback_group": group}
+        self.stage.subscription(ros.CameraInfo, parameters.info_topic, info, ros.SENSOR, **options)
         ros.ImageInput(
             self.stage,
             parameters.depth_topic,

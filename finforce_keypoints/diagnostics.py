@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce.health import Level, Outcome, Report
+from finforce.health import Level, Outcome
 from finforce.optional import import_cv2
 from finforce_keypoints.images import COLOR
 
@@ -33,13 +33,6 @@ def outcome_of_keypoints(found: JawKeypoints | None, side: str, warning: str = "
     enough = visible >= LEAST_VISIBLE
     level = Level.OK if enough and not warning else Level.WARN
     return Outcome(level=level, reason="visible" if enough else "hidden", text=text)
-
-
-def report_of_rest(alarms: Sequence[Outcome], values: Mapping[str, str]) -> Report:
-    """Return the state of a node that nobody listens to: standing faults, and values."""
-    level = max((alarm.level for alarm in alarms), default=Level.OK)
-    said = [alarm.text for alarm in alarms]
-    return Report(level=level, message="; ".join([*said, "idle: no subscriber on the key points"]), values=values)
 
 
 def describe(feed: RgbdFeed, method: str, found: JawKeypoints | None) -> dict[str, str]:

@@ -28,7 +28,6 @@ from finforce_keypoints.diagnostics import (
     describe_names,
     draw_keypoints,
     outcome_of_keypoints,
-    report_of_rest,
 )
 from finforce_keypoints.geometry.jaw_localizer import REASONS
 from finforce_keypoints.images import COLOR, DEPTH, RgbdFeed
@@ -181,7 +180,9 @@ class KeypointDetectorNode(ros.ImageNode):
     def _subscribe(self) -> None:
         """Create the subscriptions."""
         parameters = self.parameters
-        self.stage.subscription(CameraInfo, parameters.info_topic, self._on_info, ros.SENSOR)
+        stream = self.feed.stream
+        info = {"is_wanted": lambda: stream.camera is None or self._is_wanted()}
+        self.stage.subscription(CameraInfo, parameters.info_topic, self._on_info, ros.SENSOR, **info)
         wanted = {"transport": parameters.image_transport, "is_wanted": self._is_wanted}
         images = partial(ros.ImageInput, self.stage, **wanted)
         if parameters.depth != NO_DEPTH:
@@ -337,5 +338,4 @@ class KeypointDetectorNode(ros.ImageNode):
         known = describe(self.feed, self.detector.name, self.found.get(side)) | self.skips.describe()
         troubles = filter(None, (self.feed.delay_of_depth, self._mount_trouble, *self._find_losses()))
         alarms = [*alarms, *(Outcome(level=Level.WARN, reason=text, text=text) for text in troubles)]
-        report = self.health[side].report(alarms, known)
-        return report if self._is_wanted() else report_of_rest(alarms, report.values)
+        return self.health[side].report(alarms, known, "" if self._is_wanted() else self.answer)

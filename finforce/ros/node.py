@@ -237,8 +237,7 @@ def publish_diagnostics(stage: Stage, name: str, period: float, report: Callable
         status = status_message(f"{space}{name}", f"{space}{node.get_name()}", made)
         publisher.publish(DiagnosticArray(header=Header(stamp=node.get_clock().now().to_msg()), status=[status]))
 
-    # on the steady clock: a stopped /clock must show, too
-    node.create_timer(period, publish, clock=STEADY_CLOCK)
+    stage.pipeline.call_every(period, node, publish)
 
 
 def serve_trigger(stage: Stage, name: str, action: Callable[[], str], group: CallbackGroup | None = None) -> None:

@@ -21,6 +21,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
+from rclpy.timer import Timer
 from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Header
 
@@ -43,6 +44,7 @@ _OVERRIDABLE = QoSOverridingOptions.with_default_policies()  # by the parameters
 
 BUDGET = 5e-3  # [s] that a stage may take before those that could go on without it do
 WATCHED = 15  # messages over which that is judged
+_LOOKED_FOR = 0.2  # [s] between looks at who publishes, and at whether images are wanted
 _MOST_WAITING = 1000  # messages, more than any queue keeps
 
 
@@ -66,6 +68,8 @@ class Pipeline:
         self._topics: set[str] = set()
         self._waiting: dict[Port, Any] = {}
         self._left: deque[Callable[[], None]] = deque()
+        self._looks: list[Callable[[], None]] = []
+        self._timers: list[Timer] = []
         self._delayed: list[Callable[[], None]] = []
         self._depth, self._ended, self.spare = 0, perf_counter(), 0.0
 
@@ -80,8 +84,19 @@ class Pipeline:
     def add(self, port: Port) -> Port:
         """Take a subscription; before `open` it waits for who may publish."""
         self._ports.setdefault(port.topic, []).append(port)
-        self.when_open(port.connect)
+        self.when_open(lambda: port.stage.look(port.follow))
         return port
+
+    def look(self, node: Node, action: Callable[[], None]) -> None:
+        """Do something now and every so often."""
+        action()
+        self._looks.append(action)
+        if len(self._looks) == 1:
+            self.call_every(_LOOKED_FOR, node, lambda: [look() for look in self._looks])
+
+    def call_every(self, period: float, node: Node, action: Callable[[], Any]) -> None:
+        """Do something every `period` seconds, whatever /clock says, from `open` on in step: each wake is dear."""
+        self._timers.append(node.create_timer(period, action, clock=STEADY_CLOCK))
 
     def when_open(self, connect: Callable[[], None]) -> None:
         """Do something once all stages are there."""
@@ -100,6 +115,8 @@ class Pipeline:
         self._is_open = True
         while self._delayed:
             self._delayed.pop(0)()
+        for timer in self._timers:
+            timer.reset()
 
     def hand_on(self, topic: str, message: Any) -> None:
         """Give a message to the stages that take it."""
@@ -147,28 +164,34 @@ class Port:
     """A subscription, to another stage of the process or to what comes from outside.
 
     Attributes:
-        pipeline: of the process.
+        stage: whose it is.
         topic: its full name.
         callback: takes messages, guarded.
         subscribe: makes the subscription to what comes from outside.
         can_wait: whether the process goes on without it where it takes too long.
         is_contested: says whether several nodes outside publish the topic, whose messages are then dropped.
+        is_wanted: says whether messages from outside are wanted now.
         outside: the subscription to what comes from outside; None while there is none.
     """
 
-    pipeline: Pipeline
+    stage: Stage
     topic: str
     callback: Callable
     subscribe: Callable[[], Subscription]
     can_wait: bool = False
     is_contested: Callable[[], bool] = lambda: False
+    is_wanted: Callable[[], bool] = lambda: True
     outside: Subscription | None = field(default=None, init=False)
     _times: deque[float] = field(default_factory=lambda: deque(maxlen=WATCHED), init=False)
 
-    def connect(self) -> None:
-        """Subscribe to what comes from outside, if no stage of this process publishes it."""
-        if not self.pipeline.publishes(self.topic):
+    def follow(self) -> None:
+        """Subscribe to what comes from outside while it is wanted, if no stage of this process publishes it."""
+        is_wanted = not self.stage.pipeline.publishes(self.topic) and self.is_wanted()
+        if is_wanted and self.outside is None:
             self.outside = self.subscribe()
+        elif not is_wanted and self.outside is not None:
+            self.stage.node.destroy_subscription(self.outside)
+            self.outside = None
 
     @property
     def is_slow(self) -> bool:
@@ -281,6 +304,10 @@ class Stage:
             callback = note(self.node.get_name(), self.node.resolve_topic_name(topic), callback)
         return self.pipeline.turn(self.guard(callback))
 
+    def look(self, action: Callable[[], None]) -> None:
+        """Do something now and every so often."""
+        self.pipeline.look(self.node, self.guard(action))
+
     def afterwards(self, action: Callable[[], None]) -> None:
         """Do something once the image is through the whole process."""
         self.pipeline.afterwards(self.guard(action))
@@ -321,6 +348,7 @@ class Stage:
         *,
         can_wait: bool = False,
         is_exclusive: bool = True,
+        is_wanted: Callable[[], bool] = lambda: True,
         **options: Any,
     ) -> Port:
         """Create a watched subscription.
@@ -332,6 +360,7 @@ class Stage:
             qos: that is asked for.
             can_wait: a process of several nodes may go on without this one where it takes long.
             is_exclusive: messages are dropped while several nodes publish the topic: they may contradict each other.
+            is_wanted: says whether messages from outside are wanted now.
             options: of the subscription, as its callback group.
         """
         qos = copy(qos)
@@ -347,7 +376,7 @@ class Stage:
             )
 
         name = self.node.resolve_topic_name(topic)
-        return self.pipeline.add(Port(self.pipeline, name, guarded, subscribe, can_wait, is_contested))
+        return self.pipeline.add(Port(self, name, guarded, subscribe, can_wait, is_contested, is_wanted))
 
     def large_subscription(self, kind: type, topic: str, callback: Callable, **options: Any) -> Callable[[], None]:
         """Subscribe to messages of a megabyte from outside, whose lost pieces come again, unless nobody keeps them.
@@ -448,9 +477,6 @@ def send_cloud(publisher: Outlet, header: Header, columns: Mapping[str, NDArray]
     publisher.publish(CloudColumns(header, columns))
 
 
-_LOOKED_FOR = 0.2  # [s] between looks at who publishes, and at whether images are wanted
-
-
 class ImageInput:
     """A subscription to the images of a topic, raw or compressed, while they are wanted.
 
@@ -479,8 +505,7 @@ class ImageInput:
         only = packed if topic.endswith(ENDS) or transport == COMPRESSED else topic if transport == RAW else ""
         self._choices = (only,) if only else (topic, packed)
         self._topic, self._close = "", lambda: None
-        self._follow()
-        stage.node.create_timer(_LOOKED_FOR, self._follow, clock=STEADY_CLOCK)
+        stage.look(self._follow)
 
     def _follow(self) -> None:
         """Subscribe to what is published, raw images first; to nothing while nothing is wanted."""

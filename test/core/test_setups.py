@@ -1,5 +1,6 @@
 """Claims about the processes of bench and robot, with hardware and without."""
 
+import json
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -7,6 +8,9 @@ import numpy as np
 import pytest
 import rclpy
 import yaml
+from keypoint_node_fakes import FakeDetector
+from node_fakes import FakeEstimator
+from rclpy.parameter import Parameter
 
 from finforce.gripper_frames import ROBOT_CAMERA
 from finforce.ros.transport import CHOICES, PROFILES, TRANSPORT, free_domain
@@ -25,8 +29,12 @@ from finforce.systems.setups import (
     robot_processes,
 )
 from finforce_contact.mesh.object_mesh import load_object_mesh
+from finforce_contact.node import ContactEstimatorNode
 from finforce_contact.parameters import ContactParameters
 from finforce_driver.settings import DriverParameters
+from finforce_eval.cli.pipeline import pipeline_process
+from finforce_ifea.node import IfeaSolverNode
+from finforce_keypoints.node import KeypointDetectorNode
 from finforce_keypoints.parameters import DetectorParameters
 from finforce_sim.node import TwinParameters
 
@@ -144,6 +152,38 @@ def test_no_system_names_a_camera_topic_outside_of_its_namespace(processes):
     for kind in (DetectorParameters, ContactParameters):
         topics = [entry.default for entry in fields(kind) if entry.metadata.get("topic")]
         assert topics and "'/" not in repr(topics)
+
+
+COMMON = {"/tf", "/tf_static", "/diagnostics", "/parameter_events", "/rosout", "/clock"}
+
+
+def test_every_topic_of_a_robot_in_a_namespace_is_in_it(probe):
+    options = {"context": probe.context, "namespace": "r2"}
+    peer = [Parameter("peer", value="right")]
+    nodes = [
+        IfeaSolverNode(lambda *_: FakeEstimator(), parameter_overrides=peer, **options),
+        ContactEstimatorNode(parameter_overrides=[Parameter("jaws", value="both")], **options),
+        KeypointDetectorNode(
+            lambda jaws, *_, **__: FakeDetector(tuple(jaws)),
+            parameter_overrides=[Parameter("skip_off", value=["all"])],
+            **options,
+        ),
+    ]
+    ends = {end.topic_name for node in nodes for end in (*node.subscriptions, *node.publishers)} - COMMON
+    services = {node.resolve_service_name(service.srv_name) for node in nodes for service in node.services}
+    for node in nodes:
+        node.destroy_node()
+    assert len(ends) > 20 and services
+    assert not [name for name in ends | services if not name.startswith("/r2/")]
+
+
+def test_every_stage_of_a_pipeline_in_a_namespace_is_told_so():
+    process = pipeline_process(["namespace:=r2", "frame_prefix:=r2/", "object_mesh:=can.stl", "gripper:=true"])
+    parts = [json.loads(part) for part in process.arguments]
+    assert [part[0] for part in parts].count("ifea_solver") == 2 and len(parts) == 5
+    for part in parts:
+        assert {"__ns:=/r2", 'frame_prefix:="r2/"'} <= set(part)
+        assert not [word for word in part if ":=/" in word and not word.startswith("__ns")]
 
 
 def test_the_camera_gets_the_transport_of_our_nodes_unless_somebody_chose_one(monkeypatch):

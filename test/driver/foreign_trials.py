@@ -1,7 +1,7 @@
 """One gripper with an elastic object, one thing that its driver did not order, and the emulator's truth as the judge.
 
 Drawn from a seed: firmware, adapter, object, what the driver was doing, what happens and when. `run_many` counts the
-complaints of as many trials as are asked for: `python test/driver/foreign_trials.py 1000`.
+complaints of as many trials as are asked for: `PYTHONPATH=test/core python test/driver/foreign_trials.py 1000`.
 """
 
 import sys

@@ -5,8 +5,8 @@ from time import time_ns
 
 import numpy as np
 import pytest
-from keypoint_node_fakes import JAW, MILLISECOND, CameraBench, FakeKeypoints, start_detector
-from sensor_msgs.msg import Image, PointCloud2
+from keypoint_node_fakes import JAW, MILLISECOND, CameraBench, FakeKeypoints, camera_info, start_detector
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
 from finforce.health import IDLE, STILL, UNHEARD, Level
 from finforce.messages import stamp_of
@@ -48,6 +48,22 @@ def test_without_a_listener_images_are_not_even_taken_and_with_the_first_they_ar
     probe.wait_for(lambda: bench.clouds())
     probe.destroy_subscription(listener)
     probe.wait_for(lambda: not taken())
+
+
+def test_the_camera_is_heard_until_it_is_known_and_then_while_somebody_listens(probe):
+    node = start_detector(probe)
+    out = probe.speak(node.parameters.info_topic, CameraInfo)
+
+    def infos():
+        return [sub for sub in node.subscriptions if sub.msg_type is CameraInfo]
+
+    probe.connected(out)
+    probe.spin(0.5)
+    assert infos()
+    out.publish(camera_info())
+    probe.wait_for(lambda: node.feed.stream.camera and not infos())
+    probe.hear("left/keypoints", PointCloud2)
+    probe.wait_for(infos)
 
 
 def test_a_node_that_is_told_to_looks_at_images_that_nobody_asks_for(probe):
