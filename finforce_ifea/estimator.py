@@ -369,8 +369,9 @@ class ForceEstimator:
     def _relax(self, force: NDArray) -> None:
         """Let the material relax under a force (3,) [N] that is not told."""
         dt = self._pass_time()
-        self._relaxation.update(force, dt)
         self._untold.update(_UNTOLD * force, dt)
+        self._untold.doubt(force - self._relaxation.packed[0], dt)
+        self._relaxation.update(force, dt)
 
     def _pass_time(self) -> float:
         """Return the time since the material's last force [s]."""
@@ -384,6 +385,7 @@ class ForceEstimator:
         error = hypot(self._force_error, state["location_error"], _EXTRAPOLATED * state["extrapolation"])
         vectors, dt = np.empty((7, 3)), self._pass_time()
         self._untold.update(np.zeros(3), dt)
+        self._untold.doubt(state["force"] - self._relaxation.packed[0], dt)
         relaxation, untold = self._relaxation.packed, self._untold.overstress
         magnitude, stddev = compute_force(state, relaxation, untold, dt, error, self._modulus_error, vectors)
         force, torque, force_stddev, torque_stddev, point, location, normal = vectors

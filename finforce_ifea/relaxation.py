@@ -41,6 +41,14 @@ class Relaxation:
         relax_force(np.asarray(elastic, float), self.packed, dt, out)
         return out
 
+    def doubt(self, change: NDArray, dt: float) -> None:
+        """Add the standard deviation of the overstress of a force that changed by (3,) [N] within the last dt [s].
+
+        When is not known: what is left of its overstress is as likely to be anything from all to that of a change at
+        the beginning, while `update` takes a ramp.
+        """
+        _doubt(self._over, self._share, self._tau, np.asarray(change, float), dt)
+
     @property
     def overstress(self) -> NDArray:
         """The overstress that remains of past forces (3,) [N]."""
@@ -89,6 +97,17 @@ def _invert(measured, stamps, share, tau):
         elastic[i] = rest / stiffness
         over = over * decay + gain * (elastic[i] - elastic[i - 1])
     return elastic
+
+
+@njit(cache=True)
+def _doubt(over, share, tau, change, dt):
+    """Add to overstresses (n, 3) what `Relaxation.doubt` says."""
+    for k in range(len(share)):
+        ratio = max(dt / tau[k], 1e-12)
+        decay = np.exp(-ratio)
+        spread = share[k] * np.hypot((1.0 - decay) / np.sqrt(12.0), 0.5 * (1.0 + decay) + np.expm1(-ratio) / ratio)
+        for a in range(3):
+            over[k, a] = np.copysign(np.hypot(over[k, a], spread * change[a]), over[k, a])
 
 
 @njit(cache=True)

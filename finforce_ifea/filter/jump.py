@@ -57,7 +57,10 @@ OFFSET = Jump(np.array([HEIGHT]), np.array([15e-3]), 1e-4)
 JUMPS = (BUMPED, MISPLACED)
 # Log odds against a jump since the first image, its prior left out, after which the test begins anew.
 _UNLIKELY = -3.0
-NO_JUMP = -1
+# What an image shows beside the index of a jump: none, or not yet, as the object is too far from the linearisation.
+NO_JUMP, UNDECIDED = -1, -2
+# Largest change of the depth at once, within which a linearisation holds [m].
+LARGEST_MOVE = 0.7e-3
 # Correlation between the errors by which a detector misplaces two key points of one shape [-]: that of the shipped
 # network in drawn scenes.
 _ALIKE = 0.2
@@ -92,8 +95,10 @@ def weigh_jump(jump, information, score):
 
 
 @njit(**_OPTIONS)
-def correct(measured, weight, ratios, x, log_weights, P, possible):
-    """Return the posterior of one image, and which jump it shows, or `NO_JUMP`.
+def correct(measured, weight, ratios, x, log_weights, P, possible, depth):
+    """Return the posterior of one image, and which jump it shows, or `NO_JUMP`, or `UNDECIDED`.
+
+    A bend that the linearisation does not reach looks like a jump: none is looked for until it is near.
 
     Args:
         measured: see `update`.
@@ -103,12 +108,17 @@ def correct(measured, weight, ratios, x, log_weights, P, possible):
         log_weights: see `update`.
         P: predicted covariance (n, n); widened where part of the state has jumped.
         possible: mask of those of `JUMPS` that are possible now (J,).
+        depth: of the linearisation [m].
     """
     HP, S = innovate(measured.H, measured.rows, measured.u, P, measured.R)
     found = NO_JUMP
     if len(weight) == 0:
-        nu = np.dot(np.exp(log_weights), expect_innovations(measured, ratios, x))
+        before = np.exp(log_weights)
+        nu = np.dot(before, expect_innovations(measured, ratios, x))
         weight = _weigh_innovations(measured, nu, S, P[DEPTH, DEPTH])
+        asked = (before * x[:, DEPTH]).sum() + find_depth_jump(measured.H, measured.R, nu)[0]
+        if abs(asked - depth) > LARGEST_MOVE:
+            return update(measured, weight, ratios, x, log_weights, HP, S), UNDECIDED
         found = detect_jump(measured, weight, nu, S, possible)
         if found != NO_JUMP:
             for index, jump in enumerate(JUMPS):

@@ -19,7 +19,18 @@ from finforce_ifea.contact_mechanics.indenter import CELL, find_first_touch
 from finforce_ifea.contact_mechanics.pressed_jaw import PressedState, RigidContact
 from finforce_ifea.filter.filter import Posterior, reduce_covariance
 from finforce_ifea.filter.friction_path import TractionHypotheses
-from finforce_ifea.filter.jump import BUMPED, JUMPS, MISPLACED, NO_JUMP, NUDGED, OFFSET, JumpWatch, correct
+from finforce_ifea.filter.jump import (
+    BUMPED,
+    JUMPS,
+    LARGEST_MOVE,
+    MISPLACED,
+    NO_JUMP,
+    NUDGED,
+    OFFSET,
+    UNDECIDED,
+    JumpWatch,
+    correct,
+)
 from finforce_ifea.filter.measurement import Measurement, find_seen, observe
 from finforce_ifea.filter.process import (
     BUMPED_SHIFT,
@@ -81,8 +92,7 @@ _LEVEL_IMAGES = 8.0
 _LARGEST_CHANGE = 9.0
 _LARGEST_LEVEL = 25.0
 _MEDIAN_SQUARE = 2.05
-# Largest change of the depth and of the height at once [m], and the changes that no longer matter [m].
-_LARGEST_MOVE = 0.7e-3
+# Largest change of the height at once [m], and the changes that no longer matter [m].
 _LARGEST_SHIFT = 0.3e-3
 _SETTLED = 0.1e-3
 # Of the model's reach.
@@ -285,7 +295,7 @@ class ContactSearch:
         ratio, place = float(self.weights @ ratios), _Place(x, *find_x_model(contact, x))
         q = self.q + self._modes @ (place.x_model - self.state["x_model"])
         settled, iteration, last = False, 0, (np.zeros(3), 1.0)
-        posterior, weight, jump, P = None, np.empty(0), NO_JUMP, self.P.copy()
+        posterior, found, jump, P = None, UNDECIDED, NO_JUMP, self.P.copy()
         reach, possible = np.full(len(q), contact.model.reach), self._find_possible_jumps()
         image, known = (points, seen, self._level, expectation), (contact.packed_object, reach, self.track.state)
         prior = ratios, self.x, self.log_weights, P
@@ -297,15 +307,16 @@ class ContactSearch:
                 q = q + contact.approach(q, pressed.correction, at)
                 continue
             q, mechanics = q + pressed.correction, (positions, motions, at, ratio, pressed.modes, pressed.size)
-            step = _iterate(image, mechanics, prior, weight, possible, known, place.x, last)
+            given = np.empty(0) if found == UNDECIDED else posterior.weight
+            step = _iterate(image, mechanics, prior, given, possible, known, place.x, last)
             (measured, posterior, found), place, (moved, change), last, settled = step
-            jump, weight, q, place = max(jump, found), posterior.weight, q + change, _Place(*place)
-            made = pressed, positions, at
-        if posterior is None or not _is_believed(posterior.mean, weight, self._V):
+            jump, q, place, made = max(jump, found), q + change, _Place(*place), (pressed, positions, at)
+        if posterior is None or not _is_believed(posterior.mean, posterior.weight, self._V):
             return False
+        weight = posterior.weight
         before, ratios = ratios, self._preview(posterior.x, place.x[0] - posterior.mean[DEPTH])
         if np.abs(ratios - before).max() > _SAME_RATIO:
-            posterior, _ = correct(measured, weight, ratios, *prior[1:], possible)
+            posterior, _ = correct(measured, weight, ratios, *prior[1:], possible, at[DEPTH])
         pressed, positions, at = made
         self.q, self._modes, self.positions = q, pressed.modes[:, :3], positions
         self._take_jump(jump)
@@ -440,7 +451,7 @@ def _iterate(image, at, prior, weight, possible, known, x, last):
     (points, seen, level, expectation), (positions, motions, x_model, ratio, modes, size) = image, at
     (touching, reach, track), (before, share) = known, last
     measured = observe(points, seen, positions, motions, x_model, ratio, level)
-    posterior, found = correct(measured, weight, *prior, possible)
+    posterior, found = correct(measured, weight, *prior, possible, x_model[DEPTH])
     aim, variance = posterior.mean[: HEIGHT + 1] - x, max(posterior.own[0, 0], _LEAST_VARIANCE)
     aim[0] = expect_position(track, posterior.mean[DEPTH], variance, _DEPTH_NOISE) - x[0]
     x, step, share = _take_step(x, aim, before, share, expectation)
@@ -459,7 +470,7 @@ def _take_step(x, aim, last, share, expectation):
     Between two corners of an object the linearisation changes its mind: meet in the middle.
     """
     expectation, step = expectation[()], np.empty(3)
-    most = (_LARGEST_MOVE, share * expectation.largest_change, share * _LARGEST_SHIFT)
+    most = (LARGEST_MOVE, share * expectation.largest_change, share * _LARGEST_SHIFT)
     for i in range(3):
         step[i] = min(max(aim[i], -most[i]), most[i])
     if expectation.has_corners and step[1] * last[1] + step[2] * last[2] < 0.0:

@@ -122,3 +122,29 @@ def test_filter_and_course_agree():
     stamps = np.cumsum(np.r_[0.0, random.uniform(0.02, 0.05, 500)])
     elastic = np.interp(stamps, [0, 2, 6, 8, 20], [0, 4, 4, 1, 1])
     np.testing.assert_allclose(follow(elastic, stamps), apply_relaxation(elastic, stamps, TERMS), atol=1e-12)
+
+
+@pytest.mark.parametrize("gap", [0.5, 5.0, 50.0, 600.0])
+@pytest.mark.parametrize("rise", [0.1, 0.5, 1.0])
+@pytest.mark.parametrize("late", [0.0, 0.5, 1.0])
+def test_a_force_that_came_in_a_gap_is_within_the_doubt_wherever_in_it(gap, rise, late):
+    """Rises within a share of the gap, early in it or late, and the images begin again at its end."""
+    begin = late * (1.0 - rise) * gap
+    stamps = np.array([0.0, begin, begin + rise * gap, gap])
+    true = follow(np.array([0.0, 0.0, 3.0, 3.0]), stamps)[-1]
+    filter_, doubt = Relaxation(TERMS), Relaxation(TERMS)
+    found = filter_.update(3.0 * ALONG, gap) @ ALONG
+    doubt.doubt(3.0 * ALONG, gap)
+    assert abs(found - true) < 2.0 * np.linalg.norm(doubt.overstress)
+
+
+def test_doubt_of_a_gap_fades_and_hardly_grows_between_images():
+    doubt = Relaxation(TERMS)
+    for _ in range(30):  # a ramp of 3 N in a second
+        doubt.update(np.zeros(3), 1.0 / 30.0)
+        doubt.doubt(0.1 * ALONG, 1.0 / 30.0)
+    assert np.linalg.norm(doubt.overstress) < 0.01
+    doubt.doubt(3.0 * ALONG, 10.0)
+    before = np.linalg.norm(doubt.overstress)
+    doubt.update(np.zeros(3), 40.0)
+    assert np.linalg.norm(doubt.overstress) < 0.01 * before
