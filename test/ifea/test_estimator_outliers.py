@@ -153,6 +153,19 @@ def test_jump_of_5_mm_is_followed_within_five_frames(height, solver):
         assert np.abs(settled).max() < 0.10 * true.max()
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_load_that_came_in_a_pause_is_no_bump_of_the_camera(seed):
+    """4 mm next to the base, far from where the jaw was linearised before a pause of ten seconds."""
+    recording = record(1e-3 * np.r_[np.zeros(60), np.full(40, 4.0)], height=20, seed=seed, noise=0.3)
+    for index, observation in enumerate(recording.observations):
+        stddev = np.full(observation.points.shape, 0.25e-3)
+        later = replace(observation, stamp=observation.stamp + 10.0 * (index >= 60), stddev=stddev)
+        recording.observations[index] = later
+    solutions = run(recording)
+    assert np.abs(errors(recording, solutions)[62:]).max() < 0.12
+    assert max(solution.magnitude_stddev for solution in solutions[62:]) < 0.25
+
+
 @pytest.mark.parametrize("height", [20, 40])
 def test_force_during_a_jump_is_not_passed_off_as_certain(height):
     depths = 1e-3 * np.r_[np.zeros(60), np.full(40, 1.0), np.full(40, 6.0)]
