@@ -80,10 +80,12 @@ class HiddenForce:
         if pressed.is_round:  # a cylinder, which is small and round
             return 0.0
         clearance, stddev = _measure_clearances(tuple(pressed), x, covariance, self._places, self._clamped, centre)
-        if not np.isfinite(clearance).any():
+        near = np.isfinite(clearance)
+        if not near.any():
             return 0.0
-        beyond = stddev - np.abs(clearance - move_surface()[self._rows]) / APART_SIGMAS
-        return max(0.0, float(np.minimum(self._places[:, 1] * beyond, self._places[:, 2]).max()))
+        places, clearance = self._places[near], clearance[near]
+        beyond = stddev[near] - np.abs(clearance - move_surface()[self._rows[near]]) / APART_SIGMAS
+        return max(0.0, float(np.minimum(places[:, 1] * beyond, places[:, 2]).max()))
 
 
 @njit(**_OPTIONS)
