@@ -368,24 +368,24 @@ class ForceEstimator:
 
     def _relax(self, force: NDArray) -> None:
         """Let the material relax under a force (3,) [N] that is not told."""
-        dt = self._pass_time()
-        self._untold.update(_UNTOLD * force, dt)
-        self._untold.doubt(force - self._relaxation.packed[0], dt)
-        self._relaxation.update(force, dt)
+        self._relaxation.update(force, self._pass_time(force, _UNTOLD * force))
 
-    def _pass_time(self) -> float:
-        """Return the time since the material's last force [s]."""
+    def _pass_time(self, force: NDArray, untold: NDArray) -> float:
+        """Return the time since the material's last force [s], as it gets one (3,) [N], part of it not told (3,) [N].
+
+        When within that time the force came is not known, either.
+        """
         dt = 0.0 if self._relaxed is None else self._stamp - self._relaxed
         self._relaxed = self._stamp
+        self._untold.update(untold, dt)
+        self._untold.doubt(force - self._relaxation.packed[0], dt)
         return dt
 
     def _solution(self, state: ContactState, used: NDArray) -> Solution:
         """Return the force that belongs to a contact, and how good it is."""
         self._pressed = state
         error = hypot(self._force_error, state["location_error"], _EXTRAPOLATED * state["extrapolation"])
-        vectors, dt = np.empty((7, 3)), self._pass_time()
-        self._untold.update(np.zeros(3), dt)
-        self._untold.doubt(state["force"] - self._relaxation.packed[0], dt)
+        vectors, dt = np.empty((7, 3)), self._pass_time(state["force"], np.zeros(3))
         relaxation, untold = self._relaxation.packed, self._untold.overstress
         magnitude, stddev = compute_force(state, relaxation, untold, dt, error, self._modulus_error, vectors)
         force, torque, force_stddev, torque_stddev, point, location, normal = vectors

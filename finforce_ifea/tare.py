@@ -353,7 +353,7 @@ class TareKeeper:
         period = max(self._passed / max(count - 1, 1), _PERIOD)
         return max(0, round(due * max(_PERIOD / period, _LEAST_SHARE)) - count)
 
-    def add(self, points: NDArray, stddev: NDArray | None = None, *, apart: bool, dt: float = _PERIOD) -> None:
+    def add(self, points: NDArray, stddev: NDArray | None = None, *, apart: bool, dt: float) -> None:
         """Take the accepted key points (K, 3) [m] of a frame and their stated standard deviations (K, 3) [m].
 
         `apart` when the object is known not to touch; dt [s] since the frame before.

@@ -181,30 +181,33 @@ def _trace_front(coefficients, low, cell, steps):
 
 
 @njit(**_OPTIONS)
-def _find_leading(segments, c, s, low, high, least):
-    """Lessen `least` (m,) [m] to the least x of segments (s, 4) turned by (cos, sin) of the tilt, between two heights.
-
-    The heights are one `low`, and `high` (m,) [m].
-    """
-    for k in range(len(segments)):
-        ax, az = c * segments[k, 0] - s * segments[k, 1], s * segments[k, 0] + c * segments[k, 1]
-        bx, bz = c * segments[k, 2] - s * segments[k, 3], s * segments[k, 2] + c * segments[k, 3]
-        for p in range(len(high)):
-            if max(az, bz) < low or min(az, bz) > high[p] or min(ax, bx) >= least[p]:
-                continue
-            begin, end = 0.0, 1.0
-            if bz != az:
-                one, other = (low - az) / (bz - az), (high[p] - az) / (bz - az)
-                begin, end = max(0.0, min(one, other)), min(1.0, max(one, other))
-            least[p] = min(least[p], ax + begin * (bx - ax), ax + end * (bx - ax))
+def _turn(segment, c, s):
+    """Return the ends x, z, x, z [m] of a segment (4,) turned by (cos, sin) of the tilt."""
+    ax, az, bx, bz = segment
+    return c * ax - s * az, s * ax + c * az, c * bx - s * bz, s * bx + c * bz
 
 
 @njit(**_OPTIONS)
-def _find_lead(segments, c, s, low, high):
-    """Return the least x [m] between two heights [m], see `_find_leading`; 1e9 without any."""
-    least = np.full(1, 1e9)
-    _find_leading(segments, c, s, low, np.full(1, high), least)
-    return least[0]
+def _find_lead(ax, az, bx, bz, low, high):
+    """Return the least x [m] of a segment from a to b between two heights [m], 1e9 where it is not there."""
+    if max(az, bz) < low or min(az, bz) > high:
+        return 1e9
+    begin, end = 0.0, 1.0
+    if bz != az:
+        one, other = (low - az) / (bz - az), (high - az) / (bz - az)
+        begin, end = max(0.0, min(one, other)), min(1.0, max(one, other))
+    return min(ax + begin * (bx - ax), ax + end * (bx - ax))
+
+
+@njit(**_OPTIONS)
+def _find_leading(segments, c, s, low, high):
+    """Return the least x [m] of segments (s, 4) turned by (cos, sin) of the tilt, between two heights, else 1e9."""
+    least = 1e9
+    for k in range(len(segments)):
+        ax, az, bx, bz = _turn(segments[k], c, s)
+        if min(ax, bx) < least:
+            least = min(least, _find_lead(ax, az, bx, bz, low, high))
+    return least
 
 
 # The penalty rises quadratically over this depth [m] before it is linear, so that Newton's method sees no kink.
@@ -361,12 +364,12 @@ def find_first_touch(pressed, face, state):
     c, s = np.cos(state[1]), np.sin(state[1])
     if face.is_flat:
         low, high = points[0, 1] - state[2], points[-1, 1] - state[2]
-        least = _find_lead(pressed.segments, c, s, low, high)
+        least = _find_leading(pressed.segments, c, s, low, high)
         return least + pressed.front if least < _OUTSIDE else 0.0
     least = np.inf
     for p in range(len(points)):
         z = points[p, 1] - state[2]
-        lead = _find_lead(pressed.segments, c, s, z, z)
+        lead = _find_leading(pressed.segments, c, s, z, z)
         if lead < _OUTSIDE:
             least = min(least, face.x + lead - points[p, 0])
     return least + pressed.front if np.isfinite(least) else 0.0
@@ -378,8 +381,12 @@ def find_clearances(pressed, x, heights):
 
     It is negative behind the surface, and infinite where the outline is not at these heights.
     """
-    least = np.full(len(heights), 1e9)
-    _find_leading(pressed.segments, np.cos(x[1]), np.sin(x[1]), -x[2], heights - x[2], least)
+    least, c, s = np.full(len(heights), 1e9), np.cos(x[1]), np.sin(x[1])
+    for k in range(len(pressed.segments)):
+        ax, az, bx, bz = _turn(pressed.segments[k], c, s)
+        for p in range(len(heights)):
+            if min(ax, bx) < least[p]:
+                least[p] = min(least[p], _find_lead(ax, az, bx, bz, -x[2], heights[p] - x[2]))
     for p in range(len(heights)):
         least[p] = least[p] + pressed.front - x[0] if least[p] < _OUTSIDE else np.inf
     return least

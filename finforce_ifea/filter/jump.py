@@ -115,9 +115,9 @@ def correct(measured, weight, ratios, x, log_weights, P, possible, depth):
     if len(weight) == 0:
         before = np.exp(log_weights)
         nu = np.dot(before, expect_innovations(measured, ratios, x))
-        weight = _weigh_innovations(measured, nu, S, P[DEPTH, DEPTH])
-        asked = (before * x[:, DEPTH]).sum() + find_depth_jump(measured.H, measured.R, nu)[0]
-        if abs(asked - depth) > LARGEST_MOVE:
+        asked = find_depth_jump(measured.H, measured.R, nu)
+        weight = _weigh_innovations(measured, nu, S, P[DEPTH, DEPTH], asked)
+        if abs((before * x[:, DEPTH]).sum() + asked[0] - depth) > LARGEST_MOVE:
             return update(measured, weight, ratios, x, log_weights, HP, S), UNDECIDED
         found = detect_jump(measured, weight, nu, S, possible)
         if found != NO_JUMP:
@@ -155,13 +155,13 @@ def detect_jump(measured, weight, nu, S, possible):
 
 
 @njit(**_OPTIONS)
-def _weigh_innovations(measured, nu, S, depth_variance):
+def _weigh_innovations(measured, nu, S, depth_variance, asked):
     """Return weights of the key points (m,) by their innovation (2 m,), the motion of the object taken out.
 
-    That is no jump. S has a depth of which nothing is known; here the median of the key points tells it.
+    That is no jump. S has a depth of which nothing is known; here the median of the key points tells it, `asked`, see
+    `find_depth_jump`.
     """
-    H, R = measured.H, measured.R
-    deeper, variance = find_depth_jump(H, R, nu)
+    H, R, (deeper, variance) = measured.H, measured.R, asked
     moved, spread = nu - H[:, DEPTH] * deeper, variance + (_NONLINEAR * deeper) ** 2 - depth_variance
     blocks = np.empty_like(R)
     for i in range(len(R)):

@@ -313,11 +313,10 @@ class ContactSearch:
             jump, q, place, made = max(jump, found), q + change, _Place(*place), (pressed, positions, at)
         if posterior is None or not _is_believed(posterior.mean, posterior.weight, self._V):
             return False
-        weight = posterior.weight
+        (pressed, positions, at), weight = made, posterior.weight
         before, ratios = ratios, self._preview(posterior.x, place.x[0] - posterior.mean[DEPTH])
         if np.abs(ratios - before).max() > _SAME_RATIO:
             posterior, _ = correct(measured, weight, ratios, *prior[1:], possible, at[DEPTH])
-        pressed, positions, at = made
         self.q, self._modes, self.positions = q, pressed.modes[:, :3], positions
         self._take_jump(jump)
         self._level = _follow_level(self._level, posterior.distances)

@@ -48,7 +48,7 @@ def _weigh_all_or_nothing(distances):
 
 
 @njit(error_model="numpy")
-def _weigh_alike(measured, nu, S, depth_variance):
+def _weigh_alike(measured, nu, S, depth_variance, asked):
     """Return weights (m,) of 1."""
     return np.ones(len(measured.R))
 
