@@ -121,23 +121,34 @@ class PictureChanges:
     def contrasts(self, color: NDArray, x: NDArray) -> NDArray:
         """Return the contrast of each jaw's outline in an image (h, w, 3) with a change."""
         camera, poses = self._look_from(x)
-        return np.array(
-            [self._outlines[side].contrasts(color, T, camera, self._edges[side])[0] for side, T in poses.items()]
-        )
+        return np.array([self._contrast(color, side, T, camera) for side, T in poses.items()])
+
+    def _contrast(self, color: NDArray, side: str, T_camera_jaw: NDArray, camera: CameraIntrinsics) -> float:
+        """Return the contrast of a jaw's outline up to the edge of its holder."""
+        return self._outlines[side].contrasts(color, T_camera_jaw, camera, self._edges[side])[0]
 
     def _scan(self, color: NDArray, zooms: Sequence[float] = ZOOMS) -> tuple[float, NDArray]:
         """Return contrast and change where outlines in an image show best, with one of the zooms and any opening."""
-        found = []
+        found, origins = [], self._signs[:, None] * self._origins
+        poses = {
+            side: [jaw_in_camera(self._T, side, origin, self._mounts[side].turn) for origin in each]
+            for side, each in zip(self._jaws, origins, strict=True)
+        }
         for zoom in zooms:
-            tried = [np.r_[np.log(zoom), 0.0, 0.0, self._signs * half] for half in self._origins]
-            shown = np.array([self.contrasts(color, x) for x in tried])
-            best = self._signs * self._origins[shown.argmax(axis=0)]
-            found.append((float(shown.max(axis=0).mean()), np.r_[tried[0][:3], best]))
+            camera = replace(self._camera, fx=zoom * self._camera.fx, fy=zoom * self._camera.fy)
+            shown = np.array([[self._contrast(color, side, T, camera) for T in each] for side, each in poses.items()])
+            best = np.take_along_axis(origins, shown.argmax(axis=1)[:, None], axis=1)[:, 0]
+            found.append((float(shown.max(axis=1).mean()), np.r_[np.log(zoom), 0.0, 0.0, best]))
         return max(found, key=lambda each: each[0])
 
-    def find(self, color: NDArray) -> PictureChange:
-        """Return how an image (h, w, 3) was changed, begun with the outlines or with no change, what is likelier."""
-        starts = self._improve(color, self._scan(color)[1]), self.find_near(color)
+    def find(self, color: NDArray, near: PictureChange | None = None) -> PictureChange:
+        """Return how an image (h, w, 3) was changed, begun with the outlines or with no change, what is likelier.
+
+        Args:
+            color: the image.
+            near: what `find_near` has found in it, where that is known.
+        """
+        starts = self._improve(color, self._scan(color)[1]), near or self.find_near(color)
         return max(starts, key=lambda change: change.likelihood)
 
     def find_near(self, color: NDArray) -> PictureChange:
@@ -163,14 +174,17 @@ class PictureChanges:
         is_plain = all(each.likelihood >= SURE and each.contrast >= LEAST_FOUND for each in near)
         if is_plain and not describe_changes(near, self._camera.width):
             return ""
-        flip, best = (1, 1), -np.inf
+        flip, best, ends = (1, 1), -np.inf, {}
         for other in FLIPS:
-            ends = [self.find(_turn_over(color, other)) for color in (*colors[:1], *colors[1:][-1:])]
-            shown = float(np.mean([each.likelihood + each.contrast for each in ends]))
+            known = near if other == (1, 1) else [None] * len(colors)
+            tried = {n: self.find(_turn_over(colors[n], other), known[n]) for n in {0, len(colors) - 1}}
+            shown = float(np.mean([each.likelihood + each.contrast for each in tried.values()]))
             if shown > best + FLIPPED:
-                flip, best = other, shown
+                flip, best, ends = other, shown, tried
+        near = near if flip == (1, 1) else [None] * len(colors)
         colors = [_turn_over(color, flip) for color in colors]
-        changes = [change for color in colors if (change := self.find(color)).likelihood >= SURE]
+        changes = [ends.get(n) or self.find(color, near[n]) for n, color in enumerate(colors)]
+        changes = [change for change in changes if change.likelihood >= SURE]
         if len(changes) < max(min(FEWEST, len(colors)), FEWEST_SHARE * len(colors)):
             shown = np.median([self._scan(color, (1.0,))[0] for color in colors])
             hidden = "nothing of such jaws shows where the rig has them: hidden, out of the picture, or another rig?"

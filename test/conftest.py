@@ -1,6 +1,7 @@
 """What tests of several packages are given."""
 
 import os
+import signal
 import sys
 
 import pytest
@@ -10,6 +11,11 @@ from finforce.ros import transport
 
 settings.register_profile("finforce", deadline=None)  # a machine under load is not a counterexample
 settings.load_profile("finforce")
+
+# For processes that tests start: signals as in a shell's foreground, and modules compiled once.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 # A process takes seconds to show that a domain is taken: workers draw from different ones.
 if worker := os.environ.get("PYTEST_XDIST_WORKER"):

@@ -32,6 +32,7 @@ from finforce_keypoints.geometry.side_picture import find_side, project_plane
 from finforce_keypoints.geometry.template import find_shape
 from finforce_keypoints.images import RgbdImage
 from finforce_keypoints.parameters import NO_DEPTH, find_mounts
+from finforce_keypoints.picture_change import STEADY
 from finforce_keypoints.rib_check import compare_rig, describe_ribs
 
 OK, WARNING, FAULT = "ok", "warning", "fault"
@@ -226,12 +227,12 @@ def _find_reasons(mean: RgbdImage, source: KeypointSource, recording: Recording,
 
     That a network likes a picture, as it does some that show no finger, is no reason.
     """
-    readings = _readings(source, guess)
-    residual, words = min((_misfit(recording, source, mean, *reading), text) for text, *reading in readings)
-    if residual <= GOOD_RESIDUAL:
-        return [Finding(FAULT, f"the jaws show, {residual:.2f} px left over, if {words}")]
+    for readings in (_other_poses(guess, source.jaw_file), _other_fingers(guess, source.jaw_file)):
+        residual, words = min((_misfit(recording, source, mean, *reading), text) for text, *reading in readings)
+        if residual <= GOOD_RESIDUAL:
+            return [Finding(FAULT, f"the jaws show, {residual:.2f} px left over, if {words}")]
     return [
-        *(Finding(FAULT, text) for text in explain_unseen(recording, source)),
+        *(Finding(FAULT, text) for text in explain_unseen(recording, source, pictures=STEADY)),
         Finding(
             WARNING,
             "none of the known fingers; no better with other conventions of the extrinsics: are the jaws in view, lit, "
@@ -253,9 +254,8 @@ def _misfit(recording: Recording, source: KeypointSource, image: RgbdImage, pose
     return found.residual if seen >= ENOUGH else np.inf
 
 
-def _readings(source: KeypointSource, T: NDArray) -> Iterator[tuple[str, NDArray, str]]:
-    """Yield other readings: in words, and the extrinsics and the jaw file by them."""
-    own = source.jaw_file
+def _other_poses(T: NDArray, own: str) -> Iterator[tuple[str, NDArray, str]]:
+    """Yield other readings of the extrinsics: in words, the extrinsics by them, and the jaw file as it is."""
     body = _pose_of(Rotation.from_matrix([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]))
     poses = {
         "T_gripper_camera is inverted, the gripper in the camera's frame: give its inverse": invert_pose(T),
@@ -266,6 +266,10 @@ def _readings(source: KeypointSource, T: NDArray) -> Iterator[tuple[str, NDArray
     }
     for words, pose in poses.items():
         yield words, pose, own
+
+
+def _other_fingers(T: NDArray, own: str) -> Iterator[tuple[str, NDArray, str]]:
+    """Yield the other included fingers: in words, the extrinsics as they are, and the jaw file."""
     for name in list_shipped_jaws():
         if name != own and load_jaw(name).model != "frame":
             yield f"the finger is {name}: give its jaw file", T, name

@@ -26,8 +26,16 @@ UNSEEN = ("not_enough_points", NOT_FOUND)
 USELESS = (*UNSEEN, "unobservable", "diverged")
 
 
-def explain_unseen(recording: Recording, source: KeypointSource, stamps: NDArray[np.int64] | None = None) -> list[str]:
+def explain_unseen(
+    recording: Recording, source: KeypointSource, stamps: NDArray[np.int64] | None = None, pictures: int = PICTURES
+) -> list[str]:
     """Return what was done to the images of a recording, or some of them [ns], as a sentence, if anything is known.
+
+    Args:
+        recording: with images.
+        source: the detector's parameters.
+        stamps: of the images [ns]; None: all.
+        pictures: that are looked at; of jaws and cameras at rest STEADY say as much as more.
 
     Raises:
         FinforceError: an image is damaged.
@@ -35,7 +43,7 @@ def explain_unseen(recording: Recording, source: KeypointSource, stamps: NDArray
     parameters, settings, _ = build_records(source.node_parameters(recording))
     images, jaws = choose_images(recording, NO_DEPTH), load_jaws(parameters)
     stamps = images.stamps_ns if stamps is None else stamps
-    chosen = stamps[np.unique(np.linspace(0, len(stamps) - 1, PICTURES).round().astype(int))]
+    chosen = stamps[np.unique(np.linspace(0, len(stamps) - 1, pictures).round().astype(int))]
     mounts = find_mounts(parameters, jaws)
     changes = PictureChanges(
         images.camera,

@@ -296,7 +296,7 @@ class ContactSearch:
         q = self.q + self._modes @ (place.x_model - self.state["x_model"])
         settled, iteration, last = False, 0, (np.zeros(3), 1.0)
         posterior, found, jump, P = None, UNDECIDED, NO_JUMP, self.P.copy()
-        reach, possible = np.full(len(q), contact.model.reach), self._find_possible_jumps()
+        reach, possible = np.full(len(q), contact.model.reach, dtype=float), self._find_possible_jumps()
         image, known = (points, seen, self._level, expectation), (contact.packed_object, reach, self.track.state)
         prior = ratios, self.x, self.log_weights, P
         while iteration < iterations and not settled:

@@ -68,9 +68,12 @@ def test_a_latched_message_is_shown_after_it_was_sent(system, capsys):
 
 
 def test_a_topic_that_nobody_publishes_is_named_with_the_one_that_was_meant(system, capsys, monkeypatch):
-    monkeypatch.setattr(monitor, "DISCOVERY", 10.0)
-    assert main(["echo", "/left/wrensh"]) == 2
-    assert "nobody publishes /left/wrensh; did you mean /left/wrench" in capsys.readouterr().err
+    for patience in (2.0, 10.0):  # the longer on a busy machine, where others are seen late
+        monkeypatch.setattr(monitor, "DISCOVERY", patience)
+        assert main(["echo", "/left/wrensh"]) == 2
+        if "did you mean" in (said := capsys.readouterr().err):
+            break
+    assert "nobody publishes /left/wrensh; did you mean /left/wrench" in said
     assert main(["echo", "left wrench"]) == 2
     assert "expected a name such as /grasp_wrench" in capsys.readouterr().err
 

@@ -103,7 +103,7 @@ def read_forces(folder):
 
 def test_a_run_whose_scheduler_is_killed_ends_in_words_and_resumes(bags, tmp_path, once, capsys):
     out = tmp_path / "out"
-    with cluster(tmp_path / "first", "one", "two") as made:
+    with cluster(tmp_path / "first", "one") as made:
         once(lambda: lines_of(out), made.scheduler.kill)
         assert annotate(bags, out, "--scheduler", made.address) == 2
     said = capsys.readouterr().err

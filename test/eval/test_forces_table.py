@@ -20,6 +20,7 @@ from finforce_eval.evaluation.keypoint_source import KeypointSource
 from finforce_eval.recordings.writer import write_recording
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
+IMAGES = 90
 FORCE = ["force_x", "force_y", "force_z"]
 
 
@@ -29,7 +30,7 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("bags")
     whole = ff.read_recording(ff.DEMO)
     begin = int(whole.jaw("left").keypoints.stamps_ns[0])
-    write_recording(cut(whole, begin, begin + 5 * 10**9), folder / "first")
+    write_recording(cut(whole, begin, begin + IMAGES * 10**9 // 30), folder / "first")
     shutil.copytree(folder / "first", folder / "second")
     (folder / "notes.txt").write_text("none")
     return folder
@@ -50,7 +51,7 @@ def test_the_forces_are_those_of_the_command_with_stamps_in_seconds(folder, tmp_
 
 def test_a_folder_of_recordings_gives_all_of_them(folder):
     found = ff.evaluate(str(folder), contact_height=0.040, stills=True)
-    assert found.groupby("case").size().to_dict() == {"first": 150, "second": 150}
+    assert found.groupby("case").size().to_dict() == {"first": IMAGES, "second": IMAGES}
     assert not found.isna()["status"].any()
 
 
@@ -66,7 +67,7 @@ def test_forces_come_from_images(folder, tmp_path, monkeypatch):
     found = ff.evaluate(path, source="images", contact_height=0.040, extrinsics="robot", detector={"depth": "none"})
     ((images, parameters),) = looked
     assert images == 12 and parameters["depth"] == "none" and len(parameters["T_gripper_camera"]) == 7
-    assert len(found) == 150 and np.isfinite(found[FORCE]).all(axis=1).any()
+    assert len(found) == IMAGES and np.isfinite(found[FORCE]).all(axis=1).any()
 
 
 @pytest.mark.parametrize(
