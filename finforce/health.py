@@ -6,6 +6,7 @@ from collections import Counter, deque
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
+from math import inf
 from time import monotonic
 
 import numpy as np
@@ -166,6 +167,11 @@ class Health:
         self._recent: dict[tuple[Level, str], Outcome] = {}
         self._last: Outcome | None = None
         self._arrived = self._published = 0
+        self._resumed = -inf
+
+    def resume(self) -> None:
+        """Note that nothing was to arrive so far."""
+        self._resumed = monotonic()
 
     def arrive(self, source: str = "") -> None:
         """Count a message that arrived, and keep where it came from."""
@@ -213,7 +219,7 @@ class Health:
         """Return level and sentence from the messages alone."""
         if not self._arrivals or self._last is None:
             return Level.STALE, f"nothing has arrived on {self.source}"
-        silence = monotonic() - self._arrivals[-1]
+        silence = monotonic() - max(self._arrivals[-1], self._resumed)
         if silence > self._stale_after:
             return Level.STALE, f"nothing has arrived on {self.source} for {silence:.1f} s"
         return self._last.level, self._last.text

@@ -103,6 +103,7 @@ class ContactEstimatorNode(ros.ImageNode):
         ros.follow_settings(self, parameters, self._take_changes)
         self.stage = ros.Stage(self, pipeline)
         self.out = _ContactOutputs(self.stage, parameters, self.session, self.skips)
+        self.stage.rest_unheard(self.skips, self.turn)
         with self.rejections():
             self.get_logger().info(self.session.load_mesh(parameters))
         self._serve()
@@ -130,10 +131,11 @@ class ContactEstimatorNode(ros.ImageNode):
         stage, source = self.stage, self.parameters.pose_source
         self.objects = None
         if self.parameters.tracks:
-            camera, group = self.session.camera, MutuallyExclusiveCallbackGroup()
-            info, transport = partial(self._on_image, camera.take_camera, ""), self.parameters.image_transport
-            self.stage.subscription(ros.CameraInfo, self.parameters.info_topic, info, ros.SENSOR, callback_group=group)
-            images = partial(ros.ImageInput, self.stage, transport=transport, callback_group=group)
+            camera, info = self.session.camera, partial(self._on_image, self.session.camera.take_camera, "")
+            # whoever rests loses the object
+            options = {"is_wanted": lambda: True, "callback_group": MutuallyExclusiveCallbackGroup()}
+            self.stage.subscription(ros.CameraInfo, self.parameters.info_topic, info, ros.SENSOR, **options)
+            images = partial(ros.ImageInput, self.stage, transport=self.parameters.image_transport, **options)
             images("object_mask", partial(self._on_image, camera.take_mask))
             images(self.parameters.depth_topic, partial(self._on_image, camera.take_depth), end=COMPRESSED_DEPTH)
         elif source == "topic":
@@ -152,7 +154,11 @@ class ContactEstimatorNode(ros.ImageNode):
         """Subscribe to depth images, while one is due, for the comparison with the mesh."""
         parameters, group = self.parameters, MutuallyExclusiveCallbackGroup()
         info, stream = partial(self._on_camera, check), self.session.stream
-        options = {"is_wanted": lambda: stream.camera is None or check.is_due, "callback_group": group}
+
+        def is_wanted() -> bool:
+            return check.is_due and self.stage.is_needed
+
+        options = {"is_wanted": lambda: stream.camera is None or is_wanted(), "callback_group": group}
         self.stage.subscription(ros.CameraInfo, parameters.info_topic, info, ros.SENSOR, **options)
         ros.ImageInput(
             self.stage,
@@ -160,7 +166,7 @@ class ContactEstimatorNode(ros.ImageNode):
             self._on_compared,
             parameters.image_transport,
             end=COMPRESSED_DEPTH,
-            is_wanted=lambda: check.is_due,
+            is_wanted=is_wanted,
             callback_group=group,
         )
 
@@ -253,7 +259,7 @@ class ContactEstimatorNode(ros.ImageNode):
         values = describe(self.session, side) | self.skips.describe()
         if self.session.trouble:  # the object's mesh cannot be used
             alarms = [*alarms, Outcome(level=Level.ERROR, reason="object", text=self.session.trouble)]
-        return self.health[side].report(alarms, values)
+        return self.health[side].report(alarms, values, self.unheard)
 
 
 LEVELS = {"touching": Level.OK, "apart": Level.OK}  # any other status: WARN

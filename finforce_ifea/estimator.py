@@ -122,7 +122,7 @@ class ForceEstimator:
         self._followed: float | None = None  # stamp of the last image that a tracker took
         self._contact: Contact | None = None
         self._pressed: ContactState | None = None  # of the last image, if its force is told
-        self._at_rest = self.is_idle = False
+        self._at_rest = self.is_idle = self._was_interrupted = False
         self._relaxed: float | None = None
         self._taring.reset()
         self._gate.reset()
@@ -174,6 +174,19 @@ class ForceEstimator:
     def tared(self) -> bool:
         """True if the key points' offsets are known."""
         return self._taring.tared
+
+    @property
+    def is_taring(self) -> bool:
+        """True if unloaded images are needed, for the first tare or for a better average."""
+        return self._taring.is_averaging
+
+    def interrupt(self) -> None:
+        """Note that images were left out, in which an object may have been let go and grasped again.
+
+        A tare that is asked for takes none from before.
+        """
+        self._taring.interrupt()
+        self._bits, self._was_interrupted = b"", True
 
     @property
     def offsets(self) -> Tare:
@@ -373,12 +386,15 @@ class ForceEstimator:
     def _pass_time(self, force: NDArray, untold: NDArray) -> float:
         """Return the time since the material's last force [s], as it gets one (3,) [N], part of it not told (3,) [N].
 
-        When within that time the force came is not known, either.
+        When within that time the force came is not known, either; after an interruption, not even of one that stayed.
         """
         dt = 0.0 if self._relaxed is None else self._stamp - self._relaxed
         self._relaxed = self._stamp
         self._untold.update(untold, dt)
-        self._untold.doubt(force - self._relaxation.packed[0], dt)
+        before = self._relaxation.packed[0]
+        change = np.maximum(np.abs(force), np.abs(before)) if self._was_interrupted else force - before
+        self._untold.doubt(change, dt)
+        self._was_interrupted = False
         return dt
 
     def _solution(self, state: ContactState, used: NDArray) -> Solution:

@@ -108,8 +108,12 @@ class ForcePairing:
 
     @property
     def silence(self) -> float:
-        """Time since the other jaw was heard of [s], infinite before."""
+        """Time since the other jaw was heard of, or was to be [s], infinite before."""
         return monotonic() - self._heard
+
+    def resume(self) -> None:
+        """Note that nothing was to be heard of the other jaw so far."""
+        self._heard = monotonic()
 
     def add(self, stamp: int, wrench: Wrench, *, own: bool) -> Grasp | None:
         """Take the wrench on a jaw; return the grasp once the stamp [ns] has both."""

@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from finforce_ifea.estimator import ForceEstimator
 
 _SLOW = 4.0  # s of preparation, after which somebody may wonder
+_TARE_TIME = 2.0  # [s] of images for a tare that is asked for at rest
 
 
 class _SolverOutputs:
@@ -211,6 +212,7 @@ class IfeaSolverNode(ros.ImageNode):
         self.last: Solution | None = None
         self.stage = ros.Stage(self, pipeline)
         self.out = _SolverOutputs(self.stage, parameters, self.skips)
+        self.stage.rest_unheard(self.skips, self.turn, lambda: self.estimator.is_taring)
         self._serve(parameters.jaw_name)
         self._subscribe(parameters.jaw_name)
         source = "fixed" if self.contacts.is_fixed else "by topic"
@@ -229,7 +231,7 @@ class IfeaSolverNode(ros.ImageNode):
 
     def _serve(self, side: str) -> None:
         """Offer services and diagnostics."""
-        ros.serve_trigger(self.stage, f"{side}/tare", lambda: self.estimator.tare())
+        ros.serve_trigger(self.stage, f"{side}/tare", lambda: self.estimator.tare(), awake=_TARE_TIME)
         ros.serve_trigger(self.stage, f"{side}/reset", lambda: self._restart("reset by service"))
         longest = self.parameters.contact_timeout
         self.overdue = self.create_timer(longest, self.stage.guard(self._solve_waiting), clock=ros.STEADY_CLOCK)
@@ -345,6 +347,12 @@ class IfeaSolverNode(ros.ImageNode):
             T = pose_from_message(pose, pose.header.frame_id, f"the pose of the {side} jaw")
             self.pairing.distance.take(side, stamp_of(pose), T)
 
+    def turn(self) -> None:
+        """Begin or end to rest."""
+        super().turn()
+        self.pairing.resume()
+        self.estimator.interrupt()
+
     def _restart(self, reason: str) -> str:
         self.estimator.reset()
         self.resting.reset()
@@ -354,9 +362,11 @@ class IfeaSolverNode(ros.ImageNode):
     def _report(self, alarms: list[Outcome]) -> Report:
         """Return how this node is doing."""
         limit = max(1.0, self.parameters.max_age)
-        alarms = [*alarms, *peer_alarms(self.parameters.peer, self.pairing.silence, limit)]
+        if self.stage.is_needed:
+            alarms = [*alarms, *peer_alarms(self.parameters.peer, self.pairing.silence, limit)]
         (mean, stddev), source = self.estimator.friction, self.estimator.friction_source
         tared = {"tared": str(self.estimator.tared), "friction": f"{mean:.2f} ± {stddev:.2f}, {source}"}
         tared["touch probability"] = f"{self.estimator.touch_probability:.2f}"
         health = self.health[self.parameters.jaw_name]
-        return health.report(alarms, describe_solution(self.last) | tared | self.skips.describe())
+        values = describe_solution(self.last) | tared | self.skips.describe()
+        return health.report(alarms, values, self.unheard)

@@ -329,7 +329,16 @@ class TareKeeper:
         self._frames: deque[NDArray] = deque(maxlen=_LONGEST_TARE + _DELAY_FRAMES)
         self._stddevs: deque[NDArray | None] = deque(maxlen=self._frames.maxlen)
         self._open = self._settings.automatic_tare
-        self._quiet, self._passed = 0, 0.0
+        self._quiet, self._passed, self._fresh = 0, 0.0, 0
+
+    @property
+    def is_averaging(self) -> bool:
+        """True if a tare by itself is due, or would be better with more unloaded frames."""
+        return self._open and (not self.tared or len(self._frames) <= _LONGEST_TARE)
+
+    def interrupt(self) -> None:
+        """Take frames from here on alone into a tare that is asked for: what presses meanwhile is not known."""
+        self._fresh = 0
 
     @property
     def tared(self) -> bool:
@@ -359,6 +368,7 @@ class TareKeeper:
         `apart` when the object is known not to touch; dt [s] since the frame before.
         """
         self._passed += min(dt, _LONGEST_PERIOD) if self._frames else 0.0
+        self._fresh += 1
         self._frames.append(points)
         self._stddevs.append(stddev)
         if apart and not self.tared and not self._open and self._settings.automatic_tare:
@@ -403,8 +413,8 @@ class TareKeeper:
             NotEnoughDataError: Too few unloaded frames or visible key points.
             UnderLoadError: The jaw is, or looks, loaded.
         """
-        count = min(_LONGEST_TARE, self._quiet if self.tared else len(self._frames))
-        if self.tared and self._quiet == 0:
+        count = min(_LONGEST_TARE, self._fresh, self._quiet if self.tared else len(self._frames))
+        if self.tared and self._quiet == 0 and self._fresh:
             raise UnderLoadError("cannot tare: something presses on the jaw")
         if count < _FEWEST_FRAMES:
             raise NotEnoughDataError(f"cannot tare: {count} unloaded frames, expected at least {_FEWEST_FRAMES}")

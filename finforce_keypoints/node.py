@@ -16,7 +16,7 @@ from sensor_msgs.msg import CameraInfo
 
 from finforce.camera_topics import COMPRESSED_DEPTH
 from finforce.errors import FinforceError, ObservationError
-from finforce.health import IDLE, STILL, UNHEARD, Health, Idling, Level, Outcome, Report, Skips, StampGate
+from finforce.health import IDLE, STILL, Health, Idling, Level, Outcome, Report, Skips, StampGate
 from finforce.messages import CameraStream, Stamped
 from finforce.ros import node as ros
 from finforce.transforms import pose_numbers
@@ -73,14 +73,8 @@ class _DetectorOutputs:
         self.keypoints = {side: stage.publisher(ros.PointCloud2, f"{side}/keypoints", ros.RESULT) for side in sides}
         self.pose = {side: stage.publisher(ros.PoseStamped, f"{side}/jaw_pose", ros.RESULT) for side in sides}
         self.annotated = stage.publisher(ros.Image, "~/annotated", ros.RESULT)
-        self.names = stage.publisher(ros.String, "~/keypoint_names", ros.LATCHED)
+        self.names = stage.publisher(ros.String, "~/keypoint_names", ros.LATCHED, is_answer=False)
         self.names.publish(ros.String(data=describe_names(names, detector)))
-
-    @property
-    def are_heard(self) -> bool:
-        """True if anybody subscribes to what is made of images."""
-        outputs = (*self.keypoints.values(), *self.pose.values(), self.annotated)
-        return any(output.get_subscription_count() for output in outputs)
 
     def send_jaw(self, side: str, stamp: int, found: JawKeypoints) -> None:
         """Send the key points of a jaw and its pose, of the image at `stamp` [ns]."""
@@ -165,6 +159,7 @@ class KeypointDetectorNode(ros.ImageNode):
         self.idling = Idling()
         self.stage = ros.Stage(self, pipeline)
         self.out = _DetectorOutputs(self.stage, parameters, self.feed.stream, self.frames, names, self.detector)
+        self.stage.rest_unheard(self.skips, self.turn)
         self.detector.warm_up()  # before images come: those that came meanwhile would be lost
         self._serve()
         self._subscribe()
@@ -181,28 +176,26 @@ class KeypointDetectorNode(ros.ImageNode):
         """Create the subscriptions."""
         parameters = self.parameters
         stream = self.feed.stream
-        info = {"is_wanted": lambda: stream.camera is None or self._is_wanted()}
+        info = {"is_wanted": lambda: stream.camera is None or self.stage.is_needed}
         self.stage.subscription(CameraInfo, parameters.info_topic, self._on_info, ros.SENSOR, **info)
-        wanted = {"transport": parameters.image_transport, "is_wanted": self._is_wanted}
-        images = partial(ros.ImageInput, self.stage, **wanted)
+        images = partial(ros.ImageInput, self.stage, transport=parameters.image_transport)
         if parameters.depth != NO_DEPTH:
             images(parameters.depth_topic, self._on_depth, end=COMPRESSED_DEPTH)
         for topic in parameters.color_topics:
             images(topic, self._on_color)
+        mounting = {"is_wanted": lambda: self._mounting and not self._tared}
         for side in parameters.sides if self._mounting else ():  # a solver that tells a force has made its tare
-            self.stage.subscription(ros.WrenchStamped, f"{side}/wrench", self._on_wrench, ros.SENSOR)
+            self.stage.subscription(ros.WrenchStamped, f"{side}/wrench", self._on_wrench, ros.SENSOR, **mounting)
 
     def _on_info(self, message: CameraInfo) -> None:
         """Keep the camera's intrinsics."""
         with self.rejections():
             self.feed.take_info(message)
 
-    def _is_wanted(self) -> bool:
-        """Say whether key points are to be found; while they are not, no images come."""
-        is_wanted = self.out.are_heard or not self.skips.allows(UNHEARD)
-        if not is_wanted:
-            self.feed.pause()
-        return is_wanted
+    def turn(self) -> None:
+        """Begin or end to rest, in which no image gets lost."""
+        super().turn()
+        self.feed.pause()
 
     def _on_wrench(self, _: ros.WrenchStamped) -> None:
         """Keep that solvers rely on the camera's pose."""
@@ -214,9 +207,6 @@ class KeypointDetectorNode(ros.ImageNode):
             return
         for health in self.health.values():
             health.arrive(source=topic)
-        if not self._is_wanted():
-            self.skips.count(UNHEARD)
-            return
         with self.rejections():
             whole = self.feed.take_color(topic, message, self.stage.pipeline.spare)
             waiting = self.feed.waiting
@@ -338,4 +328,4 @@ class KeypointDetectorNode(ros.ImageNode):
         known = describe(self.feed, self.detector.name, self.found.get(side)) | self.skips.describe()
         troubles = filter(None, (self.feed.delay_of_depth, self._mount_trouble, *self._find_losses()))
         alarms = [*alarms, *(Outcome(level=Level.WARN, reason=text, text=text) for text in troubles)]
-        return self.health[side].report(alarms, known, "" if self._is_wanted() else self.answer)
+        return self.health[side].report(alarms, known, self.unheard)

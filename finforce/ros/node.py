@@ -11,14 +11,14 @@ from contextlib import contextmanager
 from dataclasses import Field, fields, replace
 from functools import cache, partial
 from threading import Event, Thread
-from time import perf_counter
+from time import perf_counter, sleep
 from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: F401 - for those who publish
 from geometry_msgs.msg import PoseStamped, TwistStamped, WrenchStamped  # noqa: F401 - for those who publish
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
-from rclpy.callback_groups import CallbackGroup
+from rclpy.callback_groups import CallbackGroup, MutuallyExclusiveCallbackGroup
 from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.expand_topic_name import expand_topic_name
@@ -181,9 +181,11 @@ class ImageNode(Node):
 
     Attributes:
         health: health of each jaw's answers, by side; filled by the node.
+        stage: of the node.
         answer: message that a rejected image does not get, as "wrench".
     """
 
+    stage: Stage
     answer = "answer"
 
     def __init__(self, name: str, **options: Any) -> None:
@@ -198,6 +200,16 @@ class ImageNode(Node):
         """Count a published answer to an image of `stamp` [ns] that was begun at `began` [s of perf_counter]."""
         age = (self.now() - stamp) / NANOSECONDS
         self.health[side].publish(outcome, latency=perf_counter() - began, age=age)
+
+    def turn(self) -> None:
+        """Begin or end to rest: nothing was to arrive so far."""
+        for health in self.health.values():
+            health.resume()
+
+    @property
+    def unheard(self) -> str:
+        """The answer that nobody needs; empty while somebody does."""
+        return "" if self.stage.is_needed else self.answer
 
     @contextmanager
     def rejections(self, *sides: str) -> Iterator[None]:
@@ -223,7 +235,7 @@ def warn_first_start() -> None:
 
 def publish_diagnostics(stage: Stage, name: str, period: float, report: Callable[[list[Outcome]], Report]) -> None:
     """Publish a report on /diagnostics every `period` seconds; faults of the stage's topics are its alarms."""
-    node, publisher = stage.node, stage.publisher(DiagnosticArray, "/diagnostics", RESULT)
+    node, publisher = stage.node, stage.publisher(DiagnosticArray, "/diagnostics", RESULT, is_answer=False)
     space = node.get_namespace().lstrip("/")
     space += "/" if space else ""
 
@@ -240,9 +252,14 @@ def publish_diagnostics(stage: Stage, name: str, period: float, report: Callable
     stage.pipeline.call_every(period, node, publish)
 
 
-def serve_trigger(stage: Stage, name: str, action: Callable[[], str], group: CallbackGroup | None = None) -> None:
-    """Offer an action as a Trigger service, aside in a group if it takes long; a refusal comes back as the message."""
-    _serve(stage, Trigger, name, lambda _: action(), group)
+def serve_trigger(
+    stage: Stage, name: str, action: Callable[[], str], group: CallbackGroup | None = None, *, awake: float = 0.0
+) -> None:
+    """Offer an action as a Trigger service, aside in a group if it takes long; a refusal comes back as the message.
+
+    A node that rests takes images for some time before, `awake` [s].
+    """
+    _serve(stage, Trigger, name, lambda _: action(), group, awake)
 
 
 def serve_switch(stage: Stage, name: str, action: Callable[[bool], str]) -> None:
@@ -250,7 +267,14 @@ def serve_switch(stage: Stage, name: str, action: Callable[[bool], str]) -> None
     _serve(stage, SetBool, name, lambda request: action(request.data), None)
 
 
-def _serve(stage: Stage, kind: type, name: str, action: Callable[[Any], str], group: CallbackGroup | None) -> None:
+def _serve(
+    stage: Stage,
+    kind: type,
+    name: str,
+    action: Callable[[Any], str],
+    group: CallbackGroup | None,
+    awake: float = 0.0,
+) -> None:
     node = stage.node
 
     def act(request: Any) -> tuple[bool, str]:
@@ -265,11 +289,15 @@ def _serve(stage: Stage, kind: type, name: str, action: Callable[[Any], str], gr
         return guarded(request) or (False, f"stopped by {stage.fault}; start the process again")
 
     async def answer(request: Any, response: Any) -> Any:
+        if awake and not stage.is_needed:
+            stage.keep_awake(awake)
+            await run_aside(node, partial(sleep, awake))
         answered = await run_aside(node, partial(attempt, request)) if group else attempt(request)
         response.success, response.message = answered
         return response
 
-    node.create_service(kind, name, answer, callback_group=group, qos_profile=REQUESTS)
+    own = group or (MutuallyExclusiveCallbackGroup() if awake else None)  # else no images would come meanwhile
+    node.create_service(kind, name, answer, callback_group=own, qos_profile=REQUESTS)
 
 
 async def run_aside(node: Node, action: Callable[[], Any]) -> Any:

@@ -9,11 +9,13 @@ from collections.abc import Callable, Iterator, Mapping
 from copy import copy
 from dataclasses import dataclass, field
 from functools import partial
+from math import inf
 from statistics import median
-from time import perf_counter
+from time import monotonic, perf_counter
 from typing import Any
 
 from numpy.typing import NDArray
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
@@ -27,7 +29,7 @@ from std_msgs.msg import Header
 
 from finforce.camera_topics import COMPRESSED, COMPRESSED_COLOR, ENDS, RAW
 from finforce.health import UNHEARD, Skips
-from finforce.messages import CloudColumns
+from finforce.messages import NANOSECONDS, CloudColumns
 from finforce.ros.messages import pack
 from finforce.ros.tracing import note
 
@@ -44,7 +46,8 @@ _OVERRIDABLE = QoSOverridingOptions.with_default_policies()  # by the parameters
 
 BUDGET = 5e-3  # [s] that a stage may take before those that could go on without it do
 WATCHED = 15  # messages over which that is judged
-_LOOKED_FOR = 0.2  # [s] between looks at who publishes, and at whether images are wanted
+_LOOKED_FOR, _AT_REST = 0.2, 1.0  # [s] between looks at who publishes, and at whether images are wanted
+_EVENTS = 0.02  # [s] after a look, in which events are waited for
 _MOST_WAITING = 1000  # messages, more than any queue keeps
 
 
@@ -53,33 +56,38 @@ class Pipeline:
 
     A message is taken by all stages that wait for it before its publisher goes on, so that an image is through once the
     first stage has done with it. Of a stage that takes more than its budget the others do not wait: it has its turn
-    after them, with the newest message.
+    after them, with the newest message. Messages go, and come from outside, as far as answers are needed: of whom
+    somebody outside listens to, and of whom a stage hears that is needed itself.
 
     Args:
         is_shared: whether there are several nodes; they are connected by `open`, and a fault stops one of them alone.
 
     Attributes:
+        stages: of its nodes.
         spare: time between the callback before and the one at work, for which the process had nothing to do [s].
+        looked: time of the last look, infinite before the first [s of monotonic].
     """
 
     def __init__(self, is_shared: bool = True) -> None:
         self.is_shared, self._is_open = is_shared, not is_shared
+        self.stages: list[Stage] = []
         self._ports: dict[str, list[Port]] = {}
-        self._topics: set[str] = set()
+        self._sources: dict[str, Stage] = {}
         self._waiting: dict[Port, Any] = {}
         self._left: deque[Callable[[], None]] = deque()
         self._looks: list[Callable[[], None]] = []
         self._timers: list[Timer] = []
         self._delayed: list[Callable[[], None]] = []
         self._depth, self._ended, self.spare = 0, perf_counter(), 0.0
+        self.looked = inf
 
     def publishes(self, topic: str) -> bool:
         """Say whether a stage publishes a topic."""
-        return topic in self._topics
+        return topic in self._sources
 
     def count_ports(self, topic: str) -> int:
-        """Return how many stages take a topic's messages from another one."""
-        return len(self._ports.get(topic, ())) if topic in self._topics else 0
+        """Return how many stages take a topic's messages from another one now."""
+        return sum(port.is_open for port in self._ports.get(topic, ())) if topic in self._sources else 0
 
     def add(self, port: Port) -> Port:
         """Take a subscription; before `open` it waits for who may publish."""
@@ -88,15 +96,45 @@ class Pipeline:
         return port
 
     def look(self, node: Node, action: Callable[[], None]) -> None:
-        """Do something now and every so often."""
+        """Do something now, every so often, and when somebody begins to listen to a stage that rests."""
+        self._find_needed()
         action()
         self._looks.append(action)
         if len(self._looks) == 1:
-            self.call_every(_LOOKED_FOR, node, lambda: [look() for look in self._looks])
+            self._looking = self.call_every(_LOOKED_FOR, node, self.look_again)
 
-    def call_every(self, period: float, node: Node, action: Callable[[], Any]) -> None:
+    def look_again(self) -> None:
+        """Find out which stages are needed, and do what depends on it."""
+        self.looked = monotonic()
+        self._find_needed()
+        for look in self._looks:
+            look()
+        is_awake = any(stage.is_needed for stage in self.stages)
+        period = round((_LOOKED_FOR if is_awake else _AT_REST) * NANOSECONDS)
+        if self._looking.timer_period_ns != period:
+            self._looking.timer_period_ns = period
+            self._looking.reset()
+
+    def _find_needed(self) -> None:
+        """Find the stages that are needed: from those that need images themselves back to their sources."""
+        before = [stage.is_needed for stage in self.stages]
+        for stage in self.stages:
+            stage.is_needed = False
+        left = [stage for stage in self.stages if stage.needs_images()]
+        while left:
+            stage = left.pop()
+            if not stage.is_needed:
+                stage.is_needed = True
+                own = [port for ports in self._ports.values() for port in ports if port.stage is stage]
+                left += [self._sources[port.topic] for port in own if port.topic in self._sources and port.is_wanted()]
+        for stage, was_needed in zip(self.stages, before, strict=True):
+            if stage.is_needed != was_needed:
+                stage.turned()
+
+    def call_every(self, period: float, node: Node, action: Callable[[], Any]) -> Timer:
         """Do something every `period` seconds, whatever /clock says, from `open` on in step: each wake is dear."""
         self._timers.append(node.create_timer(period, action, clock=STEADY_CLOCK))
+        return self._timers[-1]
 
     def when_open(self, connect: Callable[[], None]) -> None:
         """Do something once all stages are there."""
@@ -105,9 +143,9 @@ class Pipeline:
         else:
             self._delayed.append(connect)
 
-    def outlet(self, topic: str, publisher: Publisher, qos: QoSProfile) -> Outlet:
-        """Return what publishes a topic, inside and outside."""
-        self._topics.add(topic)
+    def outlet(self, stage: Stage, topic: str, publisher: Publisher, qos: QoSProfile) -> Outlet:
+        """Return what publishes a stage's topic, inside and outside."""
+        self._sources[topic] = stage
         return Outlet(self, topic, publisher, qos.durability == DurabilityPolicy.TRANSIENT_LOCAL)
 
     def open(self) -> None:
@@ -121,7 +159,7 @@ class Pipeline:
     def hand_on(self, topic: str, message: Any) -> None:
         """Give a message to the stages that take it."""
         for port in tuple(self._ports.get(topic, ())):
-            if port.outside is not None or not self._is_open:
+            if port.outside is not None or not port.is_open:
                 continue
             if port.is_slow:
                 self._waiting[port] = message
@@ -170,7 +208,8 @@ class Port:
         subscribe: makes the subscription to what comes from outside.
         can_wait: whether the process goes on without it where it takes too long.
         is_contested: says whether several nodes outside publish the topic, whose messages are then dropped.
-        is_wanted: says whether messages from outside are wanted now.
+        is_wanted: says whether messages are wanted now.
+        is_open: whether they were when that was last asked.
         outside: the subscription to what comes from outside; None while there is none.
     """
 
@@ -181,15 +220,17 @@ class Port:
     can_wait: bool = False
     is_contested: Callable[[], bool] = lambda: False
     is_wanted: Callable[[], bool] = lambda: True
+    is_open: bool = field(default=False, init=False)
     outside: Subscription | None = field(default=None, init=False)
     _times: deque[float] = field(default_factory=lambda: deque(maxlen=WATCHED), init=False)
 
     def follow(self) -> None:
-        """Subscribe to what comes from outside while it is wanted, if no stage of this process publishes it."""
-        is_wanted = not self.stage.pipeline.publishes(self.topic) and self.is_wanted()
-        if is_wanted and self.outside is None:
+        """Take messages while they are wanted: from outside, if no stage of this process publishes them."""
+        self.is_open = self.is_wanted()
+        is_outside = self.is_open and not self.stage.pipeline.publishes(self.topic)
+        if is_outside and self.outside is None:
             self.outside = self.subscribe()
-        elif not is_wanted and self.outside is not None:
+        elif not is_outside and self.outside is not None:
             self.stage.node.destroy_subscription(self.outside)
             self.outside = None
 
@@ -251,6 +292,19 @@ class Outlet:
         return self.pipeline.count_ports(self.topic_name) + self.publisher.get_subscription_count()
 
 
+class _EventGroup(MutuallyExclusiveCallbackGroup):
+    """The events of a stage's publishers, waited for at rest, else after every look: with every message it is dear."""
+
+    def __init__(self, stage: Stage) -> None:
+        super().__init__()
+        self._stage = stage
+
+    def can_execute(self, entity: Any) -> bool:
+        """Say whether an event is waited for now."""
+        is_due = not self._stage.is_needed or monotonic() - self._stage.pipeline.looked < _EVENTS
+        return is_due and super().can_execute(entity)
+
+
 class Stage:
     """One node's ends of topics: says which do not meet because the two ends ask for different service.
 
@@ -258,6 +312,8 @@ class Stage:
         node: whose ends these are.
         pipeline: of its process.
         fault: what has stopped this node while others of its process go on; empty while it works.
+        is_needed: whether its answers are needed; else it rests, and hears nothing. See `rest_unheard`.
+        turned: called when it begins or ends to rest.
 
     Args:
         node: whose ends these are.
@@ -266,6 +322,12 @@ class Stage:
 
     def __init__(self, node: Node, pipeline: Pipeline | None = None) -> None:
         self.node, self.pipeline, self.fault = node, pipeline or Pipeline(is_shared=False), ""
+        self.is_needed, self.turned = True, lambda: None
+        self.needs_images: Callable[[], bool] = lambda: True
+        self._answers: list[Outlet] = []
+        self._events = _EventGroup(self)
+        self._awake_until = -inf
+        self.pipeline.stages.append(self)
         self._suspects: dict[str, tuple[bool, QoSProfile]] = {}
         self._contested: set[str] = set()
 
@@ -312,12 +374,52 @@ class Stage:
         """Do something once the image is through the whole process."""
         self.pipeline.afterwards(self.guard(action))
 
-    def publisher(self, kind: type, topic: str, qos: QoSProfile) -> Outlet:
-        """Create a watched publisher."""
+    def publisher(self, kind: type, topic: str, qos: QoSProfile, *, is_answer: bool = True) -> Outlet:
+        """Create a watched publisher.
+
+        Args:
+            kind: of the messages.
+            topic: of the messages.
+            qos: that is offered.
+            is_answer: whether the messages are made of images, for which the node is needed by who listens.
+        """
         qos = copy(qos)  # overrides are written into it
-        events = PublisherEventCallbacks(incompatible_qos=lambda _: self._suspect(topic, True, qos))
-        made = self.node.create_publisher(kind, topic, qos, event_callbacks=events, qos_overriding_options=_OVERRIDABLE)
-        return self.pipeline.outlet(self.node.resolve_topic_name(topic), made, qos)
+        events = PublisherEventCallbacks(
+            incompatible_qos=lambda _: self._suspect(topic, True, qos),
+            matched=lambda _: self._end_rest(),
+        )
+        options = {"callback_group": self._events, "qos_overriding_options": _OVERRIDABLE}
+        made = self.node.create_publisher(kind, topic, qos, event_callbacks=events, **options)
+        outlet = self.pipeline.outlet(self, self.node.resolve_topic_name(topic), made, qos)
+        self._answers += [outlet] if is_answer else []
+        return outlet
+
+    def rest_unheard(
+        self, skips: Skips, turned: Callable[[], None], is_busy: Callable[[], bool] = lambda: False
+    ) -> None:
+        """Rest from now on while nobody needs the answers, unless that rule is off.
+
+        Args:
+            skips: the rules.
+            turned: called when a rest begins or ends.
+            is_busy: says whether the node needs images for itself.
+        """
+
+        def needs_images() -> bool:
+            itself = not skips.allows(UNHEARD) or is_busy() or monotonic() < self._awake_until
+            return itself or any(answer.publisher.get_subscription_count() for answer in self._answers)
+
+        self.turned, self.needs_images = self.guard(turned), needs_images
+
+    def keep_awake(self, seconds: float) -> None:
+        """Take messages for some time [s], whoever listens."""
+        self._awake_until = monotonic() + seconds
+        self._end_rest()
+
+    def _end_rest(self) -> None:
+        """Look at once who listens, if the node rests."""
+        if not self.is_needed:  # which it cannot before all stages are there
+            self.pipeline.look_again()
 
     def _is_contested(self, topic: str) -> bool:
         """Say, also in log and diagnostics, whether several nodes publish a topic."""
@@ -348,7 +450,7 @@ class Stage:
         *,
         can_wait: bool = False,
         is_exclusive: bool = True,
-        is_wanted: Callable[[], bool] = lambda: True,
+        is_wanted: Callable[[], bool] | None = None,
         **options: Any,
     ) -> Port:
         """Create a watched subscription.
@@ -360,7 +462,7 @@ class Stage:
             qos: that is asked for.
             can_wait: a process of several nodes may go on without this one where it takes long.
             is_exclusive: messages are dropped while several nodes publish the topic: they may contradict each other.
-            is_wanted: says whether messages from outside are wanted now.
+            is_wanted: says whether messages are wanted now; None: while the node's answers are needed.
             options: of the subscription, as its callback group.
         """
         qos = copy(qos)
@@ -375,7 +477,7 @@ class Stage:
                 kind, topic, taker, qos, event_callbacks=events, **{"qos_overriding_options": _OVERRIDABLE, **options}
             )
 
-        name = self.node.resolve_topic_name(topic)
+        name, is_wanted = self.node.resolve_topic_name(topic), is_wanted or (lambda: self.is_needed)
         return self.pipeline.add(Port(self, name, guarded, subscribe, can_wait, is_contested, is_wanted))
 
     def large_subscription(self, kind: type, topic: str, callback: Callable, **options: Any) -> Callable[[], None]:
@@ -486,7 +588,7 @@ class ImageInput:
         take: takes the name of the topic and a message.
         transport: raw, compressed, or auto: raw, and compressed while nobody publishes raw ones.
         end: of the topic of compressed images.
-        is_wanted: says whether anything is to be done with images.
+        is_wanted: says whether anything is to be done with images; None: while the node's answers are needed.
         options: of the subscription, as its callback group.
     """
 
@@ -497,15 +599,16 @@ class ImageInput:
         take: Callable[[str, Any], Any],
         transport: str,
         end: str = COMPRESSED_COLOR,
-        is_wanted: Callable[[], bool] = lambda: True,
+        is_wanted: Callable[[], bool] | None = None,
         **options: Any,
     ) -> None:
-        self._stage, self._take, self._is_wanted, self._options = stage, take, is_wanted, options
+        self._stage, self._take, self._options = stage, take, options
+        self._is_wanted = is_wanted or (lambda: stage.is_needed)
         packed = topic if topic.endswith(ENDS) else stage.node.resolve_topic_name(topic) + end
         only = packed if topic.endswith(ENDS) or transport == COMPRESSED else topic if transport == RAW else ""
         self._choices = (only,) if only else (topic, packed)
         self._topic, self._close = "", lambda: None
-        stage.look(self._follow)
+        stage.pipeline.when_open(lambda: stage.look(self._follow))
 
     def _follow(self) -> None:
         """Subscribe to what is published, raw images first; to nothing while nothing is wanted."""

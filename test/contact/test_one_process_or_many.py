@@ -16,7 +16,7 @@ from finforce_contact.node import ContactEstimatorNode
 from finforce_ifea.node import IfeaSolverNode
 
 IMAGES = 116
-PATIENT = {"max_age": 60.0, "skip_off": ["idle image"]}
+PATIENT = {"max_age": 60.0, "skip_off": ["idle image", "nobody subscribes"]}
 
 
 class Detector(Node):
@@ -52,7 +52,6 @@ def solve(probe, composed, mesh, images, shift):
     contact = build(
         ContactEstimatorNode,
         jaws="left",
-        skip_off=["idle image"],
         calibration_file="bench",
         object_mesh=str(mesh),
     )

@@ -59,12 +59,13 @@ class FakeEstimator:
 
     surface_triangles = np.array([[0, 1, 2], [0, 2, 3]])
     tared = is_idle = False
+    is_taring = True  # as one of whom nothing is known yet, which is never at rest
     friction = (0.0, 0.02)
     touch_probability, friction_source = 0.0, "expected"
 
     def __init__(self, **answer):
         self.answer = answer
-        self.observations, self.contacts, self.resets = [], [], 0
+        self.observations, self.contacts, self.resets, self.interruptions = [], [], 0, 0
         self.under_load = False
 
     def update(self, observation, contact):
@@ -88,6 +89,9 @@ class FakeEstimator:
 
     def reset(self):
         self.resets += 1
+
+    def interrupt(self):
+        self.interruptions += 1
 
 
 class Probe(Node):
@@ -161,13 +165,13 @@ def ros_domain():
         rclpy.try_shutdown(context=context)
 
 
-def start_solver(probe, estimator=None, **parameters):
-    """Add a solver node around an estimator to the probe's executor."""
+def start_solver(probe, estimator=None, pipeline=None, **parameters):
+    """Add a solver node around an estimator, of a pipeline or alone, to the probe's executor."""
     # a loaded machine is late: neither is an image old then, nor a node silent
     given = {"contact_height": 0.04, "diagnostics_period": 0.1, "max_age": 3.0, **parameters}
     overrides = [Parameter(name, value=value) for name, value in given.items()]
     estimator = estimator or FakeEstimator()
-    node = IfeaSolverNode(lambda *_: estimator, context=probe.context, parameter_overrides=overrides)
+    node = IfeaSolverNode(lambda *_: estimator, pipeline, context=probe.context, parameter_overrides=overrides)
     probe.spinner.add_node(node)
     return node
 

@@ -82,7 +82,7 @@ def test_images_that_announce_more_than_they_hold_are_refused(probe):
     node, refused = start_detector(probe), []
     node.reject = lambda outcome, *sides: refused.append(outcome.text)
     probe.hear("/left/keypoints", PointCloud2)
-    probe.wait_for(lambda: node.out.are_heard)
+    probe.wait_for(lambda: node.stage.is_needed)
     seen = Header(frame_id="camera_color_optical_frame")
     info = CameraInfo(header=seen, width=20_000, height=20_000, k=[9e9, 0.0, 1e4, 0.0, 9e9, 1e4, 0.0, 0.0, 1.0])
     node._on_info(info)

@@ -11,6 +11,21 @@ BAD = Outcome.of_error(ObservationError("9 key points; expected 15"))
 POOR = Outcome(level=Level.WARN, reason="not_enough_points", text="3 points")
 
 
+def test_silence_counts_from_when_messages_were_to_come(monkeypatch):
+    now, health = 100.0, Health(source="left/keypoints", stale_after=0.5)
+    monkeypatch.setattr("finforce.health.monotonic", lambda: now)
+    health.arrive()
+    health.publish(GOOD, latency=0.01, age=0.02)
+    now = 700.0
+    assert health.report(unheard="wrench").level == Level.OK
+    assert health.report().level == Level.STALE
+    health.resume()
+    now = 700.4
+    assert health.report().level == Level.OK
+    now = 700.6
+    assert "for 0.6 s" in health.report().message
+
+
 def gate():
     return StampGate(max_age=0.2)
 

@@ -17,7 +17,7 @@ from std_msgs.msg import Header, String
 from std_srvs.srv import Trigger
 
 from finforce.errors import ObservationError
-from finforce.health import Level, Report
+from finforce.health import UNHEARD, Level, Report, Skips
 from finforce.messages import CloudColumns, decode_columns, stamp_of
 from finforce.ros import node as ros
 from finforce.ros import topics
@@ -122,6 +122,118 @@ def test_a_topic_that_no_stage_publishes_comes_from_outside(probe):
     out.publish(keypoint_cloud(7))
     work(probe, executor, lambda: node.heard)
     assert stamp_of(node.heard[0]) == 7 and node.heard[0].width == 15
+    node.destroy_node()
+
+
+@pytest.fixture
+def resting(line):
+    """The same relays, which rest while nobody needs their answers; the third may be busy by itself."""
+    line[2].is_busy, line[0].turns = False, []
+    for node in line:
+        turned = partial(line[0].turns.append, node.get_name())
+        node.stage.rest_unheard(Skips(), turned, lambda node=node: getattr(node, "is_busy", False))
+    line[0].stage.pipeline.look_again()
+    return line
+
+
+def needed(line):
+    return [node.stage.is_needed for node in line]
+
+
+@pytest.mark.parametrize(("topic", "wanted"), [("one", 1), ("two", 2), ("three", 3)])
+def test_the_stages_before_a_topic_that_somebody_hears_are_awake_and_those_behind_it_rest(
+    resting, probe, topic, wanted
+):
+    first, second, third = resting
+    assert needed(resting) == [False] * 3
+    first.say(COLUMNS)
+    assert not second.heard and not first.out.get_subscription_count()
+    listener = probe.hear(topic, PointCloud2)
+    first.work(lambda: needed(resting) == [number < wanted for number in range(3)])
+    first.say(COLUMNS)
+    first.work(lambda: probe.got[topic])
+    assert len(second.heard) == (wanted > 1) and len(third.heard) == (wanted > 2)
+    assert first.out.get_subscription_count() == 1 and first.turns.count("first") == 2
+    probe.destroy_subscription(listener)
+    first.work(lambda: not any(needed(resting)))
+
+
+def test_a_stage_that_is_busy_keeps_those_before_it_awake(resting):
+    first, _, third = resting
+    third.is_busy = True
+    first.work(lambda: all(needed(resting)))
+    first.say(COLUMNS)
+    assert third.heard
+    third.is_busy = False
+    first.work(lambda: not any(needed(resting)))
+
+
+def test_a_process_at_rest_looks_for_listeners_more_rarely(resting):
+    pipeline, third = resting[0].stage.pipeline, resting[2]
+    assert pipeline._looking.timer_period_ns == round(1e9 * topics._AT_REST)
+    third.is_busy = True
+    resting[0].work(lambda: all(needed(resting)))
+    assert pipeline._looking.timer_period_ns == round(1e9 * topics._LOOKED_FOR)
+
+
+def test_who_listens_to_diagnostics_alone_wakes_nobody(resting, probe):
+    resting[0].work(lambda: len(probe.got["/diagnostics"]) > 6)
+    assert probe.count_subscribers("/diagnostics") == 1 and not any(needed(resting))
+
+
+def test_a_stage_that_rests_hears_nothing_from_outside_until_somebody_hears_it(probe, monkeypatch):
+    monkeypatch.setattr(topics, "_AT_REST", 1000.0)  # it is the listener that wakes it
+    pipeline, executor = Pipeline(), SingleThreadedExecutor(context=probe.context)
+    node = Relay(pipeline, "alone", "outside", "said", context=probe.context)
+    node.stage.rest_unheard(Skips(), lambda: None)
+    pipeline.open()
+    executor.add_node(node)
+    pipeline.look_again()  # after which the next is far
+    assert node.port.outside is None
+    probe.hear("said", PointCloud2)
+    work(probe, executor, lambda: node.port.outside is not None)
+    node.destroy_node()
+
+
+def test_events_of_publishers_are_waited_for_at_rest_else_after_a_look_alone(probe):
+    node = Relay(None, "alone", "outside", "said", context=probe.context)
+    node.stage.rest_unheard(Skips(), lambda: None)
+    pipeline, events = node.stage.pipeline, node.out.publisher.event_handlers
+
+    def are_waited_for():
+        return {event.callback_group.can_execute(event) for event in events}
+
+    pipeline.look_again()
+    sleep(2.0 * topics._EVENTS)
+    assert not node.stage.is_needed and are_waited_for() == {True}
+    node.stage.keep_awake(60.0)
+    assert node.stage.is_needed and are_waited_for() == {True}
+    sleep(2.0 * topics._EVENTS)
+    assert are_waited_for() == {False}
+    pipeline.look_again()
+    assert are_waited_for() == {True}
+    node.destroy_node()
+
+
+def test_stages_that_hear_each_other_rest_all_the_same(probe):
+    pipeline = Pipeline()
+    pair = [Relay(pipeline, *words, context=probe.context) for words in (("a", "one", "two"), ("b", "two", "one"))]
+    for node in pair:
+        node.stage.rest_unheard(Skips(), lambda: None)
+    pipeline.open()
+    assert needed(pair) == [False, False]
+    pair[0].stage.keep_awake(60.0)
+    assert needed(pair) == [True, True]
+    for node in pair:
+        node.destroy_node()
+
+
+def test_without_the_rule_no_stage_rests(probe):
+    pipeline = Pipeline()
+    node = Relay(pipeline, "alone", "outside", "said", context=probe.context)
+    node.stage.rest_unheard(Skips([UNHEARD]), lambda: None)
+    pipeline.open()
+    assert node.stage.is_needed and node.port.outside is not None
     node.destroy_node()
 
 

@@ -4,12 +4,22 @@ from time import time_ns
 
 import numpy as np
 import pytest
-from contact_node_fakes import T_CAMERA_JAW, ContactBench, cylinder_before_jaw, pose
+from contact_node_fakes import (
+    T_CAMERA_JAW,
+    ContactBench,
+    cylinder_before_jaw,
+    diagnosis,
+    pose,
+    start_contact_estimator,
+)
 from geometry_msgs.msg import WrenchStamped
+from keypoint_node_fakes import start_detector
 from node_fakes import FakeEstimator, keypoint_cloud, ros_domain, start_solver
-from sensor_msgs.msg import PointCloud2
+from sensor_msgs.msg import Image, PointCloud2
+from std_srvs.srv import Trigger
 
-from finforce.health import ALL, IDLE, UNHEARD
+from finforce.health import ALL, IDLE, UNHEARD, Level
+from finforce.ros.topics import Pipeline
 
 TENTH = 100_000_000
 AWAY_GAP, NEAR_GAP = 0.03, 0.001
@@ -88,8 +98,85 @@ class TestSolver:
         self.send(probe, node, out, [first])
         assert estimator.shown == 1 and counted(node, UNHEARD) == "off"
 
+    def start_tared(self, probe, **parameters):
+        """A solver that has its tare, before which somebody says key points."""
+        estimator = FakeEstimator()
+        node = start_solver(probe, estimator, **{"max_age": 10.0, **parameters})
+        estimator.is_taring = False
+        return node, probe.speak("left/keypoints")
+
+    def test_it_rests_from_its_tare_on_until_somebody_hears_a_force(self, probe):
+        node, out = self.start_tared(probe, peer="right", max_age=1.0)
+        probe.wait_for(lambda: not out.get_subscription_count())
+        probe.spin(1.5)  # a peer would be missed by now
+        probe.got["/diagnostics"].clear()
+        probe.diagnosis(level=bytes([Level.OK])[0], word="idle: no subscriber on the wrench")
+        probe.hear("grasp_wrench", WrenchStamped)
+        probe.connected(out)
+        probe.spin(0.3)
+        states = [status for array in probe.got["/diagnostics"][-2:] for status in array.status]
+        assert not any("no wrench of the right jaw" in status.message for status in states)
+        out.publish(keypoint_cloud())
+        probe.wait_for(lambda: node.estimator.observations)
+
+    def test_a_reset_begins_a_tare_for_which_it_wakes(self, probe):
+        node, out = self.start_tared(probe)
+        probe.wait_for(lambda: not out.get_subscription_count())
+        node.estimator.is_taring = True
+        probe.connected(out)
+
+    def test_a_tare_that_is_asked_for_at_rest_is_made_of_images_that_come_then(self, probe, monkeypatch):
+        monkeypatch.setattr("finforce_ifea.node._TARE_TIME", 1.0)
+        node, out = self.start_tared(probe)
+        probe.wait_for(lambda: not out.get_subscription_count())
+        assert node.estimator.interruptions == 1  # when its rest began
+        answer = probe.create_client(Trigger, "left/tare").call_async(Trigger.Request())
+        probe.connected(out)
+        while not answer.done():
+            out.publish(keypoint_cloud())
+            probe.spin(0.02)
+        assert answer.result().success and len(node.estimator.observations) >= 5
+        probe.wait_for(lambda: not out.get_subscription_count())
+
+    def test_without_the_rule_it_solves_for_nobody(self, probe):
+        node, out = self.start_tared(probe, skip_off=[UNHEARD])
+        probe.connected(out)
+        probe.spin(0.5)
+        out.publish(keypoint_cloud())
+        probe.wait_for(lambda: node.estimator.observations)
+
+
+def test_a_process_hears_no_camera_from_its_tare_on_until_somebody_hears_a_force(probe):
+    pipeline, estimator = Pipeline(), FakeEstimator()
+    detector = start_detector(probe, pipeline=pipeline, jaws="left")
+    solver = start_solver(probe, estimator, pipeline=pipeline, completes_grasp=True)
+    pipeline.open()
+
+    def is_filmed():
+        return any(subscription.msg_type is Image for subscription in detector.subscriptions)
+
+    probe.spin(0.5)
+    assert is_filmed()  # for the tare
+    estimator.is_taring = False
+    probe.wait_for(lambda: not is_filmed())
+    assert not solver.stage.is_needed
+    listener = probe.hear("grasp_wrench", WrenchStamped)
+    probe.wait_for(is_filmed)
+    probe.destroy_subscription(listener)
+    probe.wait_for(lambda: not is_filmed())
+
 
 class TestContactEstimator:
+    @pytest.mark.parametrize(("source", "hears"), [("topic", False), ("tracker", True)])
+    def test_it_rests_while_nobody_hears_a_contact_unless_it_would_lose_the_object(self, probe, source, hears):
+        node = start_contact_estimator(probe, jaws="left", pose_source=source)
+        assert not node.stage.is_needed
+        probe.wait_for(lambda: probe.count_subscribers("object_mask" if hears else "object_pose") == hears)
+        assert probe.count_subscribers("left/jaw_pose") == 0
+        diagnosis(probe, "left contact", level=bytes([Level.OK])[0], word="idle: no subscriber on the contact")
+        probe.hear("left/contact", PointCloud2)
+        probe.wait_for(lambda: probe.count_subscribers("left/jaw_pose") == 1)
+
     def image(self, bench, gap, stamp, *, tracked=True, late=False):
         """Send an image in which the object's pose may be known, and wait until the node has it."""
         before = bench.node.health["left"]._arrived

@@ -11,8 +11,8 @@ from finforce_keypoints.detector import KeypointDetector
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "interfaces.md"
 WORDS = {
-    "keypoint_detector": ("-p", "skip_off:=[all]"),  # else it hears no images while nobody listens
-    "contact_estimator": ("-p", "jaws:=both"),
+    "keypoint_detector": ("-p", "skip_off:=[all]"),  # else it rests
+    "contact_estimator": ("-p", "jaws:=both", "-p", "skip_off:=[all]"),
     "ifea_solver": ("-p", "peer:=right"),
     "gripper_driver": ("-p", "port:=/dev/null"),
 }

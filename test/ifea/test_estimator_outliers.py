@@ -7,6 +7,7 @@ import pytest
 from estimator_fakes import (
     HELD_5,
     MODELS,
+    MODULUS,
     REST,
     STEPS,
     assert_identical,
@@ -23,7 +24,9 @@ from estimator_fakes import (
 )
 from mechanics_fakes import BENCH
 
+from finforce_ifea.jaw.calibration import Calibration
 from finforce_ifea.observation import Contact
+from finforce_ifea.relaxation import RelaxationTerm
 
 # --- gross errors, hidden points, holes
 
@@ -164,6 +167,24 @@ def test_load_that_came_in_a_pause_is_no_bump_of_the_camera(seed):
     solutions = run(recording)
     assert np.abs(errors(recording, solutions)[62:]).max() < 0.12
     assert max(solution.magnitude_stddev for solution in solutions[62:]) < 0.25
+
+
+def test_a_force_that_stayed_through_an_interruption_may_have_been_let_go_meanwhile():
+    """Grasped again at its end, it has the whole overstress; grasped throughout, none."""
+    term = RelaxationTerm(share=0.15, time_constant=5.0)
+    calibration = Calibration(young_modulus=MODULUS, force_error=0.02, relaxation=(term,))
+    recording, found = record(ramp(5), noise=0.3), {}
+    for is_interrupted in (False, True):
+        estimator = make_estimator(solver="frame", calibration=calibration)
+        for observation in recording.observations:
+            last = estimator.update(observation, recording.contact)
+        if is_interrupted:
+            estimator.interrupt()
+        later = replace(recording.observations[-3], stamp=observation.stamp + 30.0)
+        found[is_interrupted] = estimator.update(later, recording.contact)
+    assert np.linalg.norm(last.force) > 1.0
+    overstress = 0.15 * np.linalg.norm(found[True].force)
+    assert 3.0 * found[True].magnitude_stddev > overstress > 3.0 * found[False].magnitude_stddev
 
 
 @pytest.mark.parametrize("height", [20, 40])

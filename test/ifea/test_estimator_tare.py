@@ -19,7 +19,7 @@ from estimator_fakes import (
 )
 from mechanics_fakes import BENCH
 
-from finforce_ifea.errors import UnderLoadError
+from finforce_ifea.errors import NotEnoughDataError, UnderLoadError
 from finforce_ifea.observation import Contact, Observation
 
 # --- tare
@@ -82,6 +82,34 @@ def test_tare_is_refused_under_load_and_taken_when_unloaded():
     largest, noise = (float(number) for number in found.groups())
     assert noise == pytest.approx(0.32, abs=0.05)
     assert 0.2 < largest < 1.0
+
+
+@pytest.mark.parametrize(
+    ("depths", "end"), [(np.zeros(330), 303), (ramp(2), 75), (np.full(90, 2e-3), 46)], ids=["rest", "press", "loaded"]
+)
+def test_unloaded_images_are_needed_until_the_average_is_long_enough_or_something_presses(depths, end):
+    recording, estimator = record(depths), make_estimator(solver="frame")
+    needs = [estimator.is_taring]
+    for observation in recording.observations:
+        estimator.update(observation, recording.contact)
+        needs.append(estimator.is_taring)
+    assert all(needs[: end - 15]) and not any(needs[end:])
+
+
+def test_a_tare_after_an_interruption_takes_what_came_since():
+    recording, estimator = record(np.zeros(200)), make_estimator(solver="frame")
+    images = iter(recording.observations)
+
+    def take(count):
+        for _ in range(count):
+            estimator.update(next(images), recording.contact)
+
+    take(100)
+    estimator.interrupt()
+    with pytest.raises(NotEnoughDataError, match="0 unloaded frames"):
+        estimator.tare()
+    take(20)
+    assert "over 20 frames" in estimator.tare()
 
 
 @pytest.mark.parametrize(

@@ -74,8 +74,8 @@ class FakeDetector:
         self.settings = settings
 
 
-def start_detector(probe, **parameters):
-    """Add a detector node around a fake detector to the probe's executor."""
+def start_detector(probe, pipeline=None, **parameters):
+    """Add a detector node around a fake detector, of a pipeline or alone, to the probe's executor."""
     # a loaded machine is late: neither is an image old then, nor a node silent
     given = {"diagnostics_period": 0.1, "max_age": 3.0, **parameters}
     overrides = [Parameter(name, value=value) for name, value in given.items()]
@@ -83,7 +83,7 @@ def start_detector(probe, **parameters):
     def build(jaws, *_, **__):
         return FakeDetector(tuple(jaws))
 
-    node = KeypointDetectorNode(build, context=probe.context, parameter_overrides=overrides)
+    node = KeypointDetectorNode(build, pipeline, context=probe.context, parameter_overrides=overrides)
     probe.spinner.add_node(node)
     return node
 

@@ -384,7 +384,11 @@ def test_images_that_get_lost_are_reported_with_a_remedy(probe):
 
 
 def test_images_that_nobody_asked_for_are_not_missed(probe):
-    arrivals = start_detector(probe).feed.arrivals["colour"]
+    node, listener = start_detector(probe), probe.hear("left/keypoints", PointCloud2)
+    probe.wait_for(lambda: node.stage.is_needed)
+    arrivals = node.feed.arrivals["colour"]
     for number in filter(lambda number: number % 4, range(120)):
         arrivals.take(number * 33 * MILLISECOND, 1.0)
+    assert arrivals.count_losses().arrived
+    probe.destroy_subscription(listener)
     probe.wait_for(lambda: not arrivals.count_losses().arrived)

@@ -77,7 +77,7 @@ def test_a_pose_on_tf_that_comes_late_is_taken_before_the_tare_and_not_after_it(
         solver = probe.speak("left/wrench", detector_node.ros.WrenchStamped)
         probe.connected(solver)
         solver.publish(detector_node.ros.WrenchStamped())
-        probe.wait_for(lambda: bench.node._tared)
+        probe.wait_for(lambda: not solver.get_subscription_count())  # it has heard what it listened for
     tf["gripper_base", FRAME] = CAMERA
     probe.got["/diagnostics"].clear()
     bench.shoot()
