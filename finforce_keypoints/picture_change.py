@@ -174,16 +174,15 @@ class PictureChanges:
         is_plain = all(each.likelihood >= SURE and each.contrast >= LEAST_FOUND for each in near)
         if is_plain and not describe_changes(near, self._camera.width):
             return ""
-        flip, best, ends = (1, 1), -np.inf, {}
+        flip, best, known, ends = (1, 1), -np.inf, near, {}
         for other in FLIPS:
-            known = near if other == (1, 1) else [None] * len(colors)
-            tried = {n: self.find(_turn_over(colors[n], other), known[n]) for n in {0, len(colors) - 1}}
+            given = near if other == (1, 1) else [None] * len(colors)
+            tried = {n: self.find(_turn_over(colors[n], other), given[n]) for n in {0, len(colors) - 1}}
             shown = float(np.mean([each.likelihood + each.contrast for each in tried.values()]))
             if shown > best + FLIPPED:
-                flip, best, ends = other, shown, tried
-        near = near if flip == (1, 1) else [None] * len(colors)
+                flip, best, known, ends = other, shown, given, tried
         colors = [_turn_over(color, flip) for color in colors]
-        changes = [ends.get(n) or self.find(color, near[n]) for n, color in enumerate(colors)]
+        changes = [ends.get(n) or self.find(color, known[n]) for n, color in enumerate(colors)]
         changes = [change for change in changes if change.likelihood >= SURE]
         if len(changes) < max(min(FEWEST, len(colors)), FEWEST_SHARE * len(colors)):
             shown = np.median([self._scan(color, (1.0,))[0] for color in colors])
