@@ -29,8 +29,8 @@ _DRIFT_FLOOR = 0.02  # [N]
 _NOISE_SIGMAS = 3.0  # standard errors of the drift by which noise may exceed that
 _SCALE_ERROR = 0.02  # [N]: two grams
 _RELATIVE_ERROR = 0.02  # of one reading, by the height at which it was pressed
-_WORST_MISFIT = 0.15  # [-] of a reading: estimates of one finger differ by less, readings of other holds by more
-_FEWEST_SHIFTED = 3  # readings by which a shift of all of them is told
+WORST_MISFIT = 0.15  # [-] of a reading: estimates of one finger differ by less, readings of other holds by more
+_FEWEST_SHIFTED = 3  # readings by which a shift of all of them, or a constant in all of them, is told
 _FORCE_ERRORS = 0.005, 0.5  # [-] least and largest relative deviation of forces that a weighing can leave
 
 
@@ -178,15 +178,20 @@ def weigh(holds: Sequence[Hold], grams: Sequence[float], name: str = "the record
     """
     weights = np.asarray(grams, dtype=float) * 1e-3 * GRAVITY
     if not len(weights) or not np.isfinite(weights).all() or (weights <= 0.0).any():
-        raise RecordingError(f"{name}: readings {list(grams)}: expected grams above zero, one for each hold")
+        raise RecordingError(
+            f"{name}: readings {np.asarray(grams).tolist()}: expected grams above zero, one for each hold"
+        )
     if len(weights) != len(holds):
         counts = f"{len(weights)} readings for {len(holds)} holds"
         raise RecordingError(f"{name}: {counts}; holds found: {list_holds(holds)}")
     weighing = _fit_factor(tuple(holds), weights)
-    if weighing.misfit > _WORST_MISFIT:
+    hint = _suspect_offset(weighing)
+    if hint or weighing.misfit > WORST_MISFIT:
+        left = f"{100 * weighing.misfit:.0f} % of a reading left over"
+        left += f", expected at most {100 * WORST_MISFIT:.0f} %" if weighing.misfit > WORST_MISFIT else ""
+        hint = _suspect_shift(weighing) or hint
         raise RecordingError(
-            f"{name}: the readings do not fit the holds: {100 * weighing.misfit:.0f} % of a reading left over, "
-            f"expected at most {100 * _WORST_MISFIT:.0f} %{_suspect_shift(weighing)}; holds found: {list_holds(holds)}"
+            f"{name}: the readings do not fit the holds: {left}{hint}; holds found: {list_holds(holds)}"
         )
     return weighing
 
@@ -207,6 +212,18 @@ def _fit_factor(holds: tuple[Hold, ...], weights: NDArray[np.float64]) -> Weighi
     return Weighing(factor=factor, stddev=spread / np.sqrt(information), holds=holds, weights=weights, misfit=misfit)
 
 
+def _suspect_offset(weighing: Weighing) -> str:
+    """Return a hint where a constant in all readings has changed the factor by more than readings may scatter."""
+    forces, weights = np.array([hold.force for hold in weighing.holds]), weighing.weights
+    if len(forces) < _FEWEST_SHIFTED or np.ptp(forces) < 0.5 * forces.max():  # these tell no constant
+        return ""
+    sigma = np.hypot(_SCALE_ERROR, _RELATIVE_ERROR * weights)
+    (slope, offset), covariance = np.polyfit(forces, weights, 1, w=1.0 / sigma, cov="unscaled")
+    is_wrong = abs(slope / weighing.factor - 1.0) > WORST_MISFIT and abs(offset) > 3.0 * np.sqrt(covariance[1, 1])
+    much = f"{1e3 * abs(offset) / GRAVITY:.0f} g too {'much' if offset > 0.0 else 'little'}"
+    return f"; each seems to have {much}: was the scale at zero, is the contact height right?" if is_wrong else ""
+
+
 def _suspect_shift(weighing: Weighing) -> str:
     """Return a hint where the readings fit the holds once they are shifted against them."""
     holds, weights, shifted = weighing.holds, weighing.weights, {}
@@ -218,7 +235,7 @@ def _suspect_shift(weighing: Weighing) -> str:
             holds[shift:], weights[:-shift]
         )
     best = min(shifted, key=lambda hint: shifted[hint].misfit, default=None)
-    return f"; {best}" if best and shifted[best].misfit < min(_WORST_MISFIT, 0.5 * weighing.misfit) else ""
+    return f"; {best}" if best and shifted[best].misfit < min(WORST_MISFIT, 0.5 * weighing.misfit) else ""
 
 
 def format_weighing(weighing: Weighing) -> str:

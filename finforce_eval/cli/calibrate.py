@@ -16,12 +16,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("bags", nargs="+", metavar="BAG", help=BAG_HELP)
     add_run_options(parser, calibration=False)
     parser.add_argument("-o", "--output", required=True, metavar="FILE", help="calibration file to write")
-    parser.add_argument("--force", action="store_true", help=FORCE_HELP)
+    parser.add_argument("--force", action="store_true", help=f"{FORCE_HELP}; or forces that do not fit")
 
 
 def run(options: argparse.Namespace) -> CommandResult:
     """Identify the material and write the calibration."""
-    from finforce_eval.calibration.calibrate import calibrate, calibration_case, format_fit
+    from finforce_eval.calibration.calibrate import calibrate, calibration_case, check_fit, format_fit
 
     options.calibration = None
     setup = make_setup(options)
@@ -34,7 +34,7 @@ def run(options: argparse.Namespace) -> CommandResult:
     fit = calibrate(cases, jaw, setup.settings)
     print(format_fit(fit, cases))
     if not options.force:
-        fit.calibration.check_modulus(jaw)
+        check_fit(fit.calibration, jaw)
     solver = name_mechanics(jaw, setup.settings.solver)
     found = fit.calibration.changed(solver=solver, uncertainty=fit.uncertainty)
     save_calibration(found, options.output)

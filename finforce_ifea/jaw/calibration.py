@@ -23,6 +23,7 @@ _MODELS_DIFFER = 0.03
 
 _SOFT = (5e6, 200e6)  # [Pa], range of the modulus of printed TPU over all its hardnesses
 _DATASHEET_FACTOR = 3.0  # [-], largest ratio of a modulus to that of its data sheet
+_UNIT_FACTOR = 100.0  # [-], ratio from which it is in another unit
 
 Factor = Annotated[Number, Field(ge=0.3, le=3.0)]
 
@@ -76,7 +77,7 @@ class Calibration(FileModel):
         """Return the jaw as it is.
 
         Raises:
-            CalibrationError: The calibration belongs to another jaw.
+            CalibrationError: The calibration belongs to another jaw, or its modulus is in another unit.
         """
         if self.jaw and self.jaw != jaw.name:
             raise CalibrationError(f"the calibration belongs to the jaw {self.jaw!r}, got {jaw.name!r}")
@@ -89,6 +90,11 @@ class Calibration(FileModel):
             raise CalibrationError(
                 f"the calibration has thicknesses or a clamp and no `finger`, expected the shape that it belongs to; "
                 f"add `finger: {jaw.digest}` to its file if that was this jaw {jaw.name!r}, else calibrate this one"
+            )
+        if not 1.0 / _UNIT_FACTOR < self.young_modulus / jaw.material.young_modulus < _UNIT_FACTOR:
+            raise CalibrationError(
+                f"young_modulus {self.young_modulus:.3g} Pa, the jaw file of {jaw.name!r} says "
+                f"{jaw.material.young_modulus:.3g} Pa: expected Pa in both"
             )
         material = jaw.material.model_copy(update={"young_modulus": self.young_modulus})
         if jaw.drawing is None:

@@ -120,6 +120,27 @@ def test_recordings_that_cannot_be_used_are_refused(jaw):
         calibration_case(replace(bench_recording(), case={}), jaw, ContactChoice())
 
 
+def test_true_forces_of_another_time_are_refused(jaw, tmp_path, monkeypatch, capsys):
+    recording = bench_recording()
+    track = recording.jaws["left"]
+    late = replace(track.truth, stamps_ns=track.truth.stamps_ns + 100 * 10**9)
+    with pytest.raises(RecordingError, match="pressed: no true force at the time of an image: do both have one clock"):
+        calibration_case(replace(recording, jaws={"left": replace(track, truth=late)}), jaw, ContactChoice())
+    off = replace_error(make_fit(), 0.2)
+    monkeypatch.setattr("finforce_eval.calibration.calibrate.fit_calibration", lambda *_: off)
+    words = ["calibrate", str(write_recording(recording, tmp_path / "bag")), "-o", str(tmp_path / "finger.yaml")]
+    assert main(words) == 2 and not (tmp_path / "finger.yaml").exists()
+    assert (
+        "20 % of a force left over, expected at most 15 %: do forces and images have one clock"
+        in capsys.readouterr().err
+    )
+    assert main([*words, "--force"]) == 0
+
+
+def replace_error(fit, force_error):
+    return SimpleNamespace(**{**vars(fit), "calibration": fit.calibration.changed(force_error=force_error)})
+
+
 def test_recordings_of_the_right_jaw_calibrate_its_mirror_image(tmp_path, monkeypatch):
     seen = []
     monkeypatch.setattr(

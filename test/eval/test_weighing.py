@@ -91,6 +91,13 @@ def test_readings_of_other_holds_are_refused_with_the_shift_that_fits(grams, hin
         weigh(held(RISING), grams)
 
 
+def test_readings_of_a_scale_that_was_not_at_zero_are_refused_with_what_it_showed():
+    with pytest.raises(RecordingError, match="each seems to have 50 g too much: was the scale at zero"):
+        weigh(held(RISING), [reading + 50.0 for reading in READ[1:7]])
+    alike = [1e3 * 1.1 * force / GRAVITY for force in (2.0, 2.05, 2.0)]  # tell nothing of an offset
+    assert weigh(held([2.0, 2.05, 2.1]), alike).factor == pytest.approx(1.08, abs=0.02)
+
+
 def test_noise_does_not_hide_a_hold_and_a_slow_press_stays_none():
     for seed in range(20):
         times, force = staircase([0.8, 1.6, 2.4, 1.6, 0.8], hold=3.0)

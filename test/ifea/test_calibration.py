@@ -137,6 +137,13 @@ def test_contact_face_stays_where_it_is():
     assert mesh.nodes[:, 0].max() == pytest.approx(BENCH.inner_face_x, abs=1e-12)
 
 
+@pytest.mark.parametrize("factor", [1e-3, 1e3])
+def test_a_modulus_in_another_unit_is_refused(factor):
+    modulus = factor * BENCH.material.young_modulus
+    with pytest.raises(CalibrationError, match="young_modulus 3e.* Pa, the jaw file of 'bench' says 3e.07 Pa"):
+        Calibration(young_modulus=modulus).apply(BENCH)
+
+
 def test_neutral_calibration_changes_the_modulus_alone():
     jaw = Calibration(young_modulus=BENCH.material.young_modulus).apply(BENCH)
     assert jaw.drawing == BENCH.drawing
@@ -149,7 +156,7 @@ def test_calibration_of_another_jaw_is_refused_with_both_names():
 
 
 def test_calibration_without_a_name_fits_any_jaw():
-    assert FULL.changed(jaw="", finger="").apply(load_jaw("steel")).material.young_modulus == 31.5e6
+    assert FULL.changed(jaw="", finger="").apply(load_jaw("umi")).material.young_modulus == 31.5e6
 
 
 @pytest.mark.parametrize("name", ["bench", "twin"])
