@@ -6,16 +6,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from finforce_eval.calibration.weighing import WORST_MISFIT
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.contact_source import ContactChoice, first_touch
 from finforce_eval.evaluation.forces import check_keypoint_count
 from finforce_eval.evaluation.scoring import match_truth
 from finforce_eval.recordings.objects import read_friction
 from finforce_eval.recordings.tracks import Recording
-from finforce_ifea.errors import CalibrationError
 from finforce_ifea.identification import CalibrationCase, CalibrationFit, fit_calibration
-from finforce_ifea.jaw.calibration import Calibration
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_ifea.settings import EstimatorSettings
 
@@ -76,20 +73,6 @@ def calibrate(cases: Sequence[CalibrationCase], jaw: Jaw, settings: EstimatorSet
             bar.update()
 
         return fit_calibration(jaw, cases, settings, show)
-
-
-def check_fit(calibration: Calibration, jaw: Jaw) -> None:
-    """Refuse a calibration that the true forces do not fit, or that no part has that is printed as the jaw file says.
-
-    Raises:
-        CalibrationError: it leaves more than weighing may, or has such a modulus.
-    """
-    calibration.check_modulus(jaw)
-    if calibration.force_error > WORST_MISFIT:
-        raise CalibrationError(
-            f"{100 * calibration.force_error:.0f} % of a force left over, expected at most {100 * WORST_MISFIT:.0f} %: "
-            "do forces and images have one clock? Check contact and finger, or give --force"
-        )
 
 
 def fitted_values(fit: CalibrationFit) -> dict[str, float]:

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from finforce_eval.errors import RecordingError
 from finforce_ifea.errors import CalibrationError
-from finforce_ifea.jaw.calibration import Calibration, load_calibration, name_mechanics
+from finforce_ifea.jaw.calibration import WORST_MISFIT, Calibration, load_calibration, name_mechanics
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
 
 GRAVITY = 9.80665  # [m/s^2] by which kitchen scales turn weight into grams
@@ -29,7 +29,6 @@ _DRIFT_FLOOR = 0.02  # [N]
 _NOISE_SIGMAS = 3.0  # standard errors of the drift by which noise may exceed that
 _SCALE_ERROR = 0.02  # [N]: two grams
 _RELATIVE_ERROR = 0.02  # of one reading, by the height at which it was pressed
-WORST_MISFIT = 0.15  # [-] of a reading: estimates of one finger differ by less, readings of other holds by more
 _FEWEST_SHIFTED = 3  # readings by which a shift of all of them, or a constant in all of them, is told
 _FORCE_ERRORS = 0.005, 0.5  # [-] least and largest relative deviation of forces that a weighing can leave
 
@@ -147,7 +146,7 @@ def scale_calibration(
     )
     if not force:
         try:
-            scaled.check_modulus(jaw)
+            scaled.check_plausible(jaw)
         except CalibrationError as error:
             raise CalibrationError(f"{error}{_suspect_newtons(scaled, weighing, jaw)}") from None
     stddev = scaled.young_modulus * weighing.stddev / weighing.factor
@@ -158,7 +157,7 @@ def _suspect_newtons(scaled: Calibration, weighing: Weighing, jaw: Jaw) -> str:
     """Return a hint where the readings make sense as newtons."""
     newton = 1e3 / GRAVITY  # in grams
     try:
-        scaled.changed(young_modulus=scaled.young_modulus * newton).check_modulus(jaw)
+        scaled.changed(young_modulus=scaled.young_modulus * newton).check_plausible(jaw)
     except CalibrationError:
         return ""
     grams = " ".join(f"{newton * newton * weight:.0f}" for weight in weighing.weights)

@@ -21,7 +21,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> CommandResult:
     """Identify the material and write the calibration."""
-    from finforce_eval.calibration.calibrate import calibrate, calibration_case, check_fit, format_fit
+    from finforce_eval.calibration.calibrate import calibrate, calibration_case, format_fit
 
     options.calibration = None
     setup = make_setup(options)
@@ -34,7 +34,7 @@ def run(options: argparse.Namespace) -> CommandResult:
     fit = calibrate(cases, jaw, setup.settings)
     print(format_fit(fit, cases))
     if not options.force:
-        check_fit(fit.calibration, jaw)
+        fit.calibration.check_plausible(jaw)
     solver = name_mechanics(jaw, setup.settings.solver)
     found = fit.calibration.changed(solver=solver, uncertainty=fit.uncertainty)
     save_calibration(found, options.output)

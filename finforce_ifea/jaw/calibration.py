@@ -23,6 +23,7 @@ _MODELS_DIFFER = 0.03
 
 _SOFT = (5e6, 200e6)  # [Pa], range of the modulus of printed TPU over all its hardnesses
 _DATASHEET_FACTOR = 3.0  # [-], largest ratio of a modulus to that of its data sheet
+WORST_MISFIT = 0.15  # [-] of a force: estimates of one finger differ by less, those of other times or holds by more
 _UNIT_FACTOR = 100.0  # [-], ratio from which it is in another unit
 
 Factor = Annotated[Number, Field(ge=0.3, le=3.0)]
@@ -108,11 +109,12 @@ class Calibration(FileModel):
         )
         return replace(jaw, drawing=drawing, material=material)
 
-    def check_modulus(self, jaw: Jaw) -> None:
-        """Refuse a modulus that no part printed as the jaw file says has.
+    def check_plausible(self, jaw: Jaw) -> None:
+        """Refuse a modulus that no part printed as the jaw file says has, and forces that did not fit the shapes.
 
         Raises:
-            CalibrationError: It is off the jaw file's by more than a factor of 3, or not that of a soft material.
+            CalibrationError: It is off the jaw file's by more than a factor of 3, or not that of a soft material; or
+                more than `WORST_MISFIT` is left.
         """
         drawn, found = jaw.material.young_modulus, self.young_modulus
         low, high = drawn / _DATASHEET_FACTOR, drawn * _DATASHEET_FACTOR
@@ -122,6 +124,11 @@ class Calibration(FileModel):
             raise CalibrationError(
                 f"modulus {1e-6 * found:.4g} MPa, expected {1e-6 * low:.4g} to {1e-6 * high:.4g} MPa: the jaw file "
                 f"of {jaw.name!r} says {1e-6 * drawn:.4g} MPa; check units, contact and finger, or give --force"
+            )
+        if self.force_error > WORST_MISFIT:
+            raise CalibrationError(
+                f"{100 * self.force_error:.0f} % of a force left over, expected at most {100 * WORST_MISFIT:.0f} %: do "
+                "forces and images have one clock? Check contact and finger, or give --force"
             )
 
     def expect_error(self, jaw: Jaw, solver: str) -> float:
