@@ -28,11 +28,11 @@ NEEDS = {
     r"^(ros2|source|rosdep|docker|export|\. )": "ROS 2 from apt, or another program",
     r"^(make|pytest)\b": "nothing more: .ci/run does it",
     r"^python examples/": "a running robot, or time: see test_examples.py and test_policy.py",
-    r"^python -m finforce_sim.emulator": "an end: see test_driver_port.py",
     r"fill_pages": "pages to write",
     r"\[|^finforce \w+ NAME$": "values: it is a synopsis",
     r"/dev/|--topics|live --camera": "a gripper or a camera",
-    r"^(lerobot-train|dask)|tcp://": "another program: see test_cluster.py",
+    r"^lerobot-train": "another program, on data as test_annotate_lerobot.py checks them",
+    r"^dask|tcp://": "another program: see test_cluster.py",
     r"DATASET|RECORDINGS": "a dataset of LeRobot: see test_annotate_lerobot.py",
     r"^finforce camera": "a video of a gripper in its holders: see test_placement.py",
     r"^finforce (echo|status)": "a system that runs: see test_monitor.py",
@@ -40,7 +40,7 @@ NEEDS = {
     r"launch bench": "a camera that runs",
     r"weigh weighing": "a kitchen scale: see test_weighing.py",
 }
-WAITS = re.compile(r"^finforce (launch|pipeline)\b")  # until Ctrl-C
+WAITS = re.compile(r"^(finforce (launch|pipeline)|python -m finforce_sim.emulator)\b")  # until Ctrl-C
 PATIENCE = 20.0  # [s] after which it is told to end
 QUICK = {  # options that a command is given here in addition
     "finforce twin record": "--set settle=0.1 --set record=0.3 --set closing_speed=0.06",
