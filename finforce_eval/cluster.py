@@ -232,7 +232,7 @@ class _Cluster:
             found = self._client.sync(self._client.scheduler.identity, callback_timeout=ANSWER_TIMEOUT)
         except (OSError, TimeoutError, AttributeError) as error:  # of a client that has closed itself
             raise self._lost() from error
-        if any(map(_is_busy, found["workers"].values())):
+        if any(worker["metrics"].get("task_counts", {}).get("executing") for worker in found["workers"].values()):
             self._last_sign = monotonic()
         if not found["workers"] and not self._warned:
             self._warned = True
@@ -245,11 +245,6 @@ class _Cluster:
         """Return the error of a scheduler that does not answer any more."""
         kept = f"what is done stands in {self._manifest.path}, and the same command does the rest"
         return ClusterError(f"{self._name}: the scheduler is gone; {kept}")
-
-
-def _is_busy(worker: Mapping[str, Any]) -> bool:
-    """Say whether a worker is at a task."""
-    return bool(worker["metrics"].get("task_counts", {}).get("executing"))
 
 
 def _holds(file: Path, text: str) -> bool:

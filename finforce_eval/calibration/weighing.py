@@ -227,14 +227,12 @@ def _suspect_shift(weighing: Weighing) -> str:
     """Return a hint where the readings fit the holds once they are shifted against them."""
     holds, weights, shifted = weighing.holds, weighing.weights, {}
     for shift in range(1, len(holds) - _FEWEST_SHIFTED + 1):
-        shifted[f"reading {1 + shift} fits hold 1: does reading 1 belong to a hold that was not found?"] = _fit_factor(
-            holds[:-shift], weights[shift:]
-        )
-        shifted[f"reading 1 fits hold {1 + shift}: does a hold lack a reading?"] = _fit_factor(
-            holds[shift:], weights[:-shift]
-        )
-    best = min(shifted, key=lambda hint: shifted[hint].misfit, default=None)
-    return f"; {best}" if best and shifted[best].misfit < min(WORST_MISFIT, 0.5 * weighing.misfit) else ""
+        missed = f"reading {1 + shift} fits hold 1: does reading 1 belong to a hold that was not found?"
+        shifted[missed] = _fit_factor(holds[:-shift], weights[shift:]).misfit
+        unread = f"reading 1 fits hold {1 + shift}: does a hold lack a reading?"
+        shifted[unread] = _fit_factor(holds[shift:], weights[:-shift]).misfit
+    best = min(shifted, key=shifted.__getitem__, default="")
+    return f"; {best}" if best and shifted[best] < min(WORST_MISFIT, 0.5 * weighing.misfit) else ""
 
 
 def format_weighing(weighing: Weighing) -> str:

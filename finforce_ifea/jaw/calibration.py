@@ -29,11 +29,7 @@ _UNIT_FACTOR = 100.0  # [-], ratio from which it is in another unit
 Factor = Annotated[Number, Field(ge=0.3, le=3.0)]
 
 
-def _none_is_empty(value: Any) -> Any:
-    return () if value is None else value
-
-
-Terms = Annotated[tuple[RelaxationTerm, ...], BeforeValidator(_none_is_empty)]
+Terms = Annotated[tuple[RelaxationTerm, ...], BeforeValidator(lambda value: () if value is None else value)]
 
 
 class Calibration(FileModel):
