@@ -115,11 +115,11 @@ def test_jaws_that_were_lost_for_thirty_images_are_found_again(scene, tmp_path, 
     gripper, _, _, pixels = scene
     model = str(learn(scene, tmp_path, sees_whole))
     detector = build_detector(gripper.jaws, DetectorParameters(detection_method="frame", model=model, threads=1))
-    for number in range(40):
-        has_jaws = not 3 <= number < 33
+    for number in range(62):  # searched for in 30 of them, then every 0.3 s
+        has_jaws = not 3 <= number < 50
         found = detector.detect(picture(scene, number, has_jaws))
-        assert has_jaws == any(keypoints.valid.any() for keypoints in found.values())
-        assert number != 32 or set(detector.lost_sides) == {"left", "right"}
+        assert has_jaws or not any(keypoints.valid.any() for keypoints in found.values())
+        assert number != 49 or set(detector.lost_sides) == {"left", "right"}
     for side, true in pixels.items():
         error = np.linalg.norm(found[side].pixels - true[:-1], axis=1)
         assert found[side].valid.all() and error.max() < STRIDE  # px
