@@ -197,7 +197,10 @@ class ContactEstimator:
             return self._give_up(stamp, "no_pose", message, "surrounded")
         location = self._localizer.locate(pose.T, section, surface)
         if location is None or np.abs(section.origin).max() > _OUT_OF_REACH:
-            message = f"{self._mesh.name} does not stand before the inner surface"
+            away = f"its origin lies {1e3 * np.linalg.norm(pose.T[:3, 3]):.0f} mm from the jaw's"
+            message = (
+                f"{self._mesh.name} does not stand before the inner surface: {away}; check its poses' unit and frame"
+            )
             return self._give_up(stamp, "apart", message, "out_of_reach")
         self.counts["solved"] += 1
         self._follow_face(location.height, location.touching)

@@ -284,8 +284,8 @@ class _JawRun:
         row |= {"used": solution.keypoints_used, "residual": solution.residual}
         if loop.contact.estimate is not None:
             row |= {"touching": solution.touching, "contact_status": loop.contact.estimate.status}
-            if loop.contact.estimate.status == CONTRADICTED:
-                row["message"] = loop.contact.estimate.message
+            if loop.contact.estimate.status == CONTRADICTED or solution.status == "no_contact":
+                row["message"] = loop.contact.estimate.message or row["message"]
         if self._lines is not None:
             line = self._lines.points[index], self._lines.directions[index]
             row["true_height"] = self._face.cut(loop.force.surface(), *line)

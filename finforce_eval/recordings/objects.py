@@ -127,9 +127,13 @@ def track_object(recording: Recording, side: str) -> ObjectTrack:
     jaw = _require_jaw_poses(recording, side, objects.frame_id)
     T_camera_jaw = _matrices(jaw, f"/{side}/jaw_pose", recording.name)
     nearest = find_nearest(jaw.stamps_ns, stamps)
-    paired = np.abs(jaw.stamps_ns[nearest] - stamps) <= PAIRED
+    apart = np.abs(jaw.stamps_ns[nearest] - stamps)
+    paired = apart <= PAIRED
     if not paired.any():
-        raise RecordingError(f"{recording.name}: no /{side}/jaw_pose within {PAIRED // 10**6} ms of any /object_pose")
+        raise RecordingError(
+            f"{recording.name}: /object_pose is at least {SECOND * apart.min():.3g} s from any image, or pose of the "
+            f"{side} jaw; expected {PAIRED // 10**6} ms at most: have both stamps of one clock?"
+        )
     T_jaw_camera = np.stack([invert_pose(T) for T in T_camera_jaw])[nearest[paired]]
     return ObjectTrack(
         stamps_ns=stamps[paired],
