@@ -81,6 +81,22 @@ def test_nothing_is_given_to_the_solver_before_the_first_pose():
     assert np.isfinite(result.column("contact_height")[10:]).all()
 
 
+class BentJaw(FakeEstimator):
+    """Has no force without a contact, as a jaw that is bent."""
+
+    def update(self, observation, contact):
+        solution = super().update(observation, contact)
+        return solution if contact is not None else replace(solution, status="no_contact", message="bent")
+
+
+def test_why_a_bent_jaw_has_no_contact_is_what_the_contact_estimator_says(monkeypatch):
+    monkeypatch.setitem(globals(), "FakeEstimator", BentJaw)
+    result, *_ = run(make_track(10))
+    assert result.column("status")[:10].tolist() == ["no_contact"] * 10
+    assert result.column("message")[:10].tolist() == ["no pose yet"] * 10
+    assert result.column("message")[10:].tolist() == [""] * 50
+
+
 def test_touching_is_what_the_solver_says():
     result, *_ = run(make_track(0), lost=range(20), touching=lambda update: update > 40)
     assert result.column("touching").tolist() == [False] * 20 + [True] * 40
