@@ -43,7 +43,7 @@ PARTS = {
         for name in ("grasp", "friction", "pose", "manipulation", "chip", "places")
     },
     "network": "experiment network --network {network} --report {report}",
-    "bound": f"bound {BENCH} --calibration bench --json {{json}}",
+    "bound": "bound {recordings} --calibration bench --json {json}",
     **{
         f"contact_{mode}": f"evaluate {BENCH} --calibration bench --contact {mode} --json {{json}}"
         for mode in ("estimate", "closest", "paper")
