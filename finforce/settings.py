@@ -106,7 +106,7 @@ def check_value(entry: Field, value: Any, error: type[Exception] = ParameterErro
     name = name or entry.name
     if choices and value not in choices:
         raise error(f"{name}: got {value!r}, expected one of {', '.join(filter(None, map(str, choices)))}")
-    if value != value and _may_be_nan(entry):
+    if _may_be_nan(entry) and value != value:
         return
     if (low is not None and not value >= low) or (high is not None and not value <= high):
         unit = entry.metadata.get("unit") or "1"

@@ -186,6 +186,10 @@ class ContactEstimator:
         age = stamp - self._poses.believed
         if age > self.settings.pose_timeout:
             message = f"the last pose of {self._mesh.name} is {age:.1f} s old, expected one every second"
+            if stamp - self._poses.stamp <= self.settings.pose_timeout:
+                message = (
+                    f"for {age:.1f} s no pose of {self._mesh.name} has followed from the one before; check their unit"
+                )
             return self._give_up(stamp, "no_pose", message)
         if age < -self.settings.pose_timeout:
             message = f"the last pose of {self._mesh.name} lies {-age:.1f} s ahead; reset after time has jumped back"

@@ -81,6 +81,17 @@ class TestWhatIsNotKnown:
         assert estimator.update(1.1).status == "no_pose"
         assert press(estimator, 1 * MM, start=1.2).status == "touching"
 
+    @pytest.mark.parametrize(("leap", "words"), [(0.0, "s old"), (0.3, "has followed from the one before")])
+    def test_poses_that_leap_are_not_said_to_be_missing(self, leap, words):
+        estimator, rng = estimator_of(), np.random.default_rng(4)
+        press(estimator, 1 * MM)
+        for number in range(1, 45 if leap else 2):
+            T = pressed(1 * MM)
+            T[:3, 3] += leap * rng.standard_normal(3)
+            estimator.take_pose(number * FRAME, T)
+        found = estimator.update(1.5)
+        assert found.status == "no_pose" and words in found.message
+
     @pytest.mark.parametrize("entry", [(0, 3), (1, 1)])
     def test_pose_that_is_none_is_refused_and_the_last_one_stays(self, entry):
         estimator = estimator_of()

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
+from finforce.errors import PoseError
 from finforce.gripper_frames import BENCH_CAMERA
 from finforce.settings import TimeParameters, is_parameter
 from finforce.systems.launch import options_from_texts
@@ -169,6 +170,11 @@ def test_the_bench_configuration_has_the_camera_of_the_bench(name):
     numbers = tuple(bench["/**/keypoint_detector"]["ros__parameters"]["T_gripper_camera"])
     # 1e-7: of the printed digits
     np.testing.assert_allclose(DetectorParameters(T_gripper_camera=numbers).camera_pose, BENCH_CAMERA, atol=1e-7)
+
+
+def test_a_camera_pose_that_is_a_matrix_is_refused_with_what_is_expected():
+    with pytest.raises(PoseError, match=r"expected \(3,\) and \(4,\) as x, y, z, w"):
+        DetectorParameters(T_gripper_camera=np.eye(4)).camera_pose  # noqa: B018
 
 
 def test_rviz_is_started_with_a_configuration_that_is_there():
