@@ -183,16 +183,7 @@ class ContactEstimator:
             return self._give_up(stamp, "no_pose", f"no pose of {self._mesh.name} has come yet")
         if self.contradiction:
             return self._give_up(stamp, CONTRADICTED, self.contradiction)
-        age = stamp - self._poses.believed
-        if age > self.settings.pose_timeout:
-            message = f"the last pose of {self._mesh.name} is {age:.1f} s old, expected one every second"
-            if stamp - self._poses.stamp <= self.settings.pose_timeout:
-                message = (
-                    f"for {age:.1f} s no pose of {self._mesh.name} has followed from the one before; check their unit"
-                )
-            return self._give_up(stamp, "no_pose", message)
-        if age < -self.settings.pose_timeout:
-            message = f"the last pose of {self._mesh.name} lies {-age:.1f} s ahead; reset after time has jumped back"
+        if message := self._find_stale_pose(stamp):
             return self._give_up(stamp, "no_pose", message)
         pose = self._poses.at(stamp)
         section = self._sections.at(pose.T)
@@ -222,6 +213,17 @@ class ContactEstimator:
             T_jaw_object=pose.T,
             slip=self._slips.slip,
         )
+
+    def _find_stale_pose(self, stamp: float) -> str:
+        """Return why no pose tells of the image of a stamp [s]; empty if one does."""
+        name, timeout, age = self._mesh.name, self.settings.pose_timeout, stamp - self._poses.believed
+        if age < -timeout:
+            return f"the last pose of {name} lies {-age:.1f} s ahead; reset after time has jumped back"
+        if age <= timeout:
+            return ""
+        if stamp - self._poses.stamp > timeout:
+            return f"the last pose of {name} is {age:.1f} s old, expected one every second"
+        return f"for {age:.1f} s no pose of {name} has followed from the one before; check their unit"
 
     def _surrounds_jaw(self, T: NDArray, section: ObjectSection) -> bool:
         """Return whether most of the jaw's back lies within the object."""

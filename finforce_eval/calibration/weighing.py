@@ -203,7 +203,7 @@ def list_holds(holds: Sequence[Hold]) -> str:
 def _fit_factor(holds: tuple[Hold, ...], weights: NDArray[np.float64]) -> Weighing:
     """Return the least-squares factor of weights [N] over the forces of as many holds."""
     forces = np.array([hold.force for hold in holds])
-    variance = _SCALE_ERROR**2 + (_RELATIVE_ERROR * weights) ** 2
+    variance = _reading_variance(weights)
     information = float((forces**2 / variance).sum())
     factor = float((forces * weights / variance).sum() / information)
     misfit = float(np.sqrt(np.mean((1.0 - factor * forces / weights) ** 2)))
@@ -211,13 +211,18 @@ def _fit_factor(holds: tuple[Hold, ...], weights: NDArray[np.float64]) -> Weighi
     return Weighing(factor=factor, stddev=spread / np.sqrt(information), holds=holds, weights=weights, misfit=misfit)
 
 
+def _reading_variance(weights: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the variance of readings of a scale, of weights [N]."""
+    return _SCALE_ERROR**2 + (_RELATIVE_ERROR * weights) ** 2
+
+
 def _suspect_offset(weighing: Weighing) -> str:
     """Return a hint where a constant in all readings has changed the factor by more than readings may scatter."""
     forces, weights = np.array([hold.force for hold in weighing.holds]), weighing.weights
     if len(forces) < _FEWEST_SHIFTED or np.ptp(forces) < 0.5 * forces.max():  # these tell no constant
         return ""
-    sigma = np.hypot(_SCALE_ERROR, _RELATIVE_ERROR * weights)
-    (slope, offset), covariance = np.polyfit(forces, weights, 1, w=1.0 / sigma, cov="unscaled")
+    certainty = 1.0 / np.sqrt(_reading_variance(weights))
+    (slope, offset), covariance = np.polyfit(forces, weights, 1, w=certainty, cov="unscaled")
     is_wrong = abs(slope / weighing.factor - 1.0) > WORST_MISFIT and abs(offset) > 3.0 * np.sqrt(covariance[1, 1])
     much = f"{1e3 * abs(offset) / GRAVITY:.0f} g too {'much' if offset > 0.0 else 'little'}"
     return f"; each seems to have {much}: was the scale at zero, is the contact height right?" if is_wrong else ""

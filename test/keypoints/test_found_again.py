@@ -1,4 +1,4 @@
-"""Jaws of the twin, found by networks with DeepLabCut's files and outputs, lost for 30 images, and found again."""
+"""Jaws of the twin, found by networks with DeepLabCut's files and outputs, lost for 47 images, and found again."""
 
 import numpy as np
 import onnx
@@ -111,7 +111,7 @@ def picture(scene, number, has_jaws):
 
 
 @pytest.mark.parametrize("sees_whole", [False, True])
-def test_jaws_that_were_lost_for_thirty_images_are_found_again(scene, tmp_path, sees_whole):
+def test_jaws_that_were_lost_for_a_second_and_a_half_are_found_again(scene, tmp_path, sees_whole):
     gripper, _, _, pixels = scene
     model = str(learn(scene, tmp_path, sees_whole))
     detector = build_detector(gripper.jaws, DetectorParameters(detection_method="frame", model=model, threads=1))
