@@ -87,10 +87,10 @@ class ForceEstimator:
         Raises:
             FinforceError: Jaw, settings and calibration do not fit each other.
         """
-        self.settings = settings or EstimatorSettings()
         self.calibration = calibration = None if calibration is None else load_calibration(calibration)
         jaw = jaw if isinstance(jaw, Jaw) else load_jaw(jaw)
         self.jaw = calibration.apply(jaw) if calibration else jaw
+        self.settings = (settings or EstimatorSettings()).resolve_friction(self.jaw.material)
         self.mechanics: Mechanics = build_chosen(self.jaw, self.settings)
         torsion = measure_torsion(self.jaw, self.mechanics.mesh)
         surface = self.mechanics.contact.surface

@@ -1,9 +1,14 @@
 """Settings of an estimator: defaults, units, bounds and meanings."""
 
 from dataclasses import dataclass, replace
+from math import isnan, nan
+from typing import TYPE_CHECKING
 
 from finforce.errors import ObservationError
 from finforce.settings import check_bounds, setting
+
+if TYPE_CHECKING:
+    from finforce_ifea.jaw.jaw_file import Material
 
 SOLVERS = ("default", "reduced", "solid", "frame", "plane", "paper")
 MESHES = ("coarse", "default", "fine")
@@ -33,8 +38,12 @@ class EstimatorSettings:
         100.0,
         parameter=False,
     )
-    friction: float = setting(0.45, "expected coefficient of friction of an object", "1", 0.0, 2.0)
-    friction_stddev: float = setting(0.25, "standard deviation of that coefficient (1 sigma)", "1", 1e-3, 2.0)
+    friction: float = setting(
+        nan, "expected coefficient of friction of an object; NaN: that of the finger's material", "1", 0.0, 2.0
+    )
+    friction_stddev: float = setting(
+        nan, "standard deviation of that coefficient (1 sigma); NaN: that of the finger's material", "1", 1e-3, 2.0
+    )
     held: str = setting(
         "auto",
         "whether only the jaws hold the object, so that friction balances the inclination of their faces; either: "
@@ -64,6 +73,12 @@ class EstimatorSettings:
             ObservationError: A setting is not among its choices or outside its bounds.
         """
         check_bounds(self, ObservationError)
+
+    def resolve_friction(self, material: "Material") -> "EstimatorSettings":
+        """Return settings whose expected friction is that on a finger of this material, where they state none."""
+        given = self.friction, self.friction_stddev
+        friction, stddev = (one if isnan(own) else own for own, one in zip(given, material.friction, strict=True))
+        return replace(self, friction=friction, friction_stddev=stddev)
 
     def resolve_held(self, *, both: bool) -> "EstimatorSettings":
         """Return settings in which `held` is no longer `auto`; `both` where another jaw presses the same object."""

@@ -229,7 +229,8 @@ def read_truth(recording: Recording, side: str, setup: EvaluationSetup) -> TrueI
     depth = np.where(size > _TOUCH, np.interp(size, np.linalg.norm(smooth, axis=1), depths), 0.0)
     mobilised = np.ones_like(depth)
     if friction is None:
-        friction = Coefficient(own.settings.friction, own.settings.friction_stddev)
+        settings = own.settings.resolve_friction(jaw.material)
+        friction = Coefficient(settings.friction, settings.friction_stddev)
         flat = np.interp(depth, depths, np.arctan2(smooth[:, 2], -smooth[:, 0]))
         ratio = np.where(size > 5 * _TOUCH, np.tan(np.arctan2(force[:, 2], -force[:, 0]) - flat), 0.0)
         mobilised = np.clip(ratio / np.quantile(np.abs(ratio[size > 5 * _TOUCH]), 0.9), -1.0, 1.0)

@@ -50,7 +50,7 @@ PARTS = {
     },
     "datasheet": f"evaluate {BENCH} --contact fixed:case --json {{json}}",
     "sensor": f"evaluate {BENCH} --contact fixed:case --calibration bench --json {{json}}",
-    "steel": f"evaluate {STEEL} --jaw steel --json {{json}}",
+    "steel": f"evaluate {STEEL} --jaw steel --stills --json {{json}}",
     "scenes_images": f"{RENDER}; evaluate {BAGS} --calibration twin --from images --json {{json}}",
     "scenes_truth": f"evaluate {BAGS} --calibration twin --from truth --json {{json}}",
     "recordings": "evaluate {recordings} --contact estimate --calibration bench --json {json}",

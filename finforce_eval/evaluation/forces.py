@@ -27,6 +27,7 @@ from finforce_eval.tasks import progress_bar
 if TYPE_CHECKING:
     from finforce_eval.evaluation.setup import EvaluationSetup
     from finforce_ifea.estimator import ForceEstimator
+    from finforce_ifea.observation import Observation, Solution
     from finforce_ifea.tare import Tare
 
 _VECTORS = ("force", "torque", "force_stddev", "torque_stddev", "contact_location", "contact_point")
@@ -248,7 +249,7 @@ class _JawRun:
     """
 
     def __init__(self, recording: Recording, side: str, jaw: Any, loop: ForceLoop, stills: bool = False) -> None:
-        self._name, self._updates = recording.name, STILL_UPDATES if stills else 1
+        self._name, self._stills, self._seen = recording.name, stills, None
         self._loop, self._track = loop, recording.jaw(side).keypoints
         self._lines = None
         if recording.jaw(side).truth is not None:
@@ -273,12 +274,7 @@ class _JawRun:
             RecordingError: the contact estimator refuses a pose.
         """
         loop, observation = self._loop, self._track.observation(index)
-        if self._updates > 1:
-            loop.forget()
-            if observation.stddev is None:
-                observation = replace(observation, stddev=np.full(observation.points.shape, PICKED_STDDEV))
-        for number in range(self._updates):
-            solution = loop.update(replace(observation, stamp=observation.stamp + number * STILL_PERIOD))
+        solution = self._solve_still(observation) if self._stills else loop.update(observation)
         row = self.row(solution.status, "" if solution.trusted else solution.message)
         row |= {"step_ms": loop.force_ms, "contact_ms": loop.contact_ms}
         row |= {"used": solution.keypoints_used, "residual": solution.residual}
@@ -292,6 +288,19 @@ class _JawRun:
         if solution.trusted:
             row |= {name: getattr(solution, name) for name in (*_VECTORS, "magnitude_stddev")}
         return row
+
+    def _solve_still(self, observation: Observation) -> Solution:
+        """Return what the loop makes of a photograph, which several images may show."""
+        if observation.stddev is None:
+            observation = replace(observation, stddev=np.full(observation.points.shape, PICKED_STDDEV))
+        seen = np.column_stack([observation.points, observation.stddev, observation.likelihood])
+        if self._seen is None or not np.array_equal(seen, self._seen, equal_nan=True):
+            self._loop.forget()
+            for number in range(STILL_UPDATES):
+                at = observation.stamp + number * STILL_PERIOD
+                self._solution = self._loop.update(replace(observation, stamp=at))
+            self._seen = seen
+        return self._solution
 
     def row(self, status: str, message: str) -> dict[str, Any]:
         """Return a row without a force, with the contact as it was given to the solver, if there was any."""

@@ -31,6 +31,13 @@ def _refuse_megapascals(modulus: float) -> float:
     return modulus
 
 
+# Young's modulus [Pa] above which a material is hard: a glassy plastic or a metal, no elastomer.
+_HARD = 1e9
+# Coefficient of friction of elastomers and of hard materials on dry everyday objects, and its standard deviation [-].
+# Tables for engineers have 0.2 to 0.45 for steel on plastics, 0.3 to 0.7 on wood, metals and glass.
+_ELASTOMER_FRICTION, _HARD_FRICTION = (0.45, 0.25), (0.35, 0.15)
+
+
 class Material(FileModel):
     """A linear elastic material."""
 
@@ -42,6 +49,11 @@ class Material(FileModel):
         0.0, ge=0.0, le=1.0, description="Relative standard deviation of the modulus among parts [-]"
     )
     name: Text = Field("", description="What it is called, for people")
+
+    @property
+    def friction(self) -> tuple[float, float]:
+        """Coefficient of friction to expect of an object that nothing is known of, and its standard deviation [-]."""
+        return _HARD_FRICTION if self.young_modulus > _HARD else _ELASTOMER_FRICTION
 
 
 # What printed parts of a material are like before anybody has measured one: Young's modulus at small strain [MPa],

@@ -219,7 +219,7 @@ def run_programs(page, folder):
     for block in PYTHON:
         if (block.page, block.wanted) == (page.name, "make pages runs it"):
             if '"DIR' in block.text:
-                run("finforce evaluate finforce_eval/data/steel_r20 --jaw steel --out DIR", folder)
+                run("finforce evaluate finforce_eval/data/steel_r20 --jaw steel --stills --out DIR", folder)
             (folder / "program.py").write_text(block.text, encoding="utf-8")
             failed += [str(block)] if run("python program.py", folder) else []
     return failed

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+import finforce as ff
 from finforce_eval.recordings.recording import DEMO, read_recording
 from finforce_ifea.jaw.jaw import load_jaw
 
@@ -44,3 +45,17 @@ def test_every_level_settles_and_is_recorded_as_long_as_the_others(recording, me
     stamps = recording.jaws["left"].keypoints.stamps_ns
     rows = recording.phases.index_at(stamps)[recording.phases_at(stamps)["scored"]]
     assert recording.phases.displacement_mm[rows].tolist() == np.repeat(measurement["displacement_mm"], 30).tolist()
+
+
+def test_forces_of_the_photographs_are_within_their_deviation_and_of_one_stiffness():
+    found = ff.evaluate(STEEL, jaw="steel", stills=True)
+    photographs = found.iloc[::FRAMES]
+    told = np.linalg.norm(photographs[["force_x", "force_y", "force_z"]], axis=1)
+    true = -photographs["true_force_x"].to_numpy()
+    assert np.sqrt(np.mean((told - true) ** 2)) < 0.7
+    assert (np.abs(told - true) < 1.5 * photographs["magnitude_stddev"]).all()
+    kept = ~np.eye(len(true), dtype=bool)  # one factor from five of the photographs, tested on the sixth
+    factors = [told[k] @ true[k] / (told[k] @ told[k]) for k in kept]
+    assert np.sqrt(np.mean((factors * told - true) ** 2)) < 0.4
+    repeated = found[["force_x", "force_z"]].to_numpy().reshape(-1, FRAMES, 2)  # of a photograph, seen again
+    np.testing.assert_array_equal(repeated, np.broadcast_to(repeated[:, :1], repeated.shape))

@@ -186,6 +186,7 @@ def test_no_jaw_of_one_still_is_expected_in_the_next(tmp_path):
 
 def test_nothing_of_one_still_is_known_in_the_next():
     recording, seen = make_recording(frames=4, phases=False), []
+    recording.jaw("left").keypoints.points[...] += 1e-4 * np.arange(4)[:, None, None]  # four photographs
 
     class Watched(FakeEstimator):
         def update(self, observation, contact):

@@ -9,9 +9,11 @@ import yaml
 from mechanics_fakes import SHIPPED_BENCH, changed, content_of, write_jaw, write_mesh_jaw
 
 from finforce_ifea.errors import MeshError
+from finforce_ifea.estimator import ForceEstimator
 from finforce_ifea.fem.solid import find_mirror_nodes
 from finforce_ifea.jaw.jaw import list_shipped_jaws, load_jaw
 from finforce_ifea.jaw.mesh import to_tet10
+from finforce_ifea.settings import EstimatorSettings
 
 STEEL = load_jaw("steel")
 # As an independent finite-element program has them, in mm.
@@ -154,3 +156,12 @@ def test_the_examples_of_the_documentation_load(tmp_path):
         jaw = load_jaw(path)
         jaw.build_mesh()
         assert len(jaw.candidates) > 1
+
+
+def test_a_hard_finger_is_expected_to_be_smoother_than_an_elastomer_unless_the_friction_is_stated():
+    soft, hard = (EstimatorSettings().resolve_friction(load_jaw(name).material) for name in ("bench", "steel"))
+    assert (soft.friction, soft.friction_stddev) == (0.45, 0.25)
+    assert (hard.friction, hard.friction_stddev) == (0.35, 0.15)
+    stated = EstimatorSettings(friction=0.2, friction_stddev=0.05)
+    assert stated.resolve_friction(load_jaw("steel").material) == stated
+    assert ForceEstimator(load_jaw("steel")).friction.mean == pytest.approx(0.35, abs=0.01)
