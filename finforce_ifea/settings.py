@@ -38,6 +38,13 @@ class EstimatorSettings:
         100.0,
         parameter=False,
     )
+    largest_stddev: float = setting(
+        1.0,
+        "largest standard deviation of a force that is reported; of forces above four times that, a quarter",
+        "N",
+        0.01,
+        100.0,
+    )
     friction: float = setting(
         nan, "expected coefficient of friction of an object; NaN: that of the finger's material", "1", 0.0, 2.0
     )

@@ -99,9 +99,9 @@ _BLANK_BYTES = _BLANK.tobytes()
 
 # An ambiguous state, as between two corners of an object, matters where the force changes by more than this [N].
 _AMBIGUOUS = 0.15
-# Beyond these a force is rejected: misfit of the shape, standard deviation [N], its share of the force.
+# Beyond these a force is rejected: misfit of the shape, standard deviation as a share of the force.
 _LARGEST_MISFIT = 2.0
-_VAGUE_FORCE, _VAGUE_SHARE = 1.0, 0.25
+_VAGUE_SHARE = 0.25
 # Shapes so many times as far from the stored ones as they are good for.
 _FARTHEST_SHAPE = 2.0
 # Share of the key points that has to agree.
@@ -127,12 +127,13 @@ def bound_residual(rest: NDArray, noise: NDArray) -> float:
     return float(max(LARGEST_RESIDUAL, _RESIDUAL_SHARE * np.ptp(rest[:, 2]), chance))
 
 
-def find_rejection_reason(state: ContactState, *, largest_residual: float, settles: bool) -> str:
+def find_rejection_reason(state: ContactState, *, largest_residual: float, largest_stddev: float, settles: bool) -> str:
     """Return why the force of a contact state must be rejected, empty where it can be trusted.
 
     Args:
         state: of one image.
         largest_residual: of key points of the jaw, see `bound_residual` [m].
+        largest_stddev: standard deviation with which a small force is still of use [N].
         settles: True if the solver iterates until nothing changes, so that one that has not is rejected.
     """
     state = state[()]
@@ -151,7 +152,7 @@ def find_rejection_reason(state: ContactState, *, largest_residual: float, settl
     if magnitude > state["bearable"]:
         most = f"expected {state['bearable']:.0f} N at most"
         return f"the shape would take {magnitude:.0f} N, {most}; is the contact elsewhere?"
-    ambiguity = _find_ambiguity(state, magnitude)
+    ambiguity = _find_ambiguity(state, max(largest_stddev, _VAGUE_SHARE * magnitude))
     if ambiguity or state["residual"] <= largest_residual:
         return ambiguity
     off = f"the key points lie {1e3 * state['residual']:.1f} mm off any shape of the jaw"
@@ -159,17 +160,16 @@ def find_rejection_reason(state: ContactState, *, largest_residual: float, settl
     return f"{off}, {expected}; another finger or camera, a zoomed picture, or nothing of the jaw in view?"
 
 
-def _find_ambiguity(state: ContactState, magnitude: float) -> str:
-    """Return why the force of a contact that fits the key points may still be another one."""
+def _find_ambiguity(state: ContactState, vague: float) -> str:
+    """Return why the force of a contact that fits the key points may still be another one, by `vague` [N] or more."""
     pulled = -float(state["depth"])
     if pulled > min(max(_PULLING * sqrt(state["depth_variance"]), _LEAST_PULL), _MOST_PULL):
         bent = f"the jaw is bent towards the object, as if that pulled by {1e3 * pulled:.1f} mm"
         return f"{bent}: open the jaw and tare, or the contact is elsewhere"
-    vague = max(_VAGUE_FORCE, _VAGUE_SHARE * magnitude)
     if state["hidden"] > vague:
         return "the object may press where key points hardly show a force: next to the clamp, or along its face"
     if not state["stddev"] <= vague:
-        return f"the visible key points tell the force only within {state['stddev']:.2g} N"
+        return f"the visible key points tell the force only within {state['stddev']:.2g} N, expected {vague:.2g} N"
     return ""
 
 

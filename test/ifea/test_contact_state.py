@@ -20,5 +20,23 @@ MM = 1e-3
 def test_an_object_cannot_pull(depth, stddev, rejected):
     state = blank_contact_state()
     state["depth"], state["depth_variance"], state["converged"] = depth, stddev**2, True
-    reason = find_rejection_reason(state, largest_residual=1e-3, settles=True)
+    reason = find_rejection_reason(state, largest_residual=1e-3, largest_stddev=1.0, settles=True)
     assert ("as if that pulled" in reason) == rejected == bool(reason)
+
+
+@pytest.mark.parametrize(
+    ("magnitude", "stddev", "largest", "rejected"),
+    [
+        (2.0, 0.9, 1.0, False),
+        (2.0, 1.1, 1.0, True),
+        (2.0, 1.1, 2.0, False),
+        (6.0, 1.4, 1.0, False),
+        (1.0, 0.4, 0.3, True),
+    ],
+)
+def test_a_force_is_told_with_the_deviation_that_the_user_can_do_with(magnitude, stddev, largest, rejected):
+    state = blank_contact_state()
+    state["magnitude"], state["stddev"], state["converged"] = magnitude, stddev, True
+    reason = find_rejection_reason(state, largest_residual=1e-3, largest_stddev=largest, settles=True)
+    assert bool(reason) == rejected
+    assert not reason or f"only within {stddev:.2g} N, expected {max(largest, 0.25 * magnitude):.2g} N" in reason
