@@ -64,6 +64,7 @@ GUESS_STDDEV = np.repeat((0.005, np.radians(2.0)), 3)  # the same of a guess of 
 TURN_STDDEV = 0.05
 MIDDLE_STDDEV = 1e-3  # [m] of the middle between the jaws, which says where the gripper's middle is
 CUTS = 48  # directions in which a holder may cover a jaw up to a straight edge
+HALF_OPENING = 0.045  # [m] guess of half the distance of the jaws' origins
 HIDDEN = 0.1  # likelihood of a point that is never seen, wherever it lies
 LEAST_SEEN = 8  # key points of a jaw
 # Likelihood that a rig makes of that of a typical point: a network is less sure of small and of unusual fingers.
@@ -242,7 +243,7 @@ def find_placement(
     locator: AnyFinger,
     guess: NDArray | None = None,
     guess_stddev: NDArray = GUESS_STDDEV,
-    half: float = 0.045,
+    opening: float | None = None,
     progress: Callable[[int], Any] = lambda steps: None,
 ) -> CameraPlacement:
     """Return where the camera is and how the jaws are mounted.
@@ -254,17 +255,19 @@ def find_placement(
         locator: finds the points in pictures of their sides.
         guess: T_gripper_camera (4, 4); None: it is searched for.
         guess_stddev: its standard deviations, three in m and three in rad (6,).
-        half: guess of half the distance of the jaws' origins [m].
+        opening: gap between the inner faces of both jaws where they are widest open [m]; None: not known.
         progress: called with the number of steps done since its last call.
 
     Raises:
         GeometryError: there are no such jaws in the pictures.
     """
+    stated = None if opening is None else 0.5 * opening + next(iter(jaws.values())).inner_face_x
+    half = stated or HALF_OPENING
     starts = [(guess, half, WHOLE)] if guess is not None else search_camera(images, camera, jaws, progress)
     found: list[CameraPlacement] = []
     failures: dict[float, GeometryError] = {}
-    for T, opening, edge in starts:
-        fit = _Refinement(images, camera, jaws, locator, T, opening, None if guess is None else guess_stddev)
+    for T, begin, edge in starts:
+        fit = _Refinement(images, camera, jaws, locator, T, begin, None if guess is None else guess_stddev, stated)
         fit.polish(edge)
         for rounds, is_far in PLAN:
             for _ in range(rounds):
@@ -347,9 +350,10 @@ class _Refinement:
         T: NDArray,
         half: float,
         guess_stddev: NDArray | None,
+        half_opening: float | None,
     ) -> None:
         self._least_contrast = LEAST_FOUND if guess_stddev is None else LEAST_GUESSED
-        self._is_guess = guess_stddev is not None
+        self._is_guess, self._half = guess_stddev is not None, half_opening
         self._stddev = OUTLINE_STDDEV if guess_stddev is None else guess_stddev
         self._images, self._camera, self._jaws, self._locator = images, camera, jaws, locator
         self._points = {side: np.vstack((jaw.keypoints, jaw.reference_point)) for side, jaw in jaws.items()}
@@ -369,6 +373,9 @@ class _Refinement:
         sides, count = len(self._jaws), len(self._images)
         turns = dict(zip(self._jaws, x[6 : 6 + 3 * sides].reshape(sides, 3), strict=True))
         origins = dict(zip(self._jaws, x[6 + 3 * sides :].reshape(sides, count), strict=True))
+        if self._half is not None and len(origins) == len(SIDES):
+            wider = 0.5 * np.max(origins["right"] - origins["left"]) - self._half
+            origins = {"left": origins["left"] + wider, "right": origins["right"] - wider}
         return move_pose(self._start, x[:6]), turns, origins
 
     def contrast(self, x: NDArray | None = None, edge: int | None = None) -> float:
@@ -426,8 +433,9 @@ class _Refinement:
             share = np.minimum(1.0, ALIKE / np.maximum(self._likelihood[side].sum(axis=1), 1e-9))
             weight = np.sqrt(self._likelihood[side] * share[:, None])
             parts.append((away * weight[:, :, None] / PIXEL).ravel())
-        middles = sum(origins.values()) / 2.0 if len(origins) == len(SIDES) else np.zeros(1)
-        return np.concatenate((*parts, [middles.mean() / MIDDLE_STDDEV]))
+        if len(origins) == len(SIDES):
+            parts.append([np.mean(sum(origins.values())) / 2.0 / MIDDLE_STDDEV])
+        return np.concatenate(parts)
 
     def _away(self, side: str, T: NDArray, turn: NDArray, origins: NDArray) -> NDArray:
         """Return by how many columns and rows the points seen are off their places (n, K + 1, 2) [px]."""

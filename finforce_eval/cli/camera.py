@@ -67,6 +67,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--extrinsics-stddev", nargs=2, type=positive, default=(5.0, 2.0), metavar=("MM", "DEG"), help=text
     )
+    text = "gap between the inner faces of both jaws where they are widest open in the images [mm]"
+    parser.add_argument("--opening", type=length_mm, metavar="MM", help=text)
     text = "write the rig even if its ribs are not where they should be, or may be elsewhere"
     parser.add_argument("--force", action="store_true", help=text)
     add_rest_options(parser, images=45)
@@ -102,6 +104,7 @@ def run(options: argparse.Namespace) -> CommandResult:
             locator,
             guess,
             np.repeat((1e-3, np.radians(1.0)) * np.array(options.extrinsics_stddev), 3),
+            options.opening,
             progress=bar.update,
         )
     found = add_tags(found, seen, recording.images.camera, options)
@@ -270,7 +273,7 @@ def describe_placement(found: CameraPlacement, jaws) -> str:
     if len(next(iter(found.origins.values()))) == 1:
         lines.append(
             "WARNING: one picture hardly tells the camera's distance and where along the jaws it looks: give images "
-            "at several openings"
+            "at several openings, or --opening"
         )
     askew = [side for side, mount in found.mounts.items() if np.abs(mount.turn).max() > 2.0 * TURN_STDDEV]
     if askew:

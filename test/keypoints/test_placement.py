@@ -311,27 +311,32 @@ def test_the_place_of_a_jaw_in_a_holder_is_stated_apart_from_its_points():
     assert (held.stddev[used][:, [0, 2]] < straight.stddev[used][:, [0, 2]]).all()
 
 
-def test_a_picture_without_jaws_is_refused(monkeypatch):
+def test_a_stated_opening_is_kept_and_a_picture_without_jaws_refused(monkeypatch):
     monkeypatch.setattr(placement, "PLAN", ((2, None),))
     monkeypatch.setattr(placement, "POLISH", 2)
     jaws = {side: load_jaw("bench", side) for side in ("left", "right")}
 
     class Dreamer:
-        """Sees every point wherever it is looked for, as networks do."""
+        """Sees every point wherever it is looked for, as networks do, and surer each time."""
 
-        grids = dict.fromkeys(jaws, PlaneGrid())
+        grids, likelihood = dict.fromkeys(jaws, PlaneGrid()), 0.9
 
         def locate(self, pictures, sides, starts=()):
             points = np.array([jaws[side].keypoints[:, ::2] for side in sides])
             points = np.concatenate((points, [[jaws[side].reference_point[::2]] for side in sides]), axis=1)
             pixels = np.array([PlaneGrid().pixels(each) for each in points])
+            self.likelihood += 1e-4
             return Places(
-                pixels=pixels, likelihood=np.full(pixels.shape[:2], 0.9), stddev=np.full(pixels.shape[:2], 0.5)
+                pixels=pixels,
+                likelihood=np.full(pixels.shape[:2], self.likelihood),
+                stddev=np.full(pixels.shape[:2], 0.5),
             )
 
     poses = {side: jaw_in_camera(ROBOT_CAMERA, side, x) for side, x in (("left", -0.045), ("right", 0.045))}
     found = find_placement([paint(poses, jaws)], CAMERA, jaws, Dreamer(), ROBOT_CAMERA)
     assert found.contrast > 0.8 and not any(mount.covered for mount in found.mounts.values())
+    told = find_placement([paint(poses, jaws)], CAMERA, jaws, Dreamer(), ROBOT_CAMERA, opening=0.0616)
+    assert told.origins["right"][0] - told.origins["left"][0] == pytest.approx(0.0616 + 2 * jaws["left"].inner_face_x, abs=1e-9)
     blank = np.random.default_rng(0).integers(0, 255, (480, 640, 3), dtype=np.uint8)
     with pytest.raises(GeometryError, match="do not show the finger .* finforce jaw PHOTO"):
         find_placement([blank], CAMERA, jaws, Dreamer(), ROBOT_CAMERA)
