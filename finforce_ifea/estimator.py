@@ -148,7 +148,7 @@ class ForceEstimator:
 
     @property
     def friction_source(self) -> str:
-        """Where that comes from: "stated", "expected" by the settings, or "learned" from the object's path."""
+        """Source of that coefficient: "stated", "expected" by the settings, or "learned" from the object's path."""
         return self._tracked.friction_source
 
     @property

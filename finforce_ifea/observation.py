@@ -65,7 +65,7 @@ class Observation:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Contact:
-    """Where the object touches the jaw.
+    """Contact of the object with the jaw.
 
     Attributes:
         points: (n, 3) [m], on the undeformed inner surface.

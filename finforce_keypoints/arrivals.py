@@ -118,7 +118,7 @@ class Arrivals:
 
     @property
     def rhythm(self) -> str:
-        """How far apart the stamps are, and whether they come in bursts, as those of arrivals do."""
+        """Period of the stamps in words, and whether they come in bursts, as those of arrivals do."""
         if len(self._stamps) < 3:
             return "not known yet"
         gaps = np.diff(self._stamps)

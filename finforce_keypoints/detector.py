@@ -36,7 +36,7 @@ _LEAST_SCALE_STDDEV = 5e-4  # images do not err independently: no average is bet
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Sight:
-    """What the colours of an image show: key points by side where nothing has moved, else the pixels found.
+    """Contents of the colours of an image: key points by side where nothing has moved, else the pixels found.
 
     `is_watched` says whether anybody looked for motion; `tags` are the corners (4, 2) [px] of those seen, by number.
     """
@@ -53,7 +53,7 @@ class KeypointDetector:
     A pixel detector finds their pixels. This class finds the poses of the jaws and the depths, and rejects outliers.
 
     Attributes:
-        was_still: whether nothing moved in the last image, so that its key points are means over the images before.
+        was_still: True if nothing moved in the last image, so that its key points are means over the images before.
         mounts: side -> how the jaw is mounted in the gripper.
         counts: "images", "still", "<side>" found, "<side>/<reason>" refused key points, "off centre".
 
@@ -83,7 +83,7 @@ class KeypointDetector:
             T_gripper_camera: (4, 4).
             settings: of the geometry.
             watch: notices a camera that fails; None: nobody does.
-            rests: whether pixels and depth are left out where nothing has moved.
+            rests: True if pixels and depth are left out where nothing has moved.
             mounts: by side; without, jaws stand straight and nothing covers them.
             tags: finds those of the mounts; None: nobody looks for them.
         """
@@ -142,7 +142,7 @@ class KeypointDetector:
 
     @property
     def warnings(self) -> Mapping[str, str]:
-        """What is suspicious about a jaw, by side, in a sentence."""
+        """Warnings of a jaw, by side, in a sentence."""
         said = {side: [jaw.warning] if jaw.warning else [] for side, jaw in self._jaws.items()}
         for side, share in self._shares.items():
             if self._looks[side] >= _MEMORY and share < _FEW:

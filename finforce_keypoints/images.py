@@ -66,7 +66,7 @@ class RgbdImage:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PixelDetection:
-    """Where one jaw's key points are in an image; the K points of the jaw file first, the reference point last.
+    """Pixels of one jaw's key points in an image; the K points of the jaw file first, the reference point last.
 
     Attributes:
         pixels: (K + 1, 2) column and row in the full raw, distorted image [px]; NaN where nothing was found.
@@ -378,12 +378,12 @@ class RgbdFeed:
 
     @property
     def _is_late(self) -> bool:
-        """Whether most of the last depth images came later than their colour images may wait."""
+        """True if most of the last depth images came later than their colour images may wait."""
         return bool(self._delays) and median(self._delays) > self._longest_wait
 
     @property
     def delay_of_depth(self) -> str:
-        """What depth that comes too late means for the images; empty while it comes in time."""
+        """Consequence of depth that comes too late, in words; empty while it comes in time."""
         if not self._is_late:
             return ""
         late, wait = (f"{1e3 * SECOND * time:.0f} ms" for time in (median(self._delays), self._longest_wait))

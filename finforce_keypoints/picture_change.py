@@ -146,7 +146,7 @@ class PictureChanges:
 
         Args:
             color: the image.
-            near: what `find_near` has found in it, where that is known.
+            near: answer of `find_near` for it, where that is known.
         """
         starts = self._improve(color, self._scan(color)[1]), near or self.find_near(color)
         return max(starts, key=lambda change: change.likelihood)

@@ -1,4 +1,4 @@
-"""Where a camera is and how jaws are mounted, from a few pictures of open, unloaded jaws and no guess.
+"""Pose of a camera and mounting of jaws, from a few pictures of open, unloaded jaws and no guess.
 
 A network that is shown the wrong place finds a finger there, too. What a picture shows of the finger's outline does not
 depend on it: by how much colours tell the inside of the drawn outline from what surrounds it. The outline finds the
@@ -81,7 +81,7 @@ OUTER_WEIGHT = 0.25  # of points off the face: how ribs slant differs more betwe
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CameraPlacement:
-    """Where a camera is and how jaws stand before it.
+    """Pose of a camera, and the jaws before it.
 
     Attributes:
         T_gripper_camera: (4, 4).

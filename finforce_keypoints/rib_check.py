@@ -52,7 +52,7 @@ class RibPlace:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RibComparison:
-    """Where the ribs of a jaw may be.
+    """Possible places of the ribs of a jaw.
 
     Attributes:
         here: the best place within half a rib of the rig's.

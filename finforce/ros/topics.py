@@ -60,7 +60,7 @@ class Pipeline:
     somebody outside listens to, and of whom a stage hears that is needed itself.
 
     Args:
-        is_shared: whether there are several nodes; they are connected by `open`, and a fault stops one of them alone.
+        is_shared: True if there are several nodes; they are connected by `open`, and a fault stops one of them alone.
 
     Attributes:
         stages: of its nodes.
@@ -206,10 +206,10 @@ class Port:
         topic: its full name.
         callback: takes messages, guarded.
         subscribe: makes the subscription to what comes from outside.
-        can_wait: whether the process goes on without it where it takes too long.
+        can_wait: True if the process goes on without it where it takes too long.
         is_contested: says whether several nodes outside publish the topic, whose messages are then dropped.
         is_wanted: says whether messages are wanted now.
-        is_open: whether they were when that was last asked.
+        is_open: True if they were when that was last asked.
         outside: the subscription to what comes from outside; None while there is none.
     """
 
@@ -236,7 +236,7 @@ class Port:
 
     @property
     def is_slow(self) -> bool:
-        """Whether it takes more than its budget, and others need not wait for it."""
+        """True if it takes more than its budget, and others need not wait for it."""
         return self.can_wait and len(self._times) == WATCHED and median(self._times) > BUDGET
 
     def take(self, message: Any) -> None:
@@ -273,7 +273,7 @@ class Outlet:
         pipeline: of the process.
         topic_name: the full name of the topic.
         publisher: to the outside.
-        is_kept: whether messages are kept for listeners that come later.
+        is_kept: True if messages are kept for listeners that come later.
     """
 
     pipeline: Pipeline
@@ -311,8 +311,8 @@ class Stage:
     Attributes:
         node: whose ends these are.
         pipeline: of its process.
-        fault: what has stopped this node while others of its process go on; empty while it works.
-        is_needed: whether its answers are needed; else it rests, and hears nothing. See `rest_unheard`.
+        fault: reason why this node has stopped while others of its process go on; empty while it works.
+        is_needed: True if its answers are needed; else it rests, and hears nothing. See `rest_unheard`.
         turned: called when it begins or ends to rest.
 
     Args:
@@ -381,7 +381,7 @@ class Stage:
             kind: of the messages.
             topic: of the messages.
             qos: that is offered.
-            is_answer: whether the messages are made of images, for which the node is needed by who listens.
+            is_answer: True if the messages are made of images, for which the node is needed by who listens.
         """
         qos = copy(qos)  # overrides are written into it
         events = PublisherEventCallbacks(

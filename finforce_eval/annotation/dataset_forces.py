@@ -146,7 +146,7 @@ def annotate_episode(
 
 
 class _Mark(FileModel):
-    """What annotate keeps of a feature that it has extended."""
+    """Former entries of a feature that it has extended."""
 
     kept: Annotated[int, Field(strict=True, ge=0)] | None = Field(None, description="Numbers of its own")
     names: Any = Field(None, description="Of these")

@@ -270,7 +270,7 @@ class ContactChoice:
         by_name: recording name -> height [mm], before everything else.
         object_file: mesh for every recording; None takes it from each recording's `case.json`.
         object_unit: unit of the mesh.
-        compare_mesh: whether the mesh is compared with the depth images.
+        compare_mesh: True if the mesh is compared with the depth images.
         pose_delay: from the stamp of a pose to its arrival [ns].
     """
 

@@ -55,7 +55,7 @@ class _Feature(FileModel):
 
 
 class _Info(FileModel):
-    """What `meta/info.json` has to hold; an empty number stands for its default."""
+    """Required entries of `meta/info.json`; an empty number stands for its default."""
 
     model_config = ConfigDict(extra="ignore")
     features: dict[str, _Feature] = Field(description="By name")

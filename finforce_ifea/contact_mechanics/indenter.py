@@ -279,7 +279,7 @@ class FaceProfile(NamedTuple):
 
 
 class IndenterPose(NamedTuple):
-    """Where an object in a contact state (depth, shape, height) is.
+    """Pose of an object in a contact state (depth, shape, height).
 
     Attributes:
         x: of a cylinder's axis or an outline's origin [m].

@@ -246,7 +246,7 @@ _STIFFNESS = 5e7
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ContactSurface:
-    """Where an object can touch.
+    """Surface that an object can touch.
 
     Attributes:
         points: on the undeformed inner surface (p, 3) [m], rising z, all y of one height together.

@@ -1,4 +1,4 @@
-"""Where along the width a jaw is pressed, and the lateral force on it, by the key points' motion along y.
+"""Location along the width at which a jaw is pressed, and the lateral force on it, by the key points' motion along y.
 
 A normal force N off the middle twists the finger, a lateral force bends it sideways,
 

@@ -179,7 +179,7 @@ class ContactTracker:
 
     @property
     def used(self) -> NDArray:
-        """Which key points of the last image count (K,)."""
+        """Used key points of the last image (K,), bool."""
         return self._search.points["weight"] > 0
 
     def give_shape(self) -> NDArray:
@@ -274,7 +274,7 @@ class ContactTracker:
 
     @property
     def friction_source(self) -> str:
-        """Where the coefficient of friction comes from: "stated", "expected" by the settings, or "learned"."""
+        """Source of the coefficient of friction: "stated", "expected" by the settings, or "learned"."""
         if self.friction.stddev < _LEARNT * self._friction.stddev:
             return "learned"
         return "expected" if self._is_unstated else "stated"

@@ -202,7 +202,7 @@ IGNORED = "-"  # what a body part is mapped to that belongs to no jaw
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class NameMap:
-    """Where each jaw's points are among the body parts of a network.
+    """Indices of each jaw's points among the body parts of a network.
 
     Attributes:
         rows: side -> (K + 1,) numbers of the body parts: the key points in the order of the jaw file, the reference

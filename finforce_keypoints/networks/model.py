@@ -80,7 +80,7 @@ class _Cells:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Places:
-    """Where n peaks are: pixels (n, 2), length of the offset from the cell's centre (n,), spread (n,) [px]."""
+    """Places of n peaks: pixels (n, 2), length of the offset from the cell's centre (n,), spread (n,) [px]."""
 
     pixels: NDArray
     offset: NDArray
@@ -247,7 +247,7 @@ class InputLayout:
 
 @dataclass(frozen=True, kw_only=True)
 class OutputLayout:
-    """Where a network's maps are.
+    """Layout of a network's maps.
 
     Attributes:
         heatmap: number of the output that holds the heatmaps.

@@ -56,7 +56,7 @@ class Template:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Places:
-    """Where the points of B pictures are.
+    """Points found in B pictures.
 
     Attributes:
         pixels: (B, K, 2) column and row in the picture [px].

@@ -336,7 +336,8 @@ def test_a_stated_opening_is_kept_and_a_picture_without_jaws_refused(monkeypatch
     found = find_placement([paint(poses, jaws)], CAMERA, jaws, Dreamer(), ROBOT_CAMERA)
     assert found.contrast > 0.8 and not any(mount.covered for mount in found.mounts.values())
     told = find_placement([paint(poses, jaws)], CAMERA, jaws, Dreamer(), ROBOT_CAMERA, opening=0.0616)
-    assert told.origins["right"][0] - told.origins["left"][0] == pytest.approx(0.0616 + 2 * jaws["left"].inner_face_x, abs=1e-9)
+    apart = told.origins["right"][0] - told.origins["left"][0]
+    assert apart == pytest.approx(0.0616 + 2 * jaws["left"].inner_face_x, abs=1e-9)
     blank = np.random.default_rng(0).integers(0, 255, (480, 640, 3), dtype=np.uint8)
     with pytest.raises(GeometryError, match="do not show the finger .* finforce jaw PHOTO"):
         find_placement([blank], CAMERA, jaws, Dreamer(), ROBOT_CAMERA)
