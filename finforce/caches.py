@@ -5,6 +5,7 @@ from __future__ import annotations
 import atexit
 import hashlib
 import os
+import re
 import shutil
 import stat
 import sys
@@ -12,6 +13,8 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from functools import cache
+from importlib.metadata import version
+from itertools import accumulate
 from pathlib import Path
 from tempfile import mkdtemp
 
@@ -19,8 +22,9 @@ from finforce.errors import FinforceError
 
 FIRST_START = "compiling, which takes a minute or two once; `finforce prepare` does it ahead of time"
 # Packages whose functions are compiled, and days after which what nobody has used is removed.
-_COMPILED = ("finforce", "finforce_contact", "finforce_ifea", "finforce_keypoints")
+COMPILED = ("finforce", "finforce_contact", "finforce_ifea", "finforce_keypoints", "finforce_sim")
 _UNUSED = 30.0
+_IMPORTS = re.compile(r"import[ \t]+(.*)"), re.compile(r"from[ \t]+([\w.]+)[ \t]+import[ \t]+(\([^)]*\)|.*)")
 ROOT = Path(__file__).parents[1]
 
 
@@ -75,15 +79,14 @@ def _is_own_group(number: int) -> bool:
 
 
 def keep_compiled() -> None:
-    """Let Numba keep what it compiles in a folder of these very sources, unless NUMBA_CACHE_DIR names one.
+    """Let Numba keep what it compiles in a folder of the content of these sources, unless NUMBA_CACHE_DIR names one.
 
-    Numba compiles a function anew when its own file has changed, and does not look at the files of what that calls.
     Called before anything is compiled; a folder that cannot be written leaves Numba to its own choice.
     """
     if os.environ.get("NUMBA_CACHE_DIR"):
         return _remove_truncated(Path(os.environ["NUMBA_CACHE_DIR"]))
     try:
-        folder = cache_folder() / "compiled" / _name_sources(ROOT)
+        folder = cache_folder() / "compiled" / name_sources(ROOT)
         refuse_foreign(folder)
     except CacheError as error:
         print(f"finforce: {error}; compiled code is kept for this process only", file=sys.stderr)
@@ -118,14 +121,38 @@ def is_compiled() -> bool:
     return any(Path(os.environ["NUMBA_CACHE_DIR"]).rglob("*.nbc"))
 
 
-def _name_sources(root: Path) -> str:
-    """Return a name for the sources below a folder: where they lie, and when each was written."""
-    digest = hashlib.sha256(str(root).encode())
-    for package in _COMPILED:
-        for path in sorted((root / package).rglob("*.py")):
-            state = path.stat()
-            digest.update(f"{path} {state.st_size} {state.st_mtime_ns}".encode())
+@cache
+def name_sources(root: Path) -> str:
+    """Return a name for the content of all that compiled code below a folder depends on, and for what compiles it.
+
+    Numba keeps the values of module attributes in the code that it compiles, and what is called with it. So these are
+    the modules with compiled functions, and all that those import, wherever they lie.
+    """
+    paths = [path for package in COMPILED for path in (root / package).rglob("*.py")]
+    sources = {_name_module(path.relative_to(root)): path.read_text(encoding="utf-8") for path in paths}
+    found, pending = set(), [name for name, source in sources.items() if "numba" in source or "njit" in source]
+    while pending:
+        if (name := pending.pop()) in sources and name not in found:
+            found.add(name)
+            pending += _find_imports(sources[name])
+    digest = hashlib.sha256(f"numba {version('numba')} numpy {version('numpy')}".encode())
+    for name in sorted(found):
+        digest.update(f"\n{name} {hashlib.sha256(sources[name].encode()).hexdigest()}".encode())
     return digest.hexdigest()[:16]
+
+
+def _name_module(path: Path) -> str:
+    """Return the name of the module in a file, the path of which begins with its package."""
+    return ".".join(path.with_suffix("").parts).removesuffix(".__init__")
+
+
+def _find_imports(source: str) -> Iterator[str]:
+    """Yield the names of all that a module imports, anywhere in it: packages, modules and what is in these."""
+    plain, parts = _IMPORTS
+    found = [("", names) for names in plain.findall(source)] + parts.findall(source)
+    for module, names in found:
+        for name in re.findall(r"[\w.]+", names):
+            yield from accumulate(f"{module}.{name}".strip(".").split("."), "{}.{}".format)
 
 
 @cache

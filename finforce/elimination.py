@@ -1,7 +1,8 @@
 """Small systems of linear equations for compiled code, without a library's checks and copies."""
 
-from numba import njit
 from numpy.typing import NDArray
+
+from finforce.compiled import njit
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
 

@@ -12,7 +12,8 @@ from math import exp
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+
+from finforce.compiled import njit
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from finforce.compiled import njit
 
 _OPTIONS = {"cache": True, "error_model": "numpy", "nogil": True}
 POLYNOMIAL, FISHEYE = 1.0, 2.0  # kinds of lenses in addition to the pinhole, the fifth number of a lens

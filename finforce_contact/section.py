@@ -5,9 +5,9 @@ from functools import cached_property
 from math import asin, atan2, sqrt
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from finforce.compiled import njit
 from finforce.errors import PoseError
 from finforce.optional import import_manifold3d
 from finforce.triangle_surface import chain_loops

@@ -8,9 +8,9 @@ from numbers import Integral
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from finforce.compiled import njit
 from finforce.errors import ObservationError
 from finforce.messages import check_stddev
 from finforce_ifea.errors import ContactError

@@ -7,10 +7,10 @@ h_i' = -h_i / tau_i + g_i F_e' (generalised Maxwell model, Simo and Hughes, Comp
 from collections.abc import Sequence
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 
+from finforce.compiled import njit
 from finforce.typed_yaml import FileModel, Number
 
 

@@ -8,9 +8,9 @@ from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from finforce.compiled import njit
 from finforce_ifea.errors import NotEnoughDataError, UnderLoadError
 from finforce_ifea.settings import EstimatorSettings
 

@@ -1,5 +1,1 @@
 """RGB-D images to key points in the jaw frames, by a network or by dots; see docs/keypoints.md."""
-
-from finforce.caches import keep_compiled
-
-keep_compiled()

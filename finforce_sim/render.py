@@ -7,11 +7,11 @@ from functools import cached_property, lru_cache
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from finforce.camera import CameraIntrinsics, compute_rays, rays_from_pixels
+from finforce.compiled import njit
 from finforce.optional import import_open3d
 
 _OPTIONS = {"cache": True, "error_model": "numpy", "nogil": True}

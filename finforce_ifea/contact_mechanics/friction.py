@@ -11,8 +11,9 @@ with the normal n and N = |normal force|, the tangent t = (n_z, -n_x), the point
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from finforce.compiled import njit
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
 

@@ -13,9 +13,9 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from finforce.compiled import njit
 from finforce_ifea.contact_mechanics.friction import FRICTIONLESS, POINT_SHAPE, Touch, Traction, add_traction
 from finforce_ifea.errors import ContactError
 from finforce_ifea.observation import Contact, ObjectOutline, are_same_polygons

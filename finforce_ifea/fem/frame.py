@@ -7,10 +7,10 @@ angle turns (x, z) into (z, -x): the normal of a direction, and the derivative o
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy import sparse
 
+from finforce.compiled import njit
 from finforce_ifea.errors import MeshError
 from finforce_ifea.fem.model import (
     LARGEST_MOVE,

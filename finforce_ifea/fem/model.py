@@ -5,11 +5,12 @@ from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.linalg.lapack import dpbtrf, dpbtrs
 from scipy.sparse.linalg import SuperLU, splu
+
+from finforce.compiled import njit
 
 LARGEST_MOVE, LARGEST_TURN = 2e-3, 0.3
 Across = Literal["middle", "half", "both"]

@@ -8,9 +8,9 @@ Source: Bonet, Wood, Nonlinear Continuum Mechanics for Finite Element Analysis (
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from finforce.compiled import njit
 from finforce_ifea.errors import MeshError
 from finforce_ifea.fem.model import LARGEST_MOVE, Across, Linearization
 from finforce_ifea.fem.solid import SolidModel

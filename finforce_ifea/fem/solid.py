@@ -12,10 +12,10 @@ Source: Felippa, Haugen, A unified formulation of small-strain corotational fini
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy import sparse
 
+from finforce.compiled import njit
 from finforce_ifea.fem.elements import centre_gradient, elasticity_matrix, hex_stiffness, tet_stiffness
 from finforce_ifea.fem.model import (
     LARGEST_MOVE,

@@ -10,9 +10,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from finforce.compiled import njit
 from finforce_ifea.contact_mechanics.indenter import HEIGHT, SHAPE, PressedObject, find_clearances
 from finforce_ifea.contact_mechanics.pressed_jaw import ContactSurface
 

@@ -20,9 +20,9 @@ from math import hypot, inf, isfinite, sqrt
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from finforce.compiled import njit
 from finforce_ifea.fem.solid import SolidModel
 from finforce_ifea.filter.filter import solve_lower
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE, Jaw

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from finforce.compiled import njit
 from finforce_ifea.filter.measurement import NO_WEIGHT
 from finforce_ifea.filter.state import DEPTH, HEIGHT, SHARED, TRACTION
 from finforce_ifea.tracking.contact_state import LEAST_DEPTH, LOADED_DEPTH, TOUCH_DEPTH

@@ -14,9 +14,9 @@ Visintin, Differential Models of Hysteresis, 1994, ch. III.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from finforce.compiled import njit
 from finforce_ifea.contact_mechanics.friction import FRICTIONLESS, Traction
 from finforce_ifea.contact_mechanics.pressed_jaw import RigidContact
 

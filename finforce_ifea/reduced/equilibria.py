@@ -14,8 +14,9 @@ Compiled search for the stored equilibrium that is nearest to a jaw's shape.
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from finforce.compiled import njit
 
 _OPTIONS = {"cache": True, "error_model": "numpy", "fastmath": {"contract", "reassoc", "nsz"}}
 STENCIL = 4

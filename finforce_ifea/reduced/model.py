@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from finforce.compiled import njit
 from finforce.elimination import eliminate
 from finforce_ifea.contact_mechanics.friction import FRICTIONLESS, POINT_SHAPE, Traction, add_traction
 from finforce_ifea.contact_mechanics.indenter import (

@@ -7,9 +7,9 @@ Python, as `state["x"]`, and in compiled code, as `state.x`.
 from math import sqrt
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from finforce.compiled import njit
 from finforce_ifea.relaxation import relax_force
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from finforce.camera import CameraIntrinsics
+from finforce.compiled import njit
 from finforce.elimination import eliminate
 from finforce.lens import project_point
 from finforce.optional import import_cv2

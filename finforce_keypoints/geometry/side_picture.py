@@ -10,10 +10,10 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from finforce.camera import CameraIntrinsics, rays_from_pixels
+from finforce.compiled import njit
 from finforce.lens import project_point
 from finforce.optional import import_cv2
 

@@ -15,9 +15,9 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from finforce.compiled import njit
 from finforce.errors import one_line
 from finforce.optional import import_cv2
 from finforce_keypoints.errors import DetectionError, ModelError

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 
+from finforce.compiled import njit
 from finforce_ifea.filter import jump, measurement, search
 
 _FILTER, _NEVER = "finforce_ifea.filter.", 1e-300

@@ -1,6 +1,10 @@
 """Where compiled code is kept."""
 
+import ast
 import os
+import shutil
+import subprocess
+import sys
 import time
 
 import pytest
@@ -19,19 +23,75 @@ def cache(tmp_path, monkeypatch):
     return tmp_path / "compiled"
 
 
-def make_sources(root):
-    for package in ("finforce_contact", "finforce_ifea", "finforce_keypoints"):
-        (root / package / "deep").mkdir(parents=True)
-        (root / package / "deep" / "kernels.py").write_text("one = 1\n")
+KERNELS = """from finforce.compiled import njit
+from finforce.deep import constants
+
+
+@njit(cache=True)
+def scale(x):
+    return constants.FACTOR * x
+"""
+SCALE = (
+    "from finforce.deep.kernels import scale as f; print(f(2.0), len(f.stats.cache_hits), len(f.stats.cache_misses))"
+)
+
+
+def make_sources(root, constants="from finforce.bottom import FACTOR", factor=3.0):
+    """Write a package with one function, which is compiled with what two other modules say."""
+    deep = root / "finforce" / "deep"
+    deep.mkdir(parents=True)
+    (root / "finforce" / "__init__.py").touch()
+    for name in ("errors", "caches", "compiled"):
+        shutil.copyfile(caches.ROOT / "finforce" / f"{name}.py", root / "finforce" / f"{name}.py")
+    (deep / "kernels.py").write_text(KERNELS)
+    (deep / "constants.py").write_text(f"{constants}\n")
+    (deep / "unused.py").write_text("one = 1\n")
+    (root / "finforce" / "bottom.py").write_text(f"FACTOR = {factor}\n")
     return root
 
 
-def test_another_source_has_another_folder(tmp_path):
-    root = make_sources(tmp_path)
-    name = caches._name_sources(root)
-    assert caches._name_sources(root) == name
-    (root / "finforce_ifea" / "deep" / "kernels.py").write_text("one = 11\n")
-    assert caches._name_sources(root) != name
+def test_compiled_code_is_kept_by_the_content_of_all_that_it_depends_on(tmp_path):
+    cache = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_")}
+    cache["FINFORCE_CACHE"] = str(tmp_path / "cache")
+
+    def scale(name, factor):
+        root = make_sources(tmp_path / name, factor=factor)
+        return subprocess.check_output([sys.executable, "-c", SCALE], cwd=root, env=cache, text=True).split()
+
+    assert scale("one", 3.0) == ["6.0", "0", "1"]
+    assert scale("same", 3.0) == ["6.0", "1", "0"]
+    assert scale("other", 4.0) == ["8.0", "0", "1"]
+
+
+@pytest.mark.parametrize(
+    "constants",
+    [
+        "import finforce.bottom",
+        "from finforce import (\n  bottom,\n)",
+        "def f():\n    from finforce.bottom import FACTOR",
+    ],
+)
+def test_another_content_has_another_name(tmp_path, constants):
+    root = make_sources(tmp_path / "one", constants)
+    name = caches.name_sources(root)
+    assert caches.name_sources(make_sources(tmp_path / "same", constants)) == name
+    assert caches.name_sources(make_sources(tmp_path / "other", constants, 4.0)) != name
+    unused = make_sources(tmp_path / "unused", constants)
+    (unused / "finforce" / "deep" / "unused.py").write_text("one = 2\n")
+    assert caches.name_sources(unused) == name
+
+
+def test_all_that_a_module_imports_is_found():
+    """Whatever the way in which it is written; a relative import would not be."""
+    for path in [path for package in caches.COMPILED for path in (caches.ROOT / package).rglob("*.py")]:
+        source, names = path.read_text(encoding="utf-8"), set()
+        for node in ast.walk(ast.parse(source)):
+            if isinstance(node, ast.ImportFrom):
+                assert not node.level, path
+                names |= {node.module} | {f"{node.module}.{each.name}" for each in node.names}
+            elif isinstance(node, ast.Import):
+                names |= {each.name for each in node.names}
+        assert names <= set(caches._find_imports(source)), path
 
 
 def test_numba_is_told_before_and_after_its_import(cache):

@@ -1,0 +1,42 @@
+"""Numba's `njit`, which keeps what it compiles by the content of these sources, wherever they are installed."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+from numba import njit
+from numba.core.caching import CacheImpl, UserProvidedCacheLocator
+
+from finforce.caches import COMPILED, ROOT, keep_compiled, name_sources
+
+__all__ = ["njit"]
+
+
+class SourceLocator(UserProvidedCacheLocator):
+    """Where Numba keeps a function of these sources: under the name of its package.
+
+    Numba's own locators name the folder by the path of the file, and compile anew when that file alone has changed, or
+    in older versions when it has been written.
+    """
+
+    @classmethod
+    def from_function(cls, py_func: Any, py_file: str) -> SourceLocator | None:
+        """Return the place of a function; none leaves it to Numba's own locators."""
+        path = Path(py_file)
+        is_own = path.is_relative_to(ROOT) and path.relative_to(ROOT).parts[0] in COMPILED
+        return super().from_function(py_func, py_file) if is_own else None
+
+    @classmethod
+    def get_suitable_cache_subpath(cls, py_file: str) -> str:
+        """Return the name of the folder."""
+        return ".".join(Path(py_file).relative_to(ROOT).parent.parts)
+
+    def get_source_stamp(self) -> str:
+        """Return what changes with all that the function depends on."""
+        return name_sources(ROOT) + hashlib.sha256(Path(self._py_file).read_bytes()).hexdigest()
+
+
+keep_compiled()
+CacheImpl._locator_classes.insert(0, SourceLocator)
