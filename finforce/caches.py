@@ -86,7 +86,7 @@ def keep_compiled() -> None:
     if os.environ.get("NUMBA_CACHE_DIR"):
         return _remove_truncated(Path(os.environ["NUMBA_CACHE_DIR"]))
     try:
-        folder = cache_folder() / "compiled" / name_sources(ROOT)
+        folder = cache_folder() / "compiled" / _read_sources(ROOT)[0]
         refuse_foreign(folder)
     except CacheError as error:
         print(f"finforce: {error}; compiled code is kept for this process only", file=sys.stderr)
@@ -121,15 +121,24 @@ def is_compiled() -> bool:
     return any(Path(os.environ["NUMBA_CACHE_DIR"]).rglob("*.nbc"))
 
 
-@cache
 def name_sources(root: Path) -> str:
     """Return a name for the content of all that compiled code below a folder depends on, and for what compiles it.
 
     Numba keeps the values of module attributes in the code that it compiles, and what is called with it. So these are
-    the modules with compiled functions, and all that those import, wherever they lie.
+    the modules with compiled functions, and all that those import, wherever they lie. Once one of them is written while
+    the process runs, which of the contents it has loaded is not known, and the name is one that nobody else has.
     """
-    paths = [path for package in COMPILED for path in (root / package).rglob("*.py")]
-    sources = {_name_module(path.relative_to(root)): path.read_text(encoding="utf-8") for path in paths}
+    name, before = _read_sources(root)
+    now = {path: _find_state(path) for path in before}
+    return name if now == before else f"{name} {sorted(now.values())}"
+
+
+@cache
+def _read_sources(root: Path) -> tuple[str, dict[str, tuple[int, int]]]:
+    """Return the name, and for each of the files when it was written, and its size."""
+    paths = {_name_module(path, root): path for package in COMPILED for path in (root / package).rglob("*.py")}
+    states = {name: _find_state(str(path)) for name, path in paths.items()}
+    sources = {name: path.read_text(encoding="utf-8") for name, path in paths.items()}
     found, pending = set(), [name for name, source in sources.items() if "numba" in source or "njit" in source]
     while pending:
         if (name := pending.pop()) in sources and name not in found:
@@ -138,12 +147,20 @@ def name_sources(root: Path) -> str:
     digest = hashlib.sha256(f"numba {version('numba')} numpy {version('numpy')}".encode())
     for name in sorted(found):
         digest.update(f"\n{name} {hashlib.sha256(sources[name].encode()).hexdigest()}".encode())
-    return digest.hexdigest()[:16]
+    return digest.hexdigest()[:16], {str(paths[name]): states[name] for name in found}
 
 
-def _name_module(path: Path) -> str:
-    """Return the name of the module in a file, the path of which begins with its package."""
-    return ".".join(path.with_suffix("").parts).removesuffix(".__init__")
+def _find_state(path: str) -> tuple[int, int]:
+    """Return when a file was written [ns], and its size [bytes]; zeros for one that is gone."""
+    with suppress(OSError):
+        state = os.stat(path)
+        return state.st_mtime_ns, state.st_size
+    return 0, 0
+
+
+def _name_module(path: Path, root: Path) -> str:
+    """Return the name of the module in a file below a folder."""
+    return ".".join(path.relative_to(root).with_suffix("").parts).removesuffix(".__init__")
 
 
 def _find_imports(source: str) -> Iterator[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +34,7 @@ class SourceLocator(UserProvidedCacheLocator):
 
     def get_source_stamp(self) -> str:
         """Return what changes with all that the function depends on."""
-        return name_sources(ROOT) + hashlib.sha256(Path(self._py_file).read_bytes()).hexdigest()
+        return name_sources(ROOT)
 
 
 keep_compiled()

@@ -79,6 +79,8 @@ def test_another_content_has_another_name(tmp_path, constants):
     unused = make_sources(tmp_path / "unused", constants)
     (unused / "finforce" / "deep" / "unused.py").write_text("one = 2\n")
     assert caches.name_sources(unused) == name
+    os.utime(root / "finforce" / "bottom.py", (0, 0))
+    assert caches.name_sources(root) != name  # as it is loaded from now on, it may be another
 
 
 def test_all_that_a_module_imports_is_found():
