@@ -20,6 +20,8 @@ class SourceLocator(UserProvidedCacheLocator):
     in older versions when it has been written.
     """
 
+    _last = ("", 0, "")  # file, line and stamp of the last function
+
     @classmethod
     def from_function(cls, py_func: Any, py_file: str) -> SourceLocator | None:
         """Return the place of a function; none leaves it to Numba's own locators."""
@@ -33,8 +35,12 @@ class SourceLocator(UserProvidedCacheLocator):
         return ".".join(Path(py_file).relative_to(ROOT).parent.parts)
 
     def get_source_stamp(self) -> str:
-        """Return what changes with all that the function depends on."""
-        return name_sources(ROOT)
+        """Return what changes with all that the function depends on, found out once while a module is executed."""
+        file, line, stamp = SourceLocator._last
+        if file != self._py_file or line >= self._lineno:
+            stamp = name_sources(ROOT)
+        SourceLocator._last = self._py_file, self._lineno, stamp
+        return stamp
 
 
 keep_compiled()
