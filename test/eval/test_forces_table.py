@@ -2,7 +2,6 @@
 
 import re
 import runpy
-import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -20,20 +19,22 @@ from finforce_eval.evaluation.keypoint_source import KeypointSource
 from finforce_eval.recordings.writer import write_recording
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-IMAGES = 90
+IMAGES, FEW = 60, 8
 FORCE = ["force_x", "force_y", "force_z"]
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A folder with the first seconds of the included recording, twice."""
+    """A folder with the first seconds of the included recording."""
     folder = tmp_path_factory.mktemp("bags")
-    whole = ff.read_recording(ff.DEMO)
-    begin = int(whole.jaw("left").keypoints.stamps_ns[0])
-    write_recording(cut(whole, begin, begin + IMAGES * 10**9 // 30), folder / "first")
-    shutil.copytree(folder / "first", folder / "second")
-    (folder / "notes.txt").write_text("none")
+    write_recording(cut_start(ff.read_recording(ff.DEMO), IMAGES), folder / "first")
     return folder
+
+
+def cut_start(recording, images):
+    """The first images of a recording of 30 Hz."""
+    begin = int(recording.jaw("left").keypoints.stamps_ns[0])
+    return cut(recording, begin, begin + images * 10**9 // 30)
 
 
 def test_the_forces_are_those_of_the_command_with_stamps_in_seconds(folder, tmp_path):
@@ -49,9 +50,12 @@ def test_the_forces_are_those_of_the_command_with_stamps_in_seconds(folder, tmp_
     assert found.attrs["units"] | {"stamp": "s", "force_x": "N"} == found.attrs["units"]
 
 
-def test_a_folder_of_recordings_gives_all_of_them(folder):
-    found = ff.evaluate(str(folder), contact_height=0.040, stills=True)
-    assert found.groupby("case").size().to_dict() == {"first": IMAGES, "second": IMAGES}
+def test_a_folder_of_recordings_gives_all_of_them(folder, tmp_path):
+    for name in ("first", "second"):
+        write_recording(cut_start(ff.read_recording(folder / "first"), FEW), tmp_path / name)
+    (tmp_path / "notes.txt").write_text("none")
+    found = ff.evaluate(str(tmp_path), contact_height=0.040, calibration="bench", stills=True)
+    assert found.groupby("case").size().to_dict() == {"first": FEW, "second": FEW}
     assert not found.isna()["status"].any()
 
 
@@ -64,7 +68,8 @@ def test_forces_come_from_images(folder, tmp_path, monkeypatch):
         return replace(recording, jaws=keypoints)
 
     monkeypatch.setattr(KeypointSource, "_detect", detect)
-    found = ff.evaluate(path, source="images", contact_height=0.040, extrinsics="robot", detector={"depth": "none"})
+    given = {"contact_height": 0.040, "calibration": "bench"}
+    found = ff.evaluate(path, source="images", extrinsics="robot", detector={"depth": "none"}, **given)
     ((images, parameters),) = looked
     assert images == 12 and parameters["depth"] == "none" and len(parameters["T_gripper_camera"]) == 7
     assert len(found) == IMAGES and np.isfinite(found[FORCE]).all(axis=1).any()
@@ -98,7 +103,8 @@ def test_the_example_prints_the_largest_force_of_each_recording(folder, tmp_path
 
 
 def test_the_example_prints_a_line_per_image(tmp_path, monkeypatch, capsys):
-    path = write_footage(make_footage(), tmp_path / "twin")
+    path, sensor = write_footage(make_footage(), tmp_path / "twin"), ff.ForceSensor
+    monkeypatch.setattr(ff, "ForceSensor", lambda *given, **more: sensor(*given, **more | {"calibration": "bench"}))
     monkeypatch.setattr(sys, "argv", ["images_to_forces.py", str(path)])
     runpy.run_path(str(EXAMPLES / "images_to_forces.py"))
     assert capsys.readouterr().out.count(" s  ") == 12

@@ -6,14 +6,21 @@ from pathlib import Path
 from textwrap import dedent
 
 import pytest
+from eval_fakes import cut
 
 from finforce_eval.cli import prepare as preparation
 from finforce_eval.cli.main import main
+from finforce_eval.recordings.objects import find_mesh
+from finforce_eval.recordings.recording import DEMO, read_recording
+from finforce_eval.recordings.writer import write_recording
 from finforce_ifea.errors import ContactError
 from finforce_ifea.jaw import calibration
 from finforce_ifea.jaw.jaw import load_jaw
 
+GRASP = 7  # [s], of which the object touches from 3.4 s on
 START = dedent("""
+    import sys
+
     from numba.core import event
 
     compiled = []
@@ -28,24 +35,27 @@ START = dedent("""
     event.register("numba:compile", Listener())
     from finforce_eval.cli import prepare as preparation
     from finforce_eval.cli.main import main
-    from finforce_eval.recordings.recording import DEMO
 
     preparation.compile_mechanics()
     preparation.compile_tracking()
     preparation.compile_contact()
     preparation.compile_detector()
     words = ["--contact", "estimate", "--calibration", "bench", "--set", "held=yes"]
-    assert main(["evaluate", str(DEMO), *words]) == 0
+    assert main(["evaluate", *sys.argv[1:], *words]) == 0
     print(compiled)
 """)
 
 
-def test_after_it_a_start_and_a_first_grasp_that_is_held_compile_nothing(capsys):
+def test_after_it_a_start_and_a_first_grasp_that_is_held_compile_nothing(tmp_path, capsys):
     assert main(["prepare", "--calibration", "bench"]) == 0
     said = capsys.readouterr().out
     parts = ("tracking", "mechanics", "equilibria of bench", "contact estimator", "detector")
     assert all(part in said for part in parts)
-    done = subprocess.run([sys.executable, "-c", START], capture_output=True, text=True, timeout=300, check=True)
+    whole = read_recording(DEMO)
+    begin = int(whole.jaw("left").keypoints.stamps_ns[0])
+    grasp = write_recording(cut(whole, begin, begin + GRASP * 10**9), tmp_path / "grasp")
+    command = [sys.executable, "-c", START, str(grasp), "--object", str(find_mesh(whole))]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=True)
     assert done.stdout.splitlines()[-1] == "[]"
 
 
