@@ -19,7 +19,7 @@ from finforce_eval.evaluation.keypoint_source import KeypointSource
 from finforce_eval.recordings.writer import write_recording
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-IMAGES, FEW = 60, 8
+IMAGES, FEW = 90, 8
 FORCE = ["force_x", "force_y", "force_z"]
 
 
