@@ -6,9 +6,13 @@ from pathlib import Path
 from typing import Any
 
 from numba import njit
-from numba.core.caching import CacheImpl, UserProvidedCacheLocator
 
 from finforce.caches import COMPILED, ROOT, keep_compiled, name_sources
+
+try:
+    from numba.core.caching import CacheImpl, UserProvidedCacheLocator
+except ImportError:  # another Numba, whose own locators go by path and time
+    CacheImpl = UserProvidedCacheLocator = object
 
 __all__ = ["njit"]
 
@@ -44,4 +48,4 @@ class SourceLocator(UserProvidedCacheLocator):
 
 
 keep_compiled()
-CacheImpl._locator_classes.insert(0, SourceLocator)
+getattr(CacheImpl, "_locator_classes", []).insert(0, SourceLocator)

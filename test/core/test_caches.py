@@ -54,13 +54,14 @@ def test_compiled_code_is_kept_by_the_content_of_all_that_it_depends_on(tmp_path
     cache = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_")}
     cache["FINFORCE_CACHE"] = str(tmp_path / "cache")
 
-    def scale(name, factor):
+    def scale(name, factor, before=""):
         root = make_sources(tmp_path / name, factor=factor)
-        return subprocess.check_output([sys.executable, "-c", SCALE], cwd=root, env=cache, text=True).split()
+        return subprocess.check_output([sys.executable, "-c", before + SCALE], cwd=root, env=cache, text=True).split()
 
     assert scale("one", 3.0) == ["6.0", "0", "1"]
     assert scale("same", 3.0) == ["6.0", "1", "0"]
     assert scale("other", 4.0) == ["8.0", "0", "1"]
+    assert scale("old Numba", 3.0, "from numba.core import caching; del caching.CacheImpl\n") == ["6.0", "0", "1"]
 
 
 @pytest.mark.parametrize(
