@@ -141,7 +141,7 @@ class RigidContact:
         loads = load_columns(model, probe, q, np.concatenate([contact.forces[:, :, None], contact.changes], axis=2))
         loads[:, 0] -= state.force
         steps = solve_contact(model, probe, q, model.factorise(state.tangent), loads, contact.springs)
-        relief = np.einsum("pab,pbk->ak", contact.springs, model.project(probe, q, steps))
+        relief = np.tensordot(contact.springs, model.project(probe, q, steps), axes=((0, 2), (0, 1)))
         size = np.hypot(contact.forces[:, 0], contact.forces[:, 2])
         total = size.sum()
         share = size / total if total > 0 else np.full(len(size), np.nan)

@@ -113,24 +113,29 @@ class Face:
         """Return the loads (size, 2 n) of unit forces along x and z at each row."""
         if self._loads is not None:
             return self._loads
+        if not isinstance(self._model, SolidModel):
+            moved = self._model.project(self._probe, q, np.eye(len(q)))[:, [0, 2]]
+            return sparse.csr_matrix(moved.reshape(self._count, self._across, 2, -1).mean(1).reshape(-1, len(q)).T)
         columns = np.zeros((len(q), 2 * self._count))
         for row in range(self._count):
             for number, axis in enumerate((0, 2)):
                 forces = np.zeros((self._count * self._across, 3))
                 forces[row * self._across : (row + 1) * self._across, axis] = 1.0 / self._across
                 columns[:, 2 * row + number] = self._model.load(self._probe, q, forces)
-        loads = sparse.csr_matrix(columns)
-        if isinstance(self._model, SolidModel):  # whose loads do not depend on its state
-            self._loads = loads
-        return loads
+        self._loads = sparse.csr_matrix(columns)  # they do not depend on the state
+        return self._loads
 
 
 def _condense(samples: NDArray, count: int) -> NDArray:
     """Return the `count` orthogonal combinations (size, count) that say most of samples (size, m).
 
-    Their scalar products (m, m) take the place of the unknowns' (size, size), which a large mesh could not store.
+    By the smaller one of the products of the samples (m, m) and of the unknowns (size, size), which a large mesh could
+    not store.
     """
-    m = samples.shape[1]
+    size, m = samples.shape
+    if size < m:
+        values, vectors = eigh(samples @ samples.T, subset_by_index=(max(size - count, 0), size - 1))
+        return vectors * np.sqrt(np.maximum(values, 0.0))
     return samples @ eigh(samples.T @ samples, subset_by_index=(max(m - count, 0), m - 1))[1]
 
 
