@@ -95,7 +95,7 @@ def annotate_bag(source: Path, target: Path, options: argparse.Namespace, settin
     jaws = estimate_forces(recording, setup, tares=tares)
     why = why_unanswered(jaws.values())
     notes = [*describe_unseen(recording, keypoints, jaws), *recording.notes, *compared]
-    notes += describe_contradictions(jaws.values())
+    notes += [*setup.contacts.describe_comparison(recording), *describe_contradictions(jaws.values())]
     if why:
         raise RecordingError(f"{target.name}: {'; '.join((*notes, why))}")
     figures = without_nan(_describe(jaws, recording) | {"notes": notes})

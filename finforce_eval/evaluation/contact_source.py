@@ -19,6 +19,7 @@ from finforce.errors import PoseError
 from finforce.health import Idling
 from finforce.messages import SECOND
 from finforce_contact.loop import ContactLoop, ContactSource, GivenContact, Surface
+from finforce_contact.parameters import ContactParameters
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.scoring import ONSET_FORCE
 from finforce_eval.recordings.objects import (
@@ -127,9 +128,12 @@ class RecordedCheck:
             RecordingError: an image is damaged.
         """
         while self._left and (self._left[0] <= stamp or len(self._poses) - len(self._left) < self._least):
-            shown = next(self._images)
-            with suppress(ImageError):  # without any depth
-                self._check.add(shown.image.depth, self._poses[self._left.popleft()])
+            shown = next(self._images, None)
+            while self._left and (shown is None or self._left[0] <= shown.stamp):  # of a video some cannot be made
+                self._left.popleft()
+            if shown is not None:
+                with suppress(ImageError):  # without any depth
+                    self._check.add(shown.image.depth, self._poses[shown.stamp])
         return self._check.contradiction
 
 
@@ -138,9 +142,7 @@ def check_mesh(recording: Recording, mesh: Any, *, at_once: bool = False) -> Rec
 
     See `RecordedCheck`.
     """
-    from finforce_contact.parameters import ContactParameters
-
-    track = pose_object_in_images(recording, round(ContactParameters().pose_tolerance / SECOND))
+    track = pose_object_in_images(recording, POSE_TOLERANCE)
     if track is None or not len(track.stamps_ns):
         return None
     return RecordedCheck(recording, mesh, track, at_once=at_once)
@@ -253,6 +255,8 @@ def _before_load(track: ObjectTrack, recording: Recording, side: str) -> ObjectT
 
 
 ESTIMATED = ("estimate", "closest", "paper")
+POSE_TOLERANCE = round(ContactParameters().pose_tolerance / SECOND)  # [ns]
+UNCOMPARED = "is not compared: that needs depth images and /object_pose in their frame"
 AUTOMATIC, FIXED = "automatic", "fixed"
 FROM_CASE = "case"
 METRES = 0.5  # below it a height in millimetres was meant in metres: no jaw is touched so near to its clamp
@@ -302,6 +306,14 @@ class ContactChoice:
                 self.height(recording)
             else:
                 require_mesh(recording, self.object_file)
+
+    def describe_comparison(self, recording: Recording) -> list[str]:
+        """Return that the mesh cannot be compared with the images, in a sentence; empty where it is, or need not be."""
+        modes = {self.mode_for(recording, side) for side in recording.jaws}
+        compared = pose_object_in_images(recording, POSE_TOLERANCE)
+        if modes == {FIXED} or not self.compare_mesh or (compared is not None and len(compared.stamps_ns)):
+            return []
+        return [f"the object's mesh {UNCOMPARED}; a wrong one gives wrong forces"]
 
     def height(self, recording: Recording) -> float:
         """Return the height of first touch above the clamped base for a recording [m].

@@ -40,6 +40,23 @@ class RawSample(NamedTuple):
     data: bytes | memoryview
 
 
+COMPRESSED = "sensor_msgs/msg/CompressedImage"
+PACKETS = {  # packets of videos, as Foxglove and ffmpeg_image_transport have them, whose types ROS does not bring
+    "foxglove_msgs/msg/CompressedVideo": """builtin_interfaces/Time timestamp
+string frame_id
+uint8[] data
+string format""",
+    "ffmpeg_image_transport_msgs/msg/FFMPEGPacket": """std_msgs/Header header
+int32 width
+int32 height
+string encoding
+uint64 pts
+uint8 flags
+bool is_bigendian
+uint8[] data""",
+}
+
+
 class BagReader:
     """An open bag.
 
@@ -75,8 +92,14 @@ class BagReader:
             yield message
 
     def decode(self, sample: RawSample) -> Any:
-        """Return the message of a sample."""
-        return self._types.deserialize_cdr(sample.data, self.types[sample.topic])
+        """Return the message of a sample; a packet of a video as a sensor_msgs/CompressedImage."""
+        kind = self.types[sample.topic]
+        message, types = self._types.deserialize_cdr(sample.data, kind), self._types.types
+        if kind not in PACKETS:
+            return message
+        header = getattr(message, "header", None) or types["std_msgs/msg/Header"](message.timestamp, message.frame_id)
+        words = message.encoding if hasattr(message, "encoding") else message.format
+        return types[COMPRESSED](header=header, format=words, data=message.data)
 
     def encode(self, msgtype: str, fields: Mapping[str, Any]) -> bytes:
         """Return the CDR bytes of a message with these fields."""
@@ -111,10 +134,12 @@ def open_bag(source: Path, name: str) -> Iterator[BagReader]:
         RecordingError: damaged or empty; also when it shows later, in the block.
     """
     from rosbags.rosbag2 import Reader
-    from rosbags.typesys import Stores, get_typestore
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     # not AnyReader: it registers every definition in the bag and ends at a foreign one it cannot parse
     types = get_typestore(Stores.ROS2_JAZZY)
+    for kind, fields in PACKETS.items():
+        types.register(get_types_from_msg(fields, kind))
     with damage_reported(name), ExitStack() as stack:
         with limit_growth(raise_budget(STEP_MEMORY), allowed_bytes(source)):
             _check_bounds(source)
