@@ -96,17 +96,21 @@ class RecordedContact(ContactLoop):
 class RecordedCheck:
     """The mesh of a recording compared with its depth images, as the contact estimator's node compares it live.
 
+    Without depth, its outline is compared with edges in colour.
+
     Args:
-        recording: with depth images.
+        recording: with images.
         mesh: of the object.
         track: its poses in the camera's frame at stamps of the images.
         at_once: compare as few images as a verdict needs, of all that there are.
     """
 
     def __init__(self, recording: Recording, mesh: Any, track: ObjectTrack, *, at_once: bool = False) -> None:
+        from finforce_contact.pose.edge_check import EdgeCheck
         from finforce_contact.pose.mesh_check import LEAST_IMAGES, MeshCheck, is_due
 
-        self._check, self._least = MeshCheck(mesh, recording.images.camera), LEAST_IMAGES
+        kind = MeshCheck if recording.images.has_depth else EdgeCheck
+        self._check, self._least = kind(mesh, recording.images.camera), LEAST_IMAGES
         chosen: list[int] = []
         if at_once:
             chosen += np.unique(np.linspace(0, len(track.stamps_ns) - 1, LEAST_IMAGES).astype(int)).tolist()
@@ -133,12 +137,13 @@ class RecordedCheck:
                 self._left.popleft()
             if shown is not None:
                 with suppress(ImageError):  # without any depth
-                    self._check.add(shown.image.depth, self._poses[shown.stamp])
+                    pixels = shown.image.color if shown.image.depth is None else shown.image.depth
+                    self._check.add(pixels, self._poses[shown.stamp])
         return self._check.contradiction
 
 
 def check_mesh(recording: Recording, mesh: Any, *, at_once: bool = False) -> RecordedCheck | None:
-    """Return the comparison of a mesh with the images of a recording; None without depth and poses of one frame.
+    """Return the comparison of a mesh with the images of a recording; None without images and poses of one frame.
 
     See `RecordedCheck`.
     """
@@ -257,6 +262,7 @@ def _before_load(track: ObjectTrack, recording: Recording, side: str) -> ObjectT
 ESTIMATED = ("estimate", "closest", "paper")
 POSE_TOLERANCE = round(ContactParameters().pose_tolerance / SECOND)  # [ns]
 UNCOMPARED = "is not compared: that needs depth images and /object_pose in their frame"
+OUTLINED = "is compared with edges in colour, for want of depth: only turns by right angles are told"
 AUTOMATIC, FIXED = "automatic", "fixed"
 FROM_CASE = "case"
 METRES = 0.5  # below it a height in millimetres was meant in metres: no jaw is touched so near to its clamp
@@ -308,12 +314,14 @@ class ContactChoice:
                 require_mesh(recording, self.object_file)
 
     def describe_comparison(self, recording: Recording) -> list[str]:
-        """Return that the mesh cannot be compared with the images, in a sentence; empty where it is, or need not be."""
+        """Return that the mesh is not compared with depth images, in a sentence; empty where it is, or need not be."""
         modes = {self.mode_for(recording, side) for side in recording.jaws}
-        compared = pose_object_in_images(recording, POSE_TOLERANCE)
-        if modes == {FIXED} or not self.compare_mesh or (compared is not None and len(compared.stamps_ns)):
+        if modes == {FIXED} or not self.compare_mesh:
             return []
-        return [f"the object's mesh {UNCOMPARED}; a wrong one gives wrong forces"]
+        compared = pose_object_in_images(recording, POSE_TOLERANCE)
+        if compared is None or not len(compared.stamps_ns):
+            return [f"the object's mesh {UNCOMPARED}; a wrong one gives wrong forces"]
+        return [] if recording.images.has_depth else [f"the object's mesh {OUTLINED}; a wrong one gives wrong forces"]
 
     def height(self, recording: Recording) -> float:
         """Return the height of first touch above the clamped base for a recording [m].

@@ -290,6 +290,8 @@ _OTHERS = {
     ".zstd": "compressed as a whole: unpack it with zstd -d FILE",
     ".zip": "a zip file; a replay buffer of UMI is called NAME.zarr.zip",
 }
+# of what is said of MCAP files that are not written by ROS 2
+_FOREIGN = ("Profile is not ros2", "'protobuf'", "'jsonschema'", "'flatbuffer'", "'ros1msg'")
 _OTHERS |= {".h5": _OTHERS[".hdf5"], ".zst": _OTHERS[".zstd"]}
 
 
@@ -315,6 +317,9 @@ def bag_source(path: Path) -> Path:
     if len(files) != 1:
         found = f"no metadata.yaml and {len(files)} bag files: run `ros2 bag reindex` on it; expected one or metadata"
         found = found if files else "no metadata.yaml, .mcap, .db3 or pictures"
+        packed = [] if files else [each for each in sorted(path.iterdir()) if each.suffix in _OTHERS]
+        if packed:
+            raise RecordingError(f"{packed[0].name}: {_OTHERS[packed[0].suffix]}")
         raise RecordingError(f"{path.name}: the folder is not a recording: {found} in it")
     return _check_bag(files[0])
 
@@ -423,7 +428,8 @@ def damage_reported(name: str) -> Iterator[None]:
         raise OutOfBoundsError(f"{name}: a part of it takes more than {limit} MB of memory; {_HINT}") from error
     except Exception as error:  # struct, sqlite3, zstd, lz4, yaml, ... each has its own classes
         reason = one_line(error)
-        raise DamagedError(f"{name}: truncated or damaged: {reason}") from error
+        is_foreign = any(word in reason for word in _FOREIGN)
+        raise DamagedError(f"{name}: {'not of ROS 2' if is_foreign else 'truncated or damaged'}: {reason}") from error
 
 
 def restamp(data: bytes | memoryview, stamp: int) -> bytes:

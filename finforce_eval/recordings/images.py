@@ -236,8 +236,10 @@ def find_images(bag: BagReader, source: Path, choice: ImageChoice | None = None)
         depth_stamps = stamps[depth][find_nearest(stamps[depth], stamps[color])]
         paired = np.abs(depth_stamps - stamps[color]) <= pairing
         if not paired.any():
+            nearest = np.abs(depth_stamps - stamps[color]).min()
             raise RecordingError(
-                f"{bag.name}: no depth image on {depth} within {pairing / 10**6:g} ms of one on {color}"
+                f"{bag.name}: no depth image on {depth} within {pairing / 10**6:g} ms of one on {color}; the nearest "
+                f"two are {nearest / 10**9:.3f} s apart: stamps of two clocks?"
             )
     return ImageTrack(
         source=source,

@@ -327,3 +327,16 @@ def test_packets_without_camera_info_are_of_the_size_of_their_pictures(tmp_path)
     bag = write_packets(tmp_path / "none", VIDEO, encode_packets(PICTURES)[1:4], with_info=False)
     with pytest.raises(RecordingError, match="no image on /camera/video can be decoded: .* expected a key frame"):
         read_recording(bag, ImageChoice(intrinsics=("100", "100", "64", "48")))
+
+
+def test_depth_of_another_clock_is_named_with_its_distance(tmp_path):
+    def delay(entry):
+        if entry.topic != DEPTH_TOPIC:
+            return entry
+        about = entry.message.header
+        late = replace(about, stamp=replace(about.stamp, sec=about.stamp.sec + 100))
+        return entry._replace(message=replace(entry.message, header=late))
+
+    bag = write_without(tmp_path / "bag", edit=delay)
+    with pytest.raises(RecordingError, match=r"no depth image .* nearest two are 9\d\.\d{3} s apart: stamps of two"):
+        read_recording(bag)
