@@ -78,14 +78,12 @@ class Playback:
             self._topics = {entry.topic: ours[entry.topic] for entry in chosen}
             self._count = sum({id(entry): entry.msgcount for entry in chosen}.values())
             first = next(bag.raw(self._topics), None)
-            self._headed = {
-                entry.topic: entry.msgtype in PACKED or _begins_with_header(bag.definition(entry.msgtype))
-                for entry in chosen
-            }
+            types = {entry.topic: _played_type(entry.msgtype) for entry in chosen}
+            self._headed = {topic: _begins_with_header(bag.definition(kind)) for topic, kind in types.items()}
         if first is None:
             raise RecordingError(f"{source.name}: nothing to be played in it")
         self.begin = first.time
-        self.types = {self._topics[entry.topic]: _played_type(entry.msgtype) for entry in chosen}
+        self.types = {self._topics[topic]: kind for topic, kind in types.items()}
 
     def __len__(self) -> int:
         return self._count
