@@ -370,7 +370,7 @@ def _read_camera(bag: BagReader, topic: str) -> tuple[CameraIntrinsics, str]:
         try:
             seen = camera_from_info(info, info.header.frame_id)
         except (ObservationError, IntrinsicsError) as error:
-            raise RecordingError(f"{bag.name}: {topic}: {error}") from error
+            raise RecordingError(f"{bag.name}: {topic}: {error}; --intrinsics replaces it") from error
         if camera is not None and not (same_camera(camera, seen) and info.header.frame_id == frame):
             raise RecordingError(f"{bag.name}: the camera on {topic} changes; expected one in a recording")
         camera, frame = seen, info.header.frame_id

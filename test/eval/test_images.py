@@ -340,3 +340,14 @@ def test_depth_of_another_clock_is_named_with_its_distance(tmp_path):
     bag = write_without(tmp_path / "bag", edit=delay)
     with pytest.raises(RecordingError, match=r"no depth image .* nearest two are 9\d\.\d{3} s apart: stamps of two"):
         read_recording(bag)
+
+
+def test_a_camera_that_was_never_calibrated_is_named_with_what_replaces_it(tmp_path):
+    def empty(entry):
+        zeros = {"k": np.zeros(9), "d": np.zeros(0), "distortion_model": ""}
+        return entry._replace(message=replace(entry.message, **zeros)) if entry.topic == INFO_TOPIC else entry
+
+    bag = write_without(tmp_path / "bag", edit=empty)
+    with pytest.raises(RecordingError, match="expected a positive size.*; --intrinsics replaces it"):
+        read_recording(bag)
+    assert read_recording(bag, ImageChoice(intrinsics=("43", "44", "32", "24"))).images.camera.fx == 43.0
