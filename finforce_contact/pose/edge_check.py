@@ -49,12 +49,9 @@ class EdgeCheck:
         self._count += 1
         own, best = self._contrasts[0], int(self._contrasts[1:].argmax())
         is_turned = self._contrasts[1 + best] > LEAST_RATIO * own + LEAST_CONTRAST * self._count
-        self.contradiction = ""
-        if self._count >= LEAST_IMAGES and is_turned:
-            self.contradiction = (
-                f"the camera contradicts the mesh {self._name}: edges in colour are not at its outline; the mesh fits "
-                f"when {self._turns[best].text}"
-            )
+        said = f"the camera contradicts the mesh {self._name}: edges in colour are not at its outline; the mesh fits "
+        said += f"when {self._turns[best].text}"
+        self.contradiction = said if is_turned and self._count >= LEAST_IMAGES else ""
         return self.contradiction
 
     def _find_contrast(self, slopes: NDArray, T_camera_object: NDArray) -> float:

@@ -42,18 +42,13 @@ class RawSample(NamedTuple):
 
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
 PACKETS = {  # packets of videos, as Foxglove and ffmpeg_image_transport have them, whose types ROS does not bring
-    "foxglove_msgs/msg/CompressedVideo": """builtin_interfaces/Time timestamp
-string frame_id
-uint8[] data
-string format""",
-    "ffmpeg_image_transport_msgs/msg/FFMPEGPacket": """std_msgs/Header header
-int32 width
-int32 height
-string encoding
-uint64 pts
-uint8 flags
-bool is_bigendian
-uint8[] data""",
+    "foxglove_msgs/msg/CompressedVideo": (
+        "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format"
+    ),
+    "ffmpeg_image_transport_msgs/msg/FFMPEGPacket": (
+        "std_msgs/Header header\nint32 width\nint32 height\nstring encoding\nuint64 pts\nuint8 flags\n"
+        "bool is_bigendian\nuint8[] data"
+    ),
 }
 
 
