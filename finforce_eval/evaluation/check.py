@@ -49,6 +49,7 @@ TURNED = np.radians(1.5)  # [rad], tolerated error of the stated camera rotation
 # the known ones show at most 0.75 of a wrong one's.
 ENOUGH = 0.8
 RIG_PICTURES = 4  # of the images, in which the ribs are compared with a rig
+AT_REST = 10  # images in which a camera elsewhere is looked for
 
 
 class Finding(NamedTuple):
@@ -95,6 +96,20 @@ def check_recording(
     if found.residual > GOOD_RESIDUAL:
         findings += _find_reasons(mean, source, recording, parameters.camera_pose)
     return findings, _draw(mean, jaws, parameters.camera_pose, found, look)
+
+
+def explain_camera(recording: Recording, source: KeypointSource) -> list[str]:
+    """Return where the camera is, in a sentence, if the first images show the jaws at rest but not where it says."""
+    parameters = build_records(source.node_parameters(recording)).parameters
+    images = choose_images(recording, parameters.depth)
+    first = replace(recording, images=images.at(images.stamps_ns[:AT_REST]))
+    jaws = {side: load_jaw(source.jaw_file, side) for side in recording.jaws}
+    try:
+        found, look = approach(first, source, jaws, parameters.camera_pose)
+    except FinforceError:
+        return []
+    findings = _judge_pose(found, look, recording, parameters.camera_pose)
+    return [each.text for each in findings if each.severity == FAULT]
 
 
 def check_object(recording: Recording, object_file: str | None, unit: str) -> list[Finding]:
