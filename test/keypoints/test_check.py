@@ -1,6 +1,7 @@
 """Claims about the check before any force: what fits passes, and what does not is named as what it is."""
 
 import json
+import re
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -118,7 +119,13 @@ def test_a_rig_is_tried_on_the_pictures_that_it_was_made_from(still, off, words)
     assert all(word in doubt for word, doubt in zip(words, doubts, strict=True))
 
 
-@pytest.mark.parametrize(("off", "words"), [(0.0, []), (0.008, ["the camera is 8.0 mm and 0"])])
+@pytest.mark.parametrize(
+    ("off", "words"),
+    [
+        (0.0, []),
+        (0.008, [r"the camera is (7\.[5-9]|8\.[0-4]) mm and 0\.\d\d degrees from .*; set T_gripper_camera: \["]),
+    ],
+)
 def test_a_camera_elsewhere_is_named_by_what_the_first_images_show(still, off, words):
     pose = ROBOT_CAMERA.copy()
     pose[2, 3] += off
@@ -126,7 +133,7 @@ def test_a_camera_elsewhere_is_named_by_what_the_first_images_show(still, off, w
     source = KeypointSource(source="images", jaw_file="bench", parameters=given, sides=SIDES)
     said = explain_camera(source.read(still), source)
     assert len(said) == len(words)
-    assert all(word in text and "set T_gripper_camera: [" in text for word, text in zip(words, said, strict=True))
+    assert all(re.match(word, text) for word, text in zip(words, said, strict=True))
 
 
 def test_a_mesh_that_is_not_what_the_camera_sees_is_named(footage, capsys, tmp_path):
