@@ -341,8 +341,8 @@ def open_picture(data: bytes, what: str, formats: tuple[str, ...] | None = _SENT
         raise ImageError(f"{what}: an HEIC picture; expected JPEG or PNG: export it as one of these")
     if data.startswith(PACKET):
         raise ImageError(
-            f"{what}: a packet of a video (H.264 or H.265), no picture by itself; expected JPEG or PNG: record raw or "
-            "compressed images, or unpack the packets to a video file"
+            f"{what}: a packet of a video, no picture by itself; expected JPEG or PNG, or H.264 of colours: record raw "
+            "or compressed images, or unpack the packets to a video file"
         )
     expected = f"at most {LARGEST_PICTURE} pixels"
     try:

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from finforce.camera import (
     EQUIDISTANT,
     MILLIMETRE,
+    PACKET,
     PLUMB_BOB,
     CameraIntrinsics,
     ImageError,
@@ -33,6 +34,7 @@ from finforce.camera import (
 )
 from finforce.errors import ObservationError, PoseError
 from finforce.transforms import pose_from_quaternion
+from finforce.video_packets import PacketDecoder
 
 NANOSECONDS = 1_000_000_000  # in a second
 SECOND = 1e-9  # a nanosecond [s]
@@ -468,14 +470,24 @@ def check_cloud(cloud: Any, frame: str, what: str) -> None:
         raise ObservationError(f"{what} came as {cloud.height} x {cloud.width} points; expected height 1")
 
 
-def color_from_message(message: Any) -> NDArray[np.uint8]:
+def is_packet(message: Any) -> bool:
+    """Say whether an image is a packet of a video, which needs those before it: of H.264 or H.265."""
+    return hasattr(message, "format") and bytes(message.data[: len(PACKET[0])]).startswith(PACKET)
+
+
+def color_from_message(message: Any, video: PacketDecoder | None = None) -> NDArray[np.uint8]:
     """Return the colours (h, w, 3), red green blue, of a sensor_msgs/Image, without a copy where its bytes lie so.
 
-    Of a sensor_msgs/CompressedImage the jpeg or png is decoded.
+    Of a sensor_msgs/CompressedImage the jpeg, png or packet of H.264 is decoded, the latter by a decoder that has had
+    those before it; without one, only key frames can be.
 
     Raises:
+        MissingFrameError: a packet is damaged, or what it is predicted from is missing.
         ImageError: the encoding is not known, the data do not fill the image, or the picture is damaged.
     """
+    if is_packet(message) and not any(name in message.format.lower() for name in ("265", "hevc")):
+        what = f"colour image {message.format!r}"
+        return (video or PacketDecoder()).decode(bytes(message.data), stamp_of(message), what)
     if hasattr(message, "format"):
         return decode_picture(message.data, f"colour image {message.format!r}")
     return decode_color(np.frombuffer(message.data, dtype=np.uint8), message.encoding, layout_of(message))
@@ -487,6 +499,7 @@ class CameraStream:
     Attributes:
         frame: of the camera, empty while it is not known.
         camera: its intrinsics, None until they came.
+        video: decoder of the colour images that are packets.
 
     Args:
         frame: of the camera; empty while it is not known.
@@ -496,6 +509,7 @@ class CameraStream:
     def __init__(self, frame: str = "", depth_scale: float = MILLIMETRE) -> None:
         self.frame, self._is_sure, self._depth_scale = frame, bool(frame), depth_scale
         self.camera: CameraIntrinsics | None = None
+        self.video = PacketDecoder()
 
     def frame_of(self, message: Any, *, is_sure: bool = True) -> str:
         """Return the frame, which is that of this message where none was known, or none for sure."""
@@ -525,7 +539,7 @@ class CameraStream:
     def read_color(self, message: Any) -> NDArray[np.uint8]:
         """Return the colours of an image as `color_from_message`; raises ObservationError for another frame."""
         check_frame(message, self.frame_of(message), "the colour image")
-        return color_from_message(message)
+        return color_from_message(message, self.video)
 
     def read_depth(self, message: Any) -> NDArray[np.float32]:
         """Return the depth of an image as `depth_from_message`; raises ObservationError for another frame."""

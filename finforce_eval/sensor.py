@@ -112,7 +112,7 @@ class ForceSensor:
         self.camera = camera
         jaws = {side: load_jaw(jaw or "bench", side) for side in sides}
         records = build_records({**parameters, **(detector or {})})
-        self._detector = build_detector(jaws, *records, watched=not is_video)
+        self._detector, self._is_video = build_detector(jaws, *records), is_video
         whole = settings if isinstance(settings, EstimatorSettings) else EstimatorSettings(**(settings or {}))
         settings = whole.resolve_held(both=len(sides) == len(SIDES))
         mesh = None if object_mesh is None else load_object_mesh(object_mesh)
@@ -147,7 +147,8 @@ class ForceSensor:
             self.camera = read_intrinsics(self.camera, rgb.shape[:2])
         if depth is not None:
             depth = decode_depth(depth, "16UC1" if np.asarray(depth).dtype.kind in "iu" else "32FC1")
-        seen = self._detector.detect(RgbdImage(stamp=stamp, color=rgb, depth=depth, camera=self.camera))
+        image = RgbdImage(stamp=stamp, color=rgb, depth=depth, camera=self.camera, is_video=self._is_video)
+        seen = self._detector.detect(image)
         T = None if T_camera_object is None else check_pose(T_camera_object, "T_camera_object")
         found = {side: self._solve(loop, seen.get(side), stamp, T) for side, loop in self._loops.items()}
         return combine_solutions(stamp, {side: found[side] if side in seen else None for side in found})

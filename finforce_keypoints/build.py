@@ -30,7 +30,6 @@ def build_detector(
     settings: DetectorSettings | None = None,
     dots: DotSettings | None = None,
     rests: bool = False,
-    watched: bool = True,
 ) -> KeypointDetector:
     """Return the detector of the jaws (by side) that the parameters ask for.
 
@@ -40,7 +39,6 @@ def build_detector(
         settings: of the geometry.
         dots: appearance of dots, where they are used.
         rests: True if pixels and depth are left out where nothing has moved.
-        watched: True if pictures that repeat themselves mean a frozen camera; a video repeats whatever stands still.
 
     Raises:
         PoseError: the camera's pose is none.
@@ -58,7 +56,7 @@ def build_detector(
         jaws,
         parameters.camera_pose,
         settings,
-        ImageWatch() if watched else None,
+        ImageWatch(),
         rests,
         mounts,
         TagFinder(parameters.tag_family, ids) if ids else None,

@@ -147,8 +147,8 @@ class KeypointDetector:
         for side, share in self._shares.items():
             if self._looks[side] >= _MEMORY and share < _FEW:
                 said[side].append(
-                    f"{100 * share:.0f} % of the key points are seen on average: is it the finger of the jaw file, and "
-                    "nothing before it?"
+                    f"{100 * share:.0f} % of the key points are seen on average: are the extrinsics right, is it the "
+                    "finger of the jaw file, and nothing before it? finforce check tells"
                 )
         if self._off_centre > _OFF_CENTRE:
             text = (

@@ -19,6 +19,7 @@ from finforce.messages import (
     CameraStream,
     Stamped,
     Synchronizer,
+    is_packet,
     median_period,
     pairing_tolerance,
     stamp_of,
@@ -55,6 +56,7 @@ class RgbdImage:
         depth: (h, w) float32 distance along the optical axis [m], NaN invalid; None when there is none.
         camera: intrinsics of both.
         depth_delay: from the stamp of the colours to that of the depth [s].
+        is_video: True if the colours come from a video, where what stands still may repeat itself bit by bit.
     """
 
     stamp: float
@@ -62,6 +64,7 @@ class RgbdImage:
     depth: NDArray | None
     camera: CameraIntrinsics
     depth_delay: float = 0.0
+    is_video: bool = False
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -184,7 +187,7 @@ class ImageWatch:
             FrozenImageError: it, a part of it, or the depth image is the same as the ones before.
         """
         seen = image.color[::_WATCHED_STEP, ::_WATCHED_STEP].copy()
-        self._count_same(seen, image.depth)
+        self._count_same(seen, image)
         if (brightest := _brightest(seen)) < _DARKEST:
             raise BlackImageError(
                 f"black image: its brightest pixels are {brightest:.0f} of 255; expected at least {_DARKEST}; "
@@ -207,9 +210,10 @@ class ImageWatch:
                 "between them; restart the camera"
             )
 
-    def _count_same(self, seen: NDArray, depth: NDArray | None) -> None:
+    def _count_same(self, seen: NDArray, image: RgbdImage) -> None:
         """Count how often in a row the picture, its parts and the depth were what they had been before."""
-        is_known = seen.shape == self._color.shape
+        depth = image.depth
+        is_known = seen.shape == self._color.shape and not image.is_video
         same = _all_colors(seen == self._color) if is_known else np.zeros(seen.shape[:2], dtype=bool)
         lively = _all_colors((seen > _NEAR_BLACK) & (seen < _NEAR_WHITE))
         self._same = self._same + 1 if same.all() else 0
@@ -279,6 +283,7 @@ class RgbdFeed:
 
     def pause(self) -> None:
         """Note that nobody asks for images, which are none that got lost."""
+        self.stream.video.reset()
         for arrivals in self.arrivals.values():
             arrivals.reset()
 
@@ -299,6 +304,7 @@ class RgbdFeed:
         if self.topic != topic and (self.topic is None or now - self._heard > SILENCE):
             self.topic = topic
             self._images.reset(COLOR)
+            self.stream.video.reset()
         if self.topic == topic:
             self._heard = now
         return self.topic == topic
@@ -322,7 +328,8 @@ class RgbdFeed:
         self.arrivals[COLOR].take(stamp, spare)
         camera = self.stream.known_camera(self._parameters.info_topic)
         color = self.stream.read_color(message)
-        taken = Stamped(stamp, RgbdImage(stamp=SECOND * stamp, color=color, depth=None, camera=camera))
+        image = RgbdImage(stamp=SECOND * stamp, color=color, depth=None, camera=camera, is_video=is_packet(message))
+        taken = Stamped(stamp, image)
         self._learn_period(taken.stamp)
         if self._alone:
             self.alone += 1

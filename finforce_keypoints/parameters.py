@@ -61,7 +61,7 @@ class DetectorParameters(GripperParameters):
     )
     color_topics: tuple[str, ...] = setting(
         (relative(COLOR_TOPIC), relative(OLD_COLOR_TOPIC)),
-        "Colour image topics; the first one with an image is used until it is silent; .../compressed: jpeg, png",
+        "Colour image topics; the first one with an image is used until it is silent; .../compressed: jpeg, png, H.264",
         topic=True,
     )
     depth_topic: str = setting(relative(DEPTH_TOPIC), "Topic of depth images aligned to the colour images", topic=True)

@@ -102,7 +102,7 @@ class _View(NamedTuple):
         return self._replace(T_camera_object=self.T_camera_object @ change)
 
 
-class _Reading(NamedTuple):
+class Reading(NamedTuple):
     """Another way to read the mesh: in words, and as a map (4, 4) of its own frame."""
 
     text: str
@@ -217,19 +217,19 @@ class MeshCheck:
             return f"the mesh fits when {max(fitting, key=lambda each: each[0])[1]}"
         return "no turn, scale or shift of it fits: is it the mesh of this object, in this frame?"
 
-    def _tried(self) -> Iterator[tuple[_Reading, Fit]]:
+    def _tried(self) -> Iterator[tuple[Reading, Fit]]:
         """Yield other readings of the mesh with their fits to the newest images."""
-        for reading in _turns():
+        for reading in list_turns():
             yield reading, self._fit(reading.change)
         scale = max(_SCALES, key=lambda scale: self._fit(_scaled(scale)).gain)
         scale = max(scale * _FINER, key=lambda scale: self._fit(_scaled(scale)).gain)
-        yield _Reading(f"scaled by {scale:.3g}", _scaled(scale)), self._fit(_scaled(scale))
+        yield Reading(f"scaled by {scale:.3g}", _scaled(scale)), self._fit(_scaled(scale))
         for axis, name in enumerate("xyz"):
             mirror = np.diag(np.where(np.arange(4) == axis, -1.0, 1.0))
-            yield _Reading(f"mirrored along {name}", mirror), self._fit(mirror)
+            yield Reading(f"mirrored along {name}", mirror), self._fit(mirror)
         change = self._find_shift()
         if np.linalg.norm(self._shift(change)) <= FARTHEST:
-            yield _Reading(self._describe_shift(change), change), self._fit(change)
+            yield Reading(self._describe_shift(change), change), self._fit(change)
 
     def _fit(self, change: NDArray) -> Fit:
         return _sum(self._compare(view.moved(change)) for view in self._views)
@@ -262,10 +262,11 @@ def _scaled(scale: float) -> NDArray:
     return np.diag([scale, scale, scale, 1.0])
 
 
-def _turns() -> Iterator[_Reading]:
-    """Yield the 23 turns that lay axes on axes, those by right angles first."""
+def list_turns() -> list[Reading]:
+    """Return the 23 turns that lay axes on axes, those by right angles first."""
     from scipy.spatial.transform import Rotation
 
+    turns = []
     for rotation in sorted(Rotation.create_group("O"), key=_order_of_turn):
         turn, change = rotation.magnitude(), np.eye(4)
         if turn < 1e-6:
@@ -275,7 +276,8 @@ def _turns() -> Iterator[_Reading]:
             axis, turn = -axis, -turn
         name = "xyz"[int(axis.argmax())] if np.abs(axis).sum() == 1 else str(tuple(axis.tolist()))
         change[:3, :3] = rotation.as_matrix()
-        yield _Reading(f"turned by {np.degrees(turn):.0f} degrees about {name}", change)
+        turns.append(Reading(f"turned by {np.degrees(turn):.0f} degrees about {name}", change))
+    return turns
 
 
 def _order_of_turn(rotation: Rotation) -> tuple[float, float]:

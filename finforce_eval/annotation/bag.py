@@ -22,6 +22,7 @@ from finforce.files import FileError, check_inside
 from finforce.messages import read_stamp
 from finforce_eval.annotation.video import write_video
 from finforce_eval.errors import OptionError, RecordingError, UnseenError
+from finforce_eval.evaluation.check import explain_camera
 from finforce_eval.evaluation.forces import (
     describe_contradictions,
     estimate_forces,
@@ -88,14 +89,15 @@ def annotate_bag(source: Path, target: Path, options: argparse.Namespace, settin
     try:
         recording = keypoints.apply(recording)
     except UnseenError as error:
-        raise RecordingError("; ".join((str(error), *explain_unseen(recording, keypoints)))) from error
+        why = explain_unseen(recording, keypoints) or explain_camera(recording, keypoints)
+        raise RecordingError("; ".join((str(error), *why))) from error
     tare = parse_tare_source(options.tare_from)
     other = None if tare is None or tare.episode is None else _read_episode(source, tare.episode, keypoints)
     tares, compared = borrow_tares(tare, recording, other, keypoints, setup)
     jaws = estimate_forces(recording, setup, tares=tares)
     why = why_unanswered(jaws.values())
     notes = [*describe_unseen(recording, keypoints, jaws), *recording.notes, *compared]
-    notes += describe_contradictions(jaws.values())
+    notes += [*setup.contacts.describe_comparison(recording), *describe_contradictions(jaws.values())]
     if why:
         raise RecordingError(f"{target.name}: {'; '.join((*notes, why))}")
     figures = without_nan(_describe(jaws, recording) | {"notes": notes})

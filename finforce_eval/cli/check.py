@@ -16,7 +16,8 @@ from finforce_eval.cli.parser import BAG_HELP, CommandResult, add_rest_options
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.at_rest import ROUNDS
 from finforce_eval.evaluation.check import FAULT, check_object, check_recording, check_rig
-from finforce_eval.recordings.images import CAMERA_INFO, COMPRESSED, IMAGE
+from finforce_eval.recordings.bags import COMPRESSED
+from finforce_eval.recordings.images import CAMERA_INFO, IMAGE
 from finforce_eval.recordings.writer import Entry, typestore, write_entries
 from finforce_eval.tasks import progress_bar
 

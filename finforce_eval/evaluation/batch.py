@@ -224,7 +224,7 @@ def evaluate_task(name: str, path: str, target: str, options: argparse.Namespace
     cases = {case: asdict(score) for case, score in score_results(results, [recording]).scores.items()}
     about = {"about": dict(setup.about), "path": path, "true_range_N": true_range(recording), "keypoint_names": names}
     write_table(Path(target), results, about | {"cases": cases})
-    notes = [*recording.notes, *describe_contradictions(results)]
+    notes = [*recording.notes, *setup.contacts.describe_comparison(recording), *describe_contradictions(results)]
     notes += [note_left_out(recording, result) for result in results if setup.as_live]
     return {"cases": cases, "notes": notes, "version": setup.about["version"]}
 

@@ -18,7 +18,7 @@ from finforce.transforms import invert_pose, pose_numbers, rotation_between
 from finforce_contact.mesh.object_mesh import load_object_mesh
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.at_rest import JawsAtRest, approach
-from finforce_eval.evaluation.contact_source import check_mesh
+from finforce_eval.evaluation.contact_source import OUTLINED, UNCOMPARED, check_mesh
 from finforce_eval.evaluation.keypoint_source import KeypointSource, build_records, choose_images
 from finforce_eval.evaluation.unseen import explain_unseen
 from finforce_eval.recordings.frames import STILL_RATE, FrameImages
@@ -49,6 +49,7 @@ TURNED = np.radians(1.5)  # [rad], tolerated error of the stated camera rotation
 # the known ones show at most 0.75 of a wrong one's.
 ENOUGH = 0.8
 RIG_PICTURES = 4  # of the images, in which the ribs are compared with a rig
+AT_REST = 10  # images in which a camera elsewhere is looked for
 
 
 class Finding(NamedTuple):
@@ -97,6 +98,20 @@ def check_recording(
     return findings, _draw(mean, jaws, parameters.camera_pose, found, look)
 
 
+def explain_camera(recording: Recording, source: KeypointSource) -> list[str]:
+    """Return where the camera is, in a sentence, if the first images show the jaws at rest but not where it says."""
+    parameters = build_records(source.node_parameters(recording)).parameters
+    images = choose_images(recording, parameters.depth)
+    first = replace(recording, images=images.at(images.stamps_ns[:AT_REST]))
+    jaws = {side: load_jaw(source.jaw_file, side) for side in recording.jaws}
+    try:
+        found, look = approach(first, source, jaws, parameters.camera_pose)
+    except FinforceError:
+        return []
+    findings = _judge_pose(found, look, recording, parameters.camera_pose)
+    return [each.text for each in findings if each.severity == FAULT]
+
+
 def check_object(recording: Recording, object_file: str | None, unit: str) -> list[Finding]:
     """Return whether the images show the mesh of the object where its poses say; empty without a mesh.
 
@@ -109,9 +124,10 @@ def check_object(recording: Recording, object_file: str | None, unit: str) -> li
     mesh = load_object_mesh(path, unit=unit)
     check = check_mesh(recording, mesh, at_once=True)
     if check is None or not check.is_sure:
-        text = f"{mesh.name} is not compared: that needs depth images and /object_pose in their frame"
-        return [Finding(WARNING, text)]
+        return [Finding(WARNING, f"{mesh.name} {UNCOMPARED}")]
     said = check.at(int(recording.images.stamps_ns[-1]))
+    if not said and not recording.images.has_depth:
+        return [Finding(WARNING, f"{mesh.name} {OUTLINED}")]
     return [Finding(FAULT, said) if said else Finding(OK, f"{mesh.name} is where the camera sees it")]
 
 

@@ -19,6 +19,7 @@ from finforce.errors import PoseError
 from finforce.health import Idling
 from finforce.messages import SECOND
 from finforce_contact.loop import ContactLoop, ContactSource, GivenContact, Surface
+from finforce_contact.parameters import ContactParameters
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.scoring import ONSET_FORCE
 from finforce_eval.recordings.objects import (
@@ -95,17 +96,21 @@ class RecordedContact(ContactLoop):
 class RecordedCheck:
     """The mesh of a recording compared with its depth images, as the contact estimator's node compares it live.
 
+    Without depth, its outline is compared with edges in colour.
+
     Args:
-        recording: with depth images.
+        recording: with images.
         mesh: of the object.
         track: its poses in the camera's frame at stamps of the images.
         at_once: compare as few images as a verdict needs, of all that there are.
     """
 
     def __init__(self, recording: Recording, mesh: Any, track: ObjectTrack, *, at_once: bool = False) -> None:
+        from finforce_contact.pose.edge_check import EdgeCheck
         from finforce_contact.pose.mesh_check import LEAST_IMAGES, MeshCheck, is_due
 
-        self._check, self._least = MeshCheck(mesh, recording.images.camera), LEAST_IMAGES
+        kind = MeshCheck if recording.images.has_depth else EdgeCheck
+        self._check, self._least = kind(mesh, recording.images.camera), LEAST_IMAGES
         chosen: list[int] = []
         if at_once:
             chosen += np.unique(np.linspace(0, len(track.stamps_ns) - 1, LEAST_IMAGES).astype(int)).tolist()
@@ -127,20 +132,22 @@ class RecordedCheck:
             RecordingError: an image is damaged.
         """
         while self._left and (self._left[0] <= stamp or len(self._poses) - len(self._left) < self._least):
-            shown = next(self._images)
-            with suppress(ImageError):  # without any depth
-                self._check.add(shown.image.depth, self._poses[self._left.popleft()])
+            shown = next(self._images, None)
+            while self._left and (shown is None or self._left[0] <= shown.stamp):  # of a video some cannot be made
+                self._left.popleft()
+            if shown is not None:
+                with suppress(ImageError):  # without any depth
+                    pixels = shown.image.color if shown.image.depth is None else shown.image.depth
+                    self._check.add(pixels, self._poses[shown.stamp])
         return self._check.contradiction
 
 
 def check_mesh(recording: Recording, mesh: Any, *, at_once: bool = False) -> RecordedCheck | None:
-    """Return the comparison of a mesh with the images of a recording; None without depth and poses of one frame.
+    """Return the comparison of a mesh with the images of a recording; None without images and poses of one frame.
 
     See `RecordedCheck`.
     """
-    from finforce_contact.parameters import ContactParameters
-
-    track = pose_object_in_images(recording, round(ContactParameters().pose_tolerance / SECOND))
+    track = pose_object_in_images(recording, POSE_TOLERANCE)
     if track is None or not len(track.stamps_ns):
         return None
     return RecordedCheck(recording, mesh, track, at_once=at_once)
@@ -253,6 +260,9 @@ def _before_load(track: ObjectTrack, recording: Recording, side: str) -> ObjectT
 
 
 ESTIMATED = ("estimate", "closest", "paper")
+POSE_TOLERANCE = round(ContactParameters().pose_tolerance / SECOND)  # [ns]
+UNCOMPARED = "is not compared: that needs depth images and /object_pose in their frame"
+OUTLINED = "is compared with edges in colour, for want of depth: only turns by right angles are told"
 AUTOMATIC, FIXED = "automatic", "fixed"
 FROM_CASE = "case"
 METRES = 0.5  # below it a height in millimetres was meant in metres: no jaw is touched so near to its clamp
@@ -302,6 +312,16 @@ class ContactChoice:
                 self.height(recording)
             else:
                 require_mesh(recording, self.object_file)
+
+    def describe_comparison(self, recording: Recording) -> list[str]:
+        """Return that the mesh is not compared with depth images, in a sentence; empty where it is, or need not be."""
+        modes = {self.mode_for(recording, side) for side in recording.jaws}
+        if modes == {FIXED} or not self.compare_mesh:
+            return []
+        compared = pose_object_in_images(recording, POSE_TOLERANCE)
+        if compared is None or not len(compared.stamps_ns):
+            return [f"the object's mesh {UNCOMPARED}; a wrong one gives wrong forces"]
+        return [] if recording.images.has_depth else [f"the object's mesh {OUTLINED}; a wrong one gives wrong forces"]
 
     def height(self, recording: Recording) -> float:
         """Return the height of first touch above the clamped base for a recording [m].

@@ -147,8 +147,7 @@ class KeypointSource:
         if live is not None:
             raise OptionError(f"--detector {live}: means nothing offline; leave it out, or use finforce replay")
         parameters, settings, dots = build_records(self.node_parameters(recording))
-        watched = not recording.images.is_video
-        return build_detector(load_jaws(parameters), parameters, settings, dots, self.as_live, watched)
+        return build_detector(load_jaws(parameters), parameters, settings, dots, self.as_live)
 
     def _detect(self, recording: Recording) -> Recording:
         given = self.node_parameters(recording)
@@ -376,7 +375,9 @@ def detect_keypoints(
     notes = [f"{count} images rejected: {text}" for text, count in reasons.items()] + warnings
     notes += [f"the {side} jaw is in none of the images" for side, seen in found.items() if not seen]
     if missing := len(images) - len(step_ms):
-        notes.append(f"{missing} of {len(images)} images are damaged or follow a damaged one, and are left out")
+        notes.append(
+            f"{missing} of {len(images)} images are damaged, or follow a damaged or missing one, and are left out"
+        )
     recording = replace(recording, notes=(*recording.notes, *notes))
     return with_detections(recording, found, dict.fromkeys(found, step_ms), passed)
 

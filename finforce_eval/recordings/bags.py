@@ -40,6 +40,18 @@ class RawSample(NamedTuple):
     data: bytes | memoryview
 
 
+COMPRESSED = "sensor_msgs/msg/CompressedImage"
+PACKETS = {  # packets of videos, as Foxglove and ffmpeg_image_transport have them, whose types ROS does not bring
+    "foxglove_msgs/msg/CompressedVideo": (
+        "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format"
+    ),
+    "ffmpeg_image_transport_msgs/msg/FFMPEGPacket": (
+        "std_msgs/Header header\nint32 width\nint32 height\nstring encoding\nuint64 pts\nuint8 flags\n"
+        "bool is_bigendian\nuint8[] data"
+    ),
+}
+
+
 class BagReader:
     """An open bag.
 
@@ -75,8 +87,14 @@ class BagReader:
             yield message
 
     def decode(self, sample: RawSample) -> Any:
-        """Return the message of a sample."""
-        return self._types.deserialize_cdr(sample.data, self.types[sample.topic])
+        """Return the message of a sample; a packet of a video as a sensor_msgs/CompressedImage."""
+        kind = self.types[sample.topic]
+        message, types = self._types.deserialize_cdr(sample.data, kind), self._types.types
+        if kind not in PACKETS:
+            return message
+        header = getattr(message, "header", None) or types["std_msgs/msg/Header"](message.timestamp, message.frame_id)
+        words = message.encoding if hasattr(message, "encoding") else message.format
+        return types[COMPRESSED](header=header, format=words, data=message.data)
 
     def encode(self, msgtype: str, fields: Mapping[str, Any]) -> bytes:
         """Return the CDR bytes of a message with these fields."""
@@ -111,10 +129,12 @@ def open_bag(source: Path, name: str) -> Iterator[BagReader]:
         RecordingError: damaged or empty; also when it shows later, in the block.
     """
     from rosbags.rosbag2 import Reader
-    from rosbags.typesys import Stores, get_typestore
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     # not AnyReader: it registers every definition in the bag and ends at a foreign one it cannot parse
     types = get_typestore(Stores.ROS2_JAZZY)
+    for kind, fields in PACKETS.items():
+        types.register(get_types_from_msg(fields, kind))
     with damage_reported(name), ExitStack() as stack:
         with limit_growth(raise_budget(STEP_MEMORY), allowed_bytes(source)):
             _check_bounds(source)
@@ -265,6 +285,8 @@ _OTHERS = {
     ".zstd": "compressed as a whole: unpack it with zstd -d FILE",
     ".zip": "a zip file; a replay buffer of UMI is called NAME.zarr.zip",
 }
+# of what is said of MCAP files that are not written by ROS 2
+_FOREIGN = ("Profile is not ros2", "'protobuf'", "'jsonschema'", "'flatbuffer'", "'ros1msg'")
 _OTHERS |= {".h5": _OTHERS[".hdf5"], ".zst": _OTHERS[".zstd"]}
 
 
@@ -290,6 +312,9 @@ def bag_source(path: Path) -> Path:
     if len(files) != 1:
         found = f"no metadata.yaml and {len(files)} bag files: run `ros2 bag reindex` on it; expected one or metadata"
         found = found if files else "no metadata.yaml, .mcap, .db3 or pictures"
+        packed = [] if files else [each for each in sorted(path.iterdir()) if each.suffix in _OTHERS]
+        if packed:
+            raise RecordingError(f"{packed[0].name}: {_OTHERS[packed[0].suffix]}")
         raise RecordingError(f"{path.name}: the folder is not a recording: {found} in it")
     return _check_bag(files[0])
 
@@ -398,7 +423,8 @@ def damage_reported(name: str) -> Iterator[None]:
         raise OutOfBoundsError(f"{name}: a part of it takes more than {limit} MB of memory; {_HINT}") from error
     except Exception as error:  # struct, sqlite3, zstd, lz4, yaml, ... each has its own classes
         reason = one_line(error)
-        raise DamagedError(f"{name}: truncated or damaged: {reason}") from error
+        is_foreign = any(word in reason for word in _FOREIGN)
+        raise DamagedError(f"{name}: {'not of ROS 2' if is_foreign else 'truncated or damaged'}: {reason}") from error
 
 
 def restamp(data: bytes | memoryview, stamp: int) -> bytes:

@@ -20,6 +20,7 @@ from finforce.gripper_frames import SIDES
 from finforce.messages import NANOSECONDS
 from finforce.optional import import_library
 from finforce.typed_yaml import Number
+from finforce.video_packets import STRICT
 from finforce_eval.errors import DamagedError, OptionError, RecordingError
 from finforce_eval.recordings.bags import list_pictures
 from finforce_eval.recordings.image_files import read_intrinsics
@@ -114,7 +115,9 @@ class FrameImages(Timed):
                 if frame in wanted:
                     stamp, count = wanted[frame], count + 1
                 if frame in wanted and color is not None:
-                    image = RgbdImage(stamp=stamp / NANOSECONDS, color=color, depth=None, camera=self.camera)
+                    image = RgbdImage(
+                        stamp=stamp / NANOSECONDS, color=color, depth=None, camera=self.camera, is_video=self.is_video
+                    )
                     try:
                         check_image(image)
                     except ImageError as error:
@@ -147,8 +150,7 @@ def _open_video(path: Path, name: str) -> Iterator[tuple[Any, Any]]:
     except (FileError, av.FFmpegError, IndexError) as error:
         raise RecordingError(f"{where}: {error}; expected a video") from error
     with container:
-        # decoders else paint over what is damaged, and several threads tell less of it
-        stream.codec_context.options = {"err_detect": "crccheck+bitstream+buffer+explode"}
+        stream.codec_context.options = {"err_detect": STRICT}
         stream.codec_context.thread_count = 1
         try:
             yield container, stream

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -28,13 +28,15 @@ from finforce.messages import (
     color_from_message,
     depth_from_message,
     find_nearest,
+    is_packet,
     pairing_tolerance,
     read_stamp,
     same_camera,
     stamp_of,
 )
+from finforce.video_packets import MissingFrameError, PacketDecoder
 from finforce_eval.errors import RecordingError
-from finforce_eval.recordings.bags import BagReader, check_types, open_bag
+from finforce_eval.recordings.bags import COMPRESSED, PACKETS, BagReader, check_types, open_bag
 from finforce_eval.recordings.image_files import read_intrinsics
 from finforce_eval.recordings.tracks import Timed, check_stamps
 from finforce_keypoints.images import RgbdImage, check_image
@@ -95,6 +97,7 @@ class ImageTrack(Timed):
         unpaired: (m,) stamps of colour images left out because no depth image is of their time [ns].
         depth_scale: one step of a 16-bit depth image [m].
         info: topic of camera_info, "" without.
+        is_video: True if the colour images are packets of a video.
     """
 
     source: Path
@@ -107,7 +110,7 @@ class ImageTrack(Timed):
     unpaired: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     depth_scale: float = MILLIMETRE
     info: str = ""
-    is_video = False
+    is_video: bool = False
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -135,39 +138,60 @@ class ImageTrack(Timed):
         return replace(track, topics=(self.topics[0], ""), depth_stamps=np.full(len(track.stamps_ns), ALONE))
 
     def __iter__(self) -> Iterator[StampedImage]:
-        """Read the images in the order of their stamps.
+        """Read the images in the order of their stamps, without those of a video that cannot be made.
 
         Raises:
             RecordingError: an image is damaged, of unknown encoding, or of another size than its camera.
         """
         color, depth = self.topics
         wanted = {color: set(self.stamps_ns.tolist()), depth: set(self.depth_stamps.tolist()) - {ALONE}}
+        video = PacketDecoder()
         pairs = zip(self.stamps_ns.tolist(), self.depth_stamps.tolist(), strict=True)
         waiting: dict[tuple[str, int], Any] = {}
         pair = next(pairs, None)
         with open_bag(self.source, self.name) as bag:
             for raw in bag.raw(tuple(filter(None, self.topics))):
                 stamp = read_stamp(raw.data)
-                if stamp in wanted[raw.topic]:
-                    waiting[raw.topic, stamp] = bag.decode(raw)
+                is_wanted = stamp in wanted[raw.topic]
+                if is_wanted or (self.is_video and raw.topic == color):  # a packet needs those before it
+                    message = bag.decode(raw)
+                    read = message if raw.topic == depth else self._read_color(message, stamp, video)
+                    waiting |= {(raw.topic, stamp): read} if is_wanted else {}
                 while pair and (color, pair[0]) in waiting and (pair[1] == ALONE or (depth, pair[1]) in waiting):
-                    yield self._image(pair[0], waiting.pop((color, pair[0])), waiting.get((depth, pair[1])))
+                    pixels = waiting.pop((color, pair[0]))
+                    if pixels is not None:
+                        yield self._image(pair[0], pixels, waiting.get((depth, pair[1])))
                     waiting = {key: kept for key, kept in waiting.items() if key[0] == color or key[1] >= pair[1]}
                     pair = next(pairs, None)
+                if pair is None:
+                    return
 
-    def _image(self, stamp: int, color: Any, depth: Any) -> StampedImage:
-        late = 0 if depth is None else stamp_of(depth) - stamp
+    def _read_color(self, message: Any, stamp: int, video: PacketDecoder) -> NDArray[np.uint8] | None:
+        """Return the colours of an image; None of a packet whose picture cannot be made."""
+        with self._named(stamp), suppress(MissingFrameError):
+            return color_from_message(message, video)
+        return None
+
+    @contextmanager
+    def _named(self, stamp: int) -> Iterator[None]:
+        """Name the image [ns] that is damaged."""
         try:
+            yield
+        except ImageError as error:
+            raise RecordingError(f"{self.name}: image at {stamp * 1e-9:.3f} s: {error}") from error
+
+    def _image(self, stamp: int, color: NDArray[np.uint8], depth: Any) -> StampedImage:
+        late = 0 if depth is None else stamp_of(depth) - stamp
+        with self._named(stamp):
             image = RgbdImage(
                 stamp=stamp * 1e-9,
                 depth_delay=late * 1e-9,
-                color=color_from_message(color),
+                color=color,
                 depth=None if depth is None else depth_from_message(depth, self.depth_scale),
                 camera=self.camera,
+                is_video=self.is_video,
             )
             check_image(image)
-        except ImageError as error:
-            raise RecordingError(f"{self.name}: image at {stamp * 1e-9:.3f} s: {error}") from error
         return StampedImage(stamp, image)
 
 
@@ -200,7 +224,7 @@ def find_images(bag: BagReader, source: Path, choice: ImageChoice | None = None)
     info = "" if choice.intrinsics else choice.info or _find_info(bag, color, seen[color].frame)
     topics = (color, depth) if depth else (color,)
     check_types(bag.connections, dict.fromkeys(topics, IMAGES) | {info: (CAMERA_INFO,)}, bag.name)
-    camera, frame_id = _choose_camera(bag, info, choice, seen[color])
+    camera, frame_id = _choose_camera(bag, info, choice, color, seen[color].frame)
     found: dict[str, list[int]] = {topic: [] for topic in topics}
     for raw in bag.raw(topics):
         found[raw.topic].append(read_stamp(raw.data))
@@ -212,8 +236,10 @@ def find_images(bag: BagReader, source: Path, choice: ImageChoice | None = None)
         depth_stamps = stamps[depth][find_nearest(stamps[depth], stamps[color])]
         paired = np.abs(depth_stamps - stamps[color]) <= pairing
         if not paired.any():
+            nearest = np.abs(depth_stamps - stamps[color]).min()
             raise RecordingError(
-                f"{bag.name}: no depth image on {depth} within {pairing / 10**6:g} ms of one on {color}"
+                f"{bag.name}: no depth image on {depth} within {pairing / 10**6:g} ms of one on {color}; the nearest "
+                f"two are {nearest / 10**9:.3f} s apart: stamps of two clocks?"
             )
     return ImageTrack(
         source=source,
@@ -225,18 +251,21 @@ def find_images(bag: BagReader, source: Path, choice: ImageChoice | None = None)
         frame_id=frame_id,
         unpaired=stamps[color][~paired],
         info=info,
+        is_video=seen[color].is_video,
     )
 
 
-def _choose_camera(bag: BagReader, info: str, choice: ImageChoice, first: _FirstImage) -> tuple[CameraIntrinsics, str]:
+def _choose_camera(
+    bag: BagReader, info: str, choice: ImageChoice, color: str, frame: str
+) -> tuple[CameraIntrinsics, str]:
     """Return the camera of the images, by a topic or as given, and its frame.
 
     Raises:
-        RecordingError: it changes, or is not that of the rig.
+        RecordingError: it changes, or is not that of the rig; no image can be decoded.
         OptionError: the intrinsics that were given cannot be used.
     """
     if not info:
-        return read_intrinsics(choice.intrinsics, first.shape), first.frame
+        return read_intrinsics(choice.intrinsics, _find_size(bag, color)), frame
     camera, frame_id = _read_camera(bag, info)
     if choice.camera is not None and not same_camera(choice.camera, camera):
         raise RecordingError(
@@ -261,12 +290,12 @@ def _find_topic(bag: BagReader, ends: Sequence[str]) -> str:
 
 
 class _FirstImage(NamedTuple):
-    """Properties of all images of a topic, by the first: frame, height and width, and content."""
+    """Properties of all images of a topic, by the first: frame and content."""
 
     frame: str
-    shape: tuple[int, int]
     is_depth: bool
     is_grey: bool
+    is_video: bool
 
 
 def _look_at_images(bag: BagReader) -> dict[str, _FirstImage]:
@@ -275,18 +304,25 @@ def _look_at_images(bag: BagReader) -> dict[str, _FirstImage]:
     seen: dict[str, _FirstImage] = {}
     for raw in bag.raw(topics):
         if raw.topic not in seen:
-            message, shape = bag.decode(raw), (0, 0)
+            message = bag.decode(raw)
             words = getattr(message, "encoding", None) or message.format
             is_depth = words.partition(";")[0].strip() in DEPTH_TYPES or "compressedDepth" in words
-            if hasattr(message, "height"):
-                shape = (message.height, message.width)
-            else:
-                with suppress(OSError), Image.open(io.BytesIO(bytes(message.data))) as picture:
-                    shape = (picture.height, picture.width)
-            seen[raw.topic] = _FirstImage(message.header.frame_id, shape, is_depth, words.startswith("mono"))
+            is_grey = words.startswith("mono")
+            seen[raw.topic] = _FirstImage(message.header.frame_id, is_depth, is_grey, is_packet(message))
         if len(seen) == len(topics):
             break
     return seen
+
+
+def _find_size(bag: BagReader, color: str) -> tuple[int, int]:
+    """Return height and width of the first colour image that can be decoded; raises RecordingError where none can."""
+    video, why = PacketDecoder(), ""
+    for raw in bag.raw((color,)):
+        try:
+            return color_from_message(bag.decode(raw), video).shape[:2]
+        except ImageError as error:
+            why = str(error)
+    raise RecordingError(f"{bag.name}: no image on {color} can be decoded: {why}")
 
 
 def _plain(topics: Collection[str]) -> list[str]:
@@ -334,14 +370,16 @@ def _read_camera(bag: BagReader, topic: str) -> tuple[CameraIntrinsics, str]:
         try:
             seen = camera_from_info(info, info.header.frame_id)
         except (ObservationError, IntrinsicsError) as error:
-            raise RecordingError(f"{bag.name}: {topic}: {error}") from error
+            raise RecordingError(f"{bag.name}: {topic}: {error}; --intrinsics replaces it") from error
         if camera is not None and not (same_camera(camera, seen) and info.header.frame_id == frame):
             raise RecordingError(f"{bag.name}: the camera on {topic} changes; expected one in a recording")
         camera, frame = seen, info.header.frame_id
     return camera, frame
 
 
-IMAGES = IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+IMAGE = "sensor_msgs/msg/Image"
+PACKED = (COMPRESSED, *PACKETS)
+IMAGES = (IMAGE, *PACKED)
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 QUALITY = 90  # of a jpeg, the key points' pixels stay within a few hundredths
 LEVEL = 1  # of png: the highest makes a noisy depth image a quarter smaller, and takes eighty times as long

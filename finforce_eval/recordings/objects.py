@@ -143,7 +143,7 @@ def track_object(recording: Recording, side: str) -> ObjectTrack:
 
 
 def pose_object_in_images(recording: Recording, tolerance: int) -> ObjectTrack | None:
-    """Return the object's poses T_camera_object at the stamps of depth images; None where there are no such poses.
+    """Return the object's poses T_camera_object at the stamps of images, with depth if there is some; None without.
 
     Args:
         recording: any.
@@ -153,11 +153,11 @@ def pose_object_in_images(recording: Recording, tolerance: int) -> ObjectTrack |
         RecordingError: a pose is none.
     """
     objects, images = recording.object_pose, recording.images
-    if objects is None or images is None or not images.has_depth or not len(objects.stamps_ns):
+    if objects is None or images is None or not len(objects.stamps_ns):
         return None
     if objects.frame_id.lstrip("/") != images.frame_id.lstrip("/"):
         return None
-    stamps = images.stamps_ns[images.depth_stamps != ALONE]
+    stamps = images.stamps_ns[images.depth_stamps != ALONE] if images.has_depth else images.stamps_ns
     order = np.argsort(objects.stamps_ns, kind="stable")
     nearest = order[find_nearest(objects.stamps_ns[order], stamps)]
     paired = np.abs(objects.stamps_ns[nearest] - stamps) <= tolerance

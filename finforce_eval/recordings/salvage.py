@@ -52,7 +52,7 @@ class SalvagedCopy:
         except SandboxError as error:
             raise OutOfBoundsError(f"{reason}; what is left of it {error}") from error
         if not found:
-            raise RecordingError(f"{reason}; not one message is whole")
+            raise RecordingError(f"{reason}; not one message is whole and in CDR, as ROS 2 has them")
         self.note = f"{reason}; read as far as it is good: {found}"
 
 
@@ -106,7 +106,8 @@ def _read_mcap(path: Path) -> Iterator[_Message]:
                     channel = channels[part.channel_id]
                     schema = schemas[channel.schema_id]
                     text = schema.data.decode(errors="replace")
-                    yield _Message(channel.topic, schema.name, text, part.log_time, part.data)
+                    if channel.message_encoding == "cdr":
+                        yield _Message(channel.topic, schema.name, text, part.log_time, part.data)
 
 
 def _read_sqlite(path: Path) -> Iterator[_Message]:

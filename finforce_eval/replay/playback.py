@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Collection, Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -10,13 +10,14 @@ from typing import Any, NamedTuple
 
 from finforce.camera_topics import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 from finforce.messages import color_from_message, depth_steps, read_stamp
+from finforce.video_packets import MissingFrameError, PacketDecoder
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.bags import BagReader, RawSample, bag_source, open_bag, restamp
 from finforce_eval.recordings.images import (
     COLOR_ENDS,
-    COMPRESSED,
     DEPTH_ENDS,
     IMAGE,
+    PACKED,
     ImageTrack,
 )
 
@@ -77,20 +78,26 @@ class Playback:
             self._topics = {entry.topic: ours[entry.topic] for entry in chosen}
             self._count = sum({id(entry): entry.msgcount for entry in chosen}.values())
             first = next(bag.raw(self._topics), None)
-            self._headed = {entry.topic: _begins_with_header(bag.definition(entry.msgtype)) for entry in chosen}
+            types = {entry.topic: _played_type(entry.msgtype) for entry in chosen}
+            self._headed = {topic: _begins_with_header(bag.definition(kind)) for topic, kind in types.items()}
         if first is None:
             raise RecordingError(f"{source.name}: nothing to be played in it")
         self.begin = first.time
-        self.types = {self._topics[entry.topic]: _played_type(entry.msgtype) for entry in chosen}
+        self.types = {self._topics[topic]: kind for topic, kind in types.items()}
 
     def __len__(self) -> int:
         return self._count
 
     def __iter__(self) -> Iterator[RawMessage]:
+        videos: dict[str, PacketDecoder] = defaultdict(PacketDecoder)
         with open_bag(self._source, self._source.name) as bag:
             for raw in bag.raw(self._topics):
-                topic, kind = self._topics[raw.topic], bag.types[raw.topic]
-                data = _decompress(bag, raw, topic) if kind == COMPRESSED else bytes(raw.data)
+                topic, kind, data = self._topics[raw.topic], bag.types[raw.topic], bytes(raw.data)
+                if kind in PACKED:
+                    try:
+                        data = _decompress(bag, raw, topic, videos[raw.topic])
+                    except MissingFrameError:
+                        continue
                 yield RawMessage(raw.time, topic, _played_type(kind), data, self._headed[raw.topic])
 
 
@@ -100,13 +107,13 @@ def _played_topic(topic: str) -> str:
 
 
 def _played_type(msgtype: str) -> str:
-    return IMAGE if msgtype == COMPRESSED else msgtype
+    return IMAGE if msgtype in PACKED else msgtype
 
 
-def _decompress(bag: BagReader, raw: RawSample, topic: str) -> bytes:
+def _decompress(bag: BagReader, raw: RawSample, topic: str, video: PacketDecoder) -> bytes:
     """Return the CDR bytes of a sensor_msgs/Image with the pixels of a compressed one."""
     message: Any = bag.decode(raw)
-    pixels = depth_steps(message) if topic == DEPTH_TOPIC else color_from_message(message)
+    pixels = depth_steps(message) if topic == DEPTH_TOPIC else color_from_message(message, video)
     fields = {
         "header": message.header,
         "height": pixels.shape[0],

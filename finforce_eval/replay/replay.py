@@ -96,6 +96,7 @@ def replay(
         ProcessError: a node cannot be started, or ended early.
         MissingDependencyError: ROS 2 is not installed.
     """
+    truth_sides(recording)
     played = play_to_nodes(
         recording, setup, calibration_file=calibration_file, playing=playing or Playing(), source=keypoints
     )
@@ -161,16 +162,15 @@ def _choose_keypoints(recording: Recording, jaw: Jaw, keypoints: KeypointSource,
     """Return a recording with the key points that are played, without any where images will give them.
 
     Raises:
-        RecordingError: there is no ground truth, or another number of key points than the jaw's.
+        RecordingError: they are of another number than the jaw's.
     """
     source = keypoints.source_of(recording)
     if source == IMAGES:
         recording = awaiting_keypoints(recording)
     elif source == TRUTH:
         recording = _write_truth(keypoints.apply(recording), stack)
-    for side in truth_sides(recording):
-        if source != IMAGES:
-            check_keypoint_count(recording, side, jaw)
+    for side in recording.jaws if source != IMAGES else ():
+        check_keypoint_count(recording, side, jaw)
     return recording
 
 

@@ -222,7 +222,9 @@ _LOCREF_WORDS = ("locref", "offset")
 # ImageNet's, which DeepLabCut takes off
 _MEAN = np.array([0.485, 0.456, 0.406], np.float32)
 _STD = np.array([0.229, 0.224, 0.225], np.float32)
-SNAPSHOTS = (".pt", ".pth")  # of PyTorch
+# what else networks are kept in, by the endings of their files
+OTHERS = {".pt": "PyTorch", ".pth": "PyTorch", ".pb": "TensorFlow", ".h5": "Keras", ".keras": "Keras"}
+OTHERS |= {".tflite": "TensorFlow Lite", ".engine": "TensorRT"}
 _PROBE = 256  # px, of the picture that a network of any size is tried with
 # A border of up to one cell and a half is a network's habit; a stride off by a factor of two is an error.
 _STRIDE_TOLERANCE = 0.6  # of log2(H / h / stride)
@@ -497,7 +499,7 @@ def find_network(path: str | Path) -> Path:
     """
     path = Path(path)
     try:
-        if path.is_file() and path.suffix not in SNAPSHOTS:
+        if path.is_file() and path.suffix not in OTHERS:
             return path
         files = sorted(path.glob("*"))
         found = [file for file in files if file.suffix == ".onnx"]
@@ -505,11 +507,11 @@ def find_network(path: str | Path) -> Path:
         raise ModelError(
             f"model: cannot be looked for ({error.strerror}); expected a folder with one .onnx file"
         ) from error
-    snapshots = [path] if path.suffix in SNAPSHOTS else [file for file in files if file.suffix in SNAPSHOTS]
-    if snapshots and not found:
-        raise ModelError(
-            f"{snapshots[0]}: a PyTorch file; expected an ONNX network: export it with examples/export_deeplabcut.py"
-        )
+    others = [file for file in (path, *files) if file.suffix in OTHERS]
+    if others and not found:
+        kind = OTHERS[others[0].suffix]
+        advice = "export it with examples/export_deeplabcut.py" if kind == "PyTorch" else "convert it"
+        raise ModelError(f"{others[0]}: a {kind} file; expected an ONNX network: {advice}")
     if len(found) != 1:
         names = ", ".join(file.name for file in found) or "none"
         raise ModelError(f"{path}: expected a folder with one .onnx file and its metadata, found {names}")

@@ -115,7 +115,7 @@ def test_a_port_that_is_unplugged_is_an_error_until_it_is_back(bench):
     bench.diagnosis(Level.OK, "")
 
 
-def test_a_port_that_does_not_exist_is_named_and_waited_for(bench):
+def test_a_port_that_does_not_exist_is_named_and_waited_for(bench, capfd):
     bench = bench(open_port=False)
     state = bench.diagnosis(Level.ERROR, "/dev/no_such_port")
     assert "\n" not in state.message
@@ -123,6 +123,8 @@ def test_a_port_that_does_not_exist_is_named_and_waited_for(bench):
     answer = bench.call("calibrate")
     assert not answer.success and "/dev/no_such_port" in answer.message
     assert not bench.joints
+    logged = capfd.readouterr().err
+    assert "gripper on /dev/no_such_port" in logged and "ready" not in logged
 
 
 def test_a_gripper_without_power_is_named_with_what_to_check(bench):

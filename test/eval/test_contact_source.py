@@ -11,7 +11,7 @@ from finforce_contact.loop import ForceLoop
 from finforce_eval.cli.main import parse
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation import contact_source
-from finforce_eval.evaluation.contact_source import RecordedContact, build_source
+from finforce_eval.evaluation.contact_source import OUTLINED, UNCOMPARED, RecordedContact, build_source
 from finforce_eval.evaluation.setup import read_contacts
 from finforce_eval.recordings.objects import ObjectTrack, track_object
 
@@ -160,3 +160,35 @@ def test_the_mesh_is_compared_with_the_images_unless_that_is_switched_off(words,
     choice = read_contacts(parse(["evaluate", "bag", "--contact", "estimate", *words]))
     build_source(choice, make_recording(), FakeJaw())
     assert len(calls) == compared
+
+
+class Images:
+    """Stamps of images with depth, or without."""
+
+    frame_id = "camera"
+
+    def __init__(self, has_depth):
+        self.has_depth = has_depth
+        self.stamps_ns = START + PERIOD * np.arange(20)
+        self.depth_stamps = self.stamps_ns
+
+
+def record_with(images, frame="camera"):
+    recording = make_recording()
+    return replace(recording, images=images, object_pose=replace(recording.object_pose, frame_id=frame))
+
+
+@pytest.mark.parametrize(
+    ("recording", "words", "expected"),
+    [
+        (record_with(None), ["--contact", "estimate"], [UNCOMPARED]),
+        (record_with(Images(has_depth=False)), ["--contact", "estimate"], [OUTLINED]),
+        (record_with(Images(has_depth=True), frame="world"), ["--contact", "estimate"], [UNCOMPARED]),
+        (record_with(Images(has_depth=True)), ["--contact", "estimate"], []),
+        (record_with(None), ["--contact", "estimate", "--no-compare-mesh"], []),
+        (record_with(None), ["--contact", "fixed:40"], []),
+    ],
+)
+def test_a_mesh_that_cannot_be_compared_with_the_images_is_noted(recording, words, expected):
+    notes = read_contacts(parse(["evaluate", "bag", *words])).describe_comparison(recording)
+    assert notes == [f"the object's mesh {each}; a wrong one gives wrong forces" for each in expected]

@@ -55,8 +55,8 @@ def test_other_kinds_of_pictures_and_odd_words_are_named():
     with pytest.raises(ImageError, match="neither jpeg nor png") as caught:
         color_from_message(Compressed(gif, "a\x00\nb"))
     assert "\n" not in str(caught.value)
-    with pytest.raises(ImageError, match="a packet of a video .H.264 or H.265.*record raw or compressed images"):
-        color_from_message(Compressed(b"\0\0\0\1\x67" + bytes(100), "h264"))
+    with pytest.raises(ImageError, match="a packet of a video.*or H.264 of colours: record raw or compressed images"):
+        color_from_message(Compressed(b"\0\0\0\1\x67" + bytes(100), "h265"))
 
 
 def test_inverse_depths_of_float_images_are_not_taken_for_millimetres():

@@ -6,18 +6,23 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from packet_fakes import KEY_EVERY, draw_pictures, encode_packets
+from rclpy.serialization import deserialize_message
 from rgbd_fakes import CAMERA, FakeGripper, make_footage
+from rosbags.typesys import get_types_from_msg
 from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import Image
 
 from finforce.camera import ImageError
 from finforce.camera_topics import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 from finforce.messages import DEPTH_HEADER, depth_from_message, depth_steps
 from finforce_eval.cli.twin import footage_entries, write_footage
 from finforce_eval.errors import RecordingError
-from finforce_eval.recordings.images import ImageChoice, compress_depth
+from finforce_eval.recordings.bags import PACKETS
+from finforce_eval.recordings.images import CAMERA_INFO, ImageChoice, compress_depth
 from finforce_eval.recordings.objects import find_mesh
 from finforce_eval.recordings.recording import read_recording
-from finforce_eval.recordings.writer import write_entries
+from finforce_eval.recordings.writer import Entry, header, make_message, typestore, write_entries
 from finforce_eval.replay.playback import Playback
 from finforce_sim.footage import encode_depth
 
@@ -258,3 +263,91 @@ def test_key_points_that_were_recorded_do_not_need_whole_images(tmp_path):
     colors = [entry for entry in footage if entry.topic == COLOR_TOPIC]
     read = read_recording(write_entries([*entries, *colors], tmp_path / "bag"))
     assert read.images is None and any("camera_info" in note for note in read.notes)
+
+
+COMPRESSED_IMAGE, VIDEO, PACKET = "sensor_msgs/msg/CompressedImage", *PACKETS
+PICTURES = draw_pictures(3 * KEY_EVERY)
+
+
+def write_packets(folder, kind, packets, *, with_info=True):
+    """A bag with packets of a video, none where one is None, and camera_info."""
+    types, entries = typestore(), []
+    for name, fields_of_type in PACKETS.items():
+        if name not in types.fielddefs:
+            types.register(get_types_from_msg(fields_of_type, name))
+    for number, data in enumerate(packets):
+        stamp = 10**9 + 33_333_333 * number
+        about, data = header(stamp, "camera_color_optical_frame"), np.frombuffer(data or b"", dtype=np.uint8)
+        numbers = {"width": 128, "height": 96, "pts": number, "flags": 0, "is_bigendian": False}
+        message = {
+            COMPRESSED_IMAGE: {"header": about, "format": "h264", "data": data},
+            VIDEO: {"timestamp": about["stamp"], "frame_id": about["frame_id"], "format": "h264", "data": data},
+            PACKET: {"header": about, "encoding": "h264", "data": data, **numbers},
+        }[kind]
+        if len(data):
+            entries.append(Entry(stamp, "/camera/video", make_message(kind, **message)))
+        if with_info:
+            k = np.array([100.0, 0.0, 64.0, 0.0, 100.0, 48.0, 0.0, 0.0, 1.0])
+            info = {"header": about, "width": 128, "height": 96, "distortion_model": "plumb_bob", "d": np.zeros(5)}
+            entries.append(Entry(stamp, "/camera/camera_info", make_message(CAMERA_INFO, **info, k=k)))
+    return write_entries(entries, folder)
+
+
+def numbers_of(pairs):
+    """Numbers of the pictures of pairs of stamp [ns] and colours, each of which has to be right."""
+    found = []
+    for stamp, color in pairs:
+        found.append(round((stamp - 10**9) / 33_333_333))
+        assert np.abs(color.astype(int) - PICTURES[found[-1]]).mean() < 5.0  # of 255, by compression
+    return found
+
+
+@pytest.mark.parametrize("kind", [COMPRESSED_IMAGE, VIDEO, PACKET])
+def test_packets_of_a_video_are_read_and_played_up_to_a_lost_one_and_from_the_next_key_frame_on(kind, tmp_path):
+    packets = encode_packets(PICTURES)
+    packets[:3] = [None] * 3  # recorded from the middle of a group of pictures on
+    packets[KEY_EVERY + 5] = packets[KEY_EVERY + 5][:40]
+    recording = read_recording(write_packets(tmp_path / "bag", kind, packets))
+    images = recording.images
+    assert images.is_video and len(images) == len(packets) - 3
+    right = [*range(KEY_EVERY, KEY_EVERY + 5), *range(2 * KEY_EVERY, 3 * KEY_EVERY)]
+    assert numbers_of((stamp, image.color) for stamp, image in images) == right
+    some = images.at(images.stamps_ns[-4::2])  # needs those before, too
+    assert numbers_of((stamp, image.color) for stamp, image in some) == [26, 28]
+    played = [each for each in Playback(recording.source, images=images) if each.topic == COLOR_TOPIC]
+    messages = [deserialize_message(each.data, Image) for each in played]
+    colors = [np.frombuffer(each.data, dtype=np.uint8).reshape(96, 128, 3) for each in messages]
+    assert numbers_of(zip((each.stamp for each in played), colors, strict=True)) == right
+
+
+def test_packets_without_camera_info_are_of_the_size_of_their_pictures(tmp_path):
+    bag = write_packets(tmp_path / "bag", VIDEO, [None, *encode_packets(PICTURES)[1:]], with_info=False)
+    images = read_recording(bag, ImageChoice(intrinsics=("100", "100", "64", "48"))).images
+    assert (images.camera.width, images.camera.height) == (128, 96)
+    bag = write_packets(tmp_path / "none", VIDEO, encode_packets(PICTURES)[1:4], with_info=False)
+    with pytest.raises(RecordingError, match="no image on /camera/video can be decoded: .* expected a key frame"):
+        read_recording(bag, ImageChoice(intrinsics=("100", "100", "64", "48")))
+
+
+def test_depth_of_another_clock_is_named_with_its_distance(tmp_path):
+    def delay(entry):
+        if entry.topic != DEPTH_TOPIC:
+            return entry
+        about = entry.message.header
+        late = replace(about, stamp=replace(about.stamp, sec=about.stamp.sec + 100))
+        return entry._replace(message=replace(entry.message, header=late))
+
+    bag = write_without(tmp_path / "bag", edit=delay)
+    with pytest.raises(RecordingError, match=r"no depth image .* nearest two are 9\d\.\d{3} s apart: stamps of two"):
+        read_recording(bag)
+
+
+def test_a_camera_that_was_never_calibrated_is_named_with_what_replaces_it(tmp_path):
+    def empty(entry):
+        zeros = {"k": np.zeros(9), "d": np.zeros(0), "distortion_model": ""}
+        return entry._replace(message=replace(entry.message, **zeros)) if entry.topic == INFO_TOPIC else entry
+
+    bag = write_without(tmp_path / "bag", edit=empty)
+    with pytest.raises(RecordingError, match="expected a positive size.*; --intrinsics replaces it"):
+        read_recording(bag)
+    assert read_recording(bag, ImageChoice(intrinsics=("43", "44", "32", "24"))).images.camera.fx == 43.0

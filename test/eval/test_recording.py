@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from eval_fakes import PERIOD, START, make_recording
+from mcap.writer import Writer
 
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.frames import FrameImages
@@ -143,6 +144,9 @@ def test_absent_and_empty_places_are_refused(tmp_path):
     with pytest.raises(RecordingError, match="no such recording"):
         read_recording(tmp_path / "nowhere")
     with pytest.raises(RecordingError, match="no metadata.yaml, .mcap, .db3 or pictures in it"):
+        read_recording(tmp_path)
+    (tmp_path / "bag_0.mcap.zstd").write_bytes(b"\x28\xb5\x2f\xfd")
+    with pytest.raises(RecordingError, match=r"bag_0\.mcap\.zstd: compressed as a whole: unpack it with zstd -d FILE"):
         read_recording(tmp_path)
     (tmp_path / "notes.txt").write_text("x")
     with pytest.raises(RecordingError, match="not a recording"):
@@ -307,3 +311,17 @@ def test_deviations_in_some_messages_or_along_some_axes_are_refused(tmp_path, ax
     write_entries([stated(0), stated(1, axes=axes)], tmp_path / "bag")
     with pytest.raises(RecordingError, match=reason):
         read_recording(tmp_path / "bag")
+
+
+@pytest.mark.parametrize("profile", ["", "ros2"])
+@pytest.mark.parametrize("schema", ["protobuf", "jsonschema"])
+def test_messages_of_other_systems_are_no_damage(schema, profile, tmp_path):
+    path = tmp_path / "arm.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile, "test")
+        channel = writer.register_channel("/wrist", "protobuf", writer.register_schema("foxglove.Video", schema, b"x"))
+        writer.add_message(channel, 1, b"x", 1)
+        writer.finish()
+    with pytest.raises(RecordingError, match=r"^arm: not of ROS 2: .*; not one message is whole and in CDR"):
+        read_recording(path)

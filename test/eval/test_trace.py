@@ -1,6 +1,8 @@
 """Claims about traces: what is noted, whose time is whose, and which image stands for all."""
 
 import json
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from builtin_interfaces.msg import Time
@@ -8,6 +10,7 @@ from geometry_msgs.msg import PoseStamped
 from std_msgs.msg import Header
 
 from finforce.ros import tracing
+from finforce_eval.cli.main import parse
 from finforce_eval.cli.trace import (
     WAY,
     format_trace,
@@ -15,6 +18,9 @@ from finforce_eval.cli.trace import (
     stage_figures,
 )
 from finforce_eval.errors import RecordingError
+from finforce_eval.evaluation.setup import make_setup
+from finforce_eval.recordings.recording import read_recording
+from finforce_eval.replay import replay as replaying
 
 OFFSET = 5_000
 MS = 1_000_000
@@ -79,3 +85,21 @@ def test_nothing_is_noted_unless_it_is_asked_for(monkeypatch, tmp_path):
     noted = json.loads(path.read_text(encoding="utf-8"))
     assert [entry[:3] for entry in noted] == [["node", "/topic", 7], ["node", "/said", 0]]
     assert all(begin <= end for *_, begin, end in noted)
+
+
+class BegunError(Exception):
+    """The nodes would have been started."""
+
+
+def test_a_recording_without_ground_truth_is_traced_but_not_scored(monkeypatch):
+    def begin(*_, **__):
+        raise BegunError
+
+    monkeypatch.setattr(replaying, "run_nodes", begin)
+    recording = read_recording(Path(replaying.__file__).parents[1] / "data" / "bench_cyl25_middle")
+    jaws = {side: replace(track, truth=None) for side, track in recording.jaws.items()}
+    plain, setup = replace(recording, jaws=jaws), make_setup(parse(["trace", "bag", "--contact", "fixed:40"]))
+    with pytest.raises(BegunError):
+        replaying.play_to_nodes(plain, setup, calibration_file="", playing=replaying.Playing())
+    with pytest.raises(RecordingError, match="ground truth"):
+        replaying.replay(plain, setup)

@@ -7,9 +7,11 @@ import cv2
 import numpy as np
 import pytest
 from keypoint_node_fakes import COLOR, HEIGHT, OLD_COLOR, TOPICS, WIDTH, camera_info, image_of
+from packet_fakes import KEY_EVERY, draw_pictures, encode_packets, packet_message
 
 from finforce.camera import ImageError
 from finforce.errors import ObservationError
+from finforce.video_packets import MissingFrameError
 from finforce_keypoints.errors import SyncError
 from finforce_keypoints.images import COLOR as COLORS
 from finforce_keypoints.images import SILENCE, RgbdFeed, check_image
@@ -234,3 +236,23 @@ def test_a_jpeg_stream_is_decoded_and_a_damaged_one_refused():
     huge = huge[: huge.index(b"\xff\xff") + 2] + b"\xff\xff" + huge[huge.index(b"\xff\xff") + 4 :]
     with pytest.raises(ImageError, match="expected at most 50000000 pixels"):
         camera.feed.take_color(topic, Picture(raw.header, huge))
+
+
+def test_packets_of_a_video_give_images_from_a_key_frame_on_and_again_after_a_pause():
+    camera, packets = Camera(depth="none"), encode_packets(draw_pictures(2 * KEY_EVERY))
+
+    def send(number, topic=COLOR):
+        camera.now += PERIOD
+        (taken,) = camera.feed.take_color(topic, packet_message(packets[number], round(1e9 * camera.now)))
+        return taken.value
+
+    with pytest.raises(MissingFrameError, match="a packet of H.264 .* expected a key frame"):
+        send(1)
+    assert send(0).is_video and send(1).color.shape == (96, 128, 3)
+    camera.feed.pause()
+    with pytest.raises(MissingFrameError):
+        send(2)
+    assert send(KEY_EVERY).is_video
+    camera.now += SILENCE + PERIOD
+    with pytest.raises(MissingFrameError):  # another camera's, whose frame number would fit
+        send(KEY_EVERY + 1, OLD_COLOR)

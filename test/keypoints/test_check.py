@@ -1,6 +1,7 @@
 """Claims about the check before any force: what fits passes, and what does not is named as what it is."""
 
 import json
+import re
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -21,7 +22,7 @@ from finforce_eval.cli.check import record_camera
 from finforce_eval.cli.main import main
 from finforce_eval.cli.twin import write_footage
 from finforce_eval.errors import RecordingError
-from finforce_eval.evaluation.check import FAULT, OK, WARNING, judge_picture
+from finforce_eval.evaluation.check import FAULT, OK, WARNING, explain_camera, judge_picture
 from finforce_eval.evaluation.keypoint_source import KeypointSource
 from finforce_eval.recordings.bags import open_bag
 from finforce_eval.recordings.images import CAMERA_INFO, COMPRESSED
@@ -116,6 +117,23 @@ def test_a_rig_is_tried_on_the_pictures_that_it_was_made_from(still, off, words)
     doubts = try_rig(rig, recording, source, IMAGES)
     assert len(doubts) == len(words)
     assert all(word in doubt for word, doubt in zip(words, doubts, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("off", "words"),
+    [
+        (0.0, []),
+        (0.008, [r"the camera is (7\.[5-9]|8\.[0-4]) mm and 0\.\d\d degrees from .*; set T_gripper_camera: \["]),
+    ],
+)
+def test_a_camera_elsewhere_is_named_by_what_the_first_images_show(still, off, words):
+    pose = ROBOT_CAMERA.copy()
+    pose[2, 3] += off
+    given = {"T_gripper_camera": list(pose_numbers(pose))}
+    source = KeypointSource(source="images", jaw_file="bench", parameters=given, sides=SIDES)
+    said = explain_camera(source.read(still), source)
+    assert len(said) == len(words)
+    assert all(re.match(word, text) for word, text in zip(words, said, strict=True))
 
 
 def test_a_mesh_that_is_not_what_the_camera_sees_is_named(footage, capsys, tmp_path):

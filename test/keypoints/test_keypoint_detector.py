@@ -229,7 +229,7 @@ def test_a_finger_of_which_hardly_a_point_is_seen_is_said_within_two_seconds(hid
         if n < 30:  # a hand before the camera for a moment is nothing to say
             assert not detector.warnings
     assert set(detector.warnings) == ({"left"} if is_said else set())
-    assert not is_said or "is it the finger of the jaw file" in detector.warnings["left"]
+    assert not is_said or "are the extrinsics right, is it the finger of the jaw file" in detector.warnings["left"]
 
 
 def test_a_lost_jaw_is_absent_looked_for_everywhere_and_found_again():

@@ -155,6 +155,15 @@ def test_a_frozen_camera_is_noticed_after_a_few_pictures_and_forgiven_when_it_go
     watch.check(still)
 
 
+def test_a_video_of_a_scene_at_rest_repeats_itself_and_a_black_one_is_refused():
+    rng, watch = np.random.default_rng(0), ImageWatch(frozen_after=1)
+    still = replace(noisy(rng, 90.0), is_video=True)
+    for _ in range(5):
+        watch.check(still)
+    with pytest.raises(BlackImageError):
+        watch.check(replace(noisy(rng, 1.0), is_video=True))
+
+
 def test_pictures_of_a_scene_at_rest_are_not_frozen():
     rng, watch = np.random.default_rng(0), ImageWatch(frozen_after=1)
     for _ in range(5):
