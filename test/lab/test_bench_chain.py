@@ -18,7 +18,7 @@ from lab.bench.chain import (
 
 FIRST = 10**12
 PERIOD = NANOSECONDS // 10
-COUNT = 40  # images at 10 Hz, of which the last 22 come after the tare
+EARLY, COUNT = 20, 40  # images at 10 Hz before the one that is counted as 0, and from it; of these 22 after the tare
 
 
 def stamp_of(index):
@@ -28,7 +28,7 @@ def stamp_of(index):
 @pytest.fixture
 def truth():
     """A force that grows by 1 N a second."""
-    stamps = np.array([stamp_of(index) for index in range(COUNT)])
+    stamps = np.array([stamp_of(index) for index in range(-EARLY, COUNT)])
     return TrueGrasp(stamps_ns=stamps, force=(stamps - FIRST) / NANOSECONDS)
 
 
@@ -36,7 +36,7 @@ def truth():
 def run(truth):
     """Every image is answered 30 ms late and 0.2 N too high."""
     log = ReplayLog(("left", "right"))
-    for index, stamp in enumerate(truth.stamps_ns.tolist()):
+    for index, stamp in enumerate(truth.stamps_ns.tolist(), -EARLY):
         for side in ("left", "right"):
             log.sent[side][stamp] = 0.0
         log.grasp[stamp], log.grasp_latency[stamp] = 0.1 * index + 0.2, 0.03
@@ -95,11 +95,11 @@ def test_nothing_answered_is_no_error_and_not_zero(run, truth):
 @pytest.mark.parametrize("phase", [0.0, 0.3, 0.9])
 @pytest.mark.parametrize("late", [0, 2])
 def test_a_force_shows_with_the_first_image_beyond_a_tenth_of_a_newton_and_its_latency(phase, late):
-    """The force sets in after 2 s, and grows by 1 N in each tenth of a second."""
-    rate, latency, begin = 30, 0.02, 2.0
-    stamps = START + ((np.arange(90) + phase) * NANOSECONDS / rate).astype(np.int64)
+    """The force sets in after 4 s, and grows by 1 N in each tenth of a second."""
+    rate, latency, begin = 30, 0.02, 4.0
+    stamps = START + ((np.arange(150) + phase) * NANOSECONDS / rate).astype(np.int64)
     times = 1e-9 * (stamps - START)
-    fine = np.linspace(0.0, 3.0, 30_001)
+    fine = np.linspace(0.0, 5.0, 50_001)
     truth = TrueGrasp(stamps_ns=START + (fine * 1e9).astype(np.int64), force=np.maximum(0.0, 10.0 * (fine - begin)))
     log = ReplayLog(("left", "right"))
     for index, stamp in enumerate(stamps.tolist()):
