@@ -20,9 +20,10 @@ INTRINSICS_FORMS = (
 )
 _NAMES = ("fx", "fy", "cx", "cy")
 _MODELS = {"radtan": PLUMB_BOB, "none": PLUMB_BOB, "pinhole": PLUMB_BOB, "fisheye": EQUIDISTANT, "equi": EQUIDISTANT}
+_MODELS |= {"kannala_brandt4": EQUIDISTANT, "opencv_fisheye": EQUIDISTANT}
 _MATRICES = ("K", "k", "camera_matrix", "Camera_Matrix", "cameraMatrix", "cam_K", "intrinsic_matrix")
-_LENSES = ("distortion", "D", "d", "coeffs", "distortion_coefficients", "Distortion_Coefficients", "distCoeffs")
-_LENSES += ("distortion_coeffs", "dist_coeffs")
+_LENS = re.compile(r"d|coeffs|dist(?!ance).*|(?!undist).*distortion.*", re.IGNORECASE)
+_COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _SIZES = {"width": ("width", "image_width", "image_Width"), "height": ("height", "image_height", "image_Height")}
 
 
@@ -84,7 +85,7 @@ def build_camera(named: Mapping[str, Any], shape: tuple[int, int] | None) -> Cam
             "are these the intrinsics of images of another size?"
         )
     model = str(named.get("model") or (RATIONAL if distortion.size > 5 else PLUMB_BOB))
-    return CameraIntrinsics(**size, **values, distortion=distortion, model=_MODELS.get(model.lower(), model))
+    return CameraIntrinsics(**size, **values, distortion=distortion, model=_name_model(model))
 
 
 def cut_camera(camera: CameraIntrinsics, shape: tuple[int, int], scale: float | None = None) -> CameraIntrinsics:
@@ -109,7 +110,17 @@ def _parse(text: str) -> Any:
         return _parse_xml(text)
     if len(text) > LARGEST_YAML:
         raise FileError(f"has more than {LARGEST_YAML >> 10} KiB")
-    return parse_yaml(re.sub(r"^%YAML:.*", "", text, count=1).replace("!!opencv-matrix", ""), text_keys=False)
+    text = re.sub(r"^%YAML.*", "", text, count=1).replace("!!opencv-matrix", "")
+    parts = [part for part in re.split(r"^---\s*$", text, flags=re.MULTILINE) if part.strip()]  # messages, as echoed
+    first, *others = [parse_yaml(part, text_keys=False) for part in parts] or [None]
+    if any(_leave_out_header(each) != _leave_out_header(first) for each in others):
+        raise IntrinsicsError("describes several cameras, one after the other; expected one")
+    return first
+
+
+def _leave_out_header(content: Any) -> Any:
+    """Return a message without its header, whose stamp is another one in each."""
+    return {key: value for key, value in content.items() if key != "header"} if isinstance(content, dict) else content
 
 
 def _parse_xml(text: str) -> dict[str, Any]:
@@ -170,9 +181,31 @@ def _name_entries(entries: Mapping[str, Any]) -> dict[str, Any]:
         if kind != "pinhole" or len(_numbers(intrinsics)) != 4:
             raise IntrinsicsError(f"camera_model {entries.get('camera_model')}: expected pinhole, with fu fv pu pv")
         named |= zip(_NAMES, intrinsics, strict=True)
-    named["distortion"] = next(filter(None, (_numbers(entries.get(name)) for name in _LENSES)), [])
-    named["model"] = EQUIDISTANT if entries.get("fisheye_model") else entries.get("distortion_model") or lens
+    if _name_model(str(entries.get("model"))) == EQUIDISTANT:  # else that of the device, or what the coefficients say
+        lens = EQUIDISTANT
+    lens = entries.get("distortion_model") or lens
+    named["model"] = EQUIDISTANT if entries.get("fisheye_model") else lens
+    named["distortion"] = _find_lens(entries, _name_model(str(named["model"])) == EQUIDISTANT)
     return named
+
+
+def _name_model(model: str) -> str:
+    """Return our name of a lens, or the name as it is where it is none that is known."""
+    return _MODELS.get(model.lower().removeprefix("distortion."), model)
+
+
+def _find_lens(entries: Mapping[str, Any], is_fisheye: bool) -> list[Any]:
+    """Return the coefficients of the lens: of a list, or k1, k2, ... by name, here or in an entry; none without any."""
+    found = [value for name, value in entries.items() if _LENS.fullmatch(name)]
+    if listed := next(filter(None, map(_numbers, found)), []):
+        return listed
+    named = next((each for each in (*found, entries) if isinstance(each, Mapping) and "k1" in each), {})
+    if is_fisheye:
+        return [named.get(name, 0.0) for name in ("k1", "k2", "k3", "k4")] if named else []
+    if named.get("k4") and "p1" not in named:
+        raise IntrinsicsError("k4 without p1: of a fisheye? expected model: equidistant next to them, or p1 and p2")
+    count = 8 if any(named.get(name) for name in ("k4", "k5", "k6")) else 5
+    return [named.get(name, 0.0) for name in _COEFFICIENTS[:count]] if named else []
 
 
 def _from_openicc(intrinsics: Mapping[str, Any], kind: str) -> dict[str, Any]:

@@ -108,6 +108,67 @@ def test_a_lens_keeps_its_coefficients_in_their_order(content, tmp_path):
     np.testing.assert_array_equal(camera.distortion, [0.1, -0.2, 1e-3, 2e-3, 0.05])
 
 
+PINHOLE = {"width": 640, "height": 480, "fx": 600, "fy": 601, "cx": 322, "cy": 243}
+BENT = [0.1, -0.2, 1e-3, 2e-3, 0.05]
+BENT_BY_NAME = dict(zip(("k1", "k2", "p1", "p2", "k3"), BENT, strict=True))
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        {"dist": BENT},
+        {"dist": [BENT]},
+        {"dist_coeff": BENT},
+        {"distCoeffs": BENT_BY_NAME},
+        {"distortion_params": BENT},
+        {"distortion_model": "plumb_bob", "distance": [0.3], "D": BENT},
+        {"coeffs": BENT, "model": "distortion.inverse_brown_conrady"},
+        BENT_BY_NAME,
+    ],
+)
+def test_a_lens_is_found_whatever_its_entry_is_called(lens, tmp_path):
+    camera = read_camera(write(tmp_path, PINHOLE | lens))
+    assert camera.model == "plumb_bob"
+    np.testing.assert_array_equal(camera.distortion, BENT)
+
+
+def test_coefficients_by_name_are_those_of_their_lens(tmp_path):
+    four = {"k1": -0.02, "k2": -0.01, "k3": 0.002, "k4": -1e-4}
+    for name in ("fisheye", "KANNALA_BRANDT4", "OPENCV_FISHEYE"):
+        camera = read_camera(write(tmp_path, PINHOLE | four | {"model": name}))
+        assert camera.model == "equidistant"
+        np.testing.assert_array_equal(camera.distortion, list(four.values()))
+    with pytest.raises(IntrinsicsError, match="k4 without p1: of a fisheye.*model: equidistant"):
+        read_camera(write(tmp_path, PINHOLE | four))
+    camera = read_camera(write(tmp_path, PINHOLE | BENT_BY_NAME | {"k4": 0.01, "k5": 0.02, "k6": 0.03}))
+    assert camera.model == "rational_polynomial"
+    np.testing.assert_array_equal(camera.distortion, [*BENT, 0.01, 0.02, 0.03])
+
+
+def test_the_radial_part_of_a_lens_alone_is_refused(tmp_path):
+    with pytest.raises(IntrinsicsError, match="2 coefficients|2 distortion|distortion"):
+        read_camera(write(tmp_path, PINHOLE | {"RadialDistortion": [0.1, -0.2], "TangentialDistortion": [0.0, 0.0]}))
+
+
+ECHO = """header: {{stamp: {{sec: {second}}}}}
+height: 480
+width: 640
+distortion_model: plumb_bob
+d: [0.1, -0.2, 1e-3, 2e-3, 0.05]
+k: [{focal}, 0.0, 322.0, 0.0, 601.0, 243.0, 0.0, 0.0, 1.0]
+---
+"""
+
+
+def test_what_ros_topic_echo_prints_is_one_camera(tmp_path):
+    for count in (1, 3):
+        text = "".join(ECHO.format(second=number, focal=600.0) for number in range(count))
+        assert numbers_of(read_camera(write(tmp_path, text))) == [640, 480, 600.0, 601.0, 322.0, 243.0]
+    two = ECHO.format(second=1, focal=600.0) + ECHO.format(second=2, focal=500.0)
+    with pytest.raises(IntrinsicsError, match="several cameras"):
+        read_camera(write(tmp_path, two))
+
+
 def test_opencv_tells_other_lenses_by_their_coefficients_or_a_flag(tmp_path):
     wide = OPENCV.replace("0.05 ]", "0.05, 0.01, 0.02, 0.03 ]")
     assert read_camera(write(tmp_path, wide)).model == "rational_polynomial"
