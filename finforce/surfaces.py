@@ -6,6 +6,7 @@ Formats that can announce more than they hold are read in a sandbox.
 from __future__ import annotations
 
 import io
+import re
 import sys
 import zipfile
 from collections.abc import Iterator
@@ -122,6 +123,7 @@ def _load_triangles(path: Path) -> tuple[NDArray, NDArray]:
     elif kind in ("step", "stp"):
         vertices, triangles = _read_step(content)
     else:
+        content = _count_forward(content) if kind == "obj" else content
         scene = import_trimesh().load_scene(io.BytesIO(content), file_type=kind, process=False, skip_materials=True)
         mesh = scene.to_mesh()
         vertices, triangles = np.array(mesh.vertices, dtype=float), np.array(mesh.faces, dtype=np.int64)
@@ -129,6 +131,23 @@ def _load_triangles(path: Path) -> tuple[NDArray, NDArray]:
     if len(triangles) and not np.ptp(vertices, axis=0).any():
         raise FileError("has all its points in one place, as where they are compressed in a way that is not read")
     return vertices.reshape(-1, 3), triangles.reshape(-1, 3)
+
+
+def _count_forward(content: bytes) -> bytes:
+    """Return an OBJ file whose faces name vertices by number alone, not by how far back they are from their line.
+
+    trimesh counts back from the end of the file.
+    """
+    if not re.search(rb"^\s*f\s.*-", content, re.MULTILINE):
+        return content
+    lines, count = re.sub(rb"\\\r?\n", b" ", content).splitlines(), 0
+    for place, line in enumerate(lines):
+        kind, *words = line.split(b"#")[0].split() or [b""]
+        count += kind == b"v"
+        if kind == b"f":
+            corners = [int(word.partition(b"/")[0]) for word in words]
+            lines[place] = b"f " + b" ".join(b"%d" % (each if each > 0 else count + 1 + each) for each in corners)
+    return b"\n".join(lines) + b"\n"
 
 
 def _check_numbers(triangles: NDArray, count: int) -> None:

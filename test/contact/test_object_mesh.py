@@ -39,6 +39,18 @@ def says(mesh, text):
     return any(text in note for note in mesh.notes)
 
 
+def test_corners_of_an_obj_file_count_back_from_their_own_line(tmp_path):
+    parts, lines = [fakes.box_triangles((0.02, 0.03, 0.04)), fakes.cylinder_triangles()], ["vn 0 0 1"]
+    for number, (vertices, triangles) in enumerate(parts):
+        lines += [f"o part{number}", *("v {} {} {}".format(*vertex) for vertex in vertices)]
+        lines += ["f " + " ".join(f"{corner - len(vertices)}//-1" for corner in row) for row in triangles]
+    path = tmp_path / "parts.obj"
+    path.write_text("\n".join(lines) + "\n")
+    vertices, triangles = read_triangles(path)
+    expected = [corners for points, rows in parts for corners in points[rows]]
+    np.testing.assert_allclose(vertices[triangles], expected, atol=1e-9)
+
+
 @pytest.mark.parametrize("ending", ["stl", "obj", "ply", "glb", "STL"])
 def test_every_format_gives_the_same_object(tmp_path, ending):
     moved = fakes.cylinder_triangles()[0] + (0.01, 0.02, 0.03), fakes.cylinder_triangles()[1]
