@@ -54,6 +54,11 @@ class EdgeCheck:
         self.contradiction = said if is_turned and self._count >= LEAST_IMAGES else ""
         return self.contradiction
 
+    @property
+    def sees_mesh(self) -> bool:
+        """True if the outline of the mesh is in an image."""
+        return bool(self._contrasts[0] > 0.0)
+
     def _find_contrast(self, slopes: NDArray, T_camera_object: NDArray) -> float:
         """Return the mean slope of an image (h, w, 2) across the outline of the mesh, wherever that shows best."""
         mask = np.isfinite(self._view.render(T_camera_object, self._camera, self._step).depth)

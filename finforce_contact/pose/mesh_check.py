@@ -164,11 +164,17 @@ class MeshCheck:
         )
         return self.contradiction
 
+    @property
+    def sees_mesh(self) -> bool:
+        """True if enough of the mesh is seen where its poses have it, or nearby, for a verdict."""
+        totals = [_sum(fits) for fits in zip(*((each.posed, each.aligned) for each in self._evidence), strict=True)]
+        return any(total.seen >= LEAST_PIXELS * len(self._evidence) for total in totals)
+
     def _find_trouble(self) -> str:
         """Return what speaks against the mesh as posed, "" where nothing does or too little is seen."""
         evidence = self._evidence
         posed, aligned = _sum(each.posed for each in evidence), _sum(each.aligned for each in evidence)
-        if len(evidence) < LEAST_IMAGES or max(posed.seen, aligned.seen) < LEAST_PIXELS * len(evidence):
+        if len(evidence) < LEAST_IMAGES or not self.sees_mesh:
             return ""
         if posed.behind > BEHIND * posed.seen and posed.seen >= LEAST_PIXELS * len(evidence):
             return f"it sees through {100.0 * posed.behind / posed.seen:.0f} % of its surface"

@@ -18,7 +18,7 @@ from finforce.transforms import invert_pose, pose_numbers, rotation_between
 from finforce_contact.mesh.object_mesh import load_object_mesh
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.at_rest import JawsAtRest, approach
-from finforce_eval.evaluation.contact_source import OUTLINED, UNCOMPARED, check_mesh
+from finforce_eval.evaluation.contact_source import OUTLINED, UNCOMPARED, UNSEEN, check_mesh
 from finforce_eval.evaluation.keypoint_source import KeypointSource, build_records, choose_images
 from finforce_eval.evaluation.unseen import explain_unseen
 from finforce_eval.recordings.frames import STILL_RATE, FrameImages
@@ -126,6 +126,8 @@ def check_object(recording: Recording, object_file: str | None, unit: str) -> li
     if check is None or not check.is_sure:
         return [Finding(WARNING, f"{mesh.name} {UNCOMPARED}")]
     said = check.at(int(recording.images.stamps_ns[-1]))
+    if not check.sees_mesh:
+        return [Finding(FAULT, f"{mesh.name} {UNSEEN}")]
     if not said and not recording.images.has_depth:
         return [Finding(WARNING, f"{mesh.name} {OUTLINED}")]
     return [Finding(FAULT, said) if said else Finding(OK, f"{mesh.name} is where the camera sees it")]

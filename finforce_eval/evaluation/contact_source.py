@@ -125,6 +125,11 @@ class RecordedCheck:
         """True if there are images enough for a verdict."""
         return len(self._poses) >= self._least
 
+    @property
+    def sees_mesh(self) -> bool:
+        """True if the images compared so far show enough of the mesh for a verdict."""
+        return bool(self._check.sees_mesh)
+
     def at(self, stamp: int) -> str:
         """Return what contradicts the mesh by the first images and those up to a stamp [ns], "" for nothing.
 
@@ -262,6 +267,7 @@ def _before_load(track: ObjectTrack, recording: Recording, side: str) -> ObjectT
 ESTIMATED = ("estimate", "closest", "paper")
 POSE_TOLERANCE = round(ContactParameters().pose_tolerance / SECOND)  # [ns]
 UNCOMPARED = "is not compared: that needs depth images and /object_pose in their frame"
+UNSEEN = "is not seen where its poses have it: check their unit and frame, or give images that show it"
 OUTLINED = "is compared with edges in colour, for want of depth: only turns by right angles are told"
 AUTOMATIC, FIXED = "automatic", "fixed"
 FROM_CASE = "case"

@@ -8,8 +8,9 @@ from scipy.spatial.transform import Rotation
 from table_fakes import build_d405, draw_scene
 
 from finforce.camera import ImageError
-from finforce.transforms import move_pose
+from finforce.transforms import invert_pose, move_pose
 from finforce_contact.estimator import CONTRADICTED, ContactEstimator
+from finforce_contact.pose.edge_check import EdgeCheck
 from finforce_contact.pose.mesh_check import LEAST_IMAGES, MeshCheck
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_sim.objects import build_object
@@ -75,6 +76,24 @@ def test_a_start_that_slides_to_another_place_hides_no_shift_that_fits(monkeypat
 
 def test_another_object_is_contradicted_without_a_reading_that_fits():
     assert "is it the mesh of this object" in compare(build_object("bottle"), hidden=0.0)
+
+
+@pytest.mark.parametrize("change", [lambda T: T, lambda T: move_to(T, 1e3 * T[:3, 3]), invert_pose])
+def test_poses_in_another_unit_or_frame_show_nothing_of_the_mesh(change):
+    mesh = build_object("mug")
+    scene = draw_scene(mesh, CAMERA, np.random.default_rng(5), hidden=0.0)
+    T = change(scene.T_camera_object)
+    depth, edges = MeshCheck(mesh, CAMERA), EdgeCheck(mesh, CAMERA)
+    grey = np.repeat(np.nan_to_num(255.0 * scene.depth)[..., None], 3, axis=2)
+    for _ in range(LEAST_IMAGES):
+        found = depth.add(scene.depth, T) + edges.add(grey, T)
+    assert found == "" and depth.sees_mesh == edges.sees_mesh == np.array_equal(T, scene.T_camera_object)
+
+
+def move_to(T, position):
+    moved = T.copy()
+    moved[:3, 3] = position
+    return moved
 
 
 def test_few_images_say_nothing():

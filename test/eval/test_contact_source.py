@@ -1,6 +1,8 @@
 """Claims about the order in which contact estimator and solver are fed offline."""
 
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,10 +12,12 @@ from finforce.errors import PoseError
 from finforce_contact.loop import ForceLoop
 from finforce_eval.cli.main import parse
 from finforce_eval.errors import RecordingError
-from finforce_eval.evaluation import contact_source
-from finforce_eval.evaluation.contact_source import OUTLINED, UNCOMPARED, RecordedContact, build_source
+from finforce_eval.evaluation import check, contact_source
+from finforce_eval.evaluation.contact_source import OUTLINED, UNCOMPARED, UNSEEN, RecordedContact, build_source
 from finforce_eval.evaluation.setup import read_contacts
 from finforce_eval.recordings.objects import ObjectTrack, track_object
+
+CYLINDER = Path(contact_source.__file__).parents[1] / "data" / "objects" / "cylinder_25.stl"
 
 
 def make_track(*frames):
@@ -192,3 +196,11 @@ def record_with(images, frame="camera"):
 def test_a_mesh_that_cannot_be_compared_with_the_images_is_noted(recording, words, expected):
     notes = read_contacts(parse(["evaluate", "bag", *words])).describe_comparison(recording)
     assert notes == [f"the object's mesh {each}; a wrong one gives wrong forces" for each in expected]
+
+
+@pytest.mark.parametrize(("sees", "severity"), [(True, "ok"), (False, "fault")])
+def test_a_mesh_of_which_nothing_is_seen_does_not_fit(sees, severity, monkeypatch):
+    compared = SimpleNamespace(is_sure=True, at=lambda stamp: "", sees_mesh=sees)
+    monkeypatch.setattr(check, "check_mesh", lambda *arguments, **options: compared)
+    (found,) = check.check_object(record_with(Images(has_depth=True)), CYLINDER, "m")
+    assert found.severity == severity and (UNSEEN in found.text) != sees
