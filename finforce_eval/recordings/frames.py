@@ -266,7 +266,10 @@ def read_frames(path: Path, choice: ImageChoice, sides: Sequence[str] = ()) -> R
         if shown is not None:
             times = np.rint((shown - shown[0]) * tick).astype(np.int64)
         read = partial(decode_video, path, name, shown=() if shown is None else shown.tolist())
-        shape = next(color for color in read() if color is not None).shape[:2]
+        first = next((color for color in read() if color is not None), None)
+        if first is None:
+            raise RecordingError(f"{name}: {path.name}: no frame is whole; expected a video: convert it to an .mp4")
+        shape = first.shape[:2]
     camera = choose_camera(choice, shape, name)
     images = FrameImages(
         name=name, fps=fps, camera=camera, count=count, read=read, times=times, ends_at_damage=not path.is_dir()

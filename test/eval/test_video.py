@@ -18,6 +18,7 @@ from finforce_eval.errors import DamagedError, OptionError, RecordingError
 from finforce_eval.evaluation import unseen
 from finforce_eval.evaluation.forces import STILL_UPDATES, find_forces, share_reached
 from finforce_eval.evaluation.keypoint_source import detect_keypoints
+from finforce_eval.recordings import frames
 from finforce_eval.recordings.frames import FrameImages, read_picture
 from finforce_eval.recordings.images import ImageChoice
 from finforce_eval.recordings.recording import read_recording
@@ -234,6 +235,13 @@ def test_frames_of_a_variable_rate_have_the_times_of_the_file(tmp_path):
         container.mux(stream.encode())
     images = read_recording(tmp_path / "phone.mp4", CHOICE).images
     np.testing.assert_allclose(1e-6 * images.stamps_ns, shown, atol=1.0)
+
+
+def test_a_video_without_a_whole_frame_is_refused(tmp_path, monkeypatch):
+    path = write_video(tmp_path / "a.avi")
+    monkeypatch.setattr(frames, "decode_video", lambda *arguments, **options: iter([None] * 5))
+    with pytest.raises(RecordingError, match=r"a.avi: no frame is whole.*convert it to an .mp4"):
+        read_recording(path, CHOICE)
 
 
 def test_a_cut_video_is_read_up_to_the_cut(tmp_path):
