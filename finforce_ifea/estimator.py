@@ -371,8 +371,9 @@ class ForceEstimator:
         settles = self.settings.solver != "paper"  # whose linear tetrahedra lock, and follow no bent jaw to 1 mm
         is_far = settles and state["residual"] > LARGEST_RESIDUAL  # the bound is no less
         most = bound_residual(self.jaw.keypoints, self._taring.tare.noise) if is_far else np.inf
-        bounds = {"largest_residual": most, "largest_stddev": self.settings.largest_stddev}
-        reason = find_rejection_reason(state, **bounds, settles=settles)
+        reason = find_rejection_reason(
+            state, largest_residual=most, largest_stddev=self.settings.largest_stddev, settles=settles
+        )
         if reason:
             if state["magnitude"] <= state["bearable"]:
                 self._relax(state["force"])

@@ -13,7 +13,7 @@ errors of the mechanics at the key points, of the pose, of friction and of the c
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import interp1d
 from scipy.ndimage import uniform_filter1d
 
+from finforce_contact.loop import ContactSource
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.forces import evaluate_jaws, truth_sides
 from finforce_eval.evaluation.scoring import match_truth
@@ -32,8 +33,9 @@ from finforce_eval.tasks import progress_bar
 from finforce_ifea.contact_mechanics.friction import FRICTIONLESS, Coefficient
 from finforce_ifea.contact_mechanics.indenter import OutlineIndenter
 from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics
-from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE
+from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE, Jaw
 from finforce_ifea.mechanics import build_mechanics
+from finforce_ifea.observation import ObjectOutline
 from finforce_ifea.tare import compute_tare
 from lab.ablation.scenes import settle
 from lab.harness import Figures
@@ -200,6 +202,13 @@ def _update(P: NDArray, H: NDArray, noise: NDArray) -> NDArray:
     return 0.5 * (P + P.T)
 
 
+def _find_outline(source: ContactSource, stamps: Sequence[int], jaw: Jaw) -> ObjectOutline | None:
+    """Return the last outline of the object that a source has at stamps [ns]; None without any."""
+    contacts = [source.contact_at(stamp, lambda: jaw.keypoints) for stamp in stamps]
+    outlines = [contact.outline for contact in contacts if contact is not None and contact.outline is not None]
+    return outlines[-1] if outlines else None
+
+
 def read_truth(recording: Recording, side: str, setup: EvaluationSetup) -> TrueImages:
     """Return the truth of one jaw of a recording, linearised by the full mechanics of the jaw.
 
@@ -215,10 +224,7 @@ def read_truth(recording: Recording, side: str, setup: EvaluationSetup) -> TrueI
     jaw = own.calibration.apply(own.jaw) if own.calibration else own.jaw
     force = match_truth(recording.truth(side), track.stamps_ns)
     size = np.nan_to_num(np.linalg.norm(force, axis=1))
-    source, outline = own.source(recording), None
-    for stamp in track.stamps_ns[: int(np.argmax(size)) + 1].tolist():
-        contact = source.contact_at(stamp, lambda: jaw.keypoints)
-        outline = contact.outline if contact is not None and contact.outline is not None else outline
+    outline = _find_outline(own.source(recording), track.stamps_ns[: int(np.argmax(size)) + 1].tolist(), jaw)
     if outline is None:
         raise RecordingError(f"{recording.name}: no outline of the object; expected its mesh and poses")
     mechanics = build_mechanics(jaw, replace(own.settings, solver=jaw.model))

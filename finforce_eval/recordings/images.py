@@ -229,18 +229,11 @@ def find_images(bag: BagReader, source: Path, choice: ImageChoice | None = None)
     for raw in bag.raw(topics):
         found[raw.topic].append(read_stamp(raw.data))
     stamps = {topic: check_stamps(times, topic, bag.name) for topic, times in found.items()}
-    depth_stamps = np.full(len(stamps[color]), ALONE)
-    paired = np.ones(len(depth_stamps), dtype=bool)
+    depth_stamps, paired = np.full(len(stamps[color]), ALONE), np.ones(len(stamps[color]), dtype=bool)
     if depth:
         pairing = pairing_tolerance(stamps[color]) if choice.pairing is None else choice.pairing
         depth_stamps = stamps[depth][find_nearest(stamps[depth], stamps[color])]
-        paired = np.abs(depth_stamps - stamps[color]) <= pairing
-        if not paired.any():
-            nearest = np.abs(depth_stamps - stamps[color]).min()
-            raise RecordingError(
-                f"{bag.name}: no depth image on {depth} within {pairing / 10**6:g} ms of one on {color}; the nearest "
-                f"two are {nearest / 10**9:.3f} s apart: stamps of two clocks?"
-            )
+        paired = _pair(stamps[color], depth_stamps, pairing, topics, bag.name)
     return ImageTrack(
         source=source,
         name=bag.name,
@@ -253,6 +246,30 @@ def find_images(bag: BagReader, source: Path, choice: ImageChoice | None = None)
         info=info,
         is_video=seen[color].is_video,
     )
+
+
+def _pair(
+    stamps: NDArray[np.int64], depth_stamps: NDArray[np.int64], pairing: int, topics: Sequence[str], name: str
+) -> NDArray[np.bool_]:
+    """Return for each colour image whether a depth image is of its time.
+
+    Args:
+        stamps: of the colour images (n,) [ns].
+        depth_stamps: of the depth image that is nearest to each (n,) [ns].
+        pairing: difference of the two, at most [ns].
+        topics: of colour and depth.
+        name: of the recording.
+
+    Raises:
+        RecordingError: there is no such depth image.
+    """
+    apart = np.abs(depth_stamps - stamps)
+    if not (apart <= pairing).any():
+        raise RecordingError(
+            f"{name}: no depth image on {topics[1]} within {pairing / 10**6:g} ms of one on {topics[0]}; the nearest "
+            f"two are {apart.min() / 10**9:.3f} s apart: stamps of two clocks?"
+        )
+    return apart <= pairing
 
 
 def _choose_camera(
