@@ -20,6 +20,10 @@ class PoseError(FinforceError, ValueError):
     """Numbers that were given as a pose are none."""
 
 
+class RigError(FinforceError, ValueError):
+    """A rig file cannot be used, or is of another camera than the images."""
+
+
 class ServiceError(FinforceError, RuntimeError):
     """A service of a node is not there, does not answer, or could not do what was asked; the message says which."""
 

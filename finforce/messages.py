@@ -62,16 +62,37 @@ class EncodedCloud(NamedTuple):
     data: bytes
 
 
-class Keypoints(NamedTuple):
-    """Key points of one cloud: `points (K, 3)` [m], NaN = none; `likelihood (K,)` in [0, 1]; `stddev (K, 3)` [m].
+class SharedStddev(NamedTuple):
+    """Standard deviations of the errors that all key points of an image share.
 
-    `shared` [m] is the standard deviation of a shift that all of them share.
+    Attributes:
+        shift: of the points [m], because the position of the jaw is uncertain. They may then also rotate together by a
+            few degrees.
+        height: of the jaw along its z where poses of an object are compared with it [m].
+        scale: relative error of all displacements [-].
     """
+
+    shift: float = 0.0
+    height: float = 0.0
+    scale: float = 0.0
+
+
+NOTHING_SHARED = SharedStddev()
+_SHARED = dict(zip(SharedStddev._fields, ("shared", "shared_height", "shared_scale"), strict=True))  # columns
+
+
+def shared_columns(shared: SharedStddev, count: int) -> dict[str, NDArray[np.float32]]:
+    """Return the columns (count,) of a key point cloud that say what its points share."""
+    return {_SHARED[name]: np.full(count, value, np.float32) for name, value in shared._asdict().items()}
+
+
+class Keypoints(NamedTuple):
+    """Key points of one cloud: `points (K, 3)` [m], NaN = none; `likelihood (K,)` in [0, 1]; `stddev (K, 3)` [m]."""
 
     points: NDArray[np.float64]
     likelihood: NDArray[np.float64]
     stddev: NDArray[np.float64] | None
-    shared: float = 0.0
+    shared: SharedStddev = NOTHING_SHARED
 
 
 _LARGEST_POINT = 1 << 16  # bytes
@@ -232,14 +253,16 @@ def decode_keypoints(cloud: Any) -> Keypoints:
         ObservationError: the cloud has no x, y, z, its buffer is too short, it has some of the fields `stddev_x`,
             `stddev_y`, `stddev_z` and not all, or a point states what is no standard deviation.
     """
-    columns = decode_columns(cloud, ("x", "y", "z"), ("likelihood", "valid", "shared", *STDDEV_COLUMNS))
+    columns = decode_columns(cloud, ("x", "y", "z"), ("likelihood", "valid", *_SHARED.values(), *STDDEV_COLUMNS))
     points = _stack(columns, ("x", "y", "z"))
     valid, likelihood = columns.get("valid"), columns.get("likelihood")
     if valid is not None:
         points[valid == 0] = np.nan
     ones = np.ones(len(points))
     stddev = _stated(columns, points)
-    shared = float(columns["shared"].max()) if "shared" in columns and len(points) else 0.0
+    shared = SharedStddev(
+        **{name: float(columns[column].max(initial=0.0)) for name, column in _SHARED.items() if column in columns}
+    )
     return Keypoints(points, ones if likelihood is None else likelihood.astype(np.float64), stddev, shared)
 
 

@@ -15,6 +15,7 @@ from finforce.camera import CameraIntrinsics, decode_depth
 from finforce.camera_file import build_camera, camera_numbers, read_camera
 from finforce.errors import ObservationError
 from finforce.gripper_frames import SIDES, read_extrinsics
+from finforce.rig import read_rig
 from finforce.transforms import check_pose, invert_pose, pose_numbers
 from finforce_contact.estimator import ContactEstimator
 from finforce_contact.loop import ForceLoop, GivenContact
@@ -30,7 +31,6 @@ from finforce_ifea.settings import EstimatorSettings
 from finforce_keypoints.build import build_detector
 from finforce_keypoints.geometry.jaw_localizer import JawKeypoints
 from finforce_keypoints.images import RgbdImage
-from finforce_keypoints.rig import read_rig
 
 Camera = CameraIntrinsics | str | Path | ArrayLike
 

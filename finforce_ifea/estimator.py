@@ -123,6 +123,7 @@ class ForceEstimator:
         self._contact: Contact | None = None
         self._pressed: ContactState | None = None  # of the last image, if its force is told
         self._at_rest = self.is_idle = self._was_interrupted = False
+        self._scale_error = 0.0  # relative standard deviation of the displacements that all key points share [-]
         self._relaxed: float | None = None
         self._taring.reset()
         self._gate.reset()
@@ -265,7 +266,7 @@ class ForceEstimator:
         if beyond:
             return self._fail("unobservable", beyond, used)
         dt = 0.0 if self._followed is None else min(self._stamp - self._followed, _LONGEST_GAP)
-        self._followed = self._stamp
+        self._followed, self._scale_error = self._stamp, observation.shared.scale
         try:
             state = self._tracker.update(points, self._taring.tare, dt, observation)
         except UnobservableError as error:
@@ -402,7 +403,8 @@ class ForceEstimator:
     def _solution(self, state: ContactState, used: NDArray) -> Solution:
         """Return the force that belongs to a contact, and how good it is."""
         self._pressed = state
-        error = hypot(self._force_error, state["location_error"], _EXTRAPOLATED * state["extrapolation"])
+        extrapolated = _EXTRAPOLATED * state["extrapolation"]
+        error = hypot(self._force_error, self._scale_error, state["location_error"], extrapolated)
         vectors, dt = np.empty((7, 3)), self._pass_time(state["force"], np.zeros(3))
         relaxation, untold = self._relaxation.packed, self._untold.overstress
         magnitude, stddev = compute_force(state, relaxation, untold, dt, error, self._modulus_error, vectors)

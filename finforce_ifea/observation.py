@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from finforce.compiled import njit
 from finforce.errors import ObservationError
-from finforce.messages import check_stddev
+from finforce.messages import NOTHING_SHARED, SharedStddev, check_stddev
 from finforce_ifea.errors import ContactError
 from finforce_ifea.jaw.jaw import Jaw
 
@@ -44,8 +44,7 @@ class Observation:
         likelihood: (K,) in [0, 1]; None for 1 where there is a point and 0 where it is NaN.
         stddev: (K, 3) standard deviation of each point [m] along the axes of the jaw frame, above zero where there is a
             point; None if the detector states none.
-        shared: standard deviation [m] of an additional shift that all points of the image have in common, because the
-            position of the jaw is uncertain. The points may then also rotate together by a few degrees.
+        shared: standard deviations of additional errors that all points of the image have in common.
         gravity: (3,) unit vector in the direction of gravity, jaw frame; None if unknown. With it, the object is
             expected to be held against its weight alone, up to 0.1 N of other forces along and across the fingers.
     """
@@ -54,7 +53,7 @@ class Observation:
     points: NDArray
     likelihood: NDArray | None = None
     stddev: NDArray | None = None
-    shared: float = 0.0
+    shared: SharedStddev = NOTHING_SHARED
     gravity: NDArray | None = None
 
     def __post_init__(self) -> None:
@@ -210,8 +209,9 @@ def check_observation(observation: Observation, count: int, last_stamp: float | 
         )
     if observation.stddev is not None:
         check_stddev(np.asarray(observation.stddev), points)
-    if not 0.0 <= observation.shared < np.inf:
-        raise ObservationError(f"shared standard deviation {observation.shared} m, expected a number from zero up")
+    shared = observation.shared
+    if not (isinstance(shared, SharedStddev) and all(0.0 <= stddev < np.inf for stddev in shared)):
+        raise ObservationError(f"shared standard deviations {shared}, expected SharedStddev with numbers from zero up")
     gravity = observation.gravity
     if gravity is not None and not (np.shape(gravity) == (3,) and abs(np.linalg.norm(gravity) - 1.0) < _UNIT):
         raise ObservationError(f"gravity {np.asarray(gravity).tolist()}, expected a unit vector of three numbers")

@@ -46,7 +46,3 @@ class ImageOrderError(KeypointError, ImageError):
 
 class SyncError(KeypointError, ImageError):
     """No depth image belongs to a colour image."""
-
-
-class RigError(KeypointError, ValueError):
-    """A rig file cannot be used, or is of another camera than the images."""

@@ -17,7 +17,7 @@ from sensor_msgs.msg import CameraInfo
 from finforce.camera_topics import COMPRESSED_DEPTH
 from finforce.errors import FinforceError, ObservationError
 from finforce.health import IDLE, STILL, Health, Idling, Level, Outcome, Report, Skips, StampGate
-from finforce.messages import CameraStream, Stamped
+from finforce.messages import CameraStream, Stamped, shared_columns
 from finforce.ros import node as ros
 from finforce.transforms import pose_numbers
 from finforce_keypoints.build import build_detector
@@ -109,7 +109,7 @@ def keypoint_columns(found: JawKeypoints) -> dict[str, NDArray]:
         "valid": np.asarray(found.valid, dtype=np.uint8),
         "reason": codes.astype(np.uint8),
         **dict(zip(("stddev_x", "stddev_y", "stddev_z"), stddev, strict=True)),
-        "shared": np.full(len(u), found.shared, dtype=np.float32),
+        **shared_columns(found.shared, len(u)),
     }
 
 

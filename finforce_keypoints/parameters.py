@@ -36,6 +36,12 @@ class DetectorParameters(GripperParameters):
         pose_numbers(ROBOT_CAMERA),
         "Pose of the colour camera in the gripper frame: x, y, z [m], qx, qy, qz, qw; if not set, from /tf if possible",
     )
+    left_stddev: tuple[float, ...] = setting(
+        (0.0, 0.0),
+        "Standard deviations of the left jaw's place along its z [m] and of the scale at which it is seen [-], as in a "
+        "rig file",
+    )
+    right_stddev: tuple[float, ...] = setting((0.0, 0.0), "Standard deviations of the right jaw, likewise")
     left_turn: tuple[float, ...] = setting(
         (0.0, 0.0, 0.0), "Rotation vector of the left jaw against the gripper axes, in the jaw frame [rad]"
     )
@@ -124,12 +130,14 @@ class JawMount:
         covered: names of the key points that are never seen, "reference" for the reference point.
         odds: factor on the odds of likelihoods: a network is less sure of small fingers than it could be.
         tag: that is fixed to its holder; None without one.
+        stddev: standard deviations (2,) of its place along its z [m] and of the scale at which it is seen [-].
     """
 
     turn: NDArray = field(default_factory=lambda: np.zeros(3))
     covered: frozenset[str] = frozenset()
     odds: float = 1.0
     tag: Tag | None = None
+    stddev: tuple[float, ...] = (0.0, 0.0)
 
     def seen_points(self, jaw: Jaw) -> NDArray[np.bool_]:
         """Return which of a jaw's key points, the reference point last, are not covered (K + 1,)."""
@@ -149,13 +157,13 @@ def find_mounts(parameters: DetectorParameters, jaws: Mapping[str, Jaw]) -> dict
     """Return how the jaws, by side, are mounted.
 
     Raises:
-        DetectorSettingsError: a turn is no three numbers, a tag none, or `covered` names a point that the jaw does not
-            have.
+        DetectorSettingsError: a turn is no three numbers, a deviation no two, a tag none, or `covered` names a point
+            that the jaw does not have.
     """
-    mounts, turns = {}, {"left": parameters.left_turn, "right": parameters.right_turn}
-    tags = {"left": parameters.left_tag, "right": parameters.right_tag}
+    mounts = {}
     for side, jaw in jaws.items():
-        turn = np.array(turns[side], dtype=float)
+        turn, tag, stddev = (getattr(parameters, f"{side}_{name}") for name in ("turn", "tag", "stddev"))
+        turn = np.array(turn, dtype=float)
         if turn.shape != (3,) or not np.linalg.norm(turn) <= LARGEST_TURN:
             raise DetectorSettingsError(
                 f"{side}_turn: got {turn.tolist()}, expected a rotation vector of three numbers, at most "
@@ -169,10 +177,12 @@ def find_mounts(parameters: DetectorParameters, jaws: Mapping[str, Jaw]) -> dict
                 f"'{jaw.name}' or {REFERENCE}"
             )
         try:
-            tag = read_tag(tags[side])
+            tag = read_tag(tag)
         except GeometryError as error:
             raise DetectorSettingsError(f"{side}_tag: {error}") from error
-        mounts[side] = JawMount(turn=turn, covered=covered, odds=parameters.likelihood_odds, tag=tag)
+        if len(stddev) != 2 or not all(0.0 <= each < np.inf for each in stddev):
+            raise DetectorSettingsError(f"{side}_stddev: got {stddev}, expected two numbers from zero up")
+        mounts[side] = JawMount(turn=turn, covered=covered, odds=parameters.likelihood_odds, tag=tag, stddev=stddev)
     return mounts
 
 

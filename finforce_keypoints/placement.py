@@ -35,7 +35,7 @@ from finforce_keypoints.geometry.side_picture import (
 )
 from finforce_keypoints.geometry.template import find_shape, fit_grid
 from finforce_keypoints.parameters import REFERENCE, JawMount
-from finforce_keypoints.rib_check import HERE, RibComparison, compare_ribs, find_places
+from finforce_keypoints.rib_check import HERE, INDEPENDENT, RibComparison, compare_ribs, find_places
 
 if TYPE_CHECKING:
     from finforce_ifea.jaw.jaw import Jaw
@@ -85,7 +85,7 @@ class CameraPlacement:
 
     Attributes:
         T_gripper_camera: (4, 4).
-        mounts: side -> turn and covered points.
+        mounts: side -> turn, covered points, and how sure its place is.
         origins: side -> place of the jaw's origin on the closing axis in each picture (n,) [m].
         contrast: of the outlines, 0 to 1.
         residual: root mean square distance of the points seen from where they should be [px].
@@ -281,7 +281,35 @@ def find_placement(
                 failures[fit.likeliest] = error
     if not found:
         raise failures[max(failures)]
-    return max(found, key=lambda each: each.evidence)
+    best = max(found, key=lambda each: each.evidence)
+    stddev = {side: _widen_stddev(best, found, side, jaw) for side, jaw in jaws.items()}
+    return replace(best, mounts={side: replace(mount, stddev=stddev[side]) for side, mount in best.mounts.items()})
+
+
+def compare_poses(jaw: Jaw, T: NDArray, other: NDArray) -> NDArray:
+    """Return what another T_camera_jaw (4, 4) makes of a jaw's inner face half way up (2,).
+
+    It is higher by so much [m], and by so much larger appears what moves along the closing axis [-].
+    """
+    places = np.array([jaw.inner_face_x, 0.0, 0.5 * jaw.keypoints[:, 2].max()]) + [[0.0] * 3, [1e-4, 0.0, 0.0]]
+    seen = [places @ each[:3, :3].T + each[:3, 3] for each in (T, other)]
+    height = ((seen[1][0] - T[:3, 3]) @ T[:3, :3] - places[0])[2]
+    one, two = (np.linalg.norm(np.diff(each[:, :2] / each[:, 2:], axis=0)) for each in seen)
+    return np.array([height, two / one - 1.0])
+
+
+def _widen_stddev(best: CameraPlacement, found: Sequence[CameraPlacement], side: str, jaw: Jaw) -> tuple[float, ...]:
+    """Return a jaw's standard deviations (2,) with the spread of the places that explain the pictures nearly as well.
+
+    Those found from other starts, each as likely as its ribs and tips, and the likeliest one of other ribs.
+    """
+    independent = 0.5 * INDEPENDENT * len(best.origins[side])
+    weights = np.exp(independent * np.array([each.evidence - best.evidence for each in found]))
+    away = np.array([compare_poses(jaw, best.pose(side, 0), each.pose(side, 0)) for each in found])
+    variance = np.square(best.mounts[side].stddev) + weights @ away**2 / weights.sum()
+    rival = best.ribs[side]
+    variance[0] += rival.other.shift**2 / (1.0 + np.exp(independent * rival.margin))
+    return tuple(np.sqrt(variance).tolist())
 
 
 def _add_ribs(
@@ -523,9 +551,30 @@ class _Refinement:
         covered = frozenset(names[~visible].tolist())
         return CameraPlacement(
             T_gripper_camera=T,
-            mounts={side: replace(mount, turn=turns[side], covered=covered) for side in self._jaws},
+            mounts={
+                side: replace(mount, turn=turns[side], covered=covered, stddev=stddev)
+                for side, stddev in self._find_stddev().items()
+            },
             origins=origins,
             contrast=contrast,
             residual=residual,
             seen={side: np.where(sure[side][:, :, None], seen, np.nan) for side, seen in self._seen.items()},
         )
+
+    def _find_stddev(self) -> dict[str, tuple[float, ...]]:
+        """Return by side the standard deviations of height and scale that the points' errors make."""
+        fit = least_squares(self._misses, self._x, x_scale=self._scale, loss="soft_l1", max_nfev=1)
+        _, sizes, directions = np.linalg.svd(fit.jac, full_matrices=False)
+        told = sizes > 1e-9 * sizes[0]
+        # one standard deviation in each of the independent directions
+        steps, stddev = directions[told] / sizes[told, None], {}
+        for side, jaw in self._jaws.items():
+            T = self._pose(side, self._x)
+            away = [compare_poses(jaw, T, self._pose(side, self._x + step)) for step in steps]
+            stddev[side] = tuple(np.sqrt(np.square(away).sum(axis=0)).tolist())
+        return stddev
+
+    def _pose(self, side: str, x: NDArray) -> NDArray:
+        """Return T_camera_jaw (4, 4) in the first picture."""
+        T, turns, origins = self._split(x)
+        return jaw_in_camera(T, side, origins[side][0], turns[side])

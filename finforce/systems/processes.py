@@ -11,9 +11,11 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+from finforce.errors import RigError
 from finforce.gripper_frames import SIDES
+from finforce.rig import read_rig
 from finforce.settings import setting
 from finforce.systems.parameter_file import check_sections
 
@@ -203,11 +205,31 @@ def contact_processes(jaws: str, options: SolverOptions, *, waits: bool = False)
     return [replace(node_process("contact_estimator", asked, options), remappings=topics)]
 
 
+OptionsT = TypeVar("OptionsT", bound="SolverOptions")
+
+
+def take_rig(options: OptionsT) -> OptionsT:
+    """Return options with the jaw file of their rig, and its camera's pose unless another one is asked for.
+
+    Raises:
+        RigError: the rig file cannot be used, or is of other jaws.
+    """
+    if not options.rig:
+        return options
+    rig = read_rig(options.rig)
+    if options.jaw_file not in ("", rig.jaw):
+        name = Path(options.rig).name
+        raise RigError(f"jaw_file:={options.jaw_file}: {name} is of the jaws '{rig.jaw}'; leave jaw_file out")
+    pose = options.T_gripper_camera or " ".join(map(str, rig.T_gripper_camera))
+    return replace(options, jaw_file=rig.jaw, T_gripper_camera=pose)
+
+
 def detector_processes(jaws: str, options: SolverOptions) -> list[Process]:
     """Return the key point detector of "left", "right" or "both" jaws, if images are to be used.
 
     Raises:
         ValueError: the camera's pose is not seven numbers.
+        RigError: the rig file cannot be used.
     """
     if not options.images:
         return []
@@ -219,7 +241,8 @@ def detector_processes(jaws: str, options: SolverOptions) -> list[Process]:
         "depth": "" if options.depth == "auto" else options.depth,  # the node's default, unless its file says otherwise
         "T_gripper_camera": read_numbers("T_gripper_camera", options.T_gripper_camera, 7),
     }
-    return [node_process("keypoint_detector", asked, options)]
+    mounted = read_rig(options.rig).detector_parameters() if options.rig else {}
+    return [node_process("keypoint_detector", {**mounted, **given(asked)}, options)]
 
 
 def read_numbers(name: str, text: str, count: int) -> list[float] | None:
@@ -250,6 +273,7 @@ def replay_processes(options: ReplayOptions, share: Path) -> list[Process]:
 
     With two jaws the left one completes the forces on the gripper, with one jaw that one.
     """
+    options = take_rig(options)
     if options.jaws == "both":
         solvers = [solver_process("left", options, peer="right"), solver_process("right", options, paired=True)]
     else:
@@ -334,6 +358,7 @@ class SolverOptions:
         "Depth images: aligned (every image needs one), auto (where there is one), none (colour alone)",
         choices=("aligned", "auto", "none"),
     )
+    rig: str = setting("", "Rig file of `finforce camera`: jaws, mounts and the camera's pose")
     T_gripper_camera: str = setting("", "Pose of the camera in the gripper frame: x y z [m] qx qy qz qw")
     solver: str = setting("", "Mechanics: reduced, solid, frame, plane or paper (Eq. 1)")
     parameter_file: str = setting("", "YAML file with node parameters; none: that of the system")

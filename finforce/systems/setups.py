@@ -26,6 +26,7 @@ from finforce.systems.processes import (
     node_process,
     read_numbers,
     solver_process,
+    take_rig,
     viewer,
 )
 from finforce.transforms import pose_numbers
@@ -89,9 +90,10 @@ def complete(options: OptionsT, share: Path, setup: str) -> OptionsT:
 
     Raises:
         ValueError: the twin has not got what they ask for.
+        RigError: the rig file cannot be used, or is of other jaws.
     """
     file = options.parameter_file or str(share / "config" / (f"{setup}_sim.yaml" if options.sim else f"{setup}.yaml"))
-    options = replace(options, parameter_file=file)
+    options = take_rig(replace(options, parameter_file=file))
     return simulated(options) if options.sim else options
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from finforce.camera import CameraIntrinsics, project
 from finforce.gripper_frames import SIDES, read_extrinsics
+from finforce.rig import Rig, RigCamera, RigJaw, RigTag, write_rig
 from finforce.transforms import pose_numbers
 from finforce_eval.cli.parser import BAG_HELP, CommandResult, add_rest_options, length_mm
 from finforce_eval.errors import OptionError, UnseenError
@@ -32,7 +33,7 @@ from finforce_keypoints.build import ANY_FINGER
 from finforce_keypoints.detectors.side_plane import AnyFinger
 from finforce_keypoints.errors import GeometryError
 from finforce_keypoints.networks.side_network import SideNetwork
-from finforce_keypoints.parameters import NO_DEPTH
+from finforce_keypoints.parameters import NO_DEPTH, REFERENCE, JawMount
 from finforce_keypoints.placement import (
     KEPT,
     LEAST_SEEN,
@@ -45,7 +46,6 @@ from finforce_keypoints.placement import (
     find_placement,
 )
 from finforce_keypoints.rib_check import describe_ribs
-from finforce_keypoints.rig import Rig, RigCamera, describe_mount, write_rig
 from finforce_keypoints.tags import FAMILIES, TagFinder, find_tag
 
 PICTURES = 4  # of the images, which are compared
@@ -253,6 +253,14 @@ def build_rig(found: CameraPlacement, recording: Recording, jaw: str, family: st
     )
 
 
+def describe_mount(mount: JawMount, names: tuple[str, ...]) -> RigJaw:
+    """Return how a jaw with key points of some names is mounted."""
+    covered = tuple(name for name in (*names, REFERENCE) if name in mount.covered)
+    tag = mount.tag and RigTag(id=mount.tag.id, corners=mount.tag.corners.round(5).tolist())
+    turn, stddev = (tuple(round(float(number), 5) for number in each) for each in (mount.turn, mount.stddev))
+    return RigJaw(turn=turn, covered=covered, tag=tag, stddev=stddev)
+
+
 def describe_placement(found: CameraPlacement, jaws) -> str:
     """Return what was found in words."""
     x, y, z = 1e3 * found.T_gripper_camera[:3, 3]
@@ -268,7 +276,8 @@ def describe_placement(found: CameraPlacement, jaws) -> str:
         if side in found.ribs:
             tag += f"; ribs {found.ribs[side].here.ribs:.2f}, evidence {found.ribs[side].margin:+.2f} over other places"
         lines.append(
-            f"{side} jaw: {seen} of {count} key points to be seen, turned by {turned} degrees, at {places} mm{tag}"
+            f"{side} jaw: {seen} of {count} key points to be seen, turned by {turned} degrees, at {places} mm{tag}; "
+            f"± {1e3 * mount.stddev[0]:.1f} mm along the finger, ± {100.0 * mount.stddev[1]:.1f} % in size"
         )
     if len(next(iter(found.origins.values()))) == 1:
         lines.append(

@@ -126,7 +126,7 @@ class _UseRig(argparse.Action):
     """Take the jaw of a rig file."""
 
     def __call__(self, parser: Any, namespace: argparse.Namespace, value: Any, option: str | None = None) -> None:
-        from finforce_keypoints.rig import read_rig
+        from finforce.rig import read_rig
 
         namespace.rig, namespace.jaw = value, read_rig(value).jaw
 

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from finforce.errors import FinforceError
 from finforce.gripper_frames import read_extrinsics
 from finforce.messages import SECOND
+from finforce.rig import read_rig
 from finforce.transforms import pose_numbers
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.contact_source import choose_contact
@@ -37,7 +38,6 @@ from finforce_eval.tasks import OK, EngineOptions, Manifest, Task, hash_settings
 from finforce_ifea.jaw.calibration import Calibration, load_calibration
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.settings import EstimatorSettings
-from finforce_keypoints.rig import read_rig
 
 
 def evaluate(

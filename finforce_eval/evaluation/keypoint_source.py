@@ -19,6 +19,7 @@ from finforce.errors import FinforceError, PoseError, suggest
 from finforce.gripper_frames import SIDES, read_extrinsics
 from finforce.health import Idling
 from finforce.messages import NANOSECONDS
+from finforce.rig import read_rig
 from finforce.transforms import pose_from_quaternion, pose_numbers, quaternion_from_pose
 from finforce_eval.errors import OptionError, RecordingError, UnseenError
 from finforce_eval.recordings.images import DEPTH_ENDS, ImageChoice, ImageTrack
@@ -26,7 +27,6 @@ from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.tracks import DetectionTrack, JawTrack, KeypointTrack, PoseTrack, Recording
 from finforce_eval.tasks import progress_bar
 from finforce_keypoints.errors import KeypointError
-from finforce_keypoints.rig import read_rig
 
 if TYPE_CHECKING:
     from finforce_keypoints.detector import KeypointDetector
@@ -443,7 +443,7 @@ def _with_detection(
         points=passed,
         likelihood=np.nan_to_num(_rows(seen, "likelihood", (count,))),
         stddev=np.where(np.isfinite(passed), stddev, np.nan),
-        shared=np.nan_to_num(_rows(seen, "shared", ())),
+        shared=np.nan_to_num(_rows(seen, "shared", (3,))),
     )
     unfound = np.full(count, "")
     reasons = [unfound if each is None else each.reasons for each in seen]

@@ -197,7 +197,7 @@ def _keypoint_track(samples: Sequence[Any], side: str, name: str) -> KeypointTra
         first = stated.index(not stated[0])
         raise RecordingError(f"{name}: {topic} message {first} differs from the first in whether it states stddev_x")
     stddev = np.stack([c.stddev for c in clouds]) if stated[0] else None
-    shared = np.array([c.shared for c in clouds]) if any(c.shared for c in clouds) else None
+    shared = np.array([c.shared for c in clouds]) if any(any(c.shared) for c in clouds) else None
     return KeypointTrack(stamps_ns=stamps, points=points, likelihood=likelihood, stddev=stddev, shared=shared)
 
 

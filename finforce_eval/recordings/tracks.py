@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce.messages import NANOSECONDS, SECOND
+from finforce.messages import NANOSECONDS, NOTHING_SHARED, SECOND, SharedStddev
 from finforce_eval.errors import RecordingError
 from finforce_ifea.observation import Observation
 
@@ -42,7 +42,7 @@ class KeypointTrack(Timed):
         points: (n, K, 3) [m], jaw frame; NaN = none.
         likelihood: (n, K) in [0, 1].
         stddev: (n, K, 3) one standard deviation [m], jaw frame, NaN = not known; None when nothing says.
-        shared: (n,) standard deviation of a shift that the points of an image share [m]; None: 0.
+        shared: (n, 3) standard deviations of what the points of an image share, see `SharedStddev`; None: 0.
         gravity: (n, 3) its direction, jaw frame; None when nothing says.
     """
 
@@ -70,7 +70,7 @@ class KeypointTrack(Timed):
             points=self.points[index],
             likelihood=self.likelihood[index],
             stddev=None if self.stddev is None else self.stddev[index],
-            shared=0.0 if self.shared is None else float(self.shared[index]),
+            shared=NOTHING_SHARED if self.shared is None else SharedStddev(*self.shared[index].tolist()),
             gravity=None if self.gravity is None else self.gravity[index],
         )
 

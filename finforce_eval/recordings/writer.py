@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from finforce.messages import NANOSECONDS, STDDEV_COLUMNS, encode_cloud
+from finforce.messages import NANOSECONDS, STDDEV_COLUMNS, SharedStddev, encode_cloud, shared_columns
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.recording import CLOUD, POSE, STRING, WRENCH
 from finforce_eval.recordings.tracks import KeypointTrack, PhaseTrack, PoseTrack, Recording
@@ -202,7 +202,7 @@ def _keypoint_entries(track: KeypointTrack, side: str) -> Iterator[Entry]:
         if track.stddev is not None:
             columns |= {name: track.stddev[index, :, i] for i, name in enumerate(STDDEV_COLUMNS)}
         if track.shared is not None:
-            columns["shared"] = np.full(track.count, track.shared[index])
+            columns |= shared_columns(SharedStddev(*track.shared[index]), track.count)
         cloud = cloud_message(stamp, f"{side}_jaw", {name: value.astype(np.float32) for name, value in columns.items()})
         yield Entry(int(stamp), f"/{side}/keypoints", cloud)
 

@@ -65,6 +65,7 @@ EXPECTATION = np.dtype(
         ("settled_change", float),  # of the shape that no longer matters
         ("has_corners", bool),  # whether the object may rock
         ("shared", float),  # standard deviation of a shift that all key points of an image share [m]
+        ("mount", float),  # standard deviation of the height at which the jaw is mounted [m]
     ],
     align=True,
 )
@@ -255,7 +256,7 @@ class ContactSearch:
     def _expect(self) -> Expectation:
         """Return what the state returns to."""
         mu, variance = self.friction.mean, self.expectation["variance"].copy()
-        variance[1] += float(MISPLACED.stddev[0]) ** 2 if self._misplaced else 0.0
+        variance[1] += (float(MISPLACED.stddev[0]) ** 2 if self._misplaced else 0.0) + self.expectation["mount"] ** 2
         traction = TRACTION_FLOOR**2 + (TRACTION_SHARE * mu) ** 2 + min(self.hypotheses.stddev, mu) ** 2
         shared = float(self.expectation["shared"])
         camera, time = (_BUMPED, BUMPED_TIME) if self._bumped else (_STILL, CAMERA_TIME)

@@ -212,7 +212,8 @@ class ContactTracker:
         if tare is not self._tare:
             self._tare = tare
             search.restart()
-        search.expectation["shared"] = observation.shared
+        search.expectation["shared"] = observation.shared.shift
+        search.expectation["mount"] = observation.shared.height if self._is_known else 0.0
         planar = measured - self._lateral.motions if self._is_known else measured
         self._fill(planar, tare, tare.point_noise(observation.stddev))
         most = _FULL_ITERATIONS if self._fidelity else self.settings.iterations

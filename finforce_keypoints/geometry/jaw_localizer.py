@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.camera import CameraIntrinsics, project, rays_from_pixels
+from finforce.messages import NOTHING_SHARED, SharedStddev
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_keypoints.geometry.depth import (
     DepthScale,
@@ -59,7 +60,7 @@ class JawKeypoints:
         T_camera_jaw: (4, 4) where the jaw is.
         reasons: (K,) str, "" for valid points, else what speaks against them, one of `REASONS`.
         scale: of the depth image, as this jaw shows it; None where nobody knows.
-        shared: standard deviation of a shift, beyond `stddev`, that all points share, see `Observation` [m].
+        shared: standard deviations, beyond `stddev`, of what all points share.
     """
 
     stamp: float
@@ -71,7 +72,7 @@ class JawKeypoints:
     T_camera_jaw: NDArray
     reasons: NDArray
     scale: DepthScale | None = None
-    shared: float = 0.0
+    shared: SharedStddev = NOTHING_SHARED
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -287,7 +288,7 @@ class JawLocalizer:
             T_camera_jaw=self._origin.place(replace(origin, x=origin.x - self._track.speed * late[-1])),
             reasons=reasons,
             scale=fit.scale,
-            shared=shared if is_held else 0.0,
+            shared=SharedStddev(shared if is_held else 0.0, *self._mount.stddev),
         )
 
     def _find_delays(self, seen: _Seen, T_camera_jaw: NDArray) -> NDArray:

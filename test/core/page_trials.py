@@ -129,7 +129,7 @@ def give_video(folder, shared):
     import av
 
     import finforce as ff
-    from finforce_keypoints.rig import Rig, RigCamera, RigJaw, write_rig
+    from finforce.rig import Rig, RigCamera, RigJaw, write_rig
 
     recording = ff.read_recording(images_of(shared))
     with av.open(str(folder / "demo.mp4"), "w") as container:

@@ -111,7 +111,7 @@ def test_key_points_without_likelihood_are_certain():
     points, likelihood, stddev, shared = decode_keypoints(cloud)
     np.testing.assert_array_equal(points, [[1, 2, 3], [np.nan, 2, 3]])
     np.testing.assert_array_equal(likelihood, [1, 1])
-    assert stddev is None and shared == 0.0
+    assert stddev is None and not any(shared)
 
 
 def test_rows_that_the_detector_calls_invalid_are_not_used():

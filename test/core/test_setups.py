@@ -12,7 +12,9 @@ from keypoint_node_fakes import FakeDetector
 from node_fakes import FakeEstimator
 from rclpy.parameter import Parameter
 
+from finforce.errors import RigError
 from finforce.gripper_frames import ROBOT_CAMERA
+from finforce.rig import Rig, RigCamera, RigJaw, write_rig
 from finforce.ros.transport import CHOICES, PROFILES, TRANSPORT, free_domain
 from finforce.systems.processes import (
     BenchOptions,
@@ -219,6 +221,23 @@ def test_the_published_camera_is_where_the_detector_is_told_that_it_is(tmp_path)
         T_gripper_camera=tuple(camera_pose(RobotOptions(composed=False, parameter_file=options_file())))
     )
     np.testing.assert_allclose(default.camera_pose, ROBOT_CAMERA, atol=1e-12)
+
+
+def test_a_rig_says_jaws_mounts_and_camera(tmp_path):
+    camera = RigCamera(width=640, height=480, fx=430.0, fy=430.0, cx=320.0, cy=240.0, model="plumb_bob")
+    left = RigJaw(turn=(0.0, 0.01, 0.0), stddev=(1e-3, 0.01))
+    rig = tmp_path / "rig.yaml"
+    write_rig(Rig(jaw="umi", camera=camera, T_gripper_camera=(0.0, 0.1, -0.03, 0.0, 0.0, 0.0, 1.0), left=left), rig)
+    parts = robot(rig=str(rig))
+    assert {parts[name].parameters["jaw_file"] for name in ("keypoint_detector", "left_ifea_solver")} == {"umi"}
+    detector = parts["keypoint_detector"].parameters
+    assert detector["left_turn"] == [0.0, 0.01, 0.0] and detector["left_stddev"] == [1e-3, 0.01]
+    assert detector["T_gripper_camera"][1] == 0.1 and "0.1" in parts["static_transform_publisher"].arguments
+    assert robot(rig=str(rig), T_gripper_camera=HAND_EYE)["keypoint_detector"].parameters["T_gripper_camera"][1] == 0.09
+    with pytest.raises(RigError, match="rig.yaml is of the jaws 'umi'"):
+        robot(rig=str(rig), jaw_file="bench")
+    played = by_name(replay_processes(ReplayOptions(composed=False, rig=str(rig), images=True), ROOT))
+    assert played["left_ifea_solver"].parameters["jaw_file"] == "umi"
 
 
 def options_file():

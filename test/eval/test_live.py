@@ -9,13 +9,13 @@ import pytest
 from finforce.camera import ImageError
 from finforce.gripper_frames import ROBOT_CAMERA
 from finforce.optional import import_cv2
+from finforce.rig import WIDER, Rig, RigCamera, RigJaw, write_rig
 from finforce.transforms import pose_numbers
 from finforce_eval import sensor as sensors
 from finforce_eval.cli import live
 from finforce_eval.cli.main import main
 from finforce_eval.sensor import ForceSensor, combine_solutions
 from finforce_ifea.observation import blank_solution
-from finforce_keypoints.rig import WIDER, Rig, RigCamera, RigJaw, write_rig
 
 CAMERA = RigCamera(width=64, height=48, fx=50.0, fy=50.0, cx=32.0, cy=24.0, model="plumb_bob")
 RIG = Rig(

@@ -8,6 +8,7 @@ import pytest
 from eval_fakes import PERIOD, START, make_recording
 from mcap.writer import Writer
 
+from finforce.messages import SharedStddev
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.frames import FrameImages
 from finforce_eval.recordings.images import ImageTrack
@@ -68,13 +69,13 @@ def test_what_the_points_of_an_image_share_is_read_as_it_was_written(tmp_path):
     written = make_recording("held")
     jaws = dict(written.jaws)
     for side, jaw in jaws.items():
-        shared = np.linspace(1e-3, 3e-3, len(jaw.keypoints.stamps_ns)).astype(np.float32)
+        shared = np.linspace((1e-3, 0.0, 0.01), (3e-3, 2e-3, 0.02), len(jaw.keypoints.stamps_ns)).astype(np.float32)
         jaws[side] = replace(jaw, keypoints=replace(jaw.keypoints, shared=shared.astype(np.float64)))
     written = replace(written, jaws=jaws)
     read = read_recording(write_recording(written, tmp_path / "held"))
     assert_same(read, written)
     track = next(iter(read.jaws.values())).keypoints
-    assert track.observation(2).shared == track.shared[2] > track.shared[0]
+    assert track.observation(2).shared == SharedStddev(*track.shared[2]) > SharedStddev(*track.shared[0])
 
 
 def test_times_in_python_are_seconds_as_an_estimator_takes_them():

@@ -10,6 +10,7 @@ import pytest
 from finforce.errors import MissingDependencyError
 from finforce.gripper_frames import ROBOT_CAMERA
 from finforce.messages import NANOSECONDS
+from finforce.rig import Rig, RigCamera
 from finforce_eval.annotation import buffer_copy
 from finforce_eval.cli.main import main
 from finforce_eval.errors import RecordingError
@@ -18,7 +19,6 @@ from finforce_eval.recordings.images import ImageChoice
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.zarr_store import ZarrStore
 from finforce_eval.table import ForceSeries, write_table
-from finforce_keypoints.rig import Rig, RigCamera
 
 CAMERA = RigCamera(width=64, height=48, fx=50.0, fy=50.0, cx=32.0, cy=24.0, model="plumb_bob")
 UPRIGHT = np.diag([-1.0, -1.0, 1.0, 1.0])  # a camera above the gripper, which sees its x run to the left

@@ -10,6 +10,7 @@ from eval_fakes import FakeEstimator, FakeJaw, make_recording
 from PIL import Image
 
 from finforce.gripper_frames import ROBOT_CAMERA
+from finforce.rig import Rig, RigCamera, write_rig
 from finforce.transforms import pose_numbers
 from finforce_contact.loop import GivenContact
 from finforce_eval.annotation import video
@@ -24,7 +25,6 @@ from finforce_eval.recordings.images import ImageChoice
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.tracks import DetectionTrack, PoseTrack
 from finforce_eval.table import ForceSeries
-from finforce_keypoints.rig import Rig, RigCamera, write_rig
 
 CAMERA = RigCamera(width=64, height=48, fx=50.0, fy=50.0, cx=32.0, cy=24.0, model="plumb_bob")
 RIG = Rig(jaw="bench", camera=CAMERA, T_gripper_camera=tuple(pose_numbers(ROBOT_CAMERA)))

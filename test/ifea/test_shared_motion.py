@@ -4,13 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from estimator_fakes import errors, make_estimator, ramp, record, run
+from estimator_fakes import SHAPES, contact_with, errors, make_estimator, observe, press_shape, ramp, record, run
 from mechanics_fakes import BENCH
 
 from finforce.errors import ObservationError
+from finforce.messages import NOTHING_SHARED, SharedStddev
 from finforce_ifea.observation import Observation
 
-SHARED = 3e-3
+SHARED = SharedStddev(shift=3e-3)
 
 
 def slip(observation, *, shift, turn):
@@ -62,14 +63,36 @@ def test_a_holder_that_turns_by_degrees_under_load_hides_no_force(height, turn):
 def test_what_is_shared_makes_no_force_surer(slipping):
     estimators = [make_estimator(solver="frame") for _ in range(2)]
     stated = []
-    for estimator, shared in zip(estimators, (0.0, SHARED), strict=True):
+    for estimator, shared in zip(estimators, (NOTHING_SHARED, SHARED), strict=True):
         pressed = record(ramp(3, hold=0.3), seed=3)
         last = [estimator.update(replace(o, shared=shared), pressed.contact) for o in pressed.observations][-1]
         stated.append(last.magnitude_stddev)
     assert 0.0 < stated[0] < stated[1]
 
 
-@pytest.mark.parametrize("shared", [-1e-3, np.nan, np.inf])
+def test_a_scale_that_is_unsure_makes_the_force_as_unsure():
+    pressed, stated = record(ramp(3, hold=0.3), seed=3), []
+    for scale in (0.0, 0.1):
+        estimator = make_estimator(solver="frame")
+        seen = [replace(o, shared=SharedStddev(scale=scale)) for o in pressed.observations]
+        last = [estimator.update(o, pressed.contact) for o in seen][-1]
+        stated.append(last.magnitude_stddev / np.linalg.norm(last.force))
+    assert stated[1] == pytest.approx(np.hypot(stated[0], 0.1), rel=0.02)
+
+
+def test_key_points_say_where_an_outline_touches_a_jaw_whose_height_is_unsure():
+    observations, apart = [observation for observation, _ in observe(press_shape("circle", 0.04))], []
+    for height in (0.0, 3e-3):
+        found = []
+        for stated in (0.0388, 0.0412):
+            estimator, contact = make_estimator(), contact_with(SHAPES["circle"], stated)
+            seen = [replace(o, shared=SharedStddev(height=height)) for o in observations]
+            found.append([estimator.update(o, contact) for o in seen][-1].contact_location[2])
+        apart.append(abs(found[1] - found[0]))
+    assert apart[1] < 0.3 * apart[0]
+
+
+@pytest.mark.parametrize("shared", [1e-3, *(SharedStddev(scale=each) for each in (-1e-3, np.nan, np.inf))])
 def test_a_shared_deviation_that_is_none_is_refused(shared):
     with pytest.raises(ObservationError, match="shared standard deviation"):
         make_estimator(solver="frame").update(Observation(stamp=1.0, points=BENCH.keypoints, shared=shared), None)

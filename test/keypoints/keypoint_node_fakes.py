@@ -12,6 +12,7 @@ from std_msgs.msg import Header
 
 from finforce.camera_topics import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC, OLD_COLOR_TOPIC
 from finforce.gripper_frames import ROBOT_CAMERA, jaw_in_camera
+from finforce.messages import NOTHING_SHARED, SharedStddev
 from finforce.ros import node as ros
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints.images import ImageWatch, check_image
@@ -39,7 +40,7 @@ class FakeKeypoints:
     stddev: np.ndarray = field(default_factory=lambda: np.tile((1e-4, 2e-4, 3e-4), (COUNT, 1)))
     T_camera_jaw: np.ndarray = field(default_factory=lambda: jaw_in_camera(ROBOT_CAMERA, "left", -0.04))
     reasons: np.ndarray = field(default_factory=lambda: np.full(COUNT, "", dtype=object))
-    shared: float = 0.0
+    shared: SharedStddev = NOTHING_SHARED
 
 
 class FakeDetector:

@@ -15,6 +15,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage
 
 from finforce.camera_topics import COLOR_TOPIC, INFO_TOPIC
 from finforce.gripper_frames import ROBOT_CAMERA, SIDES
+from finforce.rig import Rig, RigCamera, RigJaw
 from finforce.ros import node as ros
 from finforce.transforms import invert_pose, pose_numbers
 from finforce_eval.cli.camera import try_rig
@@ -26,7 +27,6 @@ from finforce_eval.evaluation.check import FAULT, OK, WARNING, explain_camera, j
 from finforce_eval.evaluation.keypoint_source import KeypointSource
 from finforce_eval.recordings.bags import open_bag
 from finforce_eval.recordings.images import CAMERA_INFO, COMPRESSED
-from finforce_keypoints.rig import Rig, RigCamera, RigJaw
 from finforce_sim.footage import build_footage
 from finforce_sim.scenarios import build_scenario
 

@@ -37,7 +37,10 @@ from finforce.ros import node as ros
 from finforce_keypoints.errors import DetectionError
 from finforce_keypoints.node import KeypointDetectorNode
 
-COLUMNS = ("x", "y", "z", "likelihood", "u", "v", "valid", "reason", "stddev_x", "stddev_y", "stddev_z", "shared")
+COLUMNS = (
+    *("x", "y", "z", "likelihood", "u", "v", "valid", "reason", "stddev_x", "stddev_y", "stddev_z"),
+    *("shared", "shared_height", "shared_scale"),
+)
 
 
 def columns(cloud):

@@ -1,19 +1,22 @@
 """Claims about jaws whose holders hide them, and about a camera whose place nobody has measured."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from finforce.camera import EQUIDISTANT, CameraIntrinsics, project, rays_from_pixels
+from finforce.errors import RigError
 from finforce.gripper_frames import ROBOT_CAMERA, jaw_in_camera
-from finforce.transforms import pose_numbers
+from finforce.rig import Rig, RigCamera, RigJaw, RigTag, read_rig, write_rig
+from finforce.transforms import move_pose, pose_numbers
 from finforce_eval.cli.camera import describe_placement
 from finforce_eval.evaluation.keypoint_source import build_records
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints import placement
 from finforce_keypoints.detectors.side_plane import AROUND, AnyFinger, SidePlaneDetector
-from finforce_keypoints.errors import DetectorSettingsError, GeometryError, RigError
+from finforce_keypoints.errors import DetectorSettingsError, GeometryError
 from finforce_keypoints.geometry.depth import DepthScale
 from finforce_keypoints.geometry.jaw_localizer import JawLocalizer
 from finforce_keypoints.geometry.jaw_pose import COVERED_STDDEV, OriginEstimator
@@ -23,12 +26,16 @@ from finforce_keypoints.images import PixelDetection, RgbdImage
 from finforce_keypoints.networks.side_network import Places, Template
 from finforce_keypoints.parameters import DetectorParameters, DetectorSettings, JawMount, find_mounts
 from finforce_keypoints.placement import (
+    GUESS_STDDEV,
     CameraPlacement,
     OutlineContrast,
+    _Refinement,
+    _widen_stddev,
+    compare_poses,
     find_covered,
     find_placement,
 )
-from finforce_keypoints.rig import Rig, RigCamera, RigJaw, RigTag, read_rig, write_rig
+from finforce_keypoints.rib_check import RibComparison, RibPlace
 from finforce_sim.sensor import build_d405_vga
 
 CAMERA = build_d405_vga()
@@ -46,6 +53,7 @@ RIG = Rig(
     likelihood_odds=3.0,
     left=RigJaw(
         turn=(0.0, 0.05, 0.0),
+        stddev=(0.8e-3, 0.006),
         covered=("reference",),
         tag=RigTag(id=3, corners=((0.0, 0.01, 0.0), (0.01, 0.01, 0.0), (0.01, 0.01, -0.01), (0.0, 0.01, -0.01))),
     ),
@@ -301,12 +309,13 @@ def test_the_place_of_a_jaw_in_a_holder_is_stated_apart_from_its_points():
     jaw = load_jaw("bench", "left")
     image = RgbdImage(stamp=1.0, color=np.zeros((480, 640, 3), np.uint8), depth=None, camera=CAMERA)
     found = []
-    for mount in (JawMount(), JawMount(covered=LOW)):
+    for mount in (JawMount(), JawMount(covered=LOW, stddev=(1e-3, 0.02))):
         localizer = JawLocalizer(jaw, ROBOT_CAMERA, DetectorSettings(plane_depth=True), mount)
         found.append(localizer.locate(image, localizer.imagine(CAMERA), DepthScale(error=0.0, stddev=0.015)))
     straight, held = found
     used = held.valid & straight.valid
-    assert straight.shared == 0.0 and held.shared == COVERED_STDDEV and used.sum() >= 5
+    assert held.shared[1:] == (1e-3, 0.02) and straight.shared[1:] == (0.0, 0.0)
+    assert straight.shared.shift == 0.0 and held.shared.shift == COVERED_STDDEV and used.sum() >= 5
     # what the camera is off the side, and the place along the closing axis, move all points together
     assert (held.stddev[used][:, [0, 2]] < straight.stddev[used][:, [0, 2]]).all()
 
@@ -336,11 +345,52 @@ def test_a_stated_opening_is_kept_and_a_picture_without_jaws_refused(monkeypatch
     found = find_placement([paint(poses, jaws)], CAMERA, jaws, Dreamer(), ROBOT_CAMERA)
     assert found.contrast > 0.8 and not any(mount.covered for mount in found.mounts.values())
     told = find_placement([paint(poses, jaws)], CAMERA, jaws, Dreamer(), ROBOT_CAMERA, opening=0.0616)
+    assert all(told.mounts[side].stddev[1] < found.mounts[side].stddev[1] for side in jaws)
     apart = told.origins["right"][0] - told.origins["left"][0]
     assert apart == pytest.approx(0.0616 + 2 * jaws["left"].inner_face_x, abs=1e-9)
     blank = np.random.default_rng(0).integers(0, 255, (480, 640, 3), dtype=np.uint8)
     with pytest.raises(GeometryError, match="do not show the finger .* finforce jaw PHOTO"):
         find_placement([blank], CAMERA, jaws, Dreamer(), ROBOT_CAMERA)
+
+
+def test_a_camera_comes_out_as_far_off_as_it_is_unsure(monkeypatch):
+    jaws, rng = {side: load_jaw("bench", side) for side in ("left", "right")}, np.random.default_rng(3)
+    origins, image = {"left": (-0.045, -0.03), "right": (0.045, 0.03)}, np.zeros((480, 640, 3), np.uint8)
+    noise = placement.PIXEL * np.sqrt((len(NAMES) + 1) / placement.ALIKE)
+
+    def find(images, camera, locator, side, plane, poses):
+        there = [points_of(jaws[side], jaw_in_camera(ROBOT_CAMERA, side, x)) for x in origins[side]]
+        return np.array(there) + rng.normal(scale=noise, size=np.shape(there)), np.ones((2, len(NAMES) + 1))
+
+    monkeypatch.setattr(placement, "find_points", find)
+    sigmas = []
+    for _ in range(12):
+        guess = move_pose(ROBOT_CAMERA, rng.normal(size=6) * GUESS_STDDEV)
+        fit = _Refinement([image, image], CAMERA, jaws, None, guess, 0.045, GUESS_STDDEV, None)
+        fit.improve()
+        stddev = fit._find_stddev()
+        for side, jaw in jaws.items():
+            there = jaw_in_camera(ROBOT_CAMERA, side, origins[side][0])
+            sigmas.append(compare_poses(jaw, fit._pose(side, fit._x), there) / stddev[side])
+    assert np.abs(sigmas).max() < 4.0 and (np.abs(np.sqrt(np.mean(np.square(sigmas), axis=0)) - 1.0) < 0.5).all()
+
+
+def test_a_place_that_is_nearly_as_likely_makes_a_rig_unsure():
+    jaw, away = load_jaw("bench"), np.eye(4)
+    away[2, 3] = 7e-3
+    T = jaw_in_camera(ROBOT_CAMERA, "left", -0.04)
+    assert compare_poses(jaw, T, T @ away)[0] == pytest.approx(7e-3)
+    nothing = RibPlace(evidence=0.0, ribs=0.5, shift=0.0, distance=0.0, warps=np.zeros((0, 2, 3)))
+    stddev = []
+    for margin in (2.0, 0.2, 0.0, -2.0):
+        ribs = RibComparison(here=nothing, other=replace(nothing, evidence=-margin, shift=7e-3))
+        there = CameraPlacement(
+            T_gripper_camera=ROBOT_CAMERA, mounts={"left": JawMount(stddev=(0.5e-3, 0.01))}, contrast=1.0, residual=1.0,
+            origins={"left": np.array([-0.04])}, seen={}, ribs={"left": ribs},
+        )  # fmt: skip
+        stddev.append(_widen_stddev(there, [there], "left", jaw)[0])
+    assert stddev[0] == pytest.approx(0.5e-3, rel=0.01) and stddev == sorted(stddev)
+    assert stddev[2:] == pytest.approx([np.hypot(0.5e-3, 7e-3 / np.sqrt(2)), np.hypot(0.5e-3, 7e-3)], rel=0.01)
 
 
 def test_a_rig_file_says_what_was_written(tmp_path):
@@ -351,6 +401,7 @@ def test_a_rig_file_says_what_was_written(tmp_path):
     mount = find_mounts(records.parameters, {"left": load_jaw("bench")})["left"]
     assert mount.odds == 3.0 and 0.06 < records.settings.opening_max < 0.07
     np.testing.assert_allclose(mount.turn, [0.0, 0.05, 0.0])
+    assert mount.stddev == (0.8e-3, 0.006)
     assert mount.covered == {"reference"} and not mount.seen_points(load_jaw("bench"))[-1]
 
 
@@ -375,7 +426,13 @@ def test_what_is_no_rig_is_refused_by_name(tmp_path, old, new, told):
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"covered": ("left/rib_99",)}, {"left_turn": (0.0, 1.0, 0.0)}, {"right_turn": (0.0, float("nan"), 0.0)}]
+    "wrong",
+    [
+        {"covered": ("left/rib_99",)},
+        {"left_turn": (0.0, 1.0, 0.0)},
+        {"right_turn": (0.0, float("nan"), 0.0)},
+        {"left_stddev": (-1e-3, 0.0)},
+    ],
 )
 def test_a_mount_that_cannot_be_is_refused(wrong):
     jaws = {side: load_jaw("bench", side) for side in ("left", "right")}

@@ -8,6 +8,7 @@ import numpy as np
 
 from finforce.camera import CameraIntrinsics, project
 from finforce.gripper_frames import BENCH_CAMERA, ROBOT_CAMERA, jaw_in_camera
+from finforce.messages import NOTHING_SHARED, SharedStddev
 from finforce_contact.mesh.object_mesh import ObjectMesh
 from finforce_keypoints.errors import DetectionError
 from finforce_keypoints.images import ImageWatch
@@ -118,7 +119,7 @@ class FakeKeypoints:
     stddev: np.ndarray
     T_camera_jaw: np.ndarray
     reasons: np.ndarray
-    shared: float = 0.0
+    shared: SharedStddev = NOTHING_SHARED
 
 
 @dataclass

@@ -11,11 +11,9 @@ import yaml
 from pydantic import Field
 
 from finforce.camera import CameraIntrinsics
-from finforce.errors import PoseError
+from finforce.errors import PoseError, RigError
 from finforce.transforms import pose_from_quaternion
 from finforce.typed_yaml import FileModel, Length, Number, Text, read_model
-from finforce_keypoints.errors import RigError
-from finforce_keypoints.parameters import REFERENCE, JawMount
 
 HEAD = (
     "# A camera and the jaws before it, made by `finforce camera`. m, rad, px; T_gripper_camera: x y z qx qy qz qw.\n"
@@ -55,6 +53,9 @@ class RigJaw(FileModel):
     turn: tuple[Number, Number, Number] = Field((0.0, 0.0, 0.0), description="Rotation vector in its own frame [rad]")
     covered: tuple[Text, ...] = Field((), description="Names of key points that are never seen")
     tag: RigTag | None = Field(None, description="What tells where its holder is")
+    stddev: tuple[Annotated[Number, Field(ge=0.0)], Annotated[Number, Field(ge=0.0)]] = Field(
+        (0.0, 0.0), description="Standard deviations of its place along its z [m] and of the scale at which it is seen"
+    )
 
 
 class Rig(FileModel):
@@ -87,6 +88,7 @@ class Rig(FileModel):
         return {
             "T_gripper_camera": list(self.T_gripper_camera),
             **{f"{side}_turn": list(jaw.turn) for side, jaw in jaws.items()},
+            **{f"{side}_stddev": list(jaw.stddev) for side, jaw in jaws.items()},
             **{f"{side}_tag": [float(tag.id), *chain(*tag.corners)] for side, tag in tags.items()},
             "tag_family": self.tag_family,
             "covered": covered or [""],
@@ -119,10 +121,3 @@ def write_rig(rig: Rig, path: Path) -> None:
     """Write a rig as YAML; raises OSError where it cannot be."""
     content = rig.model_dump(mode="json", exclude_none=True)
     path.write_text(HEAD + yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120))
-
-
-def describe_mount(mount: JawMount, names: tuple[str, ...]) -> RigJaw:
-    """Return how a jaw with key points of some names is mounted."""
-    covered = tuple(name for name in (*names, REFERENCE) if name in mount.covered)
-    tag = mount.tag and RigTag(id=mount.tag.id, corners=mount.tag.corners.round(5).tolist())
-    return RigJaw(turn=tuple(round(float(number), 5) for number in mount.turn), covered=covered, tag=tag)
