@@ -35,7 +35,14 @@ from finforce_keypoints.geometry.side_picture import (
 )
 from finforce_keypoints.geometry.template import find_shape, fit_grid
 from finforce_keypoints.parameters import REFERENCE, JawMount
-from finforce_keypoints.rib_check import HERE, INDEPENDENT, RibComparison, compare_ribs, find_places
+from finforce_keypoints.rib_check import (
+    HERE,
+    INDEPENDENT,
+    RibComparison,
+    compare_ribs,
+    describe_ribs,
+    find_places,
+)
 
 if TYPE_CHECKING:
     from finforce_ifea.jaw.jaw import Jaw
@@ -73,9 +80,13 @@ TYPICAL, LEAST_TYPICAL, MOST_ODDS = 0.75, 0.15, 17.0
 # 3.1 and more of other fingers, of these one rib off, and of pictures without any.
 MOST_LEFT = 2.8
 RIB_ROUNDS = 4  # of laying the jaws on their ribs
-# Rounds of finding key points with the place found before; whether jaws are then laid on ribs, of all or near places.
-PLAN = ((12, None), (0, True), (4, False))
-ROUNDS = sum(rounds for rounds, _ in PLAN)
+# Key points are found with the place found before, in rounds until nothing changes by more than a share of its scale.
+# As long as ribs speak against the place found, jaws are laid on ribs that are so far off before [pitches].
+FARTHEST = (0.0, np.inf, HERE)
+MOST_ROUNDS, SETTLED = 12, 0.05
+# How far aside a jaw is looked for [m], and by how much likelier its points have to be there.
+ASIDE, LIKELIER = 4e-3 * np.arange(-4.0, 5.0), 0.1
+ROUNDS = len(FARTHEST)
 OUTER_WEIGHT = 0.25  # of points off the face: how ribs slant differs more between fingers than where they meet the face
 
 
@@ -264,24 +275,30 @@ def find_placement(
     stated = None if opening is None else 0.5 * opening + next(iter(jaws.values())).inner_face_x
     half = stated or HALF_OPENING
     starts = [(guess, half, WHOLE)] if guess is not None else search_camera(images, camera, jaws, progress)
+    known = None if guess is None else guess_stddev
+    fits = [_Refinement(images, camera, jaws, locator, T, begin, known, stated) for T, begin, _ in starts]
+    for fit, (*_, edge) in zip(fits, starts, strict=True):
+        fit.polish(edge)
     found: list[CameraPlacement] = []
     failures: dict[float, GeometryError] = {}
-    for T, begin, edge in starts:
-        fit = _Refinement(images, camera, jaws, locator, T, begin, None if guess is None else guess_stddev, stated)
-        fit.polish(edge)
-        for rounds, is_far in PLAN:
-            for _ in range(rounds):
-                fit.improve()
-                progress(len(images))
-            if is_far is not None:
-                fit.follow_ribs(is_far)
+    for farthest in FARTHEST:
+        for fit in fits:
+            fit.follow_ribs(farthest)
+            fit.settle()
+            progress(len(images))
             try:
-                found.append(_add_ribs(fit.describe(), images, camera, jaws))
+                place = _add_ribs(fit.describe(), images, camera, jaws)
             except GeometryError as error:
                 failures[fit.likeliest] = error
-    if not found:
+                fit.keep(0.0)
+            else:
+                found.append(place)
+                fit.keep(place.evidence)
+        best = max(found, key=lambda each: each.evidence, default=None)
+        if best is not None and not describe_ribs(best.ribs):
+            break
+    if best is None:
         raise failures[max(failures)]
-    best = max(found, key=lambda each: each.evidence)
     stddev = {side: _widen_stddev(best, found, side, jaw) for side, jaw in jaws.items()}
     return replace(best, mounts={side: replace(mount, stddev=stddev[side]) for side, mount in best.mounts.items()})
 
@@ -395,6 +412,7 @@ class _Refinement:
         self._scale = np.full(len(self._x), 5e-3)  # [m]
         self._scale[3 : 6 + 3 * sides] = 0.03  # [rad]
         self._best = (-1.0, self._x)
+        self._kept = (0.0, self._x)
 
     def _split(self, x: NDArray) -> tuple[NDArray, dict[str, NDArray], dict[str, NDArray]]:
         """Return the camera's pose (4, 4), and by side the turn (3,) and the origins (n,)."""
@@ -422,35 +440,46 @@ class _Refinement:
         return float(each.max())
 
     def polish(self, edge: int | None = None) -> None:
-        """Move jaws, and a camera that is no guess, until outlines show best up to an edge; None: up to the best."""
-        first = 6 if self._is_guess else 0
-        still, start = self._x[:first] / self._scale[:first], self._x[first:] / self._scale[first:]
+        """Move camera and jaws until outlines show best up to an edge; None: up to the best."""
         if edge is None:
             self.contrast()
             edge = self._edge
 
-        def judge(moving: NDArray) -> float:
-            x = np.concatenate((still, moving))
-            turns = x[6 : 6 + 3 * len(self._jaws)] * 0.03 / TURN_STDDEV
-            return 0.01 * float(turns @ turns) - self.contrast(x * self._scale, edge)
+        known = np.concatenate((self._stddev, np.full(3 * len(self._jaws), TURN_STDDEV)))
 
-        fit = minimize(judge, start, method="L-BFGS-B", options={"maxiter": POLISH, "eps": 0.02})
-        self._x = np.concatenate((still, fit.x)) * self._scale
+        def judge(x: NDArray) -> float:
+            away = x[: len(known)] * self._scale[: len(known)] / known
+            return 0.01 * float(away @ away) - self.contrast(x * self._scale, edge)
+
+        fit = minimize(judge, self._x / self._scale, method="L-BFGS-B", options={"maxiter": POLISH, "eps": 0.02})
+        self._x = fit.x * self._scale
         self._start = self._split(self._x)[0]
         self._x[:6] = 0.0
 
     def _look(self) -> None:
         """Find the points of every jaw in every picture."""
-        T, turns, origins = self._split(self._x)
         self._seen, self._likelihood = {}, {}
         for side in self._jaws:
-            poses = [jaw_in_camera(T, side, x, turns[side]) for x in origins[side]]
-            found = find_points(self._images, self._camera, self._locator, side, self._planes[side], poses)
-            self._seen[side], likelihood = found
-            inside = np.isfinite(self._seen[side]).all(axis=2)
-            inside &= (self._seen[side] >= 0.0).all(axis=2)
-            inside &= (self._seen[side] < (self._camera.width, self._camera.height)).all(axis=2)
-            self._likelihood[side] = np.where(inside, likelihood, 0.0)
+            self._seen[side], self._likelihood[side] = self._find(side)
+
+    def _find(self, side: str, aside: float = 0.0) -> tuple[NDArray, NDArray]:
+        """Return pixels and likelihoods of a jaw's points, see `find_points`, looked for so far aside [m]."""
+        T, turns, origins = self._split(self._x)
+        poses = [jaw_in_camera(T, side, x + aside, turns[side]) for x in origins[side]]
+        seen, likelihood = find_points(self._images, self._camera, self._locator, side, self._planes[side], poses)
+        inside = np.isfinite(seen).all(axis=2)
+        inside &= (seen >= 0.0).all(axis=2)
+        inside &= (seen < (self._camera.width, self._camera.height)).all(axis=2)
+        return seen, np.where(inside, likelihood, 0.0)
+
+    def look_aside(self) -> None:
+        """Move jaws along the closing axis to where their points are much likelier."""
+        moved = self._x[6 + 3 * len(self._jaws) :].reshape(len(self._jaws), -1)
+        for origins, side in zip(moved, self._jaws, strict=True):
+            likelihood = [self._find(side, aside)[1].mean() for aside in ASIDE]
+            best = int(np.argmax(likelihood))
+            if likelihood[best] > likelihood[len(ASIDE) // 2] + LIKELIER:
+                origins += ASIDE[best]
 
     def _misses(self, x: NDArray) -> NDArray:
         """Return what is off, in standard deviations."""
@@ -460,7 +489,9 @@ class _Refinement:
             away = self._away(side, T, turns[side], origins[side])
             share = np.minimum(1.0, ALIKE / np.maximum(self._likelihood[side].sum(axis=1), 1e-9))
             weight = np.sqrt(self._likelihood[side] * share[:, None])
-            parts.append((away * weight[:, :, None] / PIXEL).ravel())
+            # soft L1: a point that is far off counts less; priors of camera and mounts hold in full
+            off = (away * weight[:, :, None] / PIXEL).ravel()
+            parts.append(np.sign(off) * np.sqrt(2.0 * (np.sqrt(1.0 + off**2) - 1.0)))
         if len(origins) == len(SIDES):
             parts.append([np.mean(sum(origins.values())) / 2.0 / MIDDLE_STDDEV])
         return np.concatenate(parts)
@@ -473,22 +504,31 @@ class _Refinement:
             away.append(seen - project(self._points[side] @ pose[:3, :3].T + pose[:3, 3], self._camera))
         return np.nan_to_num(np.array(away))
 
+    def settle(self) -> None:
+        """Find the points, and with them camera, turns and origins, until these hardly change."""
+        self.look_aside()
+        for _ in range(MOST_ROUNDS):
+            before = self._x
+            self.improve()
+            if np.abs((self._x - before) / self._scale).max() < SETTLED:
+                return
+
     def improve(self) -> None:
         """Find the points, and with them camera, turns and origins."""
         self._look()
         self._keep_best()
-        self._x = least_squares(self._misses, self._x, x_scale=self._scale, loss="soft_l1").x
+        self._x = least_squares(self._misses, self._x, x_scale=self._scale).x
 
-    def follow_ribs(self, is_far: bool) -> None:
-        """Move camera, turns and origins until jaws lie where their ribs and tips are likeliest, perhaps far off."""
-        for _ in range(RIB_ROUNDS):
+    def follow_ribs(self, farthest: float) -> None:
+        """Move camera, turns and origins to where ribs and tips are likeliest, so far off at most [pitches]."""
+        for _ in range(RIB_ROUNDS if farthest else 0):
             T, turns, origins = self._split(self._x)
             poses = {side: [jaw_in_camera(T, side, x, turns[side]) for x in origins[side]] for side in self._jaws}
             found = find_places(self._patterns, self._images, poses, self._camera)
             self._seen, self._likelihood = {}, {}
             for side, jaw in self._jaws.items():
                 places = found[side]
-                near = [each for each in places if is_far or each.distance < HERE] or places
+                near = [each for each in places if each.distance < farthest] or places
                 if not near:
                     return
                 warps = max(near, key=lambda each: each.evidence).warps
@@ -502,8 +542,14 @@ class _Refinement:
                 on_face = np.array([name.startswith("inner") for name in (*jaw.keypoint_names, REFERENCE)])
                 weight = np.where(on_face, 1.0, OUTER_WEIGHT) * np.isfinite(self._seen[side]).all(axis=2)
                 self._likelihood[side] = weight
-            self._x = least_squares(self._misses, self._x, x_scale=self._scale, loss="soft_l1").x
+            self._x = least_squares(self._misses, self._x, x_scale=self._scale).x
         self._best = (-1.0, self._x)
+
+    def keep(self, evidence: float) -> None:
+        """Keep what was found for its evidence, or go back to what was kept before for more."""
+        self._kept = max(self._kept, (evidence, self._x), key=lambda each: each[0])
+        if self._kept[0] > evidence:
+            self._x = self._kept[1]
 
     @property
     def likeliest(self) -> float:
@@ -563,7 +609,7 @@ class _Refinement:
 
     def _find_stddev(self) -> dict[str, tuple[float, ...]]:
         """Return by side the standard deviations of height and scale that the points' errors make."""
-        fit = least_squares(self._misses, self._x, x_scale=self._scale, loss="soft_l1", max_nfev=1)
+        fit = least_squares(self._misses, self._x, x_scale=self._scale, max_nfev=1)
         _, sizes, directions = np.linalg.svd(fit.jac, full_matrices=False)
         told = sizes > 1e-9 * sizes[0]
         # one standard deviation in each of the independent directions
