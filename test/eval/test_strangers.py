@@ -13,11 +13,11 @@ from finforce.camera_topics import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 from finforce_contact.loop import GivenContact
 from finforce_eval.cli.main import main
 from finforce_eval.cli.twin import footage_entries, write_footage
-from finforce_eval.errors import RecordingError
+from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.comparison import compare_evaluations
 from finforce_eval.evaluation.forces import check_solved, find_forces, why_unanswered
 from finforce_eval.evaluation.keypoint_source import detect_keypoints
-from finforce_eval.recordings.dataset import read_parquet
+from finforce_eval.recordings.dataset import open_dataset, read_parquet
 from finforce_eval.recordings.images import ImageChoice
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.writer import write_entries
@@ -288,6 +288,31 @@ def test_rows_pictures_and_numbers_that_disagree_are_refused_in_one_line(damage,
     assert annotate(dataset) == 2
     told = capsys.readouterr().err
     assert words in told and "Traceback" not in told
+
+
+@pytest.mark.parametrize("share", [0.4, -0.4, 0.6])
+def test_an_episode_that_begins_between_two_frames_of_its_video_is_refused(share, tmp_path, capsys):
+    from lerobot_fakes import CAMERA, FPS, write_dataset
+
+    pictures = [frame.color for frame in make_footage(FakeGripper(count=6))]
+    write_dataset(tmp_path / "noise", [pictures[:3], pictures[:3]], "v3.0")
+    path = next((tmp_path / "noise/meta/episodes").rglob("*.parquet"))
+    table, name = parquet.read_table(path), f"videos/{CAMERA}/from_timestamp"
+    begins = [[0.0, (3 + share) / FPS]]
+    parquet.write_table(table.set_column(table.schema.get_field_index(name), name, begins), path)
+    assert annotate(tmp_path / "noise") == 2
+    told = capsys.readouterr().err
+    assert f"expected {begins[0][1]:.3f} s" in told and "from_timestamp" in told
+
+
+def test_a_depth_map_is_no_camera_that_sees_the_jaws(dataset):
+    path = dataset / "meta/info.json"
+    info = json.loads(path.read_text())
+    info["features"]["observation.images.wrist_depth"] = {"dtype": "video", "shape": [48, 64, 1]}
+    path.write_text(json.dumps(info))
+    assert open_dataset(dataset).camera == "observation.images.wrist"
+    with pytest.raises(OptionError, match="wrist_depth: expected --color with one of observation.images.wrist$"):
+        open_dataset(dataset, "observation.images.wrist_depth")
 
 
 def test_what_a_dataset_lacks_is_said_in_one_line_before_its_videos_are_read(dataset, capsys, monkeypatch):
