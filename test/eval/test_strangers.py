@@ -10,6 +10,7 @@ from eval_fakes import FakeEstimator, FakeJaw, change_info, evaluate_recording, 
 from rgbd_fakes import CAMERA, FakeDetector, FakeGripper, make_footage
 
 from finforce.camera_topics import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
+from finforce.messages import CameraStream, same_camera
 from finforce_contact.loop import GivenContact
 from finforce_eval.cli.main import main
 from finforce_eval.cli.twin import footage_entries, write_footage
@@ -99,6 +100,24 @@ def two_cameras(folder):
     right = {name: topic.replace("left", "right") for name, topic in ZED.items() if name != DEPTH_TOPIC}
     both = [each._replace(topic=names[each.topic]) for names in (ZED, right) for each in kept if each.topic in names]
     return write_entries(sorted(both, key=lambda each: each.stamp), folder)
+
+
+@pytest.mark.parametrize(("names", "is_rectified"), [(USB, False), (ZED, True)])
+def test_rectified_images_have_the_projection_matrix_and_no_lens(names, is_rectified, tmp_path):
+    """image_pipeline 1035: image_proc's images come with the camera_info of the raw ones."""
+    projection = np.array([40.0, 0.0, 30.0, 0.0, 0.0, 41.0, 22.0, 0.0, 0.0, 0.0, 1.0, 0.0])
+    entries = [
+        each._replace(topic=names[each.topic], message=replace(each.message, p=projection) if is_info else each.message)
+        for each in footage_entries(make_footage(), False)
+        if each.topic in names
+        for is_info in [each.topic == INFO_TOPIC]
+    ]
+    camera = read_recording(write_entries(entries, tmp_path / "bag")).images.camera
+    assert (camera.fx, camera.cy) == ((40.0, 22.0) if is_rectified else (CAMERA.fx, CAMERA.cy))
+    assert camera.distortion.any() != is_rectified
+    info = next(each.message for each in entries if each.topic == names[INFO_TOPIC])
+    stream = CameraStream(topic=names[COLOR_TOPIC])
+    assert stream.take_info(info) and same_camera(stream.camera, camera)
 
 
 def test_of_several_cameras_one_is_named(tmp_path, capsys):
