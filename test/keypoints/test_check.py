@@ -152,6 +152,17 @@ def test_a_mesh_that_is_not_what_the_camera_sees_is_named(footage, capsys, tmp_p
     assert status == 0 and "object.stl is where the camera sees it" in said
 
 
+def test_a_mesh_is_compared_in_images_of_the_whole_recording(still, capsys, tmp_path, monkeypatch):
+    compared = []
+    monkeypatch.setattr(
+        "finforce_eval.cli.check.check_recording", lambda recording, *more: ([], np.zeros((480, 640, 3), np.uint8))
+    )
+    monkeypatch.setattr(
+        "finforce_eval.cli.check.check_object", lambda recording, *more: compared.append(len(recording.images)) or []
+    )
+    assert check(still, capsys, tmp_path, "--images", "5")[0] == 0 and compared == [IMAGES]
+
+
 def test_a_camera_that_is_elsewhere_is_told_where_it_is(still, capsys, tmp_path):
     T = ROBOT_CAMERA.copy()
     T[1, 3] += 0.008
@@ -252,3 +263,13 @@ def test_topics_without_a_camera_are_said_to_be_so(still, tmp_path, monkeypatch)
 def test_one_source_is_to_be_named(given, capsys):
     assert main(["check", *given]) == 2
     assert "expected" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("bars", "words"), [((60, 60, 0, 0), "60 and 60 rows"), ((0, 0, 40, 0), "40 and 0 columns")])
+def test_black_bars_of_a_padded_picture_are_named_with_what_they_shift(bars, words):
+    picture = np.random.default_rng(0).integers(60, 200, (360, 640, 3), dtype=np.uint8)
+    top, bottom, left, right = bars
+    padded = np.pad(picture, ((top, bottom), (left, right), (0, 0)))
+    assert not any("bars" in finding.text for finding in judge_picture(picture))
+    (said,) = (finding for finding in judge_picture(padded) if "bars" in finding.text)
+    assert said.severity == WARNING and words in said.text and f"{top or left} px more" in said.text
