@@ -350,6 +350,15 @@ def test_what_a_dataset_lacks_is_said_in_one_line_before_its_videos_are_read(dat
     assert "2 of 4 files cannot be read" in told and "git lfs pull" in told and len(told.splitlines()) == 1
 
 
+def test_what_plays_bags_alone_says_so_and_promises_no_datasets(dataset, capsys):
+    assert main(["trace", str(dataset), *DATASET]) == 2
+    assert "only bags with camera_info are played" in capsys.readouterr().err
+    for command in ("trace", "replay"):
+        with pytest.raises(SystemExit):
+            main([command, "--help"])
+        assert "LeRobot dataset, UMI" not in " ".join(capsys.readouterr().out.split())
+
+
 @pytest.mark.parametrize("command", ["extrinsics", "view", "evaluate"])
 def test_every_command_that_reads_a_bag_reads_an_episode(command, dataset, capsys):
     words = {"evaluate": ["--contact", "fixed:40"], "view": ["--contact", "fixed:40", "--save", "x.rrd"]}
