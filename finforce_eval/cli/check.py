@@ -15,7 +15,7 @@ from finforce_eval.cli.extrinsics import read_at_rest
 from finforce_eval.cli.parser import BAG_HELP, CommandResult, add_rest_options
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.at_rest import ROUNDS
-from finforce_eval.evaluation.check import FAULT, check_object, check_recording, check_rig
+from finforce_eval.evaluation.check import FAULT, WARNING, check_object, check_recording, check_rig
 from finforce_eval.evaluation.setup import read_recordings
 from finforce_eval.recordings.bags import COMPRESSED
 from finforce_eval.recordings.images import CAMERA_INFO, IMAGE
@@ -108,8 +108,9 @@ def _check(options: argparse.Namespace) -> CommandResult:
     folder = Path(options.report)
     folder.mkdir(parents=True, exist_ok=True)
     import_cv2().imwrite(str(folder / PICTURE), picture[..., ::-1])
-    faults = sum(line.severity == FAULT for line in found)
-    outcome = f"{faults} to be changed" if faults else "everything fits"
+    faults, warnings = (sum(line.severity == kind for line in found) for kind in (FAULT, WARNING))
+    outcome = "nothing contradicts, with the warnings above" if warnings else "everything fits"
+    outcome = f"{faults} to be changed" if faults else outcome
     print(f"{outcome}; {folder / PICTURE}: grey as given, orange as fitted, green key points")
     findings = [line._asdict() for line in found]
     return CommandResult({"faults": faults, "findings": findings}, status=int(faults > 0))

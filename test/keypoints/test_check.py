@@ -23,7 +23,7 @@ from finforce_eval.cli.check import record_camera
 from finforce_eval.cli.main import main
 from finforce_eval.cli.twin import write_footage
 from finforce_eval.errors import RecordingError
-from finforce_eval.evaluation.check import FAULT, OK, WARNING, explain_camera, judge_picture
+from finforce_eval.evaluation.check import FAULT, OK, WARNING, Finding, explain_camera, judge_picture
 from finforce_eval.evaluation.keypoint_source import KeypointSource
 from finforce_eval.recordings.bags import open_bag
 from finforce_eval.recordings.images import CAMERA_INFO, COMPRESSED
@@ -91,7 +91,7 @@ def as_option(T):
 def test_what_fits_passes_with_depth_and_without(still, capsys, tmp_path):
     for options in ((), ("--detector", "depth=none")):
         status, said = check(still, capsys, tmp_path, *options)
-        assert status == 0 and "everything fits" in said and "extrinsics within" in said
+        assert status == 0 and "nothing contradicts" in said and "extrinsics within" in said  # a mesh, but two poses
         assert ("colour alone" in said) == bool(options)
 
 
@@ -152,15 +152,21 @@ def test_a_mesh_that_is_not_what_the_camera_sees_is_named(footage, capsys, tmp_p
     assert status == 0 and "object.stl is where the camera sees it" in said
 
 
-def test_a_mesh_is_compared_in_images_of_the_whole_recording(still, capsys, tmp_path, monkeypatch):
+def test_a_mesh_is_compared_in_images_of_the_whole_recording_and_a_warning_is_no_fit(
+    still, capsys, tmp_path, monkeypatch
+):
     compared = []
+
+    def compare(recording, *more):
+        compared.append(len(recording.images))
+        return [Finding(WARNING, "compared with edges")]
+
     monkeypatch.setattr(
         "finforce_eval.cli.check.check_recording", lambda recording, *more: ([], np.zeros((480, 640, 3), np.uint8))
     )
-    monkeypatch.setattr(
-        "finforce_eval.cli.check.check_object", lambda recording, *more: compared.append(len(recording.images)) or []
-    )
-    assert check(still, capsys, tmp_path, "--images", "5")[0] == 0 and compared == [IMAGES]
+    monkeypatch.setattr("finforce_eval.cli.check.check_object", compare)
+    status, said = check(still, capsys, tmp_path, "--images", "5")
+    assert compared == [IMAGES] and status == 0 and "everything fits" not in said and "the warnings above" in said
 
 
 def test_a_camera_that_is_elsewhere_is_told_where_it_is(still, capsys, tmp_path):
