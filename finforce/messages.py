@@ -376,8 +376,10 @@ def magnitude_stddev(axes: Sequence[float]) -> float:
     return x
 
 
-def camera_from_info(info: Any, frame: str) -> CameraIntrinsics:
-    """Return the intrinsics of a sensor_msgs/CameraInfo.
+def camera_from_info(info: Any, frame: str, images: str = "") -> CameraIntrinsics:
+    """Return the intrinsics of a sensor_msgs/CameraInfo for the images on a topic.
+
+    Those of image_proc, image_rect*, are rectified: the projection matrix is theirs, without a lens.
 
     Raises:
         ObservationError: the frame is another one.
@@ -385,11 +387,15 @@ def camera_from_info(info: Any, frame: str) -> CameraIntrinsics:
     """
     check_frame(info, frame, "the camera info")
     model = FISHEYES.get(info.distortion_model, info.distortion_model) or PLUMB_BOB
+    matrix, distortion = np.ravel(info.k), np.array(info.d)
+    rectified = np.reshape(info.p, (3, 4))[:, :3].ravel()
+    if "/image_rect" in images and rectified.any() and not np.allclose(rectified, matrix):  # RealSense's P is its K
+        matrix, distortion, model = rectified, np.zeros(0), PLUMB_BOB
     return CameraIntrinsics(
         width=info.width,
         height=info.height,
-        **name_matrix([float(number) for number in info.k]),
-        distortion=np.array(info.d),
+        **name_matrix([float(number) for number in matrix]),
+        distortion=distortion,
         model=model,
     )
 
@@ -527,10 +533,11 @@ class CameraStream:
     Args:
         frame: of the camera; empty while it is not known.
         depth_scale: a step of depth images of 16 bits [m].
+        topic: of images; see `camera_from_info`.
     """
 
-    def __init__(self, frame: str = "", depth_scale: float = MILLIMETRE) -> None:
-        self.frame, self._is_sure, self._depth_scale = frame, bool(frame), depth_scale
+    def __init__(self, frame: str = "", depth_scale: float = MILLIMETRE, topic: str = "") -> None:
+        self.frame, self._is_sure, self._depth_scale, self._topic = frame, bool(frame), depth_scale, topic
         self.camera: CameraIntrinsics | None = None
         self.video = PacketDecoder()
 
@@ -547,7 +554,7 @@ class CameraStream:
             ObservationError: the frame is another one.
             IntrinsicsError: the numbers are no camera's.
         """
-        camera = camera_from_info(info, self.frame_of(info))
+        camera = camera_from_info(info, self.frame_of(info), self._topic)
         is_new = not same_camera(self.camera, camera)
         if is_new:
             self.camera = camera

@@ -257,7 +257,7 @@ class ContactSession:
         }
         self.mesh: ObjectMesh | None = None
         self.trouble = ""
-        self.stream = CameraStream(parameters.camera_frame, parameters.depth_scale)
+        self.stream = CameraStream(parameters.camera_frame, parameters.depth_scale, parameters.depth_topic)
         self._frames = parameters.jaw_frame
         self._origin = parameters.pose_origin
         self._source = ExternalPoseSource(self.stream)

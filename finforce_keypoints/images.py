@@ -252,7 +252,7 @@ class RgbdFeed:
 
     def __init__(self, parameters: DetectorParameters, clock: Callable[[], float] = monotonic) -> None:
         self._parameters, self._clock = parameters, clock
-        self.stream = CameraStream(parameters.camera_frame, parameters.depth_scale)
+        self.stream = CameraStream(parameters.camera_frame, parameters.depth_scale, parameters.color_topics[0])
         self.passed = self.alone = 0
         self.max_age = parameters.max_age
         self.arrivals = {COLOR: Arrivals(), DEPTH: Arrivals()}

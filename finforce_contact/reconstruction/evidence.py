@@ -29,6 +29,7 @@ POINT_COUNT = 2000
 OCCLUSION_STEP = 6e-3  # [m] by which what lies beyond the outline is nearer when it hides the object
 OUTSIDE_REACH = 4  # [px] beyond the outline where that is looked for
 UNSURE_WEIGHT = 0.3  # of an outline beyond which nothing was measured, or something as near
+MOST_OPEN = 0.5  # of an outline, beyond which depth goes on: a tenth of an object's on a table, 0.6 of a box around it
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -67,7 +68,8 @@ def collect_evidence(depth: NDArray, mask: NDArray, camera: CameraIntrinsics) ->
 
     Raises:
         ImageError: the sizes differ, the mask is empty, or too few of its pixels have a depth.
-        ReconstructionError: the object is farther away or larger than what a gripper holds.
+        ReconstructionError: the object is farther away or larger than what a gripper holds, or the mask holds what
+            lies behind it, too.
     """
     check_depth(depth, camera)
     depth = np.where(np.nan_to_num(depth) > 0.0, depth, np.nan).astype(float)
@@ -80,6 +82,14 @@ def collect_evidence(depth: NDArray, mask: NDArray, camera: CameraIntrinsics) ->
             f"the object is {away:.2f} m away and {across:.2f} m across; expected at most {FARTHEST_OBJECT:g} m and "
             f"{LARGEST:g} m: {DEPTH_UNITS}"
         )
+    own, beyond = _look_across(depth, mask)
+    edge = mask & ~binary_erosion(mask, border_value=0)
+    is_open = (beyond > own - OCCLUSION_STEP) & (beyond < own + OCCLUSION_STEP)
+    if (share := float(is_open[edge].mean())) > MOST_OPEN:
+        raise ReconstructionError(
+            f"mask: beyond {100.0 * share:.0f} % of its outline the depth goes on without a step; expected the outline "
+            f"of the object alone, no box around it, and an object {1e3 * OCCLUSION_STEP:g} mm high at least"
+        )
     inside, outside = distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1], distance_transform_edt(~mask)
     distance = np.where(mask, 0.5 - inside, outside - 0.5)
     return ImageEvidence(
@@ -90,7 +100,7 @@ def collect_evidence(depth: NDArray, mask: NDArray, camera: CameraIntrinsics) ->
         normals=_estimate_normals(points),
         edge_distance=distance,
         edge_slope=np.stack(np.gradient(distance)[::-1], axis=-1),
-        edge_weight=_weigh_edges(depth, mask),
+        edge_weight=_weigh_edges(own, beyond, edge),
     )
 
 
@@ -124,16 +134,19 @@ def _estimate_normals(points: NDArray, neighbours: int = 16) -> NDArray:
     return np.where(np.einsum("ij,ij->i", normals, points)[:, None] > 0.0, -normals, normals)
 
 
-def _weigh_edges(depth: NDArray, mask: NDArray) -> NDArray:
-    """Return for every pixel (h, w) how far the outline nearest to it is the object's own."""
-    size = 2 * OUTSIDE_REACH + 1
-    beyond = minimum_filter(np.where(mask | np.isnan(depth), np.inf, depth), size)
-    own = minimum_filter(np.where(mask & np.isfinite(depth), depth, np.inf), size)
+def _look_across(depth: NDArray, mask: NDArray) -> tuple[NDArray, NDArray]:
+    """Return the least depth (h, w) around each pixel, in the mask and beyond it, infinite where there is none [m]."""
+    size, known = 2 * OUTSIDE_REACH + 1, np.isfinite(depth)
+    own, beyond = (minimum_filter(np.where(known & part, depth, np.inf), size) for part in (mask, ~mask))
+    return own, beyond
+
+
+def _weigh_edges(own: NDArray, beyond: NDArray, edge: NDArray) -> NDArray:
+    """Return for every pixel (h, w) how far the outline nearest to it is the object's own; see `_look_across`."""
     is_free = np.isfinite(beyond) & (beyond > own + OCCLUSION_STEP)
     weight = np.where(is_free, 1.0, UNSURE_WEIGHT)
     weight[beyond < own - OCCLUSION_STEP] = 0.0
     weight[:2], weight[-2:], weight[:, :2], weight[:, -2:] = 0.0, 0.0, 0.0, 0.0
-    edge = mask & ~binary_erosion(mask, border_value=0)
     _, (rows, columns) = distance_transform_edt(~edge, return_indices=True)
     return weight[rows, columns]
 

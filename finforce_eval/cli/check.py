@@ -15,7 +15,8 @@ from finforce_eval.cli.extrinsics import read_at_rest
 from finforce_eval.cli.parser import BAG_HELP, CommandResult, add_rest_options
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.at_rest import ROUNDS
-from finforce_eval.evaluation.check import FAULT, check_object, check_recording, check_rig
+from finforce_eval.evaluation.check import FAULT, WARNING, check_object, check_recording, check_rig
+from finforce_eval.evaluation.setup import read_recordings
 from finforce_eval.recordings.bags import COMPRESSED
 from finforce_eval.recordings.images import CAMERA_INFO, IMAGE
 from finforce_eval.recordings.writer import Entry, typestore, write_entries
@@ -99,7 +100,7 @@ def _check(options: argparse.Namespace) -> CommandResult:
     source, recording = read_at_rest(options)
     with progress_bar(ROUNDS * len(recording.images), "image") as bar:
         found, picture = check_recording(recording, source, bar.update)
-    found += check_object(recording, options.object, options.object_unit)
+    found += check_object(*read_recordings(options.bags, source), options.object, options.object_unit)
     if options.rig is not None:
         found += check_rig(recording, source)
     for line in found:
@@ -107,8 +108,9 @@ def _check(options: argparse.Namespace) -> CommandResult:
     folder = Path(options.report)
     folder.mkdir(parents=True, exist_ok=True)
     import_cv2().imwrite(str(folder / PICTURE), picture[..., ::-1])
-    faults = sum(line.severity == FAULT for line in found)
-    outcome = f"{faults} to be changed" if faults else "everything fits"
+    faults, warnings = (sum(line.severity == kind for line in found) for kind in (FAULT, WARNING))
+    outcome = "nothing contradicts, with the warnings above" if warnings else "everything fits"
+    outcome = f"{faults} to be changed" if faults else outcome
     print(f"{outcome}; {folder / PICTURE}: grey as given, orange as fitted, green key points")
     findings = [line._asdict() for line in found]
     return CommandResult({"faults": faults, "findings": findings}, status=int(faults > 0))

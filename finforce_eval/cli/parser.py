@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 UNITS = ("m", "cm", "mm", "inch")
 SOURCES = ("images", "keypoints", "truth")
 JAWS_CHOICES = ("left", "right", "both")
-BAG_HELP = "rosbag2 folder, .mcap or .db3 file, the folder of a LeRobot dataset, UMI's or UMI-FT's .zarr or "
+PLAYED_HELP = "rosbag2 folder, .mcap or .db3 file"
+BAG_HELP = f"{PLAYED_HELP}, the folder of a LeRobot dataset, UMI's or UMI-FT's .zarr or "
 BAG_HELP += ".zarr.zip, a video, or a folder of pictures"
 JAW_HELP = "jaw file, or name of an included jaw (that of the case.json, else bench)"
 CONTACT_HELP = (

@@ -10,7 +10,7 @@ import numpy as np
 
 from finforce.optional import import_cv2
 from finforce_eval.annotation.video import ForceOverlay
-from finforce_eval.cli.parser import BAG_HELP, CommandResult, add_run_options
+from finforce_eval.cli.parser import PLAYED_HELP, CommandResult, add_run_options
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.keypoint_source import parse_source
 from finforce_eval.evaluation.score_tables import evaluation_json
@@ -58,7 +58,7 @@ def draw_grasp(result: Replay, path: Path) -> bool:
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add what names the recording and how it is played."""
-    parser.add_argument("bag", metavar="BAG", help=BAG_HELP)
+    parser.add_argument("bag", metavar="BAG", help=f"{PLAYED_HELP}, with key points, or images and camera_info")
     add_run_options(parser, settings=False)
     parser.add_argument("--rate", type=float, default=1.0, help="playback speed; other than 1 uses /clock (1)")
     parser.add_argument("--domain", type=int, metavar="ID", help="ROS_DOMAIN_ID, for example to watch in RViz (random)")

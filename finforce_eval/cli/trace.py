@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from finforce_eval.cli.parser import BAG_HELP, CommandResult, add_run_options
+from finforce_eval.cli.parser import PLAYED_HELP, CommandResult, add_run_options
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.keypoint_source import parse_source
 from finforce_eval.evaluation.setup import make_setup
@@ -21,7 +21,7 @@ from finforce_eval.replay.replay import Playing, play_to_nodes
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add what names the recording, and how the stages run."""
-    parser.add_argument("bag", metavar="BAG", help=BAG_HELP)
+    parser.add_argument("bag", metavar="BAG", help=f"{PLAYED_HELP}, with key points, or images and camera_info")
     add_run_options(parser, settings=False)
 
 

@@ -41,6 +41,7 @@ BRIGHT = 235.0  # of 255, greatest mean brightness
 BLURRED = 0.16  # share of the finest detail in that of the next scale, of a picture out of focus
 COVERED = 0.30  # share of the picture's parts without any detail, from which on something may cover the lens
 FLAT = 1.5  # of 255, contrast of a part without detail
+BLACK, BAR = 12.0, 0.03  # of 255, brightest pixel of black rows; share of the picture from which on they are a bar
 TILES = 12  # parts along each side of the image
 GOOD_RESIDUAL = 1.0  # [px] left over when jaws at rest are laid on what is seen
 FAR = 3e-3  # [m], tolerated error of the stated camera position
@@ -174,7 +175,21 @@ def judge_picture(color: NDArray) -> list[Finding]:
     if flat > 100.0 * COVERED:
         text = f"{flat:.0f} % of the image are empty: is the lens partly covered?"
         findings.append(Finding(WARNING, text))
+    findings += _find_bars(grey)
     return findings or [Finding(OK, f"brightness {level:.0f} of 255, fine detail {sharpness:.2f} of coarse")]
+
+
+def _find_bars(grey: NDArray) -> Iterator[Finding]:
+    """Yield where a picture (h, w) was padded with black to another shape."""
+    for lines, centre, brightest in (("rows", "cy", grey.max(axis=1)), ("columns", "cx", grey.max(axis=0))):
+        lit = np.flatnonzero(brightest > BLACK)
+        before, after = (lit[0], len(brightest) - 1 - lit[-1]) if len(lit) else (0, 0)
+        if max(before, after) > BAR * len(brightest):
+            yield Finding(
+                WARNING,
+                f"black bars of {before} and {after} {lines}: the intrinsics have to be those of the picture with its "
+                f"bars, {centre} {before} px more than without",
+            )
 
 
 def measure_sharpness(grey: NDArray) -> float:

@@ -102,18 +102,19 @@ class RecordedCheck:
         recording: with images.
         mesh: of the object.
         track: its poses in the camera's frame at stamps of the images.
-        at_once: compare as few images as a verdict needs, of all that there are.
+        at_once: compare as few images as a verdict needs, of all that there are; edges in colour show less than depth.
     """
 
     def __init__(self, recording: Recording, mesh: Any, track: ObjectTrack, *, at_once: bool = False) -> None:
         from finforce_contact.pose.edge_check import EdgeCheck
-        from finforce_contact.pose.mesh_check import LEAST_IMAGES, MeshCheck, is_due
+        from finforce_contact.pose.mesh_check import LEAST_IMAGES, MOST_IMAGES, MeshCheck, is_due
 
         kind = MeshCheck if recording.images.has_depth else EdgeCheck
         self._check, self._least = kind(mesh, recording.images.camera), LEAST_IMAGES
         chosen: list[int] = []
         if at_once:
-            chosen += np.unique(np.linspace(0, len(track.stamps_ns) - 1, LEAST_IMAGES).astype(int)).tolist()
+            count = LEAST_IMAGES if recording.images.has_depth else MOST_IMAGES
+            chosen += np.unique(np.linspace(0, len(track.stamps_ns) - 1, count).astype(int)).tolist()
         for index, stamp in enumerate(() if at_once else track.stamps_ns.tolist()):
             if is_due(len(chosen), SECOND * (stamp - track.stamps_ns[chosen[-1]]) if chosen else math.inf):
                 chosen.append(index)

@@ -229,8 +229,9 @@ def _read_info(folder: Path) -> dict[str, Any]:
 
 def _choose_camera(info: Mapping[str, Any], camera: str, name: str) -> str:
     """Return the feature with the pictures."""
-    kinds = {key: feature["dtype"] for key, feature in info["features"].items()}
-    there = [key for key, kind in kinds.items() if kind in ("video", "image")]
+    pictures = {key: feature for key, feature in info["features"].items() if feature["dtype"] in ("video", "image")}
+    there = [key for key, feature in pictures.items() if 3 in (feature.get("shape") or (3,))]  # no depth maps
+    there = there or list(pictures)
     wrist = [key for key in there if "wrist" in key]
     found = [camera] if camera else (wrist if len(wrist) == 1 else there)
     if len(found) != 1 or found[0] not in there:

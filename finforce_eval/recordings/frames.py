@@ -171,7 +171,7 @@ def decode_video(
     In place of frames that are broken or that the decoder leaves out, of those to be `shown` (n,) [ticks], comes None.
 
     A video that says of itself that it has another number of frames than `count` is refused, too, and one with a frame
-    that does not begin in its own period of those at a rate `fps` [Hz].
+    that begins over a quarter of a period off its time at a rate `fps` [Hz]; `begin` is half a period before the first.
     """
     number = 0
     with _open_video(path, name) as (container, stream):
@@ -183,11 +183,11 @@ def decode_video(
             time = frame.time if frame is not None else None
             if time is not None and time < begin:
                 continue
-            if fps and time is not None and not 0.0 <= time - begin - number / fps < 1.0 / fps:
-                due = begin + (number + 0.5) / fps
+            due = begin + (number + 0.5) / fps if fps else None
+            if due is not None and time is not None and abs(time - due) > 0.25 / fps:
                 raise RecordingError(
                     f"{name}: frame {number} of {path.name} is shown at {time:.3f} s; expected {due:.3f} s, the time "
-                    "of its row"
+                    "of its row, after from_timestamp where an episode has one"
                 )
             number += 1
             if is_broken:

@@ -283,7 +283,7 @@ def _choose_camera(
     """
     if not info:
         return read_intrinsics(choice.intrinsics, _find_size(bag, color)), frame
-    camera, frame_id = _read_camera(bag, info)
+    camera, frame_id = _read_camera(bag, info, color)
     if choice.camera is not None and not same_camera(choice.camera, camera):
         raise RecordingError(
             f"{bag.name}: the rig is of another camera than {info}: {choice.camera.width} x {choice.camera.height}, "
@@ -379,13 +379,13 @@ def _find_info(bag: BagReader, color: str, frame: str) -> str:
     return same[0]
 
 
-def _read_camera(bag: BagReader, topic: str) -> tuple[CameraIntrinsics, str]:
-    """Return the camera of all images, and its frame."""
+def _read_camera(bag: BagReader, topic: str, color: str) -> tuple[CameraIntrinsics, str]:
+    """Return the camera of all colour images, and its frame."""
     camera, frame = None, ""
     for raw in bag.raw((topic,)):
         info = bag.decode(raw)
         try:
-            seen = camera_from_info(info, info.header.frame_id)
+            seen = camera_from_info(info, info.header.frame_id, color)
         except (ObservationError, IntrinsicsError) as error:
             raise RecordingError(f"{bag.name}: {topic}: {error}; --intrinsics replaces it") from error
         if camera is not None and not (same_camera(camera, seen) and info.header.frame_id == frame):

@@ -216,7 +216,8 @@ class Recording:
         if truth is None:
             topic = f"/{side}/ground_truth_wrench"
             raise RecordingError(
-                f"{self.name}: no ground truth: {topic} is absent or has no messages; forces without a score: annotate"
+                f"{self.name}: no ground truth: {topic} has no messages, where a sensor's WrenchStamped is expected, "
+                "the force of the object on the jaw in its frame; forces without a score: annotate"
             )
         return truth
 

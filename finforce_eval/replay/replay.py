@@ -136,7 +136,10 @@ def play_to_nodes(
         recording = _choose_keypoints(recording, setup.jaw, keypoints, stack)
         images = recording.images if from_images else None
         if images is not None and not images.info:
-            raise RecordingError(f"{recording.name}: replay needs a bag with camera_info; evaluate does without")
+            raise RecordingError(
+                f"{recording.name}: only bags with camera_info are played through the nodes; annotate and evaluate "
+                "take other recordings, too"
+            )
         # a recording of a live run holds what the nodes write, too
         written = {f"/{side}/{name}" for side in sides for name in RESULTS}
         written |= {"/grasp_wrench", "/manipulation_wrench", "/diagnostics", "/clock", "/rosout"}

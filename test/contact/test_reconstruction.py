@@ -6,6 +6,7 @@ import pytest
 from chamfer_fakes import compute_chamfer
 from contact_fakes import bare_mesh, distance_mm, make_case
 from guess_fakes import place_mesh
+from scipy.ndimage import binary_dilation
 from scipy.spatial.transform import Rotation
 
 from finforce.camera import ImageError, compute_rays
@@ -174,6 +175,20 @@ def test_images_with_nothing_in_them_are_refused():
         collect_evidence(np.zeros_like(scene.depth), scene.mask, scene.camera)
     with pytest.raises(ImageError, match="shape"):
         collect_evidence(scene.depth, scene.mask[:-1], scene.camera)
+
+
+@pytest.mark.parametrize("kind", ["box", "wide"])
+def test_a_mask_that_holds_what_lies_behind_the_object_is_refused(kind):
+    """FoundationPose 51: a box around the object in place of its outline."""
+    scene = make_case("cylinder").scene
+    rows, columns = (np.flatnonzero(scene.mask.any(axis=axis)) for axis in (1, 0))
+    mask = binary_dilation(scene.mask, iterations=10)
+    if kind == "box":
+        mask = np.zeros_like(scene.mask)
+        mask[rows[0] - 10 : rows[-1] + 10, columns[0] - 10 : columns[-1] + 10] = True
+    collect_evidence(scene.depth, scene.mask, scene.camera)
+    with pytest.raises(ReconstructionError, match=r"beyond \d+ % of its outline the depth goes on without a step"):
+        collect_evidence(scene.depth, mask, scene.camera)
 
 
 def test_the_width_is_that_between_the_nearest_parallel_planes():

@@ -109,7 +109,7 @@ def test_empty_recording_is_refused(capsys, tmp_path):
 def test_recording_without_truth_is_refused(capsys, tmp_path):
     bag = write_recording(bench_recording(truth=False), tmp_path / "bag")
     assert_refused(capsys, ["evaluate", bag], "no ground truth")
-    assert_refused(capsys, ["calibrate", bag, "-o", tmp_path / "c.yaml"], "no ground truth")
+    assert_refused(capsys, ["calibrate", bag, "-o", tmp_path / "c.yaml"], "force of the object on the jaw in its frame")
 
 
 def test_recording_of_another_jaw_is_refused(capsys, tmp_path):

@@ -10,10 +10,18 @@ from eval_fakes import PERIOD, START, FakeContactEstimator, FakeEstimator, FakeJ
 
 from finforce.errors import PoseError
 from finforce_contact.loop import ForceLoop
+from finforce_contact.pose.mesh_check import LEAST_IMAGES, MOST_IMAGES
 from finforce_eval.cli.main import parse
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation import check, contact_source
-from finforce_eval.evaluation.contact_source import OUTLINED, UNCOMPARED, UNSEEN, RecordedContact, build_source
+from finforce_eval.evaluation.contact_source import (
+    OUTLINED,
+    UNCOMPARED,
+    UNSEEN,
+    RecordedCheck,
+    RecordedContact,
+    build_source,
+)
 from finforce_eval.evaluation.setup import read_contacts
 from finforce_eval.recordings.objects import ObjectTrack, track_object
 
@@ -204,3 +212,14 @@ def test_a_mesh_of_which_nothing_is_seen_does_not_fit(sees, severity, monkeypatc
     monkeypatch.setattr(check, "check_mesh", lambda *arguments, **options: compared)
     (found,) = check.check_object(record_with(Images(has_depth=True)), CYLINDER, "m")
     assert found.severity == severity and (UNSEEN in found.text) != sees
+
+
+@pytest.mark.parametrize(("has_depth", "expected"), [(True, LEAST_IMAGES), (False, MOST_IMAGES)])
+def test_edges_in_colour_need_more_images_than_depth_for_a_verdict_at_once(has_depth, expected, monkeypatch):
+    images = Images(has_depth=has_depth)
+    images.camera, images.at = None, lambda stamps: iter(stamps)
+    for kind in ("mesh_check.MeshCheck", "edge_check.EdgeCheck"):
+        monkeypatch.setattr(f"finforce_contact.pose.{kind}", lambda mesh, camera: None)
+    track = make_track(*range(20))
+    asked = RecordedCheck(record_with(images), None, track, at_once=True)
+    assert len(asked._poses) == expected and {*track.stamps_ns[[0, -1]]} < {*asked._poses}

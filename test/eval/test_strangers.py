@@ -10,14 +10,15 @@ from eval_fakes import FakeEstimator, FakeJaw, change_info, evaluate_recording, 
 from rgbd_fakes import CAMERA, FakeDetector, FakeGripper, make_footage
 
 from finforce.camera_topics import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
+from finforce.messages import CameraStream, same_camera
 from finforce_contact.loop import GivenContact
 from finforce_eval.cli.main import main
 from finforce_eval.cli.twin import footage_entries, write_footage
-from finforce_eval.errors import RecordingError
+from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.comparison import compare_evaluations
 from finforce_eval.evaluation.forces import check_solved, find_forces, why_unanswered
 from finforce_eval.evaluation.keypoint_source import detect_keypoints
-from finforce_eval.recordings.dataset import read_parquet
+from finforce_eval.recordings.dataset import open_dataset, read_parquet
 from finforce_eval.recordings.images import ImageChoice
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.writer import write_entries
@@ -99,6 +100,24 @@ def two_cameras(folder):
     right = {name: topic.replace("left", "right") for name, topic in ZED.items() if name != DEPTH_TOPIC}
     both = [each._replace(topic=names[each.topic]) for names in (ZED, right) for each in kept if each.topic in names]
     return write_entries(sorted(both, key=lambda each: each.stamp), folder)
+
+
+@pytest.mark.parametrize(("names", "is_rectified"), [(USB, False), (ZED, True)])
+def test_rectified_images_have_the_projection_matrix_and_no_lens(names, is_rectified, tmp_path):
+    """image_pipeline 1035: image_proc's images come with the camera_info of the raw ones."""
+    projection = np.array([40.0, 0.0, 30.0, 0.0, 0.0, 41.0, 22.0, 0.0, 0.0, 0.0, 1.0, 0.0])
+    entries = [
+        each._replace(topic=names[each.topic], message=replace(each.message, p=projection) if is_info else each.message)
+        for each in footage_entries(make_footage(), False)
+        if each.topic in names
+        for is_info in [each.topic == INFO_TOPIC]
+    ]
+    camera = read_recording(write_entries(entries, tmp_path / "bag")).images.camera
+    assert (camera.fx, camera.cy) == ((40.0, 22.0) if is_rectified else (CAMERA.fx, CAMERA.cy))
+    assert camera.distortion.any() != is_rectified
+    info = next(each.message for each in entries if each.topic == names[INFO_TOPIC])
+    stream = CameraStream(topic=names[COLOR_TOPIC])
+    assert stream.take_info(info) and same_camera(stream.camera, camera)
 
 
 def test_of_several_cameras_one_is_named(tmp_path, capsys):
@@ -290,6 +309,31 @@ def test_rows_pictures_and_numbers_that_disagree_are_refused_in_one_line(damage,
     assert words in told and "Traceback" not in told
 
 
+@pytest.mark.parametrize("share", [0.4, -0.4, 0.6])
+def test_an_episode_that_begins_between_two_frames_of_its_video_is_refused(share, tmp_path, capsys):
+    from lerobot_fakes import CAMERA, FPS, write_dataset
+
+    pictures = [frame.color for frame in make_footage(FakeGripper(count=6))]
+    write_dataset(tmp_path / "noise", [pictures[:3], pictures[:3]], "v3.0")
+    path = next((tmp_path / "noise/meta/episodes").rglob("*.parquet"))
+    table, name = parquet.read_table(path), f"videos/{CAMERA}/from_timestamp"
+    begins = [[0.0, (3 + share) / FPS]]
+    parquet.write_table(table.set_column(table.schema.get_field_index(name), name, begins), path)
+    assert annotate(tmp_path / "noise") == 2
+    told = capsys.readouterr().err
+    assert f"expected {begins[0][1]:.3f} s" in told and "from_timestamp" in told
+
+
+def test_a_depth_map_is_no_camera_that_sees_the_jaws(dataset):
+    path = dataset / "meta/info.json"
+    info = json.loads(path.read_text())
+    info["features"]["observation.images.wrist_depth"] = {"dtype": "video", "shape": [48, 64, 1]}
+    path.write_text(json.dumps(info))
+    assert open_dataset(dataset).camera == "observation.images.wrist"
+    with pytest.raises(OptionError, match="wrist_depth: expected --color with one of observation.images.wrist$"):
+        open_dataset(dataset, "observation.images.wrist_depth")
+
+
 def test_what_a_dataset_lacks_is_said_in_one_line_before_its_videos_are_read(dataset, capsys, monkeypatch):
     monkeypatch.setattr("finforce_eval.recordings.dataset.decode_video", lambda *given: 1 / 0)
     assert annotate(dataset, *DATASET[:4]) == 2
@@ -304,6 +348,15 @@ def test_what_a_dataset_lacks_is_said_in_one_line_before_its_videos_are_read(dat
     assert annotate(dataset) == 2
     told = capsys.readouterr().err
     assert "2 of 4 files cannot be read" in told and "git lfs pull" in told and len(told.splitlines()) == 1
+
+
+def test_what_plays_bags_alone_says_so_and_promises_no_datasets(dataset, capsys):
+    assert main(["trace", str(dataset), *DATASET]) == 2
+    assert "only bags with camera_info are played" in capsys.readouterr().err
+    for command in ("trace", "replay"):
+        with pytest.raises(SystemExit):
+            main([command, "--help"])
+        assert "LeRobot dataset, UMI" not in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.mark.parametrize("command", ["extrinsics", "view", "evaluate"])

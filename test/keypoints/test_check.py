@@ -23,7 +23,7 @@ from finforce_eval.cli.check import record_camera
 from finforce_eval.cli.main import main
 from finforce_eval.cli.twin import write_footage
 from finforce_eval.errors import RecordingError
-from finforce_eval.evaluation.check import FAULT, OK, WARNING, explain_camera, judge_picture
+from finforce_eval.evaluation.check import FAULT, OK, WARNING, Finding, explain_camera, judge_picture
 from finforce_eval.evaluation.keypoint_source import KeypointSource
 from finforce_eval.recordings.bags import open_bag
 from finforce_eval.recordings.images import CAMERA_INFO, COMPRESSED
@@ -91,7 +91,7 @@ def as_option(T):
 def test_what_fits_passes_with_depth_and_without(still, capsys, tmp_path):
     for options in ((), ("--detector", "depth=none")):
         status, said = check(still, capsys, tmp_path, *options)
-        assert status == 0 and "everything fits" in said and "extrinsics within" in said
+        assert status == 0 and "nothing contradicts" in said and "extrinsics within" in said  # a mesh, but two poses
         assert ("colour alone" in said) == bool(options)
 
 
@@ -150,6 +150,23 @@ def test_a_mesh_that_is_not_what_the_camera_sees_is_named(footage, capsys, tmp_p
     assert status == 1 and "the camera contradicts the mesh large.stl" in said and "scaled by 0.6" in said
     status, said = check(still, capsys, tmp_path, *more)
     assert status == 0 and "object.stl is where the camera sees it" in said
+
+
+def test_a_mesh_is_compared_in_images_of_the_whole_recording_and_a_warning_is_no_fit(
+    still, capsys, tmp_path, monkeypatch
+):
+    compared = []
+
+    def compare(recording, *more):
+        compared.append(len(recording.images))
+        return [Finding(WARNING, "compared with edges")]
+
+    monkeypatch.setattr(
+        "finforce_eval.cli.check.check_recording", lambda recording, *more: ([], np.zeros((480, 640, 3), np.uint8))
+    )
+    monkeypatch.setattr("finforce_eval.cli.check.check_object", compare)
+    status, said = check(still, capsys, tmp_path, "--images", "5")
+    assert compared == [IMAGES] and status == 0 and "everything fits" not in said and "the warnings above" in said
 
 
 def test_a_camera_that_is_elsewhere_is_told_where_it_is(still, capsys, tmp_path):
@@ -252,3 +269,13 @@ def test_topics_without_a_camera_are_said_to_be_so(still, tmp_path, monkeypatch)
 def test_one_source_is_to_be_named(given, capsys):
     assert main(["check", *given]) == 2
     assert "expected" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("bars", "words"), [((60, 60, 0, 0), "60 and 60 rows"), ((0, 0, 40, 0), "40 and 0 columns")])
+def test_black_bars_of_a_padded_picture_are_named_with_what_they_shift(bars, words):
+    picture = np.random.default_rng(0).integers(60, 200, (360, 640, 3), dtype=np.uint8)
+    top, bottom, left, right = bars
+    padded = np.pad(picture, ((top, bottom), (left, right), (0, 0)))
+    assert not any("bars" in finding.text for finding in judge_picture(picture))
+    (said,) = (finding for finding in judge_picture(padded) if "bars" in finding.text)
+    assert said.severity == WARNING and words in said.text and f"{top or left} px more" in said.text
