@@ -588,10 +588,10 @@ class _Refinement:
         if count < LEAST_SEEN or typical < LEAST_TYPICAL or contrast < self._least_contrast or residual > most:
             raise GeometryError(
                 f"the images do not show the finger '{self._jaws[first].name}': make the jaw file of another one with "
-                "finforce jaw PHOTO or STL; else check --lens, that the image is not mirrored and that open jaws are "
-                "in view, or give --extrinsics where jaws look like their background "
-                f"(contrast {contrast:.2f} of {self._least_contrast:g}, {count} of {LEAST_SEEN} key points, likelihood "
-                f"{typical:.2f} of {LEAST_TYPICAL:g}, {residual:.1f} px off of {most:.1f})"
+                "finforce jaw PHOTO or STL; else check --lens, that the image is not mirrored and that jaws are in "
+                "view, open and unloaded in all images (--images), or give --extrinsics where jaws look like their "
+                f"background (contrast {contrast:.2f} of {self._least_contrast:g}, {count} of {LEAST_SEEN} key points, "
+                f"likelihood {typical:.2f} of {LEAST_TYPICAL:g}, {residual:.1f} px off of {most:.1f})"
             )
         names = np.array([*self._jaws[first].keypoint_names, REFERENCE])
         covered = frozenset(names[~visible].tolist())

@@ -49,6 +49,7 @@ from finforce_keypoints.rib_check import describe_ribs
 from finforce_keypoints.tags import FAMILIES, TagFinder, find_tag
 
 PICTURES = 4  # of the images, which are compared
+FARTHEST_TAG = 0.02  # [m] across the side of its jaw, which holders are not
 TRIED = 10  # of the images, in which the detector has to find the jaws with the rig
 
 
@@ -107,7 +108,7 @@ def run(options: argparse.Namespace) -> CommandResult:
             options.opening,
             progress=bar.update,
         )
-    found = add_tags(found, seen, recording.images.camera, options)
+    found = add_tags(found, seen, recording.images.camera, jaws, options)
     output = Path(options.output)
     picture = output.with_suffix(".png")
     import_cv2().imwrite(str(picture), draw_placement(found, colors[0], recording, jaws)[..., ::-1])
@@ -215,12 +216,12 @@ def find_tags(colors: list[NDArray], options: argparse.Namespace) -> list[dict[i
 
 
 def add_tags(
-    found: CameraPlacement, seen: list[dict[int, NDArray]], camera: CameraIntrinsics, options: argparse.Namespace
+    found: CameraPlacement, seen: list[dict[int, NDArray]], camera: CameraIntrinsics, jaws, options: argparse.Namespace
 ) -> CameraPlacement:
     """Return a placement with the tags that the options name, each on the jaw that it is nearer to.
 
     Raises:
-        GeometryError: a tag is seen in no picture, or does not move with a jaw.
+        GeometryError: a tag is seen in no picture, does not move with a jaw, or is far from its side.
         OptionError: two tags are on one jaw.
     """
     mounts = dict(found.mounts)
@@ -228,6 +229,13 @@ def add_tags(
         corners = {n: tags[number] for n, tags in enumerate(seen) if number in tags}
         poses = {side: [found.pose(side, n) for n in corners] for side in mounts}
         side, tag = find_tag(number, list(corners.values()), poses, options.tag_size, camera)
+        beyond = float(jaws[side].keypoints[:, 1].mean()) - float(np.median(tag.corners[:, 1]))
+        if abs(beyond) > FARTHEST_TAG:
+            raise GeometryError(
+                f"tag {number} lies {1e3 * abs(beyond):.0f} mm {'behind' if beyond > 0.0 else 'in front of'} the side "
+                f"of the {side} jaw: expected {1e3 * FARTHEST_TAG:g} mm at most; is the edge of its black square "
+                f"{1e3 * options.tag_size:g} mm long, as --tag-size says?"
+            )
         if mounts[side].tag is not None:
             raise OptionError(
                 f"tags {mounts[side].tag.id} and {number} are both on the {side} jaw; expected one on each"

@@ -122,14 +122,18 @@ def test_finforce_camera_writes_tags_into_the_rig():
     )
     options = Namespace(tags=[0, 1], tag_family=FAMILY, tag_size=SIZE)
     color = picture(*(see(tag_of(side).corners, pose(side)) for side in PLACES))
-    placed = add_tags(placement, find_tags([color] * 2, options), CAMERA, options)
+    jaws = {side: load_jaw("bench", side) for side in PLACES}
+    placed = add_tags(placement, find_tags([color] * 2, options), CAMERA, jaws, options)
     for side, number in PLACES.items():
         tag = describe_mount(placed.mounts[side], NAMES).tag
         assert tag.id == number and np.abs(np.array(tag.corners) - tag_of(side).corners).max() < 0.5e-3
     with pytest.raises(OptionError, match="the pictures are mirrored"):
         find_tags([np.ascontiguousarray(color[:, ::-1])], options)
     with pytest.raises(OptionError, match="tags 0 and 0 are both on the left jaw"):
-        add_tags(placed, find_tags([color] * 2, options), CAMERA, options)
+        add_tags(placed, find_tags([color] * 2, options), CAMERA, jaws, options)
+    options.tag_size *= 10 / 8  # with its white border
+    with pytest.raises(GeometryError, match=r"tag 0 lies \d+ mm behind .*, as --tag-size says"):
+        add_tags(placement, find_tags([color] * 2, options), CAMERA, jaws, options)
 
 
 @pytest.fixture
