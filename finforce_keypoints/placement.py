@@ -69,6 +69,8 @@ PIXEL = 1.0  # [px] standard deviation of one of those
 OUTLINE_STDDEV = np.array([0.015, 0.015, 0.015, 0.06, 0.06, 0.06])
 GUESS_STDDEV = np.repeat((0.005, np.radians(2.0)), 3)  # the same of a guess of which nothing is said
 TURN_STDDEV = 0.05
+# Standard deviations of height [m] and scale [-] by what a network errs by in every picture of a finger: rendered ones.
+FINGER_STDDEV = np.array([0.6e-3, 5e-3])
 MIDDLE_STDDEV = 1e-3  # [m] of the middle between the jaws, which says where the gripper's middle is
 CUTS = 48  # directions in which a holder may cover a jaw up to a straight edge
 HALF_OPENING = 0.045  # [m] guess of half the distance of the jaws' origins
@@ -323,7 +325,7 @@ def _widen_stddev(best: CameraPlacement, found: Sequence[CameraPlacement], side:
     independent = 0.5 * INDEPENDENT * len(best.origins[side])
     weights = np.exp(independent * np.array([each.evidence - best.evidence for each in found]))
     away = np.array([compare_poses(jaw, best.pose(side, 0), each.pose(side, 0)) for each in found])
-    variance = np.square(best.mounts[side].stddev) + weights @ away**2 / weights.sum()
+    variance = FINGER_STDDEV**2 + np.square(best.mounts[side].stddev) + weights @ away**2 / weights.sum()
     rival = best.ribs[side]
     variance[0] += rival.other.shift**2 / (1.0 + np.exp(independent * rival.margin))
     return tuple(np.sqrt(variance).tolist())

@@ -26,6 +26,7 @@ from finforce_keypoints.images import PixelDetection, RgbdImage
 from finforce_keypoints.networks.side_network import Places, Template
 from finforce_keypoints.parameters import DetectorParameters, DetectorSettings, JawMount, find_mounts
 from finforce_keypoints.placement import (
+    FINGER_STDDEV,
     GUESS_STDDEV,
     CameraPlacement,
     OutlineContrast,
@@ -390,8 +391,9 @@ def test_a_place_that_is_nearly_as_likely_makes_a_rig_unsure():
             origins={"left": np.array([-0.04])}, seen={}, ribs={"left": ribs},
         )  # fmt: skip
         stddev.append(_widen_stddev(there, [there], "left", jaw)[0])
-    assert stddev[0] == pytest.approx(0.5e-3, rel=0.01) and stddev == sorted(stddev)
-    assert stddev[2:] == pytest.approx([np.hypot(0.5e-3, 7e-3 / np.sqrt(2)), np.hypot(0.5e-3, 7e-3)], rel=0.01)
+    alone = np.hypot(0.5e-3, FINGER_STDDEV[0])
+    assert stddev[0] == pytest.approx(alone, rel=0.01) and stddev == sorted(stddev)
+    assert stddev[2:] == pytest.approx([np.hypot(alone, 7e-3 / np.sqrt(2)), np.hypot(alone, 7e-3)], rel=0.01)
 
 
 def test_a_rig_file_says_what_was_written(tmp_path):
