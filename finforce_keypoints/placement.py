@@ -475,13 +475,12 @@ class _Refinement:
         return seen, np.where(inside, likelihood, 0.0)
 
     def look_aside(self) -> None:
-        """Move jaws along the closing axis to where their points are much likelier."""
+        """Move jaws along the closing axis to where in a picture their points are much likelier."""
         moved = self._x[6 + 3 * len(self._jaws) :].reshape(len(self._jaws), -1)
         for origins, side in zip(moved, self._jaws, strict=True):
-            likelihood = [self._find(side, aside)[1].mean() for aside in ASIDE]
-            best = int(np.argmax(likelihood))
-            if likelihood[best] > likelihood[len(ASIDE) // 2] + LIKELIER:
-                origins += ASIDE[best]
+            likelihood = np.array([self._find(side, aside)[1].mean(axis=1) for aside in ASIDE])
+            is_likelier = likelihood.max(axis=0) > likelihood[len(ASIDE) // 2] + LIKELIER
+            origins += np.where(is_likelier, ASIDE[likelihood.argmax(axis=0)], 0.0)
 
     def _misses(self, x: NDArray) -> NDArray:
         """Return what is off, in standard deviations."""

@@ -49,6 +49,7 @@ from finforce_keypoints.rib_check import describe_ribs
 from finforce_keypoints.tags import FAMILIES, TagFinder, find_tag
 
 PICTURES = 4  # of the images, which are compared
+LEAST_SURE = np.array([8e-3, 0.06])  # standard deviations of a rig: a rib along the finger [m], size [-]
 FARTHEST_TAG = 0.02  # [m] across the side of its jaw, which holders are not
 TRIED = 10  # of the images, in which the detector has to find the jaws with the rig
 
@@ -114,7 +115,8 @@ def run(options: argparse.Namespace) -> CommandResult:
     import_cv2().imwrite(str(picture), draw_placement(found, colors[0], recording, jaws)[..., ::-1])
     print(describe_placement(found, jaws))
     rig = build_rig(found, recording, options.jaw, options.tag_family)
-    doubts = describe_ribs(found.ribs) + try_rig(rig, recording, source, options.images)
+    doubts = describe_ribs(found.ribs) or describe_unsure(found)
+    doubts += try_rig(rig, recording, source, options.images)
     refuse_doubts(doubts, options, picture)
     write_rig(rig, output)
     for doubt in doubts:
@@ -140,8 +142,18 @@ def refuse_doubts(doubts: Sequence[str], options: argparse.Namespace, picture: P
     if doubts and not options.force:
         raise GeometryError(
             f"{'; '.join(doubts)}. No rig is written, see {picture}: give sharper pictures, at several openings, a "
-            "better --extrinsics, or --force"
+            "better --extrinsics, --opening, or --force"
         )
+
+
+def describe_unsure(found: CameraPlacement) -> list[str]:
+    """Return in words which jaws may be anywhere, by how sure their places are."""
+    return [
+        f"the {side} jaw's place is only known to {1e3 * mount.stddev[0]:.0f} mm and "
+        f"{100.0 * mount.stddev[1]:.0f} % in size (one standard deviation)"
+        for side, mount in found.mounts.items()
+        if (np.array(mount.stddev) > LEAST_SURE).any()
+    ]
 
 
 def try_rig(rig: Rig, recording: Recording, source: KeypointSource, count: int) -> list[str]:

@@ -11,7 +11,7 @@ from finforce.errors import RigError
 from finforce.gripper_frames import ROBOT_CAMERA, jaw_in_camera
 from finforce.rig import Rig, RigCamera, RigJaw, RigTag, read_rig, write_rig
 from finforce.transforms import move_pose, pose_numbers
-from finforce_eval.cli.camera import describe_placement
+from finforce_eval.cli.camera import describe_placement, describe_unsure
 from finforce_eval.evaluation.keypoint_source import build_records
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints import placement
@@ -375,6 +375,31 @@ def test_a_camera_comes_out_as_far_off_as_it_is_unsure(monkeypatch):
             there = jaw_in_camera(ROBOT_CAMERA, side, origins[side][0])
             sigmas.append(compare_poses(jaw, fit._pose(side, fit._x), there) / stddev[side])
     assert np.abs(sigmas).max() < 4.0 and (np.abs(np.sqrt(np.mean(np.square(sigmas), axis=0)) - 1.0) < 0.5).all()
+
+
+def test_a_jaw_is_looked_for_aside_in_each_picture(monkeypatch):
+    jaws, image = {"left": load_jaw("bench")}, np.zeros((480, 640, 3), np.uint8)
+    there = np.array([-0.045, -0.030])
+
+    def find(images, camera, locator, side, plane, poses):
+        x = np.array([(ROBOT_CAMERA @ T)[0, 3] for T in poses])
+        return np.full((2, 3, 2), 100.0), np.where(np.abs(x - there)[:, None] < 3e-3, 0.9, 0.1) * np.ones(3)
+
+    monkeypatch.setattr(placement, "find_points", find)
+    fit = _Refinement([image, image], CAMERA, jaws, None, ROBOT_CAMERA, 0.045, None, None)
+    fit.look_aside()
+    origins = fit._split(fit._x)[2]["left"]
+    assert origins[0] == -0.045 and abs(origins[1] - there[1]) < 3e-3
+
+
+def test_a_rig_whose_size_or_place_is_unsure_is_doubted():
+    mounts = {"left": JawMount(stddev=(1e-3, 0.02)), "right": JawMount(stddev=(1e-3, 0.08))}
+    unsure = CameraPlacement(
+        T_gripper_camera=ROBOT_CAMERA, mounts=mounts, origins={}, contrast=1.0, residual=1.0, seen={}
+    )
+    assert describe_unsure(unsure) == [
+        "the right jaw's place is only known to 1 mm and 8 % in size (one standard deviation)"
+    ]
 
 
 def test_a_place_that_is_nearly_as_likely_makes_a_rig_unsure():
