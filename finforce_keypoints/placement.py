@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -84,7 +85,7 @@ MOST_LEFT = 2.8
 RIB_ROUNDS = 4  # of laying the jaws on their ribs
 # Key points are found with the place found before, in rounds until nothing changes by more than a share of its scale.
 # As long as ribs speak against the place found, jaws are laid on ribs that are so far off before [pitches].
-FARTHEST = (0.0, np.inf, HERE)
+FARTHEST = (None, np.inf, HERE)
 MOST_ROUNDS, SETTLED = 12, 0.05
 # How far aside a jaw is looked for [m], and by how much likelier its points have to be there.
 ASIDE, LIKELIER = 4e-3 * np.arange(-4.0, 5.0), 0.1
@@ -285,17 +286,17 @@ def find_placement(
     failures: dict[float, GeometryError] = {}
     for farthest in FARTHEST:
         for fit in fits:
-            fit.follow_ribs(farthest)
-            fit.settle()
+            for step in (fit.settle,) if farthest is None else (partial(fit.follow_ribs, farthest), fit.settle):
+                step()
+                try:
+                    place = _add_ribs(fit.describe(), images, camera, jaws)
+                except GeometryError as error:
+                    failures[fit.likeliest] = error
+                else:
+                    found.append(place)
+                    fit.keep(place.evidence)
+            fit.go_back()
             progress(len(images))
-            try:
-                place = _add_ribs(fit.describe(), images, camera, jaws)
-            except GeometryError as error:
-                failures[fit.likeliest] = error
-                fit.keep(0.0)
-            else:
-                found.append(place)
-                fit.keep(place.evidence)
         best = max(found, key=lambda each: each.evidence, default=None)
         if best is not None and not describe_ribs(best.ribs):
             break
@@ -522,7 +523,7 @@ class _Refinement:
 
     def follow_ribs(self, farthest: float) -> None:
         """Move camera, turns and origins to where ribs and tips are likeliest, so far off at most [pitches]."""
-        for _ in range(RIB_ROUNDS if farthest else 0):
+        for _ in range(RIB_ROUNDS):
             T, turns, origins = self._split(self._x)
             poses = {side: [jaw_in_camera(T, side, x, turns[side]) for x in origins[side]] for side in self._jaws}
             found = find_places(self._patterns, self._images, poses, self._camera)
@@ -547,9 +548,12 @@ class _Refinement:
         self._best = (-1.0, self._x)
 
     def keep(self, evidence: float) -> None:
-        """Keep what was found for its evidence, or go back to what was kept before for more."""
+        """Keep what was found for its evidence, unless something better was kept before."""
         self._kept = max(self._kept, (evidence, self._x), key=lambda each: each[0])
-        if self._kept[0] > evidence:
+
+    def go_back(self) -> None:
+        """Go back to what was kept, if anything was."""
+        if self._kept[0] > 0.0:
             self._x = self._kept[1]
 
     @property

@@ -322,7 +322,7 @@ def test_the_place_of_a_jaw_in_a_holder_is_stated_apart_from_its_points():
 
 
 def test_a_stated_opening_is_kept_and_a_picture_without_jaws_refused(monkeypatch):
-    monkeypatch.setattr(placement, "FARTHEST", (0.0,))
+    monkeypatch.setattr(placement, "FARTHEST", (None,))
     monkeypatch.setattr(placement, "MOST_ROUNDS", 2)
     monkeypatch.setattr(placement, "POLISH", 2)
     jaws = {side: load_jaw("bench", side) for side in ("left", "right")}
