@@ -282,6 +282,24 @@ def find_placement(
     fits = [_Refinement(images, camera, jaws, locator, T, begin, known, stated) for T, begin, _ in starts]
     for fit, (*_, edge) in zip(fits, starts, strict=True):
         fit.polish(edge)
+    found = _find_places(fits, images, camera, jaws, progress)
+    best = max(found, key=lambda each: each.evidence)
+    stddev = {side: _widen_stddev(best, found, side, jaw) for side, jaw in jaws.items()}
+    return replace(best, mounts={side: replace(mount, stddev=stddev[side]) for side, mount in best.mounts.items()})
+
+
+def _find_places(
+    fits: Sequence[_Refinement],
+    images: Sequence[NDArray],
+    camera: CameraIntrinsics,
+    jaws: Mapping[str, Jaw],
+    progress: Callable[[int], Any],
+) -> list[CameraPlacement]:
+    """Return the places to which fits lead; on ribs farther off only while ribs speak against the best.
+
+    Raises:
+        GeometryError: there is none.
+    """
     found: list[CameraPlacement] = []
     failures: dict[float, GeometryError] = {}
     for farthest in FARTHEST:
@@ -297,13 +315,11 @@ def find_placement(
                     fit.keep(place.evidence)
             fit.go_back()
             progress(len(images))
-        best = max(found, key=lambda each: each.evidence, default=None)
-        if best is not None and not describe_ribs(best.ribs):
+        if found and not describe_ribs(max(found, key=lambda each: each.evidence).ribs):
             break
-    if best is None:
+    if not found:
         raise failures[max(failures)]
-    stddev = {side: _widen_stddev(best, found, side, jaw) for side, jaw in jaws.items()}
-    return replace(best, mounts={side: replace(mount, stddev=stddev[side]) for side, mount in best.mounts.items()})
+    return found
 
 
 def compare_poses(jaw: Jaw, T: NDArray, other: NDArray) -> NDArray:
@@ -321,7 +337,8 @@ def compare_poses(jaw: Jaw, T: NDArray, other: NDArray) -> NDArray:
 def _widen_stddev(best: CameraPlacement, found: Sequence[CameraPlacement], side: str, jaw: Jaw) -> tuple[float, ...]:
     """Return a jaw's standard deviations (2,) with the spread of the places that explain the pictures nearly as well.
 
-    Those found from other starts, each as likely as its ribs and tips, and the likeliest one of other ribs.
+    Those found from other starts, each as likely as its ribs and tips, and the likeliest one of other ribs; with what a
+    network errs by in every picture.
     """
     independent = 0.5 * INDEPENDENT * len(best.origins[side])
     weights = np.exp(independent * np.array([each.evidence - best.evidence for each in found]))
@@ -456,8 +473,9 @@ class _Refinement:
 
         fit = minimize(judge, self._x / self._scale, method="L-BFGS-B", options={"maxiter": POLISH, "eps": 0.02})
         self._x = fit.x * self._scale
-        self._start = self._split(self._x)[0]
-        self._x[:6] = 0.0
+        if not self._is_guess:
+            self._start = self._split(self._x)[0]
+            self._x[:6] = 0.0
 
     def _look(self) -> None:
         """Find the points of every jaw in every picture."""

@@ -377,6 +377,21 @@ def test_a_camera_comes_out_as_far_off_as_it_is_unsure(monkeypatch):
     assert np.abs(sigmas).max() < 4.0 and (np.abs(np.sqrt(np.mean(np.square(sigmas), axis=0)) - 1.0) < 0.5).all()
 
 
+def test_a_guess_is_kept_as_closely_as_it_is_known(monkeypatch):
+    monkeypatch.setattr(placement, "POLISH", 3)
+    jaws = {"left": load_jaw("bench")}
+    color = paint({"left": jaw_in_camera(ROBOT_CAMERA, "left", -0.045)}, jaws)
+    beside = move_pose(ROBOT_CAMERA, np.array([0.0, 8e-3, 0.0, 0.0, 0.0, 0.0]))
+    moved = []
+    for stddev in (0.1e-3, 10e-3):
+        fit = _Refinement(
+            [color], CAMERA, jaws, None, beside, 0.045, np.repeat((stddev, 0.01 * stddev / 1e-3), 3), None
+        )
+        fit.polish()
+        moved.append(np.linalg.norm(fit._x[:3]))
+    assert moved[0] < 0.3e-3 < moved[1]
+
+
 def test_a_jaw_is_looked_for_aside_in_each_picture(monkeypatch):
     jaws, image = {"left": load_jaw("bench")}, np.zeros((480, 640, 3), np.uint8)
     there = np.array([-0.045, -0.030])
