@@ -161,8 +161,12 @@ def find_mounts(parameters: DetectorParameters, jaws: Mapping[str, Jaw]) -> dict
             that the jaw does not have.
     """
     mounts = {}
+    stated = {
+        "left": (parameters.left_turn, parameters.left_tag, parameters.left_stddev),
+        "right": (parameters.right_turn, parameters.right_tag, parameters.right_stddev),
+    }
     for side, jaw in jaws.items():
-        turn, tag, stddev = (getattr(parameters, f"{side}_{name}") for name in ("turn", "tag", "stddev"))
+        turn, tag, stddev = stated[side]
         turn = np.array(turn, dtype=float)
         if turn.shape != (3,) or not np.linalg.norm(turn) <= LARGEST_TURN:
             raise DetectorSettingsError(
