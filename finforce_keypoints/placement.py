@@ -103,6 +103,7 @@ class CameraPlacement:
         origins: side -> place of the jaw's origin on the closing axis in each picture (n,) [m].
         contrast: of the outlines, 0 to 1.
         residual: root mean square distance of the points seen from where they should be [px].
+        strain: sum of squares of what camera and mounts are off their expected places [standard deviations].
         seen: side -> pixels of the points in each picture (n, K + 1, 2), NaN where one was not seen.
         ribs: side -> where the ribs may be.
     """
@@ -113,6 +114,7 @@ class CameraPlacement:
     contrast: float
     residual: float
     seen: Mapping[str, NDArray]
+    strain: float = 0.0
     ribs: Mapping[str, RibComparison] = field(default_factory=dict)
 
     def pose(self, side: str, number: int) -> NDArray:
@@ -121,8 +123,10 @@ class CameraPlacement:
 
     @property
     def evidence(self) -> float:
-        """Evidence of ribs and tips for this place, see `RibPlace`."""
-        return float(np.mean([each.here.evidence for each in self.ribs.values()]))
+        """Evidence of ribs and tips for this place, see `RibPlace`, less that against its camera and mounts."""
+        count = len(next(iter(self.origins.values())))
+        shown = float(np.mean([each.here.evidence for each in self.ribs.values()]))
+        return shown - self.strain / (INDEPENDENT * count)
 
 
 class OutlineContrast:
@@ -432,7 +436,7 @@ class _Refinement:
         self._scale = np.full(len(self._x), 5e-3)  # [m]
         self._scale[3 : 6 + 3 * sides] = 0.03  # [rad]
         self._best = (-1.0, self._x)
-        self._kept = (0.0, self._x)
+        self._kept = (-np.inf, self._x)
 
     def _split(self, x: NDArray) -> tuple[NDArray, dict[str, NDArray], dict[str, NDArray]]:
         """Return the camera's pose (4, 4), and by side the turn (3,) and the origins (n,)."""
@@ -504,7 +508,7 @@ class _Refinement:
     def _misses(self, x: NDArray) -> NDArray:
         """Return what is off, in standard deviations."""
         T, turns, origins = self._split(x)
-        parts = [x[:6] / self._stddev, np.concatenate([*turns.values()]) / TURN_STDDEV]
+        parts = self._strains(x[:6], turns)
         for side in self._jaws:
             away = self._away(side, T, turns[side], origins[side])
             share = np.minimum(1.0, ALIKE / np.maximum(self._likelihood[side].sum(axis=1), 1e-9))
@@ -515,6 +519,10 @@ class _Refinement:
         if len(origins) == len(SIDES):
             parts.append([np.mean(sum(origins.values())) / 2.0 / MIDDLE_STDDEV])
         return np.concatenate(parts)
+
+    def _strains(self, step: NDArray, turns: Mapping[str, NDArray]) -> list[NDArray]:
+        """Return a camera's step (6,) and the turns of jaws, in standard deviations."""
+        return [step / self._stddev, np.concatenate([*turns.values()]) / TURN_STDDEV]
 
     def _away(self, side: str, T: NDArray, turn: NDArray, origins: NDArray) -> NDArray:
         """Return by how many columns and rows the points seen are off their places (n, K + 1, 2) [px]."""
@@ -571,7 +579,7 @@ class _Refinement:
 
     def go_back(self) -> None:
         """Go back to what was kept, if anything was."""
-        if self._kept[0] > 0.0:
+        if self._kept[0] > -np.inf:
             self._x = self._kept[1]
 
     @property
@@ -627,6 +635,7 @@ class _Refinement:
             origins=origins,
             contrast=contrast,
             residual=residual,
+            strain=float(np.square(np.concatenate(self._strains(self._x[:6], turns))).sum()),
             seen={side: np.where(sure[side][:, :, None], seen, np.nan) for side, seen in self._seen.items()},
         )
 

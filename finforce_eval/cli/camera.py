@@ -33,7 +33,7 @@ from finforce_keypoints.build import ANY_FINGER
 from finforce_keypoints.detectors.side_plane import AnyFinger
 from finforce_keypoints.errors import GeometryError
 from finforce_keypoints.networks.side_network import SideNetwork
-from finforce_keypoints.parameters import NO_DEPTH, REFERENCE, JawMount
+from finforce_keypoints.parameters import LARGEST_TURN, NO_DEPTH, REFERENCE, JawMount
 from finforce_keypoints.placement import (
     KEPT,
     LEAST_SEEN,
@@ -116,7 +116,7 @@ def run(options: argparse.Namespace) -> CommandResult:
     print(describe_placement(found, jaws))
     rig = build_rig(found, recording, options.jaw, options.tag_family)
     doubts = describe_ribs(found.ribs) or describe_unsure(found)
-    doubts += try_rig(rig, recording, source, options.images)
+    doubts = doubts or try_rig(rig, recording, source, options.images)
     refuse_doubts(doubts, options, picture)
     write_rig(rig, output)
     for doubt in doubts:
@@ -147,8 +147,14 @@ def refuse_doubts(doubts: Sequence[str], options: argparse.Namespace, picture: P
 
 
 def describe_unsure(found: CameraPlacement) -> list[str]:
-    """Return in words which jaws may be anywhere, by how sure their places are."""
-    return [
+    """Return in words which jaws are turned as no mount is, or may be anywhere, by how sure their places are."""
+    turned = {side: float(np.linalg.norm(mount.turn)) for side, mount in found.mounts.items()}
+    strange = [
+        f"the {side} jaw comes out turned by {np.degrees(turn):.0f} degrees"
+        for side, turn in turned.items()
+        if turn > LARGEST_TURN
+    ]
+    return strange or [
         f"the {side} jaw's place is only known to {1e3 * mount.stddev[0]:.0f} mm and "
         f"{100.0 * mount.stddev[1]:.0f} % in size (one standard deviation)"
         for side, mount in found.mounts.items()

@@ -412,6 +412,8 @@ def test_a_rig_whose_size_or_place_is_unsure_is_doubted():
     unsure = CameraPlacement(
         T_gripper_camera=ROBOT_CAMERA, mounts=mounts, origins={}, contrast=1.0, residual=1.0, seen={}
     )
+    turned = {"left": JawMount(turn=np.array([0.0, 0.35, 0.0])), "right": JawMount()}
+    assert describe_unsure(replace(unsure, mounts=turned)) == ["the left jaw comes out turned by 20 degrees"]
     assert describe_unsure(unsure) == [
         "the right jaw's place is only known to 1 mm and 8 % in size (one standard deviation)"
     ]
@@ -434,6 +436,16 @@ def test_a_place_that_is_nearly_as_likely_makes_a_rig_unsure():
     alone = np.hypot(0.5e-3, FINGER_STDDEV[0])
     assert stddev[0] == pytest.approx(alone, rel=0.01) and stddev == sorted(stddev)
     assert stddev[2:] == pytest.approx([np.hypot(alone, 7e-3 / np.sqrt(2)), np.hypot(alone, 7e-3)], rel=0.01)
+
+
+def test_of_places_with_like_ribs_one_that_needs_no_askew_mount_is_likelier():
+    place = RibPlace(evidence=1.0, ribs=0.5, shift=0.0, distance=0.0, warps=np.zeros((0, 2, 3)))
+    straight = CameraPlacement(
+        T_gripper_camera=ROBOT_CAMERA, mounts={"left": JawMount()}, contrast=1.0, residual=1.0,
+        origins={"left": np.array([-0.04])}, seen={}, ribs={"left": RibComparison(here=place, other=place)},
+    )  # fmt: skip
+    askew = replace(straight, strain=25.0, ribs={"left": RibComparison(here=replace(place, evidence=2.0), other=place)})
+    assert straight.evidence > askew.evidence
 
 
 def test_a_rig_file_says_what_was_written(tmp_path):
