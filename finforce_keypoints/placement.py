@@ -286,13 +286,13 @@ def find_placement(
     fits = [_Refinement(images, camera, jaws, locator, T, begin, known, stated) for T, begin, _ in starts]
     for fit, (*_, edge) in zip(fits, starts, strict=True):
         fit.polish(edge)
-    found = _find_places(fits, images, camera, jaws, progress)
+    found = _try_fits(fits, images, camera, jaws, progress)
     best = max(found, key=lambda each: each.evidence)
     stddev = {side: _widen_stddev(best, found, side, jaw) for side, jaw in jaws.items()}
     return replace(best, mounts={side: replace(mount, stddev=stddev[side]) for side, mount in best.mounts.items()})
 
 
-def _find_places(
+def _try_fits(
     fits: Sequence[_Refinement],
     images: Sequence[NDArray],
     camera: CameraIntrinsics,

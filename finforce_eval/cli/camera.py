@@ -115,8 +115,7 @@ def run(options: argparse.Namespace) -> CommandResult:
     import_cv2().imwrite(str(picture), draw_placement(found, colors[0], recording, jaws)[..., ::-1])
     print(describe_placement(found, jaws))
     rig = build_rig(found, recording, options.jaw, options.tag_family)
-    doubts = describe_ribs(found.ribs) or describe_unsure(found)
-    doubts = doubts or try_rig(rig, recording, source, options.images)
+    doubts = describe_ribs(found.ribs) or describe_unsure(found) or try_rig(rig, recording, source, options.images)
     refuse_doubts(doubts, options, picture)
     write_rig(rig, output)
     for doubt in doubts:
