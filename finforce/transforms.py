@@ -142,7 +142,7 @@ def _rotation(x: float, y: float, z: float, w: float) -> list[list[float]]:
     ]
 
 
-def _quaternion(R: NDArray) -> tuple[float, float, float, float]:
+def _quaternion(R: NDArray) -> tuple[float, ...]:
     """Return x, y, z, w with w >= 0 of a rotation (3, 3).
 
     Of the four ways the one without cancellation: K. Shoemake, Animating rotation with quaternion curves, 1985.

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -407,6 +407,14 @@ def find_covered(likelihood: NDArray, places: NDArray) -> NDArray[np.bool_]:
     return covered | (likelihood < HIDDEN)
 
 
+class _Setup(NamedTuple):
+    """T_gripper_camera (4, 4); by side turn (3,) [rad] and origin in each picture (n,) [m]."""
+
+    T: NDArray
+    turns: dict[str, NDArray]
+    origins: dict[str, NDArray]
+
+
 class _Refinement:
     """Camera, turns and origins by least squares over the pixels that a network finds, again and again."""
 
@@ -438,15 +446,15 @@ class _Refinement:
         self._best = (-1.0, self._x)
         self._kept = (-np.inf, self._x)
 
-    def _split(self, x: NDArray) -> tuple[NDArray, dict[str, NDArray], dict[str, NDArray]]:
-        """Return the camera's pose (4, 4), and by side the turn (3,) and the origins (n,)."""
+    def _split(self, x: NDArray) -> _Setup:
+        """Return what the unknowns say of camera and jaws."""
         sides, count = len(self._jaws), len(self._images)
         turns = dict(zip(self._jaws, x[6 : 6 + 3 * sides].reshape(sides, 3), strict=True))
         origins = dict(zip(self._jaws, x[6 + 3 * sides :].reshape(sides, count), strict=True))
         if self._half is not None and len(origins) == len(SIDES):
             wider = 0.5 * np.max(origins["right"] - origins["left"]) - self._half
             origins = {"left": origins["left"] + wider, "right": origins["right"] - wider}
-        return move_pose(self._start, x[:6]), turns, origins
+        return _Setup(move_pose(self._start, x[:6]), turns, origins)
 
     def contrast(self, x: NDArray | None = None, edge: int | None = None) -> float:
         """Return the mean contrast of the outlines."""
@@ -478,7 +486,7 @@ class _Refinement:
         fit = minimize(judge, self._x / self._scale, method="L-BFGS-B", options={"maxiter": POLISH, "eps": 0.02})
         self._x = fit.x * self._scale
         if not self._is_guess:
-            self._start = self._split(self._x)[0]
+            self._start = self._split(self._x).T
             self._x[:6] = 0.0
 
     def _look(self) -> None:

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -269,12 +270,24 @@ def read_truth(recording: Recording, side: str, setup: EvaluationSetup) -> TrueI
     )
 
 
+class PressTable(NamedTuple):
+    """What a press without traction linearises to.
+
+    Attributes:
+        depths: (m,) [m].
+        linear: by depth, of each key point eight derivatives and its place, then twelve derivatives of the force.
+        forces: (m, 3) [N].
+    """
+
+    depths: NDArray
+    linear: interp1d
+    forces: NDArray
+
+
 def tabulate(
     mechanics: Mechanics, keypoints: NDArray, indenter: OutlineIndenter, height: float, deepest: float
-) -> tuple[NDArray, interp1d, NDArray]:
-    """Return depths (m,) [m], what is linearised there without traction, and forces (m, 3) [N].
-
-    What is linearised: of each key point eight derivatives and its place, then twelve derivatives of the force.
+) -> PressTable:
+    """Return the equilibria of a jaw that an object presses.
 
     Args:
         mechanics: of the jaw.
@@ -290,14 +303,14 @@ def tabulate(
     depths = np.concatenate([[_LEAST_DEPTH], np.arange(_EVERY, deepest + 0.5 * _EVERY, _EVERY)])
     for depth in depths:
         x = np.array([depth + touch, 0.0, height])
-        q, _, _ = settle(contact, q, x, FRICTIONLESS)
+        q = settle(contact, q, x, FRICTIONLESS).q
         pressed = contact.linearize(q, x, FRICTIONLESS)
         motions = contact.model.project(probe, q, pressed.modes)[:, [0, 2]].reshape(len(keypoints), 8)
         places = contact.model.positions(probe, q)[:, [0, 2]]
         rows.append(np.r_[np.hstack([motions, places]).ravel(), pressed.force_modes.ravel()])
         forces.append(pressed.force)
     ends = {"bounds_error": False, "fill_value": (rows[0], rows[-1])}
-    return depths, interp1d(depths, np.array(rows), axis=0, **ends), np.array(forces)
+    return PressTable(depths, interp1d(depths, np.array(rows), axis=0, **ends), np.array(forces))
 
 
 def compare(recordings: Iterable[Recording], setup: EvaluationSetup) -> Figures:

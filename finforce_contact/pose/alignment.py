@@ -104,15 +104,15 @@ class DepthImage:
 
     def look(self, pixels: NDArray) -> NDArray:
         """Return the depths (...,) [m] at pixels (..., 2), NaN where there is none or outside the image."""
-        column, row, inside = self._nearest(pixels)
-        return np.where(inside, self.depth[row, column], np.nan)
+        nearest, inside = self._nearest(pixels)
+        return np.where(inside, self.depth[nearest], np.nan)
 
     def is_masked_out(self, pixels: NDArray) -> NDArray:
         """Return where (...,) the mask says that pixels (..., 2) are not the object; nowhere without a mask."""
         if self.mask is None:
             return np.zeros(pixels.shape[:-1], bool)
-        column, row, inside = self._nearest(pixels)
-        return inside & ~self.mask[row, column]
+        nearest, inside = self._nearest(pixels)
+        return inside & ~self.mask[nearest]
 
     def compare_surface(self, surface: Samples, gate: float) -> Comparison:
         """Compare points of a surface with the depths at their pixels.
@@ -126,9 +126,9 @@ class DepthImage:
             gate: [m].
         """
         pixels = project(surface.points, self.camera)
-        column, row, inside = self._nearest(pixels)
-        depth = np.where(inside, self.depth[row, column], np.nan)
-        measured = self._rays[row, column] * depth[:, None]
+        nearest, inside = self._nearest(pixels)
+        depth = np.where(inside, self.depth[nearest], np.nan)
+        measured = self._rays[nearest] * depth[:, None]
         residuals = np.einsum("ij,ij->i", surface.directions, measured - surface.points)
         foreign = self.is_masked_out(pixels)
         sights = np.where(depth < surface.points[:, 2], Visibility.HIDDEN, Visibility.ABSENT)
@@ -137,12 +137,13 @@ class DepthImage:
         sights[near & ~foreign] = Visibility.SEEN
         return Comparison(residuals=np.where(sights == Visibility.SEEN, residuals, np.nan), sights=sights)
 
-    def _nearest(self, pixels: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    def _nearest(self, pixels: NDArray) -> tuple[tuple[NDArray, NDArray], NDArray]:
+        """Return row and column (...,) of the nearest pixels, and which are inside the image."""
         known = np.isfinite(pixels).all(axis=-1)
         whole = np.rint(np.where(known[..., None], pixels, -1.0)).astype(np.intp)
         column, row = whole[..., 0], whole[..., 1]
         inside = (column >= 0) & (column < self.camera.width) & (row >= 0) & (row < self.camera.height)
-        return np.where(inside, column, 0), np.where(inside, row, 0), inside
+        return (np.where(inside, row, 0), np.where(inside, column, 0)), inside
 
 
 # Behind the outline the image must fall back by this [m] to be told from the object's own shape and from noise.

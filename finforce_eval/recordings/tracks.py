@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -272,12 +272,21 @@ def parse_phases(stamps: Sequence[int], texts: Sequence[str], name: str) -> Phas
     )
 
 
-def _parse_phase(text: str, name: str) -> tuple[int, str, float, str]:
+class _Phase(NamedTuple):
+    """One message on /bench/phase."""
+
+    cycle: int
+    direction: str
+    displacement_mm: float
+    stage: str
+
+
+def _parse_phase(text: str, name: str) -> _Phase:
     """Split one phase."""
     try:
         cycle, direction, displacement, stage = text.split(":")
         if direction in DIRECTIONS and stage in STAGES and np.isfinite(float(displacement)):
-            return int(cycle), direction, float(displacement), stage
+            return _Phase(int(cycle), direction, float(displacement), stage)
     except ValueError:
         pass
     expected = "cycle:load|unload:displacement_mm:ramp|settle|record"

@@ -102,16 +102,16 @@ class SolidModel:
 
     def _plan_assembly(self) -> None:
         """Prepare where each lower entry of each element matrix goes in the stored tangent."""
-        _, high, low = self._find_entries()
+        _, (high, low) = self._find_entries()
         self.dof = np.append(order_unknowns(high, low, self.size), self.size)[self.dof]
-        self._source, high, low = self._find_entries()
+        self._source, (high, low) = self._find_entries()
         # the upper triangle, column by column: the pattern stays, only values change
         keys, self._slot = np.unique(high * self.size + low, return_inverse=True)
         self._pointer = np.searchsorted(keys // self.size, np.arange(self.size + 1))
         self._index = keys % self.size
         self._plan = SparsePlan(self._pointer, self._index)
 
-    def _find_entries(self) -> tuple[NDArray, NDArray, NDArray]:
+    def _find_entries(self) -> tuple[NDArray, tuple[NDArray, NDArray]]:
         """Return the lower entries of all element matrices: where they are stored there, and their two unknowns."""
         dof = self.dof[self._elements].reshape(len(self._elements), -1)
         i, j = np.nonzero(np.arange(dof.shape[1])[:, None] // 3 >= np.arange(dof.shape[1]) // 3)
@@ -119,7 +119,7 @@ class SolidModel:
         keep = (row < self.size) & (col < self.size) & ((i // 3 > j // 3) | (row >= col))
         e, entry = np.nonzero(keep)
         source = (e * dof.shape[1] + i[entry]) * dof.shape[1] + j[entry]
-        return source, np.maximum(row, col)[keep], np.minimum(row, col)[keep]
+        return source, (np.maximum(row, col)[keep], np.minimum(row, col)[keep])
 
     def expand(self, q: NDArray) -> NDArray:
         """Return the displacements (nodes, 3) [m] of all mesh nodes for unknowns q (size,)."""

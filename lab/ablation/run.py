@@ -31,7 +31,7 @@ from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.settings import EstimatorSettings
 from lab.ablation.rules import RULES, Rule
 from lab.ablation.scenes import Scene, build_scene
-from lab.harness import Figures
+from lab.harness import Figures, format_table
 from lab.stress.session import FORCE_ERROR, Bench
 from lab.stress.stress import Plan
 
@@ -170,7 +170,7 @@ def list_runs(rules: Iterable[Rule]) -> list[list[Rule]]:
 
 
 def ablate(rules: Iterable[Rule], bags: Iterable[str] = (), calibration: str = "bench") -> Figures:
-    """Switch off rules one at a time.
+    """Switch off rules one at a time, and print what each moves as soon as it is known.
 
     Args:
         rules: to be switched off.
@@ -182,7 +182,7 @@ def ablate(rules: Iterable[Rule], bags: Iterable[str] = (), calibration: str = "
     """
     rules, bags = list(rules), list(bags)
     names = [] if bags else list(dict.fromkeys(name for rule in rules for name in rule.scenes))
-    steps, found = len(names) + len(rules) + 1, {}
+    steps, rows = len(names) + len(rules) + 1, []
     with TemporaryDirectory(prefix="finforce_scenes_") as folder, progress_bar(steps, "step", "ablation") as bar:
         bench = Bench(Plan()) if names else None
         for name in names:
@@ -192,14 +192,11 @@ def ablate(rules: Iterable[Rule], bags: Iterable[str] = (), calibration: str = "
         bar.update(1)
         for each in list_runs(rules):
             for rule, figures in zip(each, run_child(each, Path(folder), bags, calibration), strict=True):
-                found[rule.name] = figures
+                own = [{"rule": rule.name, "scene": name, **describe(usual[name], figures[name])} for name in figures]
+                print(format_table(pd.DataFrame(own)), flush=True)
+                rows += own
                 bar.update(1)
-    rows = [
-        {"rule": rule.name, "scene": scene, **describe(usual[scene], figures)}
-        for rule in rules
-        for scene, figures in found[rule.name].items()
-    ]
-    table = pd.DataFrame(rows)
+    table = pd.DataFrame(sorted(rows, key=lambda row: [rule.name for rule in rules].index(row["rule"])))
     best = table.loc[table.groupby("rule", sort=False)["moves"].idxmax()].drop(columns="moves")
     told = {rule.name: rule for rule in rules}
     best.insert(1, "constant or function", [told[name].implementation for name in best.rule])

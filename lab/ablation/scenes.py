@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -126,6 +126,14 @@ def press(
     return Press(states=states, points=points, forces=forces, indenter=indenter)
 
 
+class Settled(NamedTuple):
+    """Unknowns of a jaw in equilibrium (size,), force on it (3,) [N], and traction."""
+
+    q: NDArray
+    force: NDArray
+    traction: Traction
+
+
 def settle(
     contact: RigidContact,
     q: NDArray,
@@ -134,8 +142,8 @@ def settle(
     along: float | None = None,
     *,
     tolerance: float = _SETTLED,
-) -> tuple[NDArray, NDArray, Traction]:
-    """Return unknowns (size,), force (3,) [N] and traction in equilibrium with an object in a state (3,)."""
+) -> Settled:
+    """Return the equilibrium of a jaw with an object in a state (3,)."""
     for _ in range(_ITERATIONS):
         pressed = contact.linearize(q, x, traction)
         if not pressed.touches:
@@ -147,7 +155,7 @@ def settle(
             traction = constant_traction(traction.ratio + min(max(change, -0.2), 0.2))
         if pressed.size < tolerance and abs(change) < tolerance:
             break
-    return q, pressed.force, traction
+    return Settled(q, pressed.force, traction)
 
 
 def tell_height(bench: Bench, pressed: Press, error: float = 0.0) -> list[Contact]:

@@ -235,7 +235,7 @@ class FingerScenes:
         side_y = float(finger.half_width(finger.keypoints[:, 1]).mean())
         held = self._held > 0.0 and bool(rng.random() < self._held)
         camera, centre = self._draw_camera(grid, side_y, held=held)
-        bodies, look, R = self._build(section, side_y, held=held)
+        bodies, (look, R) = self._build(section, side_y, held=held)
         moved = [replace(body, vertices=(body.vertices - centre) @ R_CAMERA_JAW.T) for body in bodies]
         scene = RenderedScene(moved, look, R, R_CAMERA_JAW @ -centre)
         color = expose(scene.render(camera).color, look.exposure, rng)
@@ -274,10 +274,10 @@ class FingerScenes:
         camera = CameraIntrinsics(width=grid.width, height=grid.height, fx=f, fy=f, cx=float(at[0]), cy=float(at[1]))
         return camera, centre
 
-    def _build(self, section: NDArray, side_y: float, *, held: bool) -> tuple[list[Body], Lighting, NDArray]:
+    def _build(self, section: NDArray, side_y: float, *, held: bool) -> tuple[list[Body], tuple[Lighting, NDArray]]:
         """Return the bodies of a scene in the jaw frame, its look, and the rotation of the look's directions."""
         rng = self._rng
-        look, R = self._light(side_y, held=held)
+        light = self._light(side_y, held=held)
         paint = _draw_finger_paint(rng, steel=self._finger.has_hinges)
         jaw, holder = self._mount(section, paint)
         bodies = [jaw, holder]
@@ -298,7 +298,7 @@ class FingerScenes:
             bodies += [_mirror(body, middle) for body in bodies[:mirrored]]
         if rng.random() < BARS:
             bodies.append(self._bar(side_y, self._solid.section.min(axis=0), self._solid.section.max(axis=0)))
-        return bodies, look, R
+        return bodies, light
 
     def _light(self, side_y: float, *, held: bool) -> tuple[Lighting, NDArray]:
         """Return lights and background, and the rotation of their directions."""

@@ -185,9 +185,9 @@ def recognize(
     turned, frame = _turn_upright(polygon, overrides, notes)
     bolts, cells = _split_holes(turned)
     bolts, cells = _fit_bolts(bolts), _drop_windows(turned, cells, notes)
-    inner, outer, ribs = _measure_walls(turned, cells)
-    slope, edge = _find_floor(turned, (inner, outer))
-    clamped_z, circles = _propose_clamp(cells, bolts, (inner, outer), (slope, edge), overrides, notes)
+    walls, ribs = _measure_walls(turned, cells)
+    slope, edge = _find_floor(turned, walls)
+    clamped_z, circles = _propose_clamp(cells, bolts, walls, (slope, edge), overrides, notes)
     if base is not None:
         heights = (shapely.get_coordinates(base) @ frame[:, :2].T + frame[:, 2]) @ [-slope, 1.0]
         floor = min(float((cell @ [-slope, 1.0]).min()) for cell in cells)
@@ -199,8 +199,8 @@ def recognize(
         width=width - float(taper @ frame[:, 2]),
         taper=taper,
         bolts=bolts,
-        inner=inner,
-        outer=outer,
+        inner=walls[0],
+        outer=walls[1],
         ribs=ribs,
         clamped_z=clamped_z,
         clamp_slope=slope,
@@ -599,7 +599,7 @@ def _measure_face(
     return float(reach.max()), deviation  # the place that is farthest in front
 
 
-def _measure_walls(polygon: shapely.Polygon, cells: list[NDArray]) -> tuple[Wall, Wall, list[RecognizedRib]]:
+def _measure_walls(polygon: shapely.Polygon, cells: list[NDArray]) -> tuple[tuple[Wall, Wall], list[RecognizedRib]]:
     """Return inner band, outer band and ribs: what lies between the cells and around them.
 
     From places along the sides of each cell a ray goes straight into the material. What it meets says which wall it
@@ -621,7 +621,7 @@ def _measure_walls(polygon: shapely.Polygon, cells: list[NDArray]) -> tuple[Wall
             bands["outer"].append(found)
     inner, outer = (_string_up(np.array(bands[name]).reshape(-1, 3), name) for name in ("inner", "outer"))
     walls = {pair: np.array(found) for pair, found in between.items() if len(found) >= _FEWEST}
-    return inner, outer, [_string_rib(walls[pair], inner, outer) for pair in _find_ribs(walls, polygon, cells)]
+    return (inner, outer), [_string_rib(walls[pair], inner, outer) for pair in _find_ribs(walls, polygon, cells)]
 
 
 def _find_ribs(
