@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from finforce.camera import CameraIntrinsics, project
 from finforce.gripper_frames import OpeningRange, jaw_in_camera
 from finforce_keypoints.geometry.side_picture import find_side
-from finforce_keypoints.placement import LEAST_FOUND, LEAST_GUESSED, OutlineContrast, find_points
+from finforce_keypoints.placement import LEAST_CONTRAST, OutlineContrast, find_points
 
 if TYPE_CHECKING:
     from finforce_ifea.jaw.jaw import Jaw
@@ -35,6 +35,7 @@ FLIPS = {
     (1, -1): "the pictures are mirrored from top to bottom: give them as the camera of the rig took its own",
 }
 SURE = 0.7  # likelihood of points in pictures that show the jaws
+PLAIN = 0.75  # contrast of the outlines of such jaws
 FLIPPED = 0.2  # of likelihood and contrast that turning over wins: networks dream, outlines look like something else
 ZOOMS = 1.1 ** np.arange(-6.0, 7.0)  # tried; outlines are found from half as far away
 STEP, SEARCH = 4e-3, 8e-3  # [m] between the openings tried, likewise, by outlines and by key points
@@ -171,7 +172,7 @@ class PictureChanges:
     def explain(self, colors: Sequence[NDArray]) -> str:
         """Return what was done to pictures (h, w, 3) of one video, and what to do; "" where it is nothing known."""
         near = [self.find_near(color) for color in colors]
-        is_plain = all(each.likelihood >= SURE and each.contrast >= LEAST_FOUND for each in near)
+        is_plain = all(each.likelihood >= SURE and each.contrast >= PLAIN for each in near)
         if is_plain and not describe_changes(near, self._camera.width):
             return ""
         flip, best, known, ends = (1, 1), -np.inf, near, {}
@@ -187,7 +188,7 @@ class PictureChanges:
         if len(changes) < max(min(FEWEST, len(colors)), FEWEST_SHARE * len(colors)):
             shown = np.median([self._scan(color, (1.0,))[0] for color in colors])
             hidden = "nothing of such jaws shows where the rig has them: hidden, out of the picture, or another rig?"
-            return hidden if shown < LEAST_GUESSED else ""
+            return hidden if shown < LEAST_CONTRAST else ""
         return FLIPS[flip] or describe_changes(changes, self._camera.width)
 
     def _find_points(self, color: NDArray, x: NDArray) -> tuple[NDArray, NDArray]:

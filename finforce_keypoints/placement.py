@@ -1,23 +1,24 @@
 """Pose of a camera and mounting of jaws, from a few pictures of open, unloaded jaws and no guess.
 
 A network that is shown the wrong place finds a finger there, too. What a picture shows of the finger's outline does not
-depend on it: by how much colours tell the inside of the drawn outline from what surrounds it. The outline finds the
-camera; the network's key points then say how each jaw is turned, where it stands in each picture, and which of its
-points are never seen. Neither tells one rib from the next: the pattern of the ribs moves what was found along the
-fingers, and of all places the one is taken that this pattern and the tips make likeliest.
+depend on it: by how much colours tell the inside of the drawn outline from what surrounds it. The outlines of many
+random cameras say which of them are worth a look; the network's key points and the pattern of the ribs pull each of
+these to the jaws of one picture, and where the points are likeliest all pictures are taken: they say how each jaw is
+turned, where it stands in each picture, and which of its points are never seen. Neither outline nor points tell one rib
+from the next: the pattern of the ribs moves what was found along the fingers, and of all places the one is taken that
+this pattern and the tips make likeliest.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares, minimize
-from scipy.spatial.transform import Rotation
 
 from finforce.camera import CameraIntrinsics, project
 from finforce.gripper_frames import SIDES, jaw_in_camera, look_at
@@ -58,12 +59,10 @@ BEYOND = 0.3  # share of the compared pixels outside the image, from which on no
 WHOLE = 0  # the edge beyond which there is nothing
 # Where wrist cameras are, in the gripper: y, z [m], tilt down [rad], half opening of the jaws [m].
 LOW, HIGH = np.array([0.04, -0.15, -0.2, 0.015]), np.array([0.18, 0.05, 0.9, 0.08])
-STARTS, KEPT, STEPS = 3000, 4, 300  # places that are tried; improved, whole and up to an edge; and in how many steps
-POLISHED, POLISH = 2, 15  # of each of these, places whose jaws are turned, too, and in how many steps
-SIMPLEX = np.array([0.008, 0.008, 0.05, 0.008, 0.006, 0.02, 0.05])  # [m, m, rad, m, m, rad, rad]
-# Least contrast of outlines that are there, in the mean; a part of them taken for held, the best of thousands of places
-# explains pictures of no jaw better. With a guess, a grey finger before a textured ground shows with 0.44.
-LEAST_FOUND, LEAST_GUESSED = 0.75, 0.3
+STARTS, PULLED, KEPT = 3000, 16, 2  # places that are tried; pulled to the jaws of one picture; and to those of all
+POLISH = 15  # steps in which outlines move a guess
+# Least contrast of outlines that are there, in the mean: a grey finger before a textured ground shows with 0.44.
+LEAST_CONTRAST = 0.3
 ALIKE = 8.0  # independent points that all the points of a jaw in a picture are worth: what they err by is shared
 PIXEL = 1.0  # [px] standard deviation of one of those
 # How far outlines may be off the camera's place: three in m, three in rad; and how far jaws are mounted askew [rad].
@@ -79,16 +78,17 @@ HIDDEN = 0.1  # likelihood of a point that is never seen, wherever it lies
 LEAST_SEEN = 8  # key points of a jaw
 # Likelihood that a rig makes of that of a typical point: a network is less sure of small and of unusual fingers.
 TYPICAL, LEAST_TYPICAL, MOST_ODDS = 0.75, 0.15, 17.0
-# [px] Root mean square of points seen off their places, over their likelihood: 0.9 to 2.6 of real fingers in holders,
+# [px] Typical distance of points seen from their places, over their likelihood: 0.9 to 2.6 of real fingers in holders,
 # 3.1 and more of other fingers, of these one rib off, and of pictures without any.
 MOST_LEFT = 2.8
-RIB_ROUNDS = 4  # of laying the jaws on their ribs
+RMS_OF_MEDIAN = 1.2  # root mean square over median of the length of normal errors in a plane: 1 / sqrt(ln 2)
+RIB_ROUNDS, RIB_ROUNDS_PULLED = 4, 2  # of laying the jaws on their ribs, in all pictures and in one
 # Key points are found with the place found before, in rounds until nothing changes by more than a share of its scale.
 # As long as ribs speak against the place found, jaws are laid on ribs that are so far off before [pitches].
 FARTHEST = (None, np.inf, HERE)
-MOST_ROUNDS, SETTLED = 12, 0.05
+MOST_ROUNDS, ROUNDS_PULLED, SETTLED = 12, 3, 0.05
 # How far aside a jaw is looked for [m], and by how much likelier its points have to be there.
-ASIDE, LIKELIER = 4e-3 * np.arange(-4.0, 5.0), 0.1
+ASIDE, LIKELIER = 4e-3 * np.arange(-6.0, 7.0), 0.1
 ROUNDS = len(FARTHEST)
 OUTER_WEIGHT = 0.25  # of points off the face: how ribs slant differs more between fingers than where they meet the face
 
@@ -102,7 +102,7 @@ class CameraPlacement:
         mounts: side -> turn, covered points, and how sure its place is.
         origins: side -> place of the jaw's origin on the closing axis in each picture (n,) [m].
         contrast: of the outlines, 0 to 1.
-        residual: root mean square distance of the points seen from where they should be [px].
+        residual: typical distance of the points seen from where they should be [px].
         strain: sum of squares of what camera and mounts are off their expected places [standard deviations].
         seen: side -> pixels of the points in each picture (n, K + 1, 2), NaN where one was not seen.
         ribs: side -> where the ribs may be.
@@ -195,59 +195,38 @@ def place_camera(x: NDArray, right: float) -> NDArray:
     """Return T_gripper_camera (4, 4) of a wrist camera.
 
     Args:
-        x: y, z [m], tilt down [rad], half opening (not used); perhaps x [m], turn to the side and about its axis [rad].
+        x: y, z [m], tilt down [rad], half opening (not used).
         right: direction of the image's rows along the gripper's x, 1 or -1.
     """
-    y, z, tilt, _, aside, turned, rolled = np.pad(x, (0, 7 - len(x)))
-    ahead = np.array([np.sin(turned), -np.sin(tilt), np.cos(tilt)])
-    T = look_at((aside, y, z), np.array([aside, y, z]) + ahead, (right, 0.0, 0.0))
-    T[:3, :3] = T[:3, :3] @ Rotation.from_rotvec([0.0, 0.0, rolled]).as_matrix()
-    return T
+    y, z, tilt, _ = x
+    return look_at((0.0, y, z), (0.0, y - np.sin(tilt), z + np.cos(tilt)), (right, 0.0, 0.0))
 
 
 def search_camera(
-    images: Sequence[NDArray], camera: CameraIntrinsics, jaws: Mapping[str, Jaw], progress: Callable[[int], Any]
-) -> list[tuple[NDArray, float, int | None]]:
-    """Return T_gripper_camera (4, 4), half the distance of the jaws' origins [m] and the edge where outlines show.
+    image: NDArray, camera: CameraIntrinsics, jaws: Mapping[str, Jaw], progress: Callable[[int], Any]
+) -> list[tuple[NDArray, float]]:
+    """Return the T_gripper_camera (4, 4) and half openings of the jaws [m] with which outlines show best.
 
     Args:
-        images: (h, w, 3) uint8 RGB.
+        image: (h, w, 3) uint8 RGB.
         camera: intrinsics.
         jaws: by side.
         progress: called with the number of places tried since its last call.
     """
     outlines = {side: OutlineContrast(jaw) for side, jaw in jaws.items()}
-
-    def compare(x: NDArray, right: float, colors: Sequence[NDArray], edge: int | None = None) -> NDArray:
-        T = place_camera(x, right)
-        poses = {side: jaw_in_camera(T, side, _origin(side, x[3])) for side in jaws}
-        shown = [
-            outlines[side].contrasts(color, pose, camera, edge) for side, pose in poses.items() for color in colors
-        ]
-        return np.mean(shown, axis=0)
-
     rng, tried = np.random.default_rng(0), []
     for number in range(STARTS):
-        x, right = rng.uniform(LOW, HIGH), -1.0 if number % 2 else 1.0
-        tried.append((compare(x, right, images[:1]), right, x))
+        x = rng.uniform(LOW, HIGH)
+        T = place_camera(x, -1.0 if number % 2 else 1.0)
+        poses = {side: jaw_in_camera(T, side, _origin(side, x[3])) for side in jaws}
+        shown = [outlines[side].contrasts(image, pose, camera) for side, pose in poses.items()]
+        tried.append((np.mean(shown, axis=0), T, float(x[3])))
         progress(1)
-    starts = []
-    for edge in (WHOLE, None):  # a holder that is not there explains much where something else stands
-        best = []
-        tried.sort(key=lambda each, edge=edge: each[0].max() if edge is None else each[0][edge], reverse=True)
-        for _, right, start in tried[:KEPT]:
-            begin = np.r_[start, 0.0, 0.0, 0.0]
-            fit = minimize(
-                lambda x, right=right, edge=edge: -compare(x, right, images, edge).max(),
-                begin,
-                method="Nelder-Mead",
-                options={"maxfev": STEPS, "initial_simplex": np.vstack((begin, begin + np.diag(SIMPLEX)))},
-            )
-            best.append((fit.fun, right, fit.x))
-            progress(STEPS)
-        best.sort(key=lambda each: each[0])
-        starts += [(place_camera(x, right), float(x[3]), edge) for _, right, x in best[:POLISHED]]
-    return starts
+    # a holder that is not there explains much where something else stands
+    whole = sorted(tried, key=lambda each: each[0][WHOLE], reverse=True)[: PULLED // 2]
+    held = sorted(tried, key=lambda each: each[0].max(), reverse=True)
+    chosen = whole + [each for each in held[:PULLED] if not any(each is other for other in whole)]
+    return [(T, half) for _, T, half in chosen[:PULLED]]
 
 
 def _origin(side: str, half: float) -> float:
@@ -279,26 +258,31 @@ def find_placement(
     Raises:
         GeometryError: there are no such jaws in the pictures.
     """
-    stated = None if opening is None else 0.5 * opening + next(iter(jaws.values())).inner_face_x
-    half = stated or HALF_OPENING
-    starts = [(guess, half, WHOLE)] if guess is not None else search_camera(images, camera, jaws, progress)
-    known = None if guess is None else guess_stddev
-    fits = [_Refinement(images, camera, jaws, locator, T, begin, known, stated) for T, begin, _ in starts]
-    for fit, (*_, edge) in zip(fits, starts, strict=True):
-        fit.polish(edge)
-    found = _try_fits(fits, images, camera, jaws, progress)
+    half = None if opening is None else 0.5 * opening + next(iter(jaws.values())).inner_face_x
+    task = _Task(images=images, camera=camera, jaws=jaws, locator=locator, half_opening=half)
+    if guess is None:
+        fits = _pull_starts(task, progress)
+    else:
+        fits = [_Refinement(task, guess, half or HALF_OPENING, guess_stddev)]
+        fits[0].polish()
+    found = _try_fits(fits, task, progress)
     best = max(found, key=lambda each: each.evidence)
     stddev = {side: _widen_stddev(best, found, side, jaw) for side, jaw in jaws.items()}
     return replace(best, mounts={side: replace(mount, stddev=stddev[side]) for side, mount in best.mounts.items()})
 
 
-def _try_fits(
-    fits: Sequence[_Refinement],
-    images: Sequence[NDArray],
-    camera: CameraIntrinsics,
-    jaws: Mapping[str, Jaw],
-    progress: Callable[[int], Any],
-) -> list[CameraPlacement]:
+def _pull_starts(task: _Task, progress: Callable[[int], Any]) -> list[_Refinement]:
+    """Return the likeliest of the places to which the first picture pulls random ones, in all pictures."""
+    one, pulled = replace(task, images=task.images[:1], half_opening=None), []
+    for T, half in search_camera(task.images[0], task.camera, task.jaws, progress):
+        fit = _Refinement(one, T, half, OUTLINE_STDDEV)
+        pulled.append((fit.pull(), fit))
+        progress(STARTS // PULLED)
+    pulled.sort(key=lambda each: each[0], reverse=True)
+    return [fit.widen(task) for _, fit in pulled[:KEPT]]
+
+
+def _try_fits(fits: Sequence[_Refinement], task: _Task, progress: Callable[[int], Any]) -> list[CameraPlacement]:
     """Return the places to which fits lead; on ribs farther off only while ribs speak against the best.
 
     Raises:
@@ -308,17 +292,18 @@ def _try_fits(
     failures: dict[float, GeometryError] = {}
     for farthest in FARTHEST:
         for fit in fits:
-            for step in (fit.settle,) if farthest is None else (partial(fit.follow_ribs, farthest), fit.settle):
+            first = fit.look_aside if farthest is None else partial(fit.follow_ribs, farthest)
+            for step in (first, fit.settle):
                 step()
                 try:
-                    place = _add_ribs(fit.describe(), images, camera, jaws)
+                    place = _add_ribs(fit.describe(), task)
                 except GeometryError as error:
                     failures[fit.likeliest] = error
                 else:
                     found.append(place)
                     fit.keep(place.evidence)
             fit.go_back()
-            progress(len(images))
+            progress(len(task.images))
         if found and not describe_ribs(max(found, key=lambda each: each.evidence).ribs):
             break
     if not found:
@@ -353,12 +338,10 @@ def _widen_stddev(best: CameraPlacement, found: Sequence[CameraPlacement], side:
     return tuple(np.sqrt(variance).tolist())
 
 
-def _add_ribs(
-    found: CameraPlacement, images: Sequence[NDArray], camera: CameraIntrinsics, jaws: Mapping[str, Jaw]
-) -> CameraPlacement:
+def _add_ribs(found: CameraPlacement, task: _Task) -> CameraPlacement:
     """Return a placement with where its ribs may be."""
-    poses = {side: [found.pose(side, number) for number in range(len(images))] for side in jaws}
-    return replace(found, ribs=compare_ribs({s: RibPattern(jaw) for s, jaw in jaws.items()}, images, poses, camera))
+    poses = {side: [found.pose(side, number) for number in range(len(task.images))] for side in task.jaws}
+    return replace(found, ribs=compare_ribs(task.patterns, task.images, poses, task.camera))
 
 
 def find_points(
@@ -415,30 +398,49 @@ class _Setup(NamedTuple):
     origins: dict[str, NDArray]
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Task:
+    """What is looked for, and in which pictures; see `find_placement`.
+
+    Attributes:
+        half_opening: half the distance of the jaws' origins where they are widest open [m]; None: not known.
+    """
+
+    images: Sequence[NDArray]
+    camera: CameraIntrinsics
+    jaws: Mapping[str, Jaw]
+    locator: AnyFinger
+    half_opening: float | None
+
+    @cached_property
+    def points(self) -> dict[str, NDArray]:
+        """Key points and reference point of each jaw (K + 1, 3) [m]."""
+        return {side: np.vstack((jaw.keypoints, jaw.reference_point)) for side, jaw in self.jaws.items()}
+
+    @cached_property
+    def planes(self) -> dict[str, SidePlane]:
+        """Side of each jaw."""
+        return {side: find_side(jaw) for side, jaw in self.jaws.items()}
+
+    @cached_property
+    def outlines(self) -> dict[str, OutlineContrast]:
+        """Outline of each jaw."""
+        return {side: OutlineContrast(jaw, FINER) for side, jaw in self.jaws.items()}
+
+    @cached_property
+    def patterns(self) -> dict[str, RibPattern]:
+        """Ribs of each jaw."""
+        return {side: RibPattern(jaw) for side, jaw in self.jaws.items()}
+
+
 class _Refinement:
     """Camera, turns and origins by least squares over the pixels that a network finds, again and again."""
 
-    def __init__(
-        self,
-        images: Sequence[NDArray],
-        camera: CameraIntrinsics,
-        jaws: Mapping[str, Jaw],
-        locator: AnyFinger,
-        T: NDArray,
-        half: float,
-        guess_stddev: NDArray | None,
-        half_opening: float | None,
-    ) -> None:
-        self._least_contrast = LEAST_FOUND if guess_stddev is None else LEAST_GUESSED
-        self._is_guess, self._half = guess_stddev is not None, half_opening
-        self._stddev = OUTLINE_STDDEV if guess_stddev is None else guess_stddev
-        self._images, self._camera, self._jaws, self._locator = images, camera, jaws, locator
-        self._points = {side: np.vstack((jaw.keypoints, jaw.reference_point)) for side, jaw in jaws.items()}
-        self._planes = {side: find_side(jaw) for side, jaw in jaws.items()}
-        self._outlines = {side: OutlineContrast(jaw, FINER) for side, jaw in jaws.items()}
-        self._patterns = {side: RibPattern(jaw) for side, jaw in jaws.items()}
-        self._start, count, sides = T, len(images), len(jaws)
-        origins = [np.full(count, _origin(side, half)) for side in jaws]
+    def __init__(self, task: _Task, T: NDArray, half: float, stddev: NDArray) -> None:
+        """Begin with T_gripper_camera (4, 4) of standard deviations (6,), and half an opening [m]."""
+        self._task, self._start, self._stddev = task, T, stddev
+        count, sides = len(task.images), len(task.jaws)
+        origins = [np.full(count, _origin(side, half)) for side in task.jaws]
         # step of the camera, turns of the jaws, origins by jaw and picture
         self._x = np.concatenate((np.zeros(6 + 3 * sides), *origins))
         self._scale = np.full(len(self._x), 5e-3)  # [m]
@@ -446,13 +448,23 @@ class _Refinement:
         self._best = (-1.0, self._x)
         self._kept = (-np.inf, self._x)
 
+    def widen(self, task: _Task) -> _Refinement:
+        """Return the same for other pictures, in which jaws stand as in the first of these."""
+        T, turns, origins = self._split(self._x)
+        wider = _Refinement(task, T, 0.0, self._stddev)
+        places = [np.full(len(task.images), each[0]) for each in origins.values()]
+        wider._x = np.concatenate((np.zeros(6), *turns.values(), *places))
+        wider._best = wider._kept = (-np.inf, wider._x)
+        return wider
+
     def _split(self, x: NDArray) -> _Setup:
         """Return what the unknowns say of camera and jaws."""
-        sides, count = len(self._jaws), len(self._images)
-        turns = dict(zip(self._jaws, x[6 : 6 + 3 * sides].reshape(sides, 3), strict=True))
-        origins = dict(zip(self._jaws, x[6 + 3 * sides :].reshape(sides, count), strict=True))
-        if self._half is not None and len(origins) == len(SIDES):
-            wider = 0.5 * np.max(origins["right"] - origins["left"]) - self._half
+        sides, count = len(self._task.jaws), len(self._task.images)
+        turns = dict(zip(self._task.jaws, x[6 : 6 + 3 * sides].reshape(sides, 3), strict=True))
+        origins = dict(zip(self._task.jaws, x[6 + 3 * sides :].reshape(sides, count), strict=True))
+        half = self._task.half_opening
+        if half is not None and len(origins) == len(SIDES):
+            wider = 0.5 * np.max(origins["right"] - origins["left"]) - half
             origins = {"left": origins["left"] + wider, "right": origins["right"] - wider}
         return _Setup(move_pose(self._start, x[:6]), turns, origins)
 
@@ -461,9 +473,9 @@ class _Refinement:
         T, turns, origins = self._split(self._x if x is None else x)
         each = np.mean(
             [
-                self._outlines[side].contrasts(color, jaw_in_camera(T, side, place, turns[side]), self._camera, edge)
-                for side in self._jaws
-                for color, place in zip(self._images, origins[side], strict=True)
+                outline.contrasts(color, jaw_in_camera(T, side, place, turns[side]), self._task.camera, edge)
+                for side, outline in self._task.outlines.items()
+                for color, place in zip(self._task.images, origins[side], strict=True)
             ],
             axis=0,
         )
@@ -471,44 +483,55 @@ class _Refinement:
             self._edge = int(np.argmax(each))
         return float(each.max())
 
-    def polish(self, edge: int | None = None) -> None:
-        """Move camera and jaws until outlines show best up to an edge; None: up to the best."""
-        if edge is None:
-            self.contrast()
-            edge = self._edge
-
-        known = np.concatenate((self._stddev, np.full(3 * len(self._jaws), TURN_STDDEV)))
+    def polish(self) -> None:
+        """Move camera and jaws until outlines show best."""
+        known = np.concatenate((self._stddev, np.full(3 * len(self._task.jaws), TURN_STDDEV)))
 
         def judge(x: NDArray) -> float:
             away = x[: len(known)] * self._scale[: len(known)] / known
-            return 0.01 * float(away @ away) - self.contrast(x * self._scale, edge)
+            return 0.01 * float(away @ away) - self.contrast(x * self._scale, WHOLE)
 
         fit = minimize(judge, self._x / self._scale, method="L-BFGS-B", options={"maxiter": POLISH, "eps": 0.02})
         self._x = fit.x * self._scale
-        if not self._is_guess:
-            self._start = self._split(self._x).T
-            self._x[:6] = 0.0
+
+    def pull(self) -> float:
+        """Move camera and jaws to the points and ribs near by; return the logarithm of how likely these are."""
+        self.look_aside()
+        self.settle(ROUNDS_PULLED)
+        self.keep(self._weigh())
+        self.follow_ribs(np.inf, RIB_ROUNDS_PULLED)
+        self.settle(ROUNDS_PULLED)
+        self.keep(self._weigh())
+        self.go_back()
+        return self._kept[0]
+
+    def _weigh(self) -> float:
+        """Return the logarithm of how likely points, camera and mounts are."""
+        strain = np.square(np.concatenate(self._strains(self._x[:6], self._split(self._x).turns))).sum()
+        count = ALIKE * len(self._task.images)
+        return float(count * sum(np.log(max(each.mean(), 1e-9)) for each in self._likelihood.values()) - 0.5 * strain)
 
     def _look(self) -> None:
         """Find the points of every jaw in every picture."""
         self._seen, self._likelihood = {}, {}
-        for side in self._jaws:
+        for side in self._task.jaws:
             self._seen[side], self._likelihood[side] = self._find(side)
 
     def _find(self, side: str, aside: float = 0.0) -> tuple[NDArray, NDArray]:
         """Return pixels and likelihoods of a jaw's points, see `find_points`, looked for so far aside [m]."""
         T, turns, origins = self._split(self._x)
         poses = [jaw_in_camera(T, side, x + aside, turns[side]) for x in origins[side]]
-        seen, likelihood = find_points(self._images, self._camera, self._locator, side, self._planes[side], poses)
+        task = self._task
+        seen, likelihood = find_points(task.images, task.camera, task.locator, side, task.planes[side], poses)
         inside = np.isfinite(seen).all(axis=2)
         inside &= (seen >= 0.0).all(axis=2)
-        inside &= (seen < (self._camera.width, self._camera.height)).all(axis=2)
+        inside &= (seen < (task.camera.width, task.camera.height)).all(axis=2)
         return seen, np.where(inside, likelihood, 0.0)
 
     def look_aside(self) -> None:
         """Move jaws along the closing axis to where in a picture their points are much likelier."""
-        moved = self._x[6 + 3 * len(self._jaws) :].reshape(len(self._jaws), -1)
-        for origins, side in zip(moved, self._jaws, strict=True):
+        moved = self._x[6 + 3 * len(self._task.jaws) :].reshape(len(self._task.jaws), -1)
+        for origins, side in zip(moved, self._task.jaws, strict=True):
             likelihood = np.array([self._find(side, aside)[1].mean(axis=1) for aside in ASIDE])
             is_likelier = likelihood.max(axis=0) > likelihood[len(ASIDE) // 2] + LIKELIER
             origins += np.where(is_likelier, ASIDE[likelihood.argmax(axis=0)], 0.0)
@@ -517,7 +540,7 @@ class _Refinement:
         """Return what is off, in standard deviations."""
         T, turns, origins = self._split(x)
         parts = self._strains(x[:6], turns)
-        for side in self._jaws:
+        for side in self._task.jaws:
             away = self._away(side, T, turns[side], origins[side])
             share = np.minimum(1.0, ALIKE / np.maximum(self._likelihood[side].sum(axis=1), 1e-9))
             weight = np.sqrt(self._likelihood[side] * share[:, None])
@@ -537,13 +560,12 @@ class _Refinement:
         away = []
         for x, seen in zip(origins, self._seen[side], strict=True):
             pose = jaw_in_camera(T, side, x, turn)
-            away.append(seen - project(self._points[side] @ pose[:3, :3].T + pose[:3, 3], self._camera))
+            away.append(seen - project(self._task.points[side] @ pose[:3, :3].T + pose[:3, 3], self._task.camera))
         return np.nan_to_num(np.array(away))
 
-    def settle(self) -> None:
+    def settle(self, rounds: int = MOST_ROUNDS) -> None:
         """Find the points, and with them camera, turns and origins, until these hardly change."""
-        self.look_aside()
-        for _ in range(MOST_ROUNDS):
+        for _ in range(rounds):
             before = self._x
             self.improve()
             if np.abs((self._x - before) / self._scale).max() < SETTLED:
@@ -555,23 +577,23 @@ class _Refinement:
         self._keep_best()
         self._x = least_squares(self._misses, self._x, x_scale=self._scale).x
 
-    def follow_ribs(self, farthest: float) -> None:
+    def follow_ribs(self, farthest: float, rounds: int = RIB_ROUNDS) -> None:
         """Move camera, turns and origins to where ribs and tips are likeliest, so far off at most [pitches]."""
-        for _ in range(RIB_ROUNDS):
+        for _ in range(rounds):
             T, turns, origins = self._split(self._x)
-            poses = {side: [jaw_in_camera(T, side, x, turns[side]) for x in origins[side]] for side in self._jaws}
-            found = find_places(self._patterns, self._images, poses, self._camera)
+            poses = {side: [jaw_in_camera(T, side, x, turns[side]) for x in origins[side]] for side in self._task.jaws}
+            found = find_places(self._task.patterns, self._task.images, poses, self._task.camera)
             self._seen, self._likelihood = {}, {}
-            for side, jaw in self._jaws.items():
+            for side, jaw in self._task.jaws.items():
                 places = found[side]
                 near = [each for each in places if each.distance < farthest] or places
                 if not near:
                     return
-                warps = max(near, key=lambda each: each.evidence).warps
-                points = self._points[side][:, ::2]
+                warps, plane = max(near, key=lambda each: each.evidence).warps, self._task.planes[side]
+                points = self._task.points[side][:, ::2]
                 self._seen[side] = np.array(
                     [
-                        project_plane(points @ warp[:, :2].T + warp[:, 2], self._planes[side], pose, self._camera)
+                        project_plane(points @ warp[:, :2].T + warp[:, 2], plane, pose, self._task.camera)
                         for warp, pose in zip(warps, poses[side], strict=True)
                     ]
                 )
@@ -612,27 +634,28 @@ class _Refinement:
         self._x = self._best[1]
         self._look()
         (T, turns, origins), contrast = self._split(self._x), self.contrast()
-        first = next(iter(self._jaws))
+        first = next(iter(self._task.jaws))
         usual = np.array([np.median(each, axis=0) for each in self._likelihood.values()]).mean(axis=0)
         # a typical point is one that neither the edge of a holder nor that of the image covers
-        _, across, edge = next(iter(self._outlines.values())).edges[self._edge]
-        there = usual[(self._points[first][:, ::2] @ across > edge) & (usual > 0.0)]
+        _, across, edge = next(iter(self._task.outlines.values())).edges[self._edge]
+        there = usual[(self._task.points[first][:, ::2] @ across > edge) & (usual > 0.0)]
         typical = float(np.clip(np.median(there), 1e-6, TYPICAL)) if there.size else 1e-6
         mount = JawMount(odds=float(np.clip(TYPICAL / (1.0 - TYPICAL) * (1.0 - typical) / typical, 1.0, MOST_ODDS)))
-        visible = ~find_covered(mount.believe(usual), self._points[first][:, ::2])
+        visible = ~find_covered(mount.believe(usual), self._task.points[first][:, ::2])
         sure = {s: visible & (mount.believe(each) >= 0.5) for s, each in self._likelihood.items()}
-        away = np.concatenate([self._away(s, T, turns[s], origins[s])[sure[s]] for s in self._jaws])
-        residual = float(np.sqrt((away**2).sum() / max(len(away), 1)))
+        away = np.concatenate([self._away(s, T, turns[s], origins[s])[sure[s]] for s in self._task.jaws])
+        # root mean square of normal errors with the median of these: a few points that are far off do not count
+        residual = float(RMS_OF_MEDIAN * np.median(np.linalg.norm(away, axis=1))) if len(away) else 0.0
         count, most = int(visible[:-1].sum()), MOST_LEFT * typical
-        if count < LEAST_SEEN or typical < LEAST_TYPICAL or contrast < self._least_contrast or residual > most:
+        if count < LEAST_SEEN or typical < LEAST_TYPICAL or contrast < LEAST_CONTRAST or residual > most:
             raise GeometryError(
-                f"the images do not show the finger '{self._jaws[first].name}': make the jaw file of another one with "
-                "finforce jaw PHOTO or STL; else check --lens, that the image is not mirrored and that jaws are in "
-                "view, open and unloaded in all images (--images), or give --extrinsics where jaws look like their "
-                f"background (contrast {contrast:.2f} of {self._least_contrast:g}, {count} of {LEAST_SEEN} key points, "
+                f"the images do not show the finger '{self._task.jaws[first].name}': make the jaw file of another one "
+                "with finforce jaw PHOTO or STL; else check --lens, that the image is not mirrored and that jaws are "
+                "in view, open and unloaded in all images (--images), or give --extrinsics where jaws look like their "
+                f"background (contrast {contrast:.2f} of {LEAST_CONTRAST:g}, {count} of {LEAST_SEEN} key points, "
                 f"likelihood {typical:.2f} of {LEAST_TYPICAL:g}, {residual:.1f} px off of {most:.1f})"
             )
-        names = np.array([*self._jaws[first].keypoint_names, REFERENCE])
+        names = np.array([*self._task.jaws[first].keypoint_names, REFERENCE])
         covered = frozenset(names[~visible].tolist())
         return CameraPlacement(
             T_gripper_camera=T,
@@ -654,7 +677,7 @@ class _Refinement:
         told = sizes > 1e-9 * sizes[0]
         # one standard deviation in each of the independent directions
         steps, stddev = directions[told] / sizes[told, None], {}
-        for side, jaw in self._jaws.items():
+        for side, jaw in self._task.jaws.items():
             T = self._pose(side, self._x)
             away = [compare_poses(jaw, T, self._pose(side, self._x + step)) for step in steps]
             stddev[side] = tuple(np.sqrt(np.square(away).sum(axis=0)).tolist())

@@ -33,14 +33,12 @@ from finforce_keypoints.build import ANY_FINGER
 from finforce_keypoints.detectors.side_plane import AnyFinger
 from finforce_keypoints.errors import GeometryError
 from finforce_keypoints.networks.side_network import SideNetwork
-from finforce_keypoints.parameters import LARGEST_TURN, NO_DEPTH, REFERENCE, JawMount
+from finforce_keypoints.parameters import NO_DEPTH, REFERENCE, JawMount
 from finforce_keypoints.placement import (
     KEPT,
     LEAST_SEEN,
-    POLISHED,
     ROUNDS,
     STARTS,
-    STEPS,
     TURN_STDDEV,
     CameraPlacement,
     find_placement,
@@ -49,6 +47,7 @@ from finforce_keypoints.rib_check import describe_ribs
 from finforce_keypoints.tags import FAMILIES, TagFinder, find_tag
 
 PICTURES = 4  # of the images, which are compared
+MOST_TURNED = np.sqrt(11.3) * TURN_STDDEV  # [rad] 99 % of mounts, by chi square of three turns
 LEAST_SURE = np.array([8e-3, 0.06])  # standard deviations of a rig: a rib along the finger [m], size [-]
 FARTHEST_TAG = 0.02  # [m] across the side of its jaw, which holders are not
 TRIED = 10  # of the images, in which the detector has to find the jaws with the rig
@@ -98,7 +97,7 @@ def run(options: argparse.Namespace) -> CommandResult:
     locator = AnyFinger(SideNetwork(source.parameters.get("model") or ANY_FINGER), jaws)
     guess = source.node_parameters(recording).get("T_gripper_camera")
     guess = None if guess is None else read_extrinsics(guess)
-    with progress_bar(STARTS + 2 * (KEPT * STEPS + POLISHED * ROUNDS * len(colors)), "step") as bar:
+    with progress_bar(2 * STARTS + KEPT * ROUNDS * len(colors), "step") as bar:
         found = find_placement(
             colors,
             recording.images.camera,
@@ -151,7 +150,7 @@ def describe_unsure(found: CameraPlacement) -> list[str]:
     strange = [
         f"the {side} jaw comes out turned by {np.degrees(turn):.0f} degrees"
         for side, turn in turned.items()
-        if turn > LARGEST_TURN
+        if turn > MOST_TURNED
     ]
     return strange or [
         f"the {side} jaw's place is only known to {1e3 * mount.stddev[0]:.0f} mm and "

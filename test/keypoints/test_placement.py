@@ -1,6 +1,7 @@
 """Claims about jaws whose holders hide them, and about a camera whose place nobody has measured."""
 
 import re
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -28,9 +29,11 @@ from finforce_keypoints.parameters import DetectorParameters, DetectorSettings, 
 from finforce_keypoints.placement import (
     FINGER_STDDEV,
     GUESS_STDDEV,
+    OUTLINE_STDDEV,
     CameraPlacement,
     OutlineContrast,
     _Refinement,
+    _Task,
     _widen_stddev,
     compare_poses,
     find_covered,
@@ -355,6 +358,35 @@ def test_a_stated_opening_is_kept_and_a_picture_without_jaws_refused(monkeypatch
         find_placement([blank], CAMERA, jaws, Dreamer(), ROBOT_CAMERA)
 
 
+def look_for(jaws, images):
+    """Return the task of finding jaws in images without a network."""
+    return _Task(images=images, camera=CAMERA, jaws=jaws, locator=None, half_opening=None)
+
+
+@pytest.mark.parametrize(("off", "told"), [((40.0,), ""), ((5.0,) * (len(NAMES) + 1), "do not show the finger")])
+def test_without_a_guess_jaws_are_found_unless_their_points_are_off(off, told, monkeypatch):
+    for name, value in (("STARTS", 200), ("PULLED", 6), ("FARTHEST", (None,))):
+        monkeypatch.setattr(placement, name, value)
+    monkeypatch.setattr(_Refinement, "follow_ribs", lambda self, farthest, rounds: None)
+    jaws = {side: load_jaw("bench", side) for side in ("left", "right")}
+    poses = {side: jaw_in_camera(ROBOT_CAMERA, side, x) for side, x in (("left", -0.04), ("right", 0.04))}
+    sideways = np.resize((1.0, -1.0), len(off)) * off
+
+    def find(images, camera, locator, side, plane, looked):
+        there = np.array([points_of(jaws[side], poses[side])] * len(looked))
+        expected = np.array([points_of(jaws[side], pose) for pose in looked])
+        is_near = np.linalg.norm(expected - there, axis=2).max(axis=1) < 150.0
+        there[:, : len(off), 0] += sideways
+        return there, np.where(is_near, 0.9, 0.05)[:, None] * np.ones(there.shape[:2])
+
+    monkeypatch.setattr(placement, "find_points", find)
+    with pytest.raises(GeometryError, match=told) if told else nullcontext():
+        found = find_placement([paint(poses, jaws)], CAMERA, jaws, None)
+        for side, jaw in jaws.items():
+            height, scale = compare_poses(jaw, found.pose(side, 0), poses[side])
+            assert abs(height) < 1e-3 and abs(scale) < 0.02
+
+
 def test_a_camera_comes_out_as_far_off_as_it_is_unsure(monkeypatch):
     jaws, rng = {side: load_jaw("bench", side) for side in ("left", "right")}, np.random.default_rng(3)
     origins, image = {"left": (-0.045, -0.03), "right": (0.045, 0.03)}, np.zeros((480, 640, 3), np.uint8)
@@ -368,7 +400,7 @@ def test_a_camera_comes_out_as_far_off_as_it_is_unsure(monkeypatch):
     sigmas = []
     for _ in range(12):
         guess = move_pose(ROBOT_CAMERA, rng.normal(size=6) * GUESS_STDDEV)
-        fit = _Refinement([image, image], CAMERA, jaws, None, guess, 0.045, GUESS_STDDEV, None)
+        fit = _Refinement(look_for(jaws, [image, image]), guess, 0.045, GUESS_STDDEV)
         fit.improve()
         stddev = fit._find_stddev()
         for side, jaw in jaws.items():
@@ -384,9 +416,8 @@ def test_a_guess_is_kept_as_closely_as_it_is_known(monkeypatch):
     beside = move_pose(ROBOT_CAMERA, np.array([0.0, 8e-3, 0.0, 0.0, 0.0, 0.0]))
     moved = []
     for stddev in (0.1e-3, 10e-3):
-        fit = _Refinement(
-            [color], CAMERA, jaws, None, beside, 0.045, np.repeat((stddev, 0.01 * stddev / 1e-3), 3), None
-        )
+        known = np.repeat((stddev, 0.01 * stddev / 1e-3), 3)
+        fit = _Refinement(look_for(jaws, [color]), beside, 0.045, known)
         fit.polish()
         moved.append(np.linalg.norm(fit._x[:3]))
     assert moved[0] < 0.3e-3 < moved[1]
@@ -401,7 +432,7 @@ def test_a_jaw_is_looked_for_aside_in_each_picture(monkeypatch):
         return np.full((2, 3, 2), 100.0), np.where(np.abs(x - there)[:, None] < 3e-3, 0.9, 0.1) * np.ones(3)
 
     monkeypatch.setattr(placement, "find_points", find)
-    fit = _Refinement([image, image], CAMERA, jaws, None, ROBOT_CAMERA, 0.045, None, None)
+    fit = _Refinement(look_for(jaws, [image, image]), ROBOT_CAMERA, 0.045, OUTLINE_STDDEV)
     fit.look_aside()
     origins = fit._split(fit._x)[2]["left"]
     assert origins[0] == -0.045 and abs(origins[1] - there[1]) < 3e-3
@@ -412,8 +443,8 @@ def test_a_rig_whose_size_or_place_is_unsure_is_doubted():
     unsure = CameraPlacement(
         T_gripper_camera=ROBOT_CAMERA, mounts=mounts, origins={}, contrast=1.0, residual=1.0, seen={}
     )
-    turned = {"left": JawMount(turn=np.array([0.0, 0.35, 0.0])), "right": JawMount()}
-    assert describe_unsure(replace(unsure, mounts=turned)) == ["the left jaw comes out turned by 20 degrees"]
+    turned = {"left": JawMount(turn=np.array([0.0, 0.19, 0.0])), "right": JawMount(turn=np.array([0.0, 0.1, 0.0]))}
+    assert describe_unsure(replace(unsure, mounts=turned)) == ["the left jaw comes out turned by 11 degrees"]
     assert describe_unsure(unsure) == [
         "the right jaw's place is only known to 1 mm and 8 % in size (one standard deviation)"
     ]
