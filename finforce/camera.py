@@ -274,7 +274,6 @@ COLOR_ENCODINGS = {
     "nv21": (_BYTE, 1, "YUV2RGB_NV21"),
     **{f"bayer_{tiles}8": (_BYTE, 1, f"Bayer{tiles.upper()}2RGB") for tiles in ("rggb", "bggr", "gbrg", "grbg")},
 }
-_LUMA = {"uyvy": 1, "yuv422": 1, "yuyv": 0, "yuv422_yuy2": 0}  # byte of each pixel that holds its brightness
 _HALF_CHROMA = ("nv12", "nv21")  # whose rows of brightness are followed by half as many of colour
 
 
@@ -307,21 +306,17 @@ def decode_color(data: NDArray | bytes, encoding: str, layout: ImageLayout | Non
         )
     if dtype == _WORD:
         image = (image >> 8).astype(np.uint8)
-    if encoding in _LUMA and image.shape[1] > 2:
+    if channels == 2 and image.shape[1] > 2:
         _check_luma(image, encoding)
     return _convert(image, encoding, conversion) if conversion else np.ascontiguousarray(image)
 
 
 def _check_luma(image: NDArray, encoding: str) -> None:
-    """Refuse an image (h, w, 2) whose brightness and colours are the other way round.
-
-    Brightness has more detail, and only colours, two of them in turn, differ more from a byte to the next than to the
-    one after it.
-    """
-    rows, luma = image[::8].astype(np.int16), _LUMA[encoding]
+    """Refuse an image (h, w, 2) whose brightness, which has more detail, is where the two colours in turn should be."""
+    rows, luma = image[::8].astype(np.int16), int("UYVY" in COLOR_ENCODINGS[encoding][2])
     near, far = (np.abs(rows[:, apart:] - rows[:, :-apart]).mean(axis=(0, 1)) for apart in (1, 2))
     if far[1 - luma] > 1.5 * far[luma] and near[1 - luma] < 1.1 * far[1 - luma]:
-        others = " or ".join(name for name, place in _LUMA.items() if place != luma)
+        others = ("uyvy or yuv422", "yuyv or yuv422_yuy2")[luma]
         raise ImageError(f"colour image: said to be {encoding}, its bytes are those of {others}: correct its encoding")
 
 

@@ -76,7 +76,6 @@ from finforce.ros.transport import (  # noqa: F401 - for those with topics
     CHOICES,
     PROFILES,
     TRANSPORT,
-    describe_domain,
     provide_transport,
     remedy_for_losses,
 )
@@ -370,8 +369,6 @@ def run_nodes(
 ) -> int:
     """Build nodes and let them work in one thread, as `run_node` does one."""
     try:
-        if wrong := describe_domain(os.environ.get("ROS_DOMAIN_ID", "")):
-            raise RuntimeError(wrong)
         rclpy.init(args=args)
     except RuntimeError as error:  # what stands after --ros-args is none of its words
         print(f"{name}: {str(error).partition(', at ')[0]}", file=sys.stderr)

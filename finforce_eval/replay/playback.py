@@ -21,7 +21,7 @@ from finforce_eval.recordings.images import (
     PACKED,
     ImageTrack,
 )
-from finforce_eval.recordings.writer import make_message, typestore
+from finforce_eval.recordings.writer import make_message
 from finforce_sim.footage import info_fields
 
 HEADER = "std_msgs/msg/Header"
@@ -59,8 +59,7 @@ class RawMessage(NamedTuple):
 class Playback:
     """The messages of a bag in the order of their receipt; every iteration reads them anew.
 
-    Camera topics come out where the nodes listen, compressed images as plain ones, and intrinsics that were given
-    beside every colour image.
+    Camera topics come out where the nodes listen, compressed images as plain ones, given intrinsics beside each.
 
     Args:
         path: rosbag2 folder, .mcap or .db3 file.
@@ -107,8 +106,7 @@ class Playback:
                 yield RawMessage(raw.time, topic, _played_type(kind), data, self._headed[raw.topic])
                 if self._camera and topic == COLOR_TOPIC:
                     info = make_message(CAMERA_INFO, header=bag.decode(raw).header, **info_fields(self._camera))
-                    data = bytes(typestore().serialize_cdr(info, CAMERA_INFO))
-                    yield RawMessage(raw.time, INFO_TOPIC, CAMERA_INFO, data, True)
+                    yield RawMessage(raw.time, INFO_TOPIC, CAMERA_INFO, bag.encode(CAMERA_INFO, vars(info)), True)
 
 
 def _played_topic(topic: str) -> str:

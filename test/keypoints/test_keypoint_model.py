@@ -174,7 +174,7 @@ def test_networks_of_other_programs_are_told_how_to_become_one(name, kind, tmp_p
     for path in (tmp_path, tmp_path / name):
         with pytest.raises(ModelError, match=f"{name}: a {kind} file; expected an ONNX .*export_deeplabcut.py") as told:
             KeypointModel(path)
-        assert ("version 3" in str(told.value)) == (kind == "TensorFlow")
+        assert ("DeepLabCut 3" in str(told.value)) == (kind == "TensorFlow")
 
 
 def test_files_that_are_missing_or_doubled_or_broken_are_named(tmp_path):
