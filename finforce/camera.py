@@ -306,7 +306,18 @@ def decode_color(data: NDArray | bytes, encoding: str, layout: ImageLayout | Non
         )
     if dtype == _WORD:
         image = (image >> 8).astype(np.uint8)
+    if channels == 2 and image.shape[1] > 2:
+        _check_luma(image, encoding)
     return _convert(image, encoding, conversion) if conversion else np.ascontiguousarray(image)
+
+
+def _check_luma(image: NDArray, encoding: str) -> None:
+    """Refuse an image (h, w, 2) whose brightness, which has more detail, is where the two colours in turn should be."""
+    rows, luma = image[::8].astype(np.int16), int("UYVY" in COLOR_ENCODINGS[encoding][2])
+    near, far = (np.abs(rows[:, apart:] - rows[:, :-apart]).mean(axis=(0, 1)) for apart in (1, 2))
+    if far[1 - luma] > 1.5 * far[luma] and near[1 - luma] < 1.1 * far[1 - luma]:
+        others = ("uyvy or yuv422", "yuyv or yuv422_yuy2")[luma]
+        raise ImageError(f"colour image: said to be {encoding}, its bytes are those of {others}: correct its encoding")
 
 
 def _convert(image: NDArray, encoding: str, conversion: str) -> NDArray[np.uint8]:

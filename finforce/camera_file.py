@@ -1,4 +1,4 @@
-"""Intrinsics from the files that people keep them in: ROS, OpenCV, kalibr, BOP, OpenICC (UMI), or plain numbers."""
+"""Intrinsics from the files that people keep them in: ROS, OpenCV, kalibr, BOP, OpenICC, ORB-SLAM, or numbers."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from finforce.camera import EQUIDISTANT, PLUMB_BOB, RATIONAL, CameraIntrinsics, 
 from finforce.files import LARGEST_YAML, FileError, parse_json, parse_yaml, read_text
 
 INTRINSICS_FORMS = (
-    "fx fy cx cy [k1 k2 p1 p2 k3], or a file of ROS, OpenCV, kalibr, BOP or OpenICC, of a 3x3 matrix, or with the "
-    "names fx, fy, cx, cy"
+    "fx fy cx cy [k1 k2 p1 p2 k3], or a file of ROS, OpenCV, kalibr, BOP, OpenICC or ORB-SLAM, of a 3x3 matrix, "
+    "or with the names fx, fy, cx, cy"
 )
 _NAMES = ("fx", "fy", "cx", "cy")
 _MODELS = {"radtan": PLUMB_BOB, "none": PLUMB_BOB, "pinhole": PLUMB_BOB, "fisheye": EQUIDISTANT, "equi": EQUIDISTANT}
-_MODELS |= {"kannala_brandt4": EQUIDISTANT, "opencv_fisheye": EQUIDISTANT}
+_MODELS |= {"kannala_brandt4": EQUIDISTANT, "opencv_fisheye": EQUIDISTANT, "kannalabrandt8": EQUIDISTANT}
 _MATRICES = ("K", "k", "camera_matrix", "Camera_Matrix", "cameraMatrix", "cam_K", "intrinsic_matrix")
 _LENS = re.compile(r"d|coeffs|dist(?!ance).*|(?!undist).*distortion.*", re.IGNORECASE)
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -152,7 +152,7 @@ def _choose(content: Any, name: str) -> Mapping[str, Any]:
         if isinstance(value, Mapping) and ("cam_K" in value or isinstance(value.get("intrinsics"), list))
     }
     if not cameras:
-        return {str(key): value for key, value in content.items()}
+        return {re.sub(r"^Camera1?\.", "", str(key)): value for key, value in content.items()}  # of ORB-SLAM
     found = [cameras[name]] if name in cameras else [] if name else list(cameras.values())
     named = [_name_entries(each) for each in found]
     if not found or any(each != named[0] for each in named):
@@ -181,7 +181,9 @@ def _name_entries(entries: Mapping[str, Any]) -> dict[str, Any]:
         if kind != "pinhole" or len(_numbers(intrinsics)) != 4:
             raise IntrinsicsError(f"camera_model {entries.get('camera_model')}: expected pinhole, with fu fv pu pv")
         named |= zip(_NAMES, intrinsics, strict=True)
-    if _name_model(str(entries.get("model"))) == EQUIDISTANT:  # else that of the device, or what the coefficients say
+    if EQUIDISTANT in (
+        _name_model(str(entries.get(name))) for name in ("model", "type")
+    ):  # else that of the device, or what the coefficients say
         lens = EQUIDISTANT
     lens = entries.get("distortion_model") or lens
     named["model"] = EQUIDISTANT if entries.get("fisheye_model") else lens

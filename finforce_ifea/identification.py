@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
+from scipy.optimize import OptimizeResult, least_squares
 
 from finforce_ifea.contact_mechanics.friction import Coefficient
 from finforce_ifea.contact_mechanics.indenter import DEPTH, ExpectedObject, expect_object
@@ -465,6 +465,7 @@ _LEAST_STDDEV = 0.1e-3
 _RELATIVE_ERROR, _ABSOLUTE_ERROR = 0.02, 0.03
 # Errors of neighbouring frames are alike; this many count as one.
 _CORRELATED_FRAMES = 30
+_LEADS, _ONE_CLOCK = np.arange(-6, 7) / 20.0, 0.05  # [s] of the true forces before the images: tried, tolerated
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -518,19 +519,19 @@ def fit_force_history(
         progress: called after each recording.
 
     Raises:
-        CalibrationError: The estimator trusts hardly a loaded frame of the recordings.
+        CalibrationError: The estimator trusts hardly a loaded frame of the recordings, or there are two clocks.
     """
     histories = []
     for case, own in zip(cases, settings, strict=True):
         histories.append(_track_force(jaw, case, own, calibration))
         progress(float("nan"))
-    fit = least_squares(
-        _residuals,
-        np.r_[0.0, BRANCH_PRIOR],
-        bounds=(np.r_[-_LARGEST_SCALE, BRANCH_LOW], np.r_[_LARGEST_SCALE, BRANCH_HIGH]),
-        x_scale=np.r_[1.0, BRANCH_STDDEV],
-        args=(histories,),
-    )
+    lead = min(_LEADS, key=lambda lead: _fit_branches(histories, lead).cost)  # early forces look like relaxed ones
+    if abs(lead) > _ONE_CLOCK:
+        raise CalibrationError(
+            f"calibration: the forces fit those {abs(lead):.2f} s {'later' if lead > 0.0 else 'earlier'} than the "
+            "images: expected the stamps of one clock, those of the exposure for the images"
+        )
+    fit = _fit_branches(histories)
     errors = np.concatenate([_model(fit.x, history) - history.true for history in histories])
     true = np.concatenate([history.true for history in histories])
     loaded = true > _LOADED_FORCE
@@ -541,6 +542,18 @@ def fit_force_history(
         stddev=stddev * [1.0, np.exp(fit.x[2]), 1.0, np.exp(fit.x[4])],
         force_rms=float(np.sqrt(np.mean(errors[loaded] ** 2))),
         relative=float(1.48 * np.median(np.abs(errors[loaded] / true[loaded]))),
+    )
+
+
+def _fit_branches(histories: Sequence[_ForceHistory], lead: float = 0.0) -> OptimizeResult:
+    """Fit the log of the scale of the modulus, and the branches of the relaxation, to true forces of a later time."""
+    later = [replace(each, true=np.interp(each.stamps + lead, each.stamps, each.true)) for each in histories]
+    return least_squares(
+        _residuals,
+        np.r_[0.0, BRANCH_PRIOR],
+        bounds=(np.r_[-_LARGEST_SCALE, BRANCH_LOW], np.r_[_LARGEST_SCALE, BRANCH_HIGH]),
+        x_scale=np.r_[1.0, BRANCH_STDDEV],
+        args=(later,),
     )
 
 

@@ -128,7 +128,7 @@ def check_image(image: RgbdImage) -> None:
     if image.depth is not None and (np.shape(image.depth) != size or image.depth.dtype.kind != "f"):
         raise ImageError(
             f"depth image: {image.depth.dtype} of shape {np.shape(image.depth)}; expected metres of shape {size}, "
-            "that of the colour image; use the depth that is aligned to colour"
+            "that of the colour image; use the depth that is aligned to colour, or none, by depth=none"
         )
     if image.depth is not None and not np.isfinite(image.depth).any():
         raise EmptyDepthError(

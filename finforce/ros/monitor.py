@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -23,6 +24,7 @@ from finforce.errors import MissingDependencyError, SilentTopicError, suggest
 from finforce.health import Level, Report
 from finforce.messages import decode_columns
 from finforce.ros.topics import RESULT, SENSOR
+from finforce.ros.transport import describe_domain
 
 DISCOVERY = 5.0  # [s] in which a publisher is found
 PATIENCE = 5.0  # [s] of silence after which it is noted
@@ -37,7 +39,12 @@ def open_listener(domain: int | None = None) -> Iterator[tuple[Node, SingleThrea
 
     Args:
         domain: ROS_DOMAIN_ID; None for that of the environment.
+
+    Raises:
+        SilentTopicError: there can be no such domain.
     """
+    if wrong := describe_domain(os.environ.get("ROS_DOMAIN_ID", "") if domain is None else str(domain)):
+        raise SilentTopicError(wrong)
     context = rclpy.Context()
     rclpy.init(context=context, domain_id=domain)
     try:

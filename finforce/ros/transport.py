@@ -14,6 +14,7 @@ PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"
 FROM_FILE = "RMW_FASTRTPS_USE_QOS_FROM_XML"  # by which rmw_fastrtps takes how memory is kept from the file, too
 CHOICES = (PROFILES, "FASTDDS_DEFAULT_PROFILES_FILE", "FASTDDS_BUILTIN_TRANSPORTS")
 DOMAINS = range(1, 100)
+LAST_DOMAIN = 232  # of a ROS_DOMAIN_ID: the ports of greater ones are none (DDSI-RTPS 2.3, 9.6.1.1)
 RECEIVE_BUFFER = 2147483647  # bytes, net.core.rmem_max as the DDS tuning page of the ROS 2 documentation sets it
 
 
@@ -35,6 +36,12 @@ def remedy_for_losses(topic: str, is_here: bool) -> str:
         return f"start the camera's process with {PROFILES}={TRANSPORT}"
     other = "" if topic.endswith(ENDS) else ", or use image_transport:=compressed"
     return f"raise the receive buffers of both machines (sudo sysctl -w net.core.rmem_max={RECEIVE_BUFFER}){other}"
+
+
+def describe_domain(domain: str) -> str:
+    """Return what is wrong with a ROS_DOMAIN_ID, "" for one that can be and for none."""
+    can_be = not domain or (domain.isascii() and domain.isdigit() and int(domain) <= LAST_DOMAIN)
+    return "" if can_be else f"ROS_DOMAIN_ID={domain}: expected 0 to {LAST_DOMAIN}"
 
 
 def free_domain() -> int:

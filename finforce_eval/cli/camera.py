@@ -139,8 +139,8 @@ def refuse_doubts(doubts: Sequence[str], options: argparse.Namespace, picture: P
     """
     if doubts and not options.force:
         raise GeometryError(
-            f"{'; '.join(doubts)}. No rig is written, see {picture}: give sharper pictures, at several openings, a "
-            "better --extrinsics, --opening, or --force"
+            f"{'; '.join(doubts)}. No rig is written, see {picture}: give sharper pictures, at several openings, the "
+            "intrinsics of their lens setting, a better --extrinsics, --opening, or --force"
         )
 
 

@@ -117,7 +117,7 @@ def add_detector_options(parser: argparse._ActionsContainer) -> None:
     text = "topic of the camera_info (the one next to the colour images)"
     parser.add_argument("--camera-info", metavar="TOPIC", help=text)
     text = "intrinsics instead of camera_info: fx fy cx cy [k1 k2 p1 p2 k3] in pixels, or a "
-    text += "file of ROS, OpenCV, kalibr, BOP or OpenICC (UMI), with the name of the camera if it has several"
+    text += "file of ROS, OpenCV, kalibr, BOP, OpenICC (UMI) or ORB-SLAM, with the name of the camera if it has several"
     parser.add_argument("--intrinsics", nargs="+", metavar="NUMBER", help=text)
     episode = whole_number(0, 10**9)
     parser.add_argument("--episode", type=episode, default=0, metavar="N", help="episode of a dataset or .zarr (0)")

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from finforce.optional import import_cv2
+from finforce.ros.transport import LAST_DOMAIN
 from finforce_eval.annotation.video import ForceOverlay
 from finforce_eval.cli.parser import PLAYED_HELP, CommandResult, add_run_options
 from finforce_eval.errors import OptionError
@@ -73,8 +74,8 @@ def run(options: argparse.Namespace) -> CommandResult:
     """
     if not 0.01 <= options.rate <= 100.0:
         raise OptionError(f"--rate {options.rate:g}: expected 0.01 to 100")
-    if options.domain is not None and not 0 <= options.domain <= 232:
-        raise OptionError(f"--domain {options.domain}: expected 0 to 232")
+    if options.domain is not None and not 0 <= options.domain <= LAST_DOMAIN:
+        raise OptionError(f"--domain {options.domain}: expected 0 to {LAST_DOMAIN}")
     setup = make_setup(options)
     playing = Playing(rate=options.rate, domain=options.domain)
     keypoints, calibration = parse_source(options), options.calibration or ""

@@ -225,10 +225,11 @@ def _describe_camera(recording: Recording, depth: str) -> Iterator[Finding]:
     if not 0.97 < aspect < 1.03:
         yield Finding(WARNING, f"fx / fy is {aspect:.3f}; expected 1: are the intrinsics those of another image size?")
     aside = np.hypot(camera.cx - 0.5 * (camera.width - 1), camera.cy - 0.5 * (camera.height - 1))
+    turned = np.hypot(camera.cx - 0.5 * (camera.height - 1), camera.cy - 0.5 * (camera.width - 1))
     if aside > 0.1 * camera.width:
-        yield Finding(
-            WARNING, f"principal point {aside:.0f} px off the middle: was the image cropped, but not the intrinsics?"
-        )
+        likely = "turned by 90 degrees" if turned < 0.25 * aside else "cropped"
+        text = f"principal point {aside:.0f} px off the middle: was the image {likely}, but not the intrinsics?"
+        yield Finding(WARNING, text)
 
 
 def _judge_pose(found: Extrinsics, look: JawsAtRest, recording: Recording, guess: NDArray) -> list[Finding]:

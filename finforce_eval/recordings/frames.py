@@ -196,6 +196,8 @@ def decode_video(
                 color = frame.to_ndarray(format="rgb24")
                 turns = round(frame.rotation / 90.0) % 4
                 yield np.ascontiguousarray(np.rot90(color, turns)) if turns else color
+    if fps and not number:
+        raise RecordingError(f"{name}: {path.name} ends before {begin + 0.5 / fps:.3f} s, its from_timestamp")
 
 
 def _decode_checked(container: Any, stream: Any, shown: Sequence[int], where: str) -> Iterator[tuple[Any, bool]]:

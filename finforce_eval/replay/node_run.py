@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import psutil
 
-from finforce.camera_topics import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
+from finforce.camera_topics import COLOR_TOPIC, INFO_TOPIC
 from finforce.optional import import_ros
 from finforce.ros.transport import free_domain
 from finforce.systems.processes import PIPELINE, executables_of
@@ -62,7 +62,7 @@ def awaited_topics(processes: Sequence[Process], sides: Sequence[str]) -> list[s
     """Return the topics that nodes of some jaws listen to once all of them are ready."""
     names, composed = executables_of(processes), any(process.executable == PIPELINE for process in processes)
     sees, localizes = "keypoint_detector" in names, "contact_estimator" in names
-    topics = [COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC] if sees else []
+    topics = [COLOR_TOPIC, INFO_TOPIC] if sees else []  # to depth, with depth:=none, nobody listens
     if not (sees and composed):
         kinds = ("keypoints", "jaw_pose") if localizes else ("keypoints",)
         topics += [f"/{side}/{kind}" for side in sides for kind in kinds]

@@ -14,12 +14,15 @@ from finforce.video_packets import MissingFrameError, PacketDecoder
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.bags import BagReader, RawSample, bag_source, open_bag, restamp
 from finforce_eval.recordings.images import (
+    CAMERA_INFO,
     COLOR_ENDS,
     DEPTH_ENDS,
     IMAGE,
     PACKED,
     ImageTrack,
 )
+from finforce_eval.recordings.writer import make_message
+from finforce_sim.footage import info_fields
 
 HEADER = "std_msgs/msg/Header"
 # where the nodes listen -> the ends of the topics that are played there
@@ -56,7 +59,7 @@ class RawMessage(NamedTuple):
 class Playback:
     """The messages of a bag in the order of their receipt; every iteration reads them anew.
 
-    Camera topics come out where the nodes listen, and compressed images as plain ones.
+    Camera topics come out where the nodes listen, compressed images as plain ones, given intrinsics beside each.
 
     Args:
         path: rosbag2 folder, .mcap or .db3 file.
@@ -84,6 +87,8 @@ class Playback:
             raise RecordingError(f"{source.name}: nothing to be played in it")
         self.begin = first.time
         self.types = {self._topics[topic]: kind for topic, kind in types.items()}
+        self._camera = images.camera if images is not None and not images.info else None
+        self.types |= {INFO_TOPIC: CAMERA_INFO} if self._camera else {}
 
     def __len__(self) -> int:
         return self._count
@@ -99,6 +104,9 @@ class Playback:
                     except MissingFrameError:
                         continue
                 yield RawMessage(raw.time, topic, _played_type(kind), data, self._headed[raw.topic])
+                if self._camera and topic == COLOR_TOPIC:
+                    info = make_message(CAMERA_INFO, header=bag.decode(raw).header, **info_fields(self._camera))
+                    yield RawMessage(raw.time, INFO_TOPIC, CAMERA_INFO, bag.encode(CAMERA_INFO, vars(info)), True)
 
 
 def _played_topic(topic: str) -> str:

@@ -15,6 +15,7 @@ from typing import IO, Any
 import psutil
 
 from finforce.errors import FinforceError
+from finforce.ros.transport import describe_domain
 from finforce.systems.processes import RESPAWN_DELAY, SINGLE_THREAD, UNUSABLE, Process
 
 # how long each signal is given before the next, harder one [s]
@@ -42,6 +43,8 @@ class ProcessGroup:
         self._dead: dict[int, float] = {}  # places of processes, and when [s] they were seen to have ended
 
     def __enter__(self) -> ProcessGroup:
+        if wrong := describe_domain(self._environment.get("ROS_DOMAIN_ID", "")):
+            raise ProcessError(wrong)
         try:
             for process in self._processes:
                 self._children.append(self._start(process))

@@ -21,6 +21,7 @@ from finforce_eval.evaluation.gripper import with_distances
 from finforce_eval.evaluation.keypoint_source import IMAGES, TRUTH, KeypointSource, awaiting_keypoints
 from finforce_eval.evaluation.scoring import Evaluation, GraspScore, score_grasp, score_results
 from finforce_eval.evaluation.setup import EvaluationSetup
+from finforce_eval.recordings.images import ImageTrack
 from finforce_eval.recordings.objects import find_mesh, read_friction, require_mesh
 from finforce_eval.recordings.tracks import Recording
 from finforce_eval.recordings.writer import write_recording
@@ -135,10 +136,10 @@ def play_to_nodes(
     with ExitStack() as stack:
         recording = _choose_keypoints(recording, setup.jaw, keypoints, stack)
         images = recording.images if from_images else None
-        if images is not None and not images.info:
+        if images is not None and not isinstance(images, ImageTrack):
             raise RecordingError(
-                f"{recording.name}: only bags with camera_info are played through the nodes; annotate and evaluate "
-                "take other recordings, too"
+                f"{recording.name}: only bags are played through the nodes; annotate and evaluate take other "
+                "recordings, too"
             )
         # a recording of a live run holds what the nodes write, too
         written = {f"/{side}/{name}" for side in sides for name in RESULTS}

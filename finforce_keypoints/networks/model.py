@@ -510,7 +510,8 @@ def find_network(path: str | Path) -> Path:
     others = [file for file in (path, *files) if file.suffix in OTHERS]
     if others and not found:
         kind = OTHERS[others[0].suffix]
-        advice = "export it with examples/export_deeplabcut.py" if kind == "PyTorch" else "convert it"
+        export = "export it with examples/export_deeplabcut.py"
+        advice = export if kind == "PyTorch" else f"convert it, or train with DeepLabCut 3 (PyTorch) and {export}"
         raise ModelError(f"{others[0]}: a {kind} file; expected an ONNX network: {advice}")
     if len(found) != 1:
         names = ", ".join(file.name for file in found) or "none"

@@ -209,6 +209,38 @@ def test_a_fisheye_of_umi_is_the_equidistant_lens(tmp_path):
     np.testing.assert_allclose(rays_from_pixels(pixel, camera), [[x, y, 1.0]], atol=1e-8)
 
 
+ORB_SLAM = """%YAML:1.0
+
+Camera.type: "{kind}"
+{name}.fx: 600.
+{name}.fy: 601.
+{name}.cx: 322.
+{name}.cy: 243.
+{name}.k1: 0.1
+{name}.k2: -0.2
+{lens}
+Camera2.fx: 1.
+Camera.width: 640
+Camera.height: 480
+Camera.fps: 30
+"""
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "lens", "model", "expected"),
+    [
+        ("PinHole", "Camera", ("p1: 1e-3", "p2: 2e-3", "k3: 0.05"), "plumb_bob", [0.1, -0.2, 1e-3, 2e-3, 0.05]),
+        ("KannalaBrandt8", "Camera1", ("k3: 0.3", "k4: 0.4"), "equidistant", [0.1, -0.2, 0.3, 0.4]),
+    ],
+)
+def test_settings_of_orb_slam_are_those_of_its_first_camera(kind, name, lens, model, expected, tmp_path):
+    lines = "\n".join(f"{name}.{line}" for line in lens)
+    camera = read_camera(write(tmp_path, ORB_SLAM.format(kind=kind, name=name, lens=lines)))
+    assert camera.model == model and (camera.width, camera.height) == (640, 480)
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (600.0, 601.0, 322.0, 243.0)
+    np.testing.assert_array_equal(camera.distortion, expected)
+
+
 def test_of_several_cameras_one_has_to_be_named(tmp_path):
     both = KALIBR.format(model="radtan") + KALIBR.format(model="radtan").partition("\n")[2].replace(
         "cam0", "cam1"

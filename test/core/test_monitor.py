@@ -97,6 +97,12 @@ def test_without_a_system_its_domain_is_named(monkeypatch):
         next(monitor.iter_statuses(0.1, domain=domain))
 
 
+def test_a_domain_that_cannot_be_is_named(monkeypatch, capsys):
+    monkeypatch.setenv("ROS_DOMAIN_ID", "9999")
+    assert main(["status", "--once"]) != 0
+    assert "ROS_DOMAIN_ID=9999: expected 0 to 232" in capsys.readouterr().err
+
+
 def test_the_state_of_a_running_solver_is_a_table(system, monkeypatch, capsys):
     monkeypatch.setattr(status, "COLLECTED", 3.0)
     assert main(["status", "--once"]) == 0

@@ -107,3 +107,17 @@ def test_variables_reach_the_processes():
         wait_for(lambda: fails(group))
         with pytest.raises(ProcessError, match="42 1"):
             group.check()
+
+
+@pytest.mark.parametrize("domain", ["233", "9999", "-1", "one"])
+def test_a_domain_that_cannot_be_is_refused_before_anything_starts(domain, monkeypatch):
+    monkeypatch.setenv("ROS_DOMAIN_ID", domain)
+    with pytest.raises(ProcessError, match=f"^ROS_DOMAIN_ID={domain}: expected 0 to 232"), ProcessGroup([], {}):
+        pass
+
+
+def test_domains_that_can_be_are_none_and_those_with_ports(monkeypatch):
+    for domain in ("", "0", "232"):
+        monkeypatch.setenv("ROS_DOMAIN_ID", domain)
+        with ProcessGroup([], {}):
+            pass

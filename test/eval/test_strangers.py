@@ -7,10 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from eval_fakes import FakeEstimator, FakeJaw, change_info, evaluate_recording, make_recording
+from rclpy.serialization import deserialize_message
 from rgbd_fakes import CAMERA, FakeDetector, FakeGripper, make_footage
+from sensor_msgs.msg import CameraInfo
 
 from finforce.camera_topics import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
-from finforce.messages import CameraStream, same_camera
+from finforce.messages import CameraStream, camera_from_info, same_camera
 from finforce_contact.loop import GivenContact
 from finforce_eval.cli.main import main
 from finforce_eval.cli.twin import footage_entries, write_footage
@@ -155,6 +157,29 @@ def test_a_camera_without_camera_info_needs_its_intrinsics(tmp_path):
         read_recording(bag)
     camera = read_recording(bag, ImageChoice(intrinsics=("43", "44", "32", "24"))).images.camera
     assert (camera.width, camera.height, camera.fx, camera.fy) == (64, 48, 43.0, 44.0)
+
+
+@pytest.mark.parametrize("names", [{COLOR_TOPIC: "/image_raw"}, USB])
+def test_intrinsics_that_were_given_are_played_beside_every_image(names, tmp_path):
+    given = ImageChoice(intrinsics=("43", "44", "32", "24", "0.1", "0", "0", "0"))
+    recording = read_recording(write_renamed(tmp_path / "bag", names), given)
+    messages = list(Playback(recording.source, images=recording.images))
+    stamps = {topic: [m.stamp for m in messages if m.topic == topic] for topic in (COLOR_TOPIC, INFO_TOPIC)}
+    assert stamps[COLOR_TOPIC] == stamps[INFO_TOPIC] and len(stamps[INFO_TOPIC]) == 12
+    info = deserialize_message(next(m.data for m in messages if m.topic == INFO_TOPIC), CameraInfo)
+    assert same_camera(camera_from_info(info, recording.images.frame_id), recording.images.camera)
+
+
+def test_an_episode_after_the_end_of_its_video_is_named(tmp_path, capsys):
+    from lerobot_fakes import CAMERA, FPS, write_dataset
+
+    pictures = [frame.color for frame in make_footage(FakeGripper(count=6))]
+    write_dataset(tmp_path / "merged", [pictures[:3], pictures[:3]], "v3.0")
+    path = next((tmp_path / "merged/meta/episodes").rglob("*.parquet"))
+    table, name = parquet.read_table(path), f"videos/{CAMERA}/from_timestamp"
+    parquet.write_table(table.set_column(table.schema.get_field_index(name), name, [[0.0, 3 / FPS + 460.4]]), path)
+    assert annotate(tmp_path / "merged") == 2
+    assert "file-000.mp4 ends before 460.500 s, its from_timestamp" in capsys.readouterr().err
 
 
 def test_a_score_of_unloaded_frames_alone_is_none(tmp_path):
@@ -352,7 +377,7 @@ def test_what_a_dataset_lacks_is_said_in_one_line_before_its_videos_are_read(dat
 
 def test_what_plays_bags_alone_says_so_and_promises_no_datasets(dataset, capsys):
     assert main(["trace", str(dataset), *DATASET]) == 2
-    assert "only bags with camera_info are played" in capsys.readouterr().err
+    assert "only bags are played" in capsys.readouterr().err
     for command in ("trace", "replay"):
         with pytest.raises(SystemExit):
             main([command, "--help"])

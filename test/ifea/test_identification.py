@@ -7,6 +7,7 @@ import pytest
 from estimator_fakes import SMOOTH, magnitudes, make_estimator, ramp, record, run
 from mechanics_fakes import BENCH, MODULUS
 
+from finforce_ifea import identification
 from finforce_ifea.errors import CalibrationError
 from finforce_ifea.identification import CalibrationCase, find_plateaus, fit_calibration
 from finforce_ifea.jaw.calibration import Calibration
@@ -140,6 +141,22 @@ def test_truth_may_come_at_a_rate_of_its_own():
     for left, right in zip(first, second, strict=True):
         assert right.force == pytest.approx(left.force, rel=0.01)
         np.testing.assert_allclose(dense[right.instants], case.stamps_true[left.instants], atol=0.2)
+
+
+@pytest.mark.parametrize(("late", "words"), [(0.15, "later"), (-0.15, "earlier"), (-0.02, ""), (0.0, "")])
+def test_forces_of_another_clock_are_refused_instead_of_taken_for_relaxation(late, words, monkeypatch):
+    stamps = np.arange(0.0, 40.0, 1.0 / 30.0)
+    elastic = np.interp(stamps % 20.0, [2.0, 3.0, 6.0, 7.0, 10.0, 11.0, 14.0], [0.0, 2.0, 2.0, 4.0, 4.0, 0.0, 0.0])
+    true = np.interp(stamps - late, stamps, apply_relaxation(elastic, stamps, TERMS))
+    history = identification._ForceHistory(stamps=stamps, elastic=elastic, true=true)
+    monkeypatch.setattr(identification, "_track_force", lambda *given: history)
+    given = load_jaw("bench"), [None], [FRAME], None, lambda cost: None
+    if words:
+        with pytest.raises(CalibrationError, match=rf"the forces fit those 0.15 s {words} than the images.*one clock"):
+            identification.fit_force_history(*given)
+    else:
+        terms = identification.fit_force_history(*given).terms
+        assert [term.share for term in terms] == pytest.approx([0.12, 0.06], abs=0.1 * (late != 0) + 0.02)
 
 
 def test_only_so_many_plateaus_of_a_case_are_taken():

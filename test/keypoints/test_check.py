@@ -183,6 +183,17 @@ def test_a_picture_that_is_wrong_is_named(two_fingers, record, capsys, tmp_path)
     assert status == 1 and "upside down" in said and "mean brightness" in said
 
 
+def test_pictures_turned_without_their_intrinsics_are_named(footage, two_fingers, capsys, tmp_path):
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    for number, frame in enumerate(footage[1]):
+        cv2.imwrite(str(folder / f"{number}.png"), np.rot90(frame.color)[..., ::-1])
+    camera = footage[0].camera
+    numbers = [f"{each:.2f}" for each in (camera.fx, camera.fy, camera.cx, camera.cy)]
+    assert main(["check", str(folder), "--images", "6", "--report", str(tmp_path), "--intrinsics", *numbers]) == 1
+    assert "was the image turned by 90 degrees, but not the intrinsics?" in capsys.readouterr().out
+
+
 def test_extrinsics_of_another_convention_are_named(two_fingers, still, capsys, tmp_path):
     x, y, z, qx, qy, qz, qw = pose_numbers(ROBOT_CAMERA)
     first = "--extrinsics=" + ",".join(f"{number:.6f}" for number in (x, y, z, qw, qx, qy, qz))

@@ -4,11 +4,13 @@ from time import time_ns
 
 import numpy as np
 import pytest
-from keypoint_node_fakes import HEIGHT, MILLISECOND, OLD_COLOR, TOPICS, WIDTH, CameraBench, camera_info
+from keypoint_node_fakes import FRAME, HEIGHT, MILLISECOND, OLD_COLOR, TOPICS, WIDTH, CameraBench, camera_info
 from sensor_msgs.msg import Image
 
 import finforce_keypoints.images as images
+from finforce.camera import EQUIDISTANT
 from finforce.health import Level
+from finforce.messages import camera_from_info, same_camera
 from finforce_keypoints.images import FROZEN_AFTER
 
 PERIOD = 33 * MILLISECOND
@@ -95,6 +97,13 @@ def test_camera_info_that_no_camera_has_is_refused(probe, changes, word):
     bench.refused(word, Level.ERROR)
     bench.send_info()
     recovers(bench)
+
+
+@pytest.mark.parametrize("kind", ["Inverse Brown Conrady", "Brown Conrady", "None"])
+def test_a_lens_of_librealsense_is_that_of_its_driver(kind):
+    expected = camera_from_info(camera_info(), FRAME)
+    assert same_camera(camera_from_info(camera_info(distortion_model=kind), FRAME), expected)
+    assert camera_from_info(camera_info(distortion_model="Kannala Brandt4", d=[0.1] * 4), FRAME).model == EQUIDISTANT
 
 
 def test_depth_of_another_size_is_refused(probe):

@@ -89,6 +89,23 @@ def test_what_cameras_send_becomes_rgb(encoding):
             assert np.abs(found[patch].astype(int) - PATCHES[patch]).max() <= 3
 
 
+@pytest.mark.parametrize(("said", "sent"), [("yuv422", "yuyv"), ("uyvy", "yuyv"), ("yuv422_yuy2", "uyvy")])
+def test_brightness_and_colours_the_other_way_round_are_named(said, sent):
+    """A grey texture with noise, in the order of bytes of another encoding than is said; flat and dark ones pass."""
+    noise = np.random.default_rng(0)
+    y = np.clip(128 + 40 * np.sin(np.arange(64) / 3.0) + noise.normal(0, 2, (48, 64)), 0, 255)
+    chroma = np.broadcast_to(np.where(np.arange(64) % 2, 120, 135), y.shape) + noise.normal(0, 1, y.shape)
+    for scale, is_named in ((1.0, True), (0.0, False)):
+        parts = [scale * y, scale * chroma]
+        image = np.stack(parts if sent == "yuyv" else parts[::-1], axis=-1).astype(np.uint8)
+        assert decode_color(image, sent).shape == (48, 64, 3)
+        if is_named:
+            with pytest.raises(ImageError, match=f"said to be {said}, its bytes are those of {sent} or "):
+                decode_color(image, said)
+        else:
+            decode_color(image, said)
+
+
 def test_half_a_pair_of_columns_is_refused():
     with pytest.raises(ImageError, match="even"):
         decode_color(bytes(2 * 3 * 2), "yuyv", ImageLayout(height=2, width=3))

@@ -168,6 +168,15 @@ def test_offsets_are_left_alone_where_the_metadata_say_so(tmp_path):
     assert model.run(paint(SQUARES)[None])[1] is None
 
 
+@pytest.mark.parametrize(("name", "kind"), [("snapshot-50000.pb", "TensorFlow"), ("snapshot-050.pt", "PyTorch")])
+def test_networks_of_other_programs_are_told_how_to_become_one(name, kind, tmp_path):
+    (tmp_path / name).write_bytes(b"x")
+    for path in (tmp_path, tmp_path / name):
+        with pytest.raises(ModelError, match=f"{name}: a {kind} file; expected an ONNX .*export_deeplabcut.py") as told:
+            KeypointModel(path)
+        assert ("DeepLabCut 3" in str(told.value)) == (kind == "TensorFlow")
+
+
 def test_files_that_are_missing_or_doubled_or_broken_are_named(tmp_path):
     with pytest.raises(ModelError, match="found none"):
         KeypointModel(tmp_path)

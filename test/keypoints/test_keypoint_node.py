@@ -30,10 +30,12 @@ from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 from std_msgs.msg import String
 
-from finforce.camera_topics import INFO_TOPIC
+from finforce.camera_topics import COLOR_TOPIC, INFO_TOPIC
 from finforce.health import Level
 from finforce.messages import decode_columns, pose_from_message, stamp_of
 from finforce.ros import node as ros
+from finforce.systems.processes import Process
+from finforce_eval.replay.node_run import awaited_topics
 from finforce_keypoints.errors import DetectionError
 from finforce_keypoints.node import KeypointDetectorNode
 
@@ -395,3 +397,14 @@ def test_images_that_nobody_asked_for_are_not_missed(probe):
     assert arrivals.count_losses().arrived
     probe.destroy_subscription(listener)
     probe.wait_for(lambda: not arrivals.count_losses().arrived)
+
+
+@pytest.mark.parametrize("depth", ["none", "auto"])
+def test_a_replay_awaits_no_camera_topic_that_the_detector_does_not_listen_to(probe, depth):
+    start_detector(probe, depth=depth)
+    probe.hear("left/keypoints", PointCloud2)
+    awaited = awaited_topics([Process(executable="keypoint_detector", name="keypoint_detector")], ("left",))
+    cameras = [topic for topic in awaited if topic.startswith("/camera")]
+    assert {COLOR_TOPIC, INFO_TOPIC} <= set(cameras)
+    for topic in cameras:
+        probe.connected(probe.speak(topic, CameraInfo if topic == INFO_TOPIC else Image, ros.RESULT))
