@@ -465,7 +465,9 @@ _LEAST_STDDEV = 0.1e-3
 _RELATIVE_ERROR, _ABSOLUTE_ERROR = 0.02, 0.03
 # Errors of neighbouring frames are alike; this many count as one.
 _CORRELATED_FRAMES = 30
-_LEADS, _ONE_CLOCK = np.arange(-6, 7) / 20.0, 0.05  # [s] of the true forces before the images: tried, tolerated
+# Times [s] by which the true forces may lead the images: tried, tolerated; and the share of the cost that one has to
+# leave: forces that are held tell nothing of it.
+_LEADS, _ONE_CLOCK, _CLEARLY = np.arange(-6, 7) / 20.0, 0.05, 0.8
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -525,13 +527,13 @@ def fit_force_history(
     for case, own in zip(cases, settings, strict=True):
         histories.append(_track_force(jaw, case, own, calibration))
         progress(float("nan"))
-    lead = min(_LEADS, key=lambda lead: _fit_branches(histories, lead).cost)  # early forces look like relaxed ones
-    if abs(lead) > _ONE_CLOCK:
+    fits = {lead: _fit_branches(histories, lead) for lead in _LEADS}  # early forces look like relaxed ones
+    lead, fit = min(fits, key=lambda lead: fits[lead].cost), fits[0.0]
+    if abs(lead) > _ONE_CLOCK and fits[lead].cost < _CLEARLY * fit.cost:
         raise CalibrationError(
             f"calibration: the forces fit those {abs(lead):.2f} s {'later' if lead > 0.0 else 'earlier'} than the "
             "images: expected the stamps of one clock, those of the exposure for the images"
         )
-    fit = _fit_branches(histories)
     errors = np.concatenate([_model(fit.x, history) - history.true for history in histories])
     true = np.concatenate([history.true for history in histories])
     loaded = true > _LOADED_FORCE
@@ -547,7 +549,9 @@ def fit_force_history(
 
 def _fit_branches(histories: Sequence[_ForceHistory], lead: float = 0.0) -> OptimizeResult:
     """Fit the log of the scale of the modulus, and the branches of the relaxation, to true forces of a later time."""
-    later = [replace(each, true=np.interp(each.stamps + lead, each.stamps, each.true)) for each in histories]
+    # whole images, for interpolated forces are less noisy than any
+    rows = [np.interp(each.stamps + lead, each.stamps, np.arange(len(each.stamps))) for each in histories]
+    later = [replace(each, true=each.true[np.rint(row).astype(int)]) for each, row in zip(histories, rows, strict=True)]
     return least_squares(
         _residuals,
         np.r_[0.0, BRANCH_PRIOR],

@@ -159,6 +159,17 @@ def test_forces_of_another_clock_are_refused_instead_of_taken_for_relaxation(lat
         assert [term.share for term in terms] == pytest.approx([0.12, 0.06], abs=0.1 * (late != 0) + 0.02)
 
 
+def test_a_clock_of_which_held_forces_tell_nothing_is_not_doubted(monkeypatch):
+    stamps, rng = np.arange(0.0, 20.0, 1.0 / 30.0), np.random.default_rng(5)
+    elastic = np.full(len(stamps), 2.0)
+    true = elastic + rng.normal(scale=0.05, size=len(stamps))
+    history = identification._ForceHistory(stamps=stamps, elastic=elastic, true=true)
+    monkeypatch.setattr(identification, "_track_force", lambda *given: history)
+    best = min(identification._LEADS, key=lambda lead: identification._fit_branches([history], lead).cost)
+    assert abs(best) > identification._ONE_CLOCK
+    identification.fit_force_history(load_jaw("bench"), [None], [FRAME], None, lambda cost: None)
+
+
 def test_only_so_many_plateaus_of_a_case_are_taken():
     assert len(find_plateaus([make_case(40), make_case(60)], BENCH, FRAME, per_case=2)) == 4
 
