@@ -59,7 +59,8 @@ BEYOND = 0.3  # share of the compared pixels outside the image, from which on no
 WHOLE = 0  # the edge beyond which there is nothing
 # Where wrist cameras are, in the gripper: y, z [m], tilt down [rad], half opening of the jaws [m].
 LOW, HIGH = np.array([0.04, -0.15, -0.2, 0.015]), np.array([0.18, 0.05, 0.9, 0.08])
-STARTS, PULLED, KEPT = 3000, 16, 2  # places that are tried; pulled to the jaws of one picture; and to those of all
+STARTS, PULLED, KEPT = 3000, 16, 3  # places that are tried; pulled to the jaws of one picture; and to those of all
+NOT_SHOWN = 1e3  # logarithm by which places are less likely at which the jaws do not show
 POLISH = 15  # steps in which outlines move a guess
 # Least contrast of outlines that are there, in the mean: a grey finger before a textured ground shows with 0.44.
 LEAST_CONTRAST = 0.3
@@ -276,7 +277,14 @@ def _pull_starts(task: _Task, progress: Callable[[int], Any]) -> list[_Refinemen
     one, pulled = replace(task, images=task.images[:1], half_opening=None), []
     for T, half in search_camera(task.images[0], task.camera, task.jaws, progress):
         fit = _Refinement(one, T, half, OUTLINE_STDDEV)
-        pulled.append((fit.pull(), fit))
+        likely = fit.pull()
+        try:
+            place = _add_ribs(fit.describe(), one)
+        except GeometryError:
+            likely -= NOT_SHOWN
+        else:
+            likely += 0.5 * INDEPENDENT * np.mean([each.here.evidence for each in place.ribs.values()])
+        pulled.append((likely, fit))
         progress(STARTS // PULLED)
     pulled.sort(key=lambda each: each[0], reverse=True)
     return [fit.widen(task) for _, fit in pulled[:KEPT]]
