@@ -18,7 +18,7 @@ __all__ = ["njit"]
 
 
 class SourceLocator(UserProvidedCacheLocator):
-    """Where Numba keeps a function of these sources: under the name of its package.
+    """Place at which Numba keeps a function of these sources: under the name of its package.
 
     Numba's own locators name the folder by the path of the file, and compile anew when that file alone has changed, or
     in older versions when it has been written.

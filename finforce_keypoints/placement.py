@@ -408,7 +408,7 @@ class _Setup(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Task:
-    """What is looked for, and in which pictures; see `find_placement`.
+    """Jaws and the pictures in which they are looked for; see `find_placement`.
 
     Attributes:
         half_opening: half the distance of the jaws' origins where they are widest open [m]; None: not known.

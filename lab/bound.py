@@ -271,7 +271,7 @@ def read_truth(recording: Recording, side: str, setup: EvaluationSetup) -> TrueI
 
 
 class PressTable(NamedTuple):
-    """What a press without traction linearises to.
+    """Linearised equilibria of a press without traction.
 
     Attributes:
         depths: (m,) [m].

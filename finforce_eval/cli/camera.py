@@ -97,7 +97,8 @@ def run(options: argparse.Namespace) -> CommandResult:
     locator = AnyFinger(SideNetwork(source.parameters.get("model") or ANY_FINGER), jaws)
     guess = source.node_parameters(recording).get("T_gripper_camera")
     guess = None if guess is None else read_extrinsics(guess)
-    with progress_bar(2 * STARTS + KEPT * ROUNDS * len(colors), "step") as bar:
+    searched = 2 * STARTS if guess is None else 0
+    with progress_bar(searched + KEPT * ROUNDS * len(colors), "step") as bar:
         found = find_placement(
             colors,
             recording.images.camera,
