@@ -196,10 +196,10 @@ def place_camera(x: NDArray, right: float) -> NDArray:
     """Return T_gripper_camera (4, 4) of a wrist camera.
 
     Args:
-        x: y, z [m], tilt down [rad], half opening (not used).
+        x: y, z [m], tilt down [rad] (3,).
         right: direction of the image's rows along the gripper's x, 1 or -1.
     """
-    y, z, tilt, _ = x
+    y, z, tilt = x
     return look_at((0.0, y, z), (0.0, y - np.sin(tilt), z + np.cos(tilt)), (right, 0.0, 0.0))
 
 
@@ -218,7 +218,7 @@ def search_camera(
     rng, tried = np.random.default_rng(0), []
     for number in range(STARTS):
         x = rng.uniform(LOW, HIGH)
-        T = place_camera(x, -1.0 if number % 2 else 1.0)
+        T = place_camera(x[:3], -1.0 if number % 2 else 1.0)
         poses = {side: jaw_in_camera(T, side, _origin(side, x[3])) for side in jaws}
         shown = [outlines[side].contrasts(image, pose, camera) for side, pose in poses.items()]
         tried.append((np.mean(shown, axis=0), T, float(x[3])))
@@ -619,6 +619,7 @@ class _Refinement:
         """Go back to what was kept, if anything was."""
         if self._kept[0] > -np.inf:
             self._x = self._kept[1]
+            self._best = (-1.0, self._x)
 
     @property
     def likeliest(self) -> float:
