@@ -16,12 +16,14 @@ from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.keypoint_source import parse_source
 from finforce_eval.evaluation.score_tables import evaluation_json
 from finforce_eval.evaluation.setup import make_setup
+from finforce_eval.recordings.images import ALONE
 from finforce_eval.replay.replay import Playing, Replay, replay
 
 GRASP = "grasp.png"  # picture on top of the report
 
 
 ENOUGH = 0.5  # of the images in the record phases that have to be answered for a score
+SOME = 0.2  # of the images without depth, as where depth comes at a lower rate
 
 
 def format_summary(result: Replay) -> list[str]:
@@ -30,7 +32,10 @@ def format_summary(result: Replay) -> list[str]:
     error, delay, lines = score.error, score.delay, []
     answered = f"{error.n} of {score.frames} images in the record phases answered"
     if error.n < ENOUGH * score.frames:
-        return [f"Grasp force: no score, {answered}; if the machine was busy, --rate 0.5 plays at half the speed"]
+        images, advice = result.recording.images, "if the machine was busy, --rate 0.5 plays at half the speed"
+        if images is not None and images.has_depth and (alone := (images.depth_stamps == ALONE).mean()) > SOME:
+            advice = f"{100 * alone:.0f} % of the images have no depth: --detector depth=none waits for none"
+        return [f"Grasp force: no score, {answered}; {advice}"]
     if error.rmse_N is not None:
         errors = f"{error.rmse_N:.3f} N RMSE, {error.max_error_N:.3f} N largest error, of {score.largest:.2f} N at most"
         lines.append(f"Grasp force: {errors}; {answered}")

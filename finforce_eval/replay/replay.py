@@ -18,7 +18,14 @@ from finforce_eval.errors import RecordingError, SilentReplayError
 from finforce_eval.evaluation.contact_source import FIXED, ContactChoice
 from finforce_eval.evaluation.forces import check_keypoint_count, truth_sides
 from finforce_eval.evaluation.gripper import with_distances
-from finforce_eval.evaluation.keypoint_source import IMAGES, TRUTH, KeypointSource, awaiting_keypoints
+from finforce_eval.evaluation.keypoint_source import (
+    IMAGES,
+    TRUTH,
+    KeypointSource,
+    awaiting_keypoints,
+    build_records,
+    choose_images,
+)
 from finforce_eval.evaluation.scoring import Evaluation, GraspScore, score_grasp, score_results
 from finforce_eval.evaluation.setup import EvaluationSetup
 from finforce_eval.recordings.images import ImageTrack
@@ -170,7 +177,8 @@ def _choose_keypoints(recording: Recording, jaw: Jaw, keypoints: KeypointSource,
     """
     source = keypoints.source_of(recording)
     if source == IMAGES:
-        recording = awaiting_keypoints(recording)
+        depth = build_records(keypoints.node_parameters(recording)).parameters.depth
+        recording = replace(awaiting_keypoints(recording), images=choose_images(recording, depth))
     elif source == TRUTH:
         recording = _write_truth(keypoints.apply(recording), stack)
     for side in recording.jaws if source != IMAGES else ():

@@ -3,6 +3,7 @@
 import json
 from argparse import Namespace
 from base64 import b64decode
+from contextlib import ExitStack
 from dataclasses import replace
 
 import numpy as np
@@ -14,10 +15,12 @@ from finforce_contact.loop import GivenContact
 from finforce_eval.cli import demo, replay
 from finforce_eval.cli.twin import write_footage
 from finforce_eval.errors import RecordingError
-from finforce_eval.evaluation.keypoint_source import detect_keypoints
+from finforce_eval.evaluation.keypoint_source import KeypointSource, detect_keypoints
 from finforce_eval.evaluation.scoring import score_grasp, score_results
+from finforce_eval.recordings.images import ALONE
 from finforce_eval.recordings.recording import read_recording
-from finforce_eval.replay.replay import Replay
+from finforce_eval.replay.replay import Replay, _choose_keypoints
+from finforce_ifea.jaw.jaw import load_jaw
 
 
 @pytest.fixture
@@ -154,6 +157,29 @@ def test_no_score_comes_of_fewer_than_half_of_the_images(played, count, is_score
     text = "\n".join(replay.format_summary(answer_some(played, count)))
     assert f"{count} of 40 images in the record phases answered" in text
     assert ("RMSE" in text) == is_scored != ("no score" in text and "--rate 0.5" in text)
+
+
+def test_depth_at_a_lower_rate_is_named_where_few_images_are_answered(played):
+    alone = np.where(np.arange(len(played.images.stamps_ns)) % 4, ALONE, played.images.stamps_ns)
+    slow = replace(played, images=replace(played.images, depth_stamps=alone))
+    text = "\n".join(replay.format_summary(replace(answer_some(played, 10), recording=slow)))
+    assert "75 % of the images have no depth: --detector depth=none" in text and "--rate" not in text
+
+
+@pytest.mark.parametrize(("depth", "is_alone"), [("auto", False), ("none", True)])
+def test_images_without_depth_are_played_and_scored_too(depth, is_alone, played):
+    half = len(played.images.stamps_ns) // 2
+    images = replace(
+        played.images,
+        stamps_ns=played.images.stamps_ns[:half],
+        depth_stamps=played.images.stamps_ns[:half],
+        unpaired=played.images.stamps_ns[half:],
+    )
+    source = KeypointSource(source="images", parameters={"depth": depth})
+    with ExitStack() as stack:
+        chosen = _choose_keypoints(replace(played, images=images), load_jaw("bench"), source, stack).images
+    assert np.array_equal(chosen.stamps_ns, played.images.stamps_ns)
+    assert np.array_equal(chosen.depth_stamps == ALONE, (np.arange(2 * half) >= half) | is_alone)
 
 
 def test_the_demo_plays_its_recording_and_ends_with_figures_and_report(rendered, played, tmp_path, monkeypatch, capsys):
