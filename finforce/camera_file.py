@@ -181,9 +181,8 @@ def _name_entries(entries: Mapping[str, Any]) -> dict[str, Any]:
         if kind != "pinhole" or len(_numbers(intrinsics)) != 4:
             raise IntrinsicsError(f"camera_model {entries.get('camera_model')}: expected pinhole, with fu fv pu pv")
         named |= zip(_NAMES, intrinsics, strict=True)
-    if EQUIDISTANT in (
-        _name_model(str(entries.get(name))) for name in ("model", "type")
-    ):  # else that of the device, or what the coefficients say
+    # else that of the device, or what the coefficients say
+    if EQUIDISTANT in [_name_model(str(entries.get(name))) for name in ("model", "type")]:
         lens = EQUIDISTANT
     lens = entries.get("distortion_model") or lens
     named["model"] = EQUIDISTANT if entries.get("fisheye_model") else lens

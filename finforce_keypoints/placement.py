@@ -60,7 +60,6 @@ WHOLE = 0  # the edge beyond which there is nothing
 # Where wrist cameras are, in the gripper: y, z [m], tilt down [rad], half opening of the jaws [m].
 LOW, HIGH = np.array([0.04, -0.15, -0.2, 0.015]), np.array([0.18, 0.05, 0.9, 0.08])
 STARTS, PULLED, KEPT = 3000, 16, 3  # places that are tried; pulled to the jaws of one picture; and to those of all
-NOT_SHOWN = 1e3  # logarithm by which places are less likely at which the jaws do not show
 POLISH = 15  # steps in which outlines move a guess
 # Least contrast of outlines that are there, in the mean: a grey finger before a textured ground shows with 0.44.
 LEAST_CONTRAST = 0.3
@@ -90,7 +89,6 @@ FARTHEST = (None, np.inf, HERE)
 MOST_ROUNDS, ROUNDS_PULLED, SETTLED = 12, 3, 0.05
 # How far aside a jaw is looked for [m], and by how much likelier its points have to be there.
 ASIDE, LIKELIER = 4e-3 * np.arange(-6.0, 7.0), 0.1
-ROUNDS = len(FARTHEST)
 OUTER_WEIGHT = 0.25  # of points off the face: how ribs slant differs more between fingers than where they meet the face
 
 
@@ -215,23 +213,29 @@ def search_camera(
         progress: called with the number of places tried since its last call.
     """
     outlines = {side: OutlineContrast(jaw) for side, jaw in jaws.items()}
-    rng, tried = np.random.default_rng(0), []
+    rng, tried, contrasts = np.random.default_rng(0), [], []
     for number in range(STARTS):
         x = rng.uniform(LOW, HIGH)
         T = place_camera(x[:3], -1.0 if number % 2 else 1.0)
         poses = {side: jaw_in_camera(T, side, _origin(side, x[3])) for side in jaws}
         shown = [outlines[side].contrasts(image, pose, camera) for side, pose in poses.items()]
-        tried.append((np.mean(shown, axis=0), T, float(x[3])))
+        tried.append((T, float(x[3])))
+        contrasts.append(np.mean(shown, axis=0))
         progress(1)
     # a holder that is not there explains much where something else stands
-    whole = sorted(tried, key=lambda each: each[0][WHOLE], reverse=True)[: PULLED // 2]
-    held = sorted(tried, key=lambda each: each[0].max(), reverse=True)
-    chosen = whole + [each for each in held[:PULLED] if not any(each is other for other in whole)]
-    return [(T, half) for _, T, half in chosen[:PULLED]]
+    whole, held = (
+        np.argsort(-each, kind="stable") for each in (np.array(contrasts)[:, WHOLE], np.max(contrasts, axis=1))
+    )
+    return [tried[n] for n in dict.fromkeys([*whole[: PULLED // 2], *held[:PULLED]])][:PULLED]
 
 
 def _origin(side: str, half: float) -> float:
     return -half if side == "left" else half
+
+
+def count_steps(images: int, is_guessed: bool) -> int:
+    """Return how many steps `find_placement` takes at most in so many images."""
+    return len(FARTHEST) * images if is_guessed else 2 * STARTS + KEPT * len(FARTHEST) * images
 
 
 def find_placement(
@@ -277,17 +281,16 @@ def _pull_starts(task: _Task, progress: Callable[[int], Any]) -> list[_Refinemen
     one, pulled = replace(task, images=task.images[:1], half_opening=None), []
     for T, half in search_camera(task.images[0], task.camera, task.jaws, progress):
         fit = _Refinement(one, T, half, OUTLINE_STDDEV)
-        likely = fit.pull()
+        likely, shows = fit.pull(), True
         try:
             place = _add_ribs(fit.describe(), one)
-        except GeometryError:
-            likely -= NOT_SHOWN
-        else:
             likely += 0.5 * INDEPENDENT * np.mean([each.here.evidence for each in place.ribs.values()])
-        pulled.append((likely, fit))
+        except GeometryError:
+            shows = False
+        pulled.append((shows, likely, fit))
         progress(STARTS // PULLED)
-    pulled.sort(key=lambda each: each[0], reverse=True)
-    return [fit.widen(task) for _, fit in pulled[:KEPT]]
+    pulled.sort(key=lambda each: each[:2], reverse=True)
+    return [fit.widen(task) for *_, fit in pulled[:KEPT]]
 
 
 def _try_fits(fits: Sequence[_Refinement], task: _Task, progress: Callable[[int], Any]) -> list[CameraPlacement]:
@@ -515,9 +518,8 @@ class _Refinement:
 
     def _weigh(self) -> float:
         """Return the logarithm of how likely points, camera and mounts are."""
-        strain = np.square(np.concatenate(self._strains(self._x[:6], self._split(self._x).turns))).sum()
-        count = ALIKE * len(self._task.images)
-        return float(count * sum(np.log(max(each.mean(), 1e-9)) for each in self._likelihood.values()) - 0.5 * strain)
+        points = sum(np.log(max(each.mean(), 1e-9)) for each in self._likelihood.values())
+        return float(ALIKE * len(self._task.images) * points - 0.5 * self._strain())
 
     def _look(self) -> None:
         """Find the points of every jaw in every picture."""
@@ -562,6 +564,10 @@ class _Refinement:
     def _strains(self, step: NDArray, turns: Mapping[str, NDArray]) -> list[NDArray]:
         """Return a camera's step (6,) and the turns of jaws, in standard deviations."""
         return [step / self._stddev, np.concatenate([*turns.values()]) / TURN_STDDEV]
+
+    def _strain(self) -> float:
+        """Return the sum of squares of `_strains` where camera and jaws are now."""
+        return float(np.square(np.concatenate(self._strains(self._x[:6], self._split(self._x).turns))).sum())
 
     def _away(self, side: str, T: NDArray, turn: NDArray, origins: NDArray) -> NDArray:
         """Return by how many columns and rows the points seen are off their places (n, K + 1, 2) [px]."""
@@ -675,7 +681,7 @@ class _Refinement:
             origins=origins,
             contrast=contrast,
             residual=residual,
-            strain=float(np.square(np.concatenate(self._strains(self._x[:6], turns))).sum()),
+            strain=self._strain(),
             seen={side: np.where(sure[side][:, :, None], seen, np.nan) for side, seen in self._seen.items()},
         )
 

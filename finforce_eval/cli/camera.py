@@ -35,12 +35,10 @@ from finforce_keypoints.errors import GeometryError
 from finforce_keypoints.networks.side_network import SideNetwork
 from finforce_keypoints.parameters import NO_DEPTH, REFERENCE, JawMount
 from finforce_keypoints.placement import (
-    KEPT,
     LEAST_SEEN,
-    ROUNDS,
-    STARTS,
     TURN_STDDEV,
     CameraPlacement,
+    count_steps,
     find_placement,
 )
 from finforce_keypoints.rib_check import describe_ribs
@@ -97,8 +95,7 @@ def run(options: argparse.Namespace) -> CommandResult:
     locator = AnyFinger(SideNetwork(source.parameters.get("model") or ANY_FINGER), jaws)
     guess = source.node_parameters(recording).get("T_gripper_camera")
     guess = None if guess is None else read_extrinsics(guess)
-    searched = 2 * STARTS if guess is None else 0
-    with progress_bar(searched + KEPT * ROUNDS * len(colors), "step") as bar:
+    with progress_bar(count_steps(len(colors), guess is not None), "step") as bar:
         found = find_placement(
             colors,
             recording.images.camera,

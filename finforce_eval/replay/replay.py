@@ -143,11 +143,6 @@ def play_to_nodes(
     with ExitStack() as stack:
         recording = _choose_keypoints(recording, setup.jaw, keypoints, stack)
         images = recording.images if from_images else None
-        if images is not None and not isinstance(images, ImageTrack):
-            raise RecordingError(
-                f"{recording.name}: only bags are played through the nodes; annotate and evaluate take other "
-                "recordings, too"
-            )
         # a recording of a live run holds what the nodes write, too
         written = {f"/{side}/{name}" for side in sides for name in RESULTS}
         written |= {"/grasp_wrench", "/manipulation_wrench", "/diagnostics", "/clock", "/rosout"}
@@ -173,10 +168,15 @@ def _choose_keypoints(recording: Recording, jaw: Jaw, keypoints: KeypointSource,
     """Return a recording with the key points that are played, without any where images will give them.
 
     Raises:
-        RecordingError: they are of another number than the jaw's.
+        RecordingError: they are of another number than the jaw's, or come from images that are in no bag.
     """
     source = keypoints.source_of(recording)
     if source == IMAGES:
+        if not isinstance(recording.images, ImageTrack):
+            raise RecordingError(
+                f"{recording.name}: only bags are played through the nodes; annotate and evaluate take other "
+                "recordings, too"
+            )
         depth = build_records(keypoints.node_parameters(recording)).parameters.depth
         recording = replace(awaiting_keypoints(recording), images=choose_images(recording, depth))
     elif source == TRUTH:

@@ -196,9 +196,9 @@ def ablate(rules: Iterable[Rule], bags: Iterable[str] = (), calibration: str = "
                 print(format_table(pd.DataFrame(own)), flush=True)
                 rows += own
                 bar.update(1)
-    table = pd.DataFrame(sorted(rows, key=lambda row: [rule.name for rule in rules].index(row["rule"])))
-    best = table.loc[table.groupby("rule", sort=False)["moves"].idxmax()].drop(columns="moves")
     told = {rule.name: rule for rule in rules}
+    table = pd.DataFrame(sorted(rows, key=lambda row: [*told].index(row["rule"])))
+    best = table.loc[table.groupby("rule", sort=False)["moves"].idxmax()].drop(columns="moves")
     best.insert(1, "constant or function", [told[name].implementation for name in best.rule])
     best.insert(2, "purpose", [told[name].purpose for name in best.rule])
     still = [name for name, moved in table.groupby("rule", sort=False)["moves"].max().items() if moved < 1.0]

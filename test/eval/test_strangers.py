@@ -376,8 +376,9 @@ def test_what_a_dataset_lacks_is_said_in_one_line_before_its_videos_are_read(dat
 
 
 def test_what_plays_bags_alone_says_so_and_promises_no_datasets(dataset, capsys):
-    assert main(["trace", str(dataset), *DATASET]) == 2
-    assert "only bags are played" in capsys.readouterr().err
+    for depth in ("auto", "aligned"):
+        assert main(["trace", str(dataset), *DATASET, "--detector", f"depth={depth}"]) == 2
+        assert "only bags are played" in capsys.readouterr().err
     for command in ("trace", "replay"):
         with pytest.raises(SystemExit):
             main([command, "--help"])
