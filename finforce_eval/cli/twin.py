@@ -267,7 +267,7 @@ def record_footage(
         "jaw": str(Path(scenario.jaw).resolve()) if Path(scenario.jaw).is_file() else scenario.jaw,
         "object": {"kind": scenario.object},
     }
-    if scenario.is_guided:
+    if scenario.is_guided and not scenario.roughness:
         case["friction"] = FRICTIONLESS
     with progress_bar(len(footage), "image", scenario.name) as bar:
         write_footage(footage, folder, compressed=compressed, case=case, seen=lambda _: bar.update())

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce.messages import SharedStddev
 from finforce_ifea.contact_mechanics.friction import FRICTIONLESS, Traction, constant_traction
 from finforce_ifea.contact_mechanics.indenter import Indenter, OutlineIndenter, RoundIndenter
 from finforce_ifea.contact_mechanics.pressed_jaw import RigidContact
@@ -299,7 +300,7 @@ def build_unplaced(bench: Bench, random: np.random.Generator) -> Scene:
     way, turn, stretch = (np.sin(rate * phase) for rate in (3.0, 4.0, 5.0))
     turned = 0.035 * turn * np.stack([rest[:, 2], 0.0 * rest[:, 2], -rest[:, 0]], axis=1)
     longer = 0.02 * stretch * rest * [0.0, 0.0, 1.0]
-    return shift(scene, 1e-3 * way * [0.7, 0.0, 0.7] + turned + longer, shared=0.7e-3)
+    return shift(scene, 1e-3 * way * [0.7, 0.0, 0.7] + turned + longer, shared=SharedStddev(shift=0.7e-3))
 
 
 def build_misplaced(bench: Bench, random: np.random.Generator) -> Scene:

@@ -76,6 +76,13 @@ def test_a_recording_states_the_friction_of_an_object_that_is_guided(tmp_path):
     assert read_friction(read_recording(tmp_path / "bag")) == (0.0, 0.03)
 
 
+@pytest.mark.usefixtures("asked")
+def test_a_recording_states_no_friction_of_a_rough_object(tmp_path):
+    rough = ["grasp_cylinder", "--set", "roughness=0.5", "-o", str(tmp_path / "bag")]
+    assert main(["twin", "record", *rough]) == 0
+    assert read_friction(read_recording(tmp_path / "bag")) is None
+
+
 @pytest.mark.parametrize(
     ("words", "reason"),
     [

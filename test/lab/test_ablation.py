@@ -1,6 +1,7 @@
 """Rules of the estimator that are switched off, each in a process of its own."""
 
 import pickle
+from dataclasses import replace
 from functools import reduce
 from importlib import import_module
 
@@ -8,9 +9,10 @@ import numpy as np
 import pytest
 
 from finforce_eval.errors import OptionError
+from finforce_ifea.observation import check_contact, check_observation
 from lab.ablation.rules import RULES
 from lab.ablation.run import find_compiled, list_runs, run_child, switch_off
-from lab.ablation.scenes import SCENES, Press, film, tell_height
+from lab.ablation.scenes import SCENES, Press, build_scene, film, tell_height
 from lab.cli.ablation import choose_rules
 from lab.stress.session import Bench
 from lab.stress.stress import Plan
@@ -34,6 +36,27 @@ def test_a_value_that_is_compiled_in_asks_for_another_compilation_of_what_holds_
     assert find_compiled(BY_NAME["reset after a release"]) == ()
 
 
+@pytest.fixture(scope="module")
+def bench():
+    return Bench(Plan())
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_the_estimator_takes_every_image_of_a_scene(name, bench, monkeypatch):
+    def press(bench, depths, *, indenter=None, shape=0.0125, height=0.040, **_):
+        states = np.stack(np.broadcast_arrays(depths, shape, height), axis=1)
+        points = np.tile(bench.jaw.keypoints, (len(depths), 1, 1))
+        rest = Press(states=states, points=points, forces=np.zeros((len(depths), 3)))
+        return rest if indenter is None else replace(rest, indenter=indenter)
+
+    monkeypatch.setattr("lab.ablation.scenes.press", press)
+    scene, before = build_scene(bench, name), None
+    for image, contact in zip(scene.images, scene.contacts, strict=True):
+        check_observation(image, len(bench.jaw.keypoints), before)
+        check_contact(contact, bench.jaw)
+        before = image.stamp
+
+
 def test_a_place_that_is_gone_is_an_error():
     rule = BY_NAME["reset after a release"]
     gone = type(rule)(**{**vars(rule), "off": {"finforce_ifea.filter.tracker:_NO_SUCH_RULE": 0}})
@@ -47,9 +70,9 @@ def test_an_unknown_rule_lists_the_known_ones():
 
 
 @pytest.fixture(scope="module")
-def scenes(tmp_path_factory):
+def scenes(bench, tmp_path_factory):
     """A folder with an unloaded jaw, seen with more noise than in the tare, and with a point that comes and goes."""
-    bench, random, folder = Bench(Plan()), np.random.default_rng(0), tmp_path_factory.mktemp("scenes")
+    random, folder = np.random.default_rng(0), tmp_path_factory.mktemp("scenes")
     count = 120
     rest = np.tile(bench.jaw.keypoints, (count, 1, 1))
     pressed = Press(states=np.tile([0.0, 0.0125, 0.040], (count, 1)), points=rest, forces=np.zeros((count, 3)))
