@@ -8,6 +8,7 @@ than both, the position begins anew.
 
 from __future__ import annotations
 
+from copy import copy
 from math import exp
 from typing import NamedTuple
 
@@ -48,10 +49,10 @@ class Track:
             motion, the covariance of position and speed, and the variance of the speed (8,).
     """
 
-    def __init__(self, noise: MotionNoise, x: float, variance: float) -> None:
-        """Start at rest at x with a variance."""
+    def __init__(self, noise: MotionNoise, x: float, variance: float, speed: float = 0.0) -> None:
+        """Start at x with a variance, at rest or at a speed."""
         self.noise = noise
-        self.state = np.array([0.5, x, x, 0.0, variance, variance, 0.0, noise.start])
+        self.state = np.array([0.5, x, x, speed, variance, variance, 0.0, noise.start])
 
     @property
     def x(self) -> float:
@@ -80,6 +81,17 @@ class Track:
     def widen(self, variance: float) -> None:
         """Add a variance to the position."""
         self.state[4:6] += variance
+
+    def stop(self) -> None:
+        """Take it that nothing moves."""
+        self.state[[0, 3]] = 1.0, 0.0
+
+    def after(self, dt: float) -> Track:
+        """Return the track a time [s] later."""
+        later = copy(self)
+        later.state = self.state.copy()
+        later.predict(dt)
+        return later
 
     def predict(self, dt: float, rest_time: float | None = None) -> None:
         """Advance by a time [s]; a mean time of rest [s] goes before that of the noise."""

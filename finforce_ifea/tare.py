@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import compress
 from typing import NamedTuple
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from finforce.compiled import njit
 from finforce_ifea.errors import NotEnoughDataError, UnderLoadError
+from finforce_ifea.filter.measurement import NO_COMMON_NOISE, CommonNoise, weigh
 from finforce_ifea.settings import EstimatorSettings
 
 # Of a key point that no tare has seen: noise along one axis, and constant offset [m].
@@ -139,6 +140,10 @@ def _enlarge_noise(covariance, usual, stddev):
 _FARTHEST_OFFSET = 3e-3
 _FARTHEST_FROM_MEDIAN = 1.8e-3
 _NOISE_FLOOR = 0.02e-3
+# Key points of an image that tell a shift and a turn from their own noise.
+_FEWEST_MOVED = 4
+# Least share of the noise that is a key point's own [-].
+_LEAST_INDEPENDENT = 0.1
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -150,12 +155,14 @@ class Tare:
         counts: (K,) frames behind each offset.
         noise: covariance of one key point in one frame (3, 3) [m^2], pooled over all of them.
         stated: that of each key point by the standard deviations that came with it; None without such.
+        common: the part of it that the key points of an image share.
     """
 
     offsets: NDArray
     counts: NDArray
     noise: NDArray
     stated: StatedNoise | None = None
+    common: CommonNoise = NO_COMMON_NOISE
 
     @cached_property
     def is_taken(self) -> bool:
@@ -231,14 +238,50 @@ def compute_tare(
         return None
     offsets = np.zeros_like(keypoints)
     offsets[often] = np.nanmean(deviations[:, often], axis=0)
-    scatter = deviations - offsets
+    scatter = np.where(often[:, None], deviations - offsets, np.nan)
     noise = scatter[:, often].reshape(-1, 3)
     noise = np.cov(noise[np.isfinite(noise[:, 0])].T) + _NOISE_FLOOR**2 * np.eye(3)
     stated = None
     if all(stddev is not None for stddev in stddevs):
-        scatter[:, ~often] = np.nan
         stated = match_stated(scatter, np.stack(stddevs), _NOISE_FLOOR)
-    return Tare(offsets=offsets, counts=np.where(often, counts, 0), noise=noise, stated=stated)
+    tare = Tare(offsets=offsets, counts=np.where(often, counts, 0), noise=noise, stated=stated)
+    return replace(tare, common=measure_common_noise(scatter, tare.point_noise(None), keypoints))
+
+
+def measure_common_noise(scatter: NDArray, noise: PointNoise, keypoints: NDArray) -> CommonNoise:
+    """Return the part of the noise that all key points of an image share.
+
+    With c_i the shift and the turn that fit the key points of image i best, M^-1 their covariance where the noise of
+    all key points is independent, and rho the variance of what the fit leaves over that of the noise,
+
+        Q = Cov c_i - rho M^-1,
+
+    without what is negative or within a standard error of chance. Outliers get the filter's weights.
+
+    Args:
+        scatter: about each key point's mean (n, K, 3) [m], NaN where it was not used.
+        noise: of the key points.
+        keypoints: drawn (K, 3) [m].
+    """
+    left = scatter[..., ::2] - noise.gain * scatter[..., 1:2]
+    seen = np.isfinite(left[..., 0])
+    enough = seen.sum(axis=1) >= _FEWEST_MOVED
+    seen, left, count = seen[enough], np.where(seen[enough][..., None], left[enough], 0.0), int(enough.sum())
+    if count < _FEWEST_FRAMES:
+        return NO_COMMON_NOISE
+    information, still = np.linalg.inv(noise.plane), np.zeros(len(keypoints))
+    modes = np.array([[still + 1.0, still, keypoints[:, 2]], [still, still + 1.0, -keypoints[:, 0]]]).transpose(2, 0, 1)
+    distances = np.einsum("nka,kab,nkb->nk", left, information, left)
+    weight = seen * weigh(distances.ravel()).reshape(distances.shape)
+    M = np.einsum("nk,kai,kab,kbj->nij", weight, modes, information, modes)
+    moved = np.linalg.solve(M, np.einsum("nk,kai,kab,nkb->ni", weight, modes, information, left)[..., None])[..., 0]
+    total, fitted = float((weight * distances).sum()), float(np.einsum("ni,nij,nj->", moved, M, moved))
+    rho = (total - fitted) / (2.0 * weight.sum() - 3.0 * count)
+    L = np.linalg.cholesky(M.mean(axis=0))
+    size, axes = np.linalg.eigh(np.cov((moved @ L).T))
+    root = np.linalg.solve(L.T, axes * np.sqrt(np.maximum(size - rho * (1.0 + np.sqrt(2.0 / count)), 0.0)))
+    share = float(((L.T @ root) ** 2).sum()) * count / (2.0 * float(weight.sum()))
+    return CommonNoise(root @ root.T, max(1.0 - share, _LEAST_INDEPENDENT))
 
 
 Significance = Callable[[Tare, float], float]

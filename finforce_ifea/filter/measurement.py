@@ -4,7 +4,8 @@ In the plane of the jaw's motion, with what the noise along y tells of that alon
 
     z_k = p_k(d, s, h, kappa) + camera_k + o_k + r_k |u_k| + n_k,
 
-with p_k the mechanics' position and u_k its displacement. n_k is Student's t, whose weights
+with p_k the mechanics' position and u_k its displacement. Part of the noise n_k is a shift and a turn of all key points
+of the image; the rest of it is Student's t, whose weights
 
     w_k = (nu + 3) / (nu + D_k^2)
 
@@ -45,6 +46,21 @@ _MEDIAN = 1.57
 LATERAL_ERROR = 0.1e-3
 
 
+class CommonNoise(NamedTuple):
+    """The part of an image's noise that all its key points share.
+
+    Attributes:
+        common: covariance of their shift along x and z [m] and of their turn [rad] in an image (3, 3).
+        independent: share of the variance of a key point that is its own [-].
+    """
+
+    common: NDArray
+    independent: float
+
+
+NO_COMMON_NOISE = CommonNoise(np.zeros((3, 3)), 1.0)
+
+
 class Measurement(NamedTuple):
     """Two rows, x and z, of each of m key points of an image, linearised about a state.
 
@@ -55,6 +71,8 @@ class Measurement(NamedTuple):
         z: measured positions less the part of the linearised ones that does not depend on x (2 m,) [m].
         R: noise (m, 2, 2) [m^2].
         square: squared normalised residuals along y (m,).
+        common: see `CommonNoise`.
+        independent: see `CommonNoise`.
     """
 
     H: NDArray
@@ -63,6 +81,8 @@ class Measurement(NamedTuple):
     z: NDArray
     R: NDArray
     square: NDArray
+    common: NDArray
+    independent: float
 
 
 @njit(**_OPTIONS)
@@ -79,19 +99,19 @@ def find_seen(points):
 
 
 @njit(**_OPTIONS)
-def observe(points, seen, positions, motions, at, ratio, level):
+def observe(points, noise, seen, positions, motions, at, ratio):
     """Return the measurement by key points.
 
     Args:
         points: all key points of the image (K,), see `KEYPOINT`.
+        noise: its variance over that in the tare, and see `CommonNoise` for what key points share of it.
         seen: those that are used (m,).
         positions: of the mechanics (K, 3) [m].
         motions: their derivatives by depth, shape, height and traction ratio (K, 3, 4).
         at: depth, shape and height at which the mechanics stands (3,).
         ratio: traction ratio at which it stands.
-        level: variance of the noise over that in the tare.
     """
-    m = len(seen)
+    m, (level, common, independent) = len(seen), noise
     H, rows, u, z = np.zeros((2 * m, SHARED)), np.empty(2 * m, np.int64), np.empty(2 * m), np.empty(2 * m)
     R, square = np.empty((m, 2, 2)), np.empty(m)
     for i in range(m):
@@ -114,7 +134,7 @@ def observe(points, seen, positions, motions, at, ratio, level):
         H[2 * i, CAMERA_X], H[2 * i + 1, CAMERA_Z] = 1.0, 1.0
         H[2 * i, CAMERA_TURN], H[2 * i + 1, CAMERA_TURN] = p[2], -p[0]
         H[2 * i + 1, CAMERA_STRETCH] = p[2]
-    return Measurement(H, rows, u, z, R, square)
+    return Measurement(H, rows, u, z, R, square, level * common, independent)
 
 
 @njit(**_OPTIONS)

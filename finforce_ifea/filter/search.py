@@ -31,7 +31,7 @@ from finforce_ifea.filter.jump import (
     JumpWatch,
     correct,
 )
-from finforce_ifea.filter.measurement import Measurement, find_seen, observe
+from finforce_ifea.filter.measurement import NO_COMMON_NOISE, Measurement, find_seen, observe
 from finforce_ifea.filter.process import (
     BUMPED_SHIFT,
     BUMPED_TIME,
@@ -130,6 +130,7 @@ class ContactSearch:
 
     Attributes:
         points: key points of the last image (K,), see `KEYPOINT`.
+        noise: the part of it that they share.
         state: of the contact in the last image in which it was found, see `CONTACT_STATE`.
         expectation: of the object, see `EXPECTATION`.
         q: unknowns of the jaw (size,).
@@ -145,6 +146,7 @@ class ContactSearch:
         """Prepare the filter for `count` key points."""
         self.settings = settings
         self.points, self.positions = np.zeros(count, KEYPOINT), np.zeros((count, 3))
+        self.noise = NO_COMMON_NOISE
         self.state, self.expectation = blank_contact_state(), np.zeros((), EXPECTATION)
         self._count = count
         self._watches = [JumpWatch(jump, state_size(count)) for jump in (NUDGED, OFFSET)]
@@ -188,7 +190,8 @@ class ContactSearch:
     def restart(self) -> None:
         """Start anew where the contact is now, as after another tare; what is known of friction stays."""
         self.x: NDArray | None = None
-        self._bumped, self._smooth, self._level = False, 0.0, 1.0
+        self._bumped, self._smooth, self._level, self._scatter = False, 0.0, 1.0, 1.0
+        self._raw = np.full(2, np.nan)
         self._forget_innovations()
 
     def _forget_innovations(self) -> None:
@@ -225,6 +228,7 @@ class ContactSearch:
         if self.x is not None:
             self.x[:, DEPTH] += change
             self.track.shift(change)
+            self._raw += change
             self.hypotheses.shift(change)
 
     def lose(self, stddev: float) -> None:
@@ -298,7 +302,8 @@ class ContactSearch:
         settled, iteration, last = False, 0, (np.zeros(3), 1.0)
         posterior, found, jump, P = None, UNDECIDED, NO_JUMP, self.P.copy()
         reach, possible = np.full(len(q), contact.model.reach, dtype=float), self._find_possible_jumps()
-        image, known = (points, seen, self._level, expectation), (contact.packed_object, reach, self.track.state)
+        image = points, (self._level, *self.noise), seen, expectation
+        known = contact.packed_object, reach, self.track.state, self._scatter
         prior = ratios, self.x, self.log_weights, P
         while iteration < iterations and not settled:
             iteration += 1
@@ -359,10 +364,12 @@ class ContactSearch:
 
     def _smooth_depth(self, raw: float, variance: float) -> float:
         """Smooth a depth [m] of some variance [m^2]; return by which factor that lessens its standard deviation."""
-        variance = max(variance, _LEAST_VARIANCE)
-        self.track.update(raw, variance)
+        own = max(variance, _LEAST_VARIANCE)
+        self._scatter = _follow_scatter(self._scatter, self._raw, raw, self._scatter * own)
+        self._raw = np.array([self._raw[1], raw])
+        self.track.update(raw, self._scatter * own)
         self._smooth = self.track.x - raw
-        return sqrt(min(self.track.variance / variance, 1.0))
+        return sqrt(min(self.track.variance / own, self._scatter))
 
     def _read_out(
         self, pressed: PressedState, at: NDArray, place: _Place, posterior: Posterior, traction: tuple[NDArray, float]
@@ -435,12 +442,13 @@ def _iterate(image, at, prior, weight, possible, known, x, last):
     """Return what one image makes of one linearisation: the step that it asks for.
 
     Args:
-        image: `points`, `seen` and `level` of `observe`; see `EXPECTATION`.
+        image: `points`, `noise` and `seen` of `observe`; see `EXPECTATION`.
         at: `positions`, `motions`, `at` and `ratio` of `observe`; modes (size, 4) and size of the `PressedState`.
         prior: `ratios`, `x`, `log_weights` and `P` of `correct`.
         weight: see `correct`.
         possible: see `correct`.
-        known: object and surface, see `find_first_touch`; reach of the model (size,); state of the depth's `Track`.
+        known: object and surface, see `find_first_touch`; reach of the model (size,); state of the depth's `Track`, and
+            the variance of depths over that by the noise.
         x: state of the contact (3,).
         last: step (3,), and the share of a step that this one may have.
 
@@ -448,11 +456,11 @@ def _iterate(image, at, prior, weight, possible, known, x, last):
         Measurement, posterior and jump; the next `_Place`; the motion of the mechanics (3,) and of its unknowns
         (size,); this step, and the next share; whether it changes nothing that matters.
     """
-    (points, seen, level, expectation), (positions, motions, x_model, ratio, modes, size) = image, at
-    (touching, reach, track), (before, share) = known, last
-    measured = observe(points, seen, positions, motions, x_model, ratio, level)
+    (points, noise, seen, expectation), (positions, motions, x_model, ratio, modes, size) = image, at
+    (touching, reach, track, scatter), (before, share) = known, last
+    measured = observe(points, noise, seen, positions, motions, x_model, ratio)
     posterior, found = correct(measured, weight, *prior, possible, x_model[DEPTH])
-    aim, variance = posterior.mean[: HEIGHT + 1] - x, max(posterior.own[0, 0], _LEAST_VARIANCE)
+    aim, variance = posterior.mean[: HEIGHT + 1] - x, max(posterior.own[0, 0], _LEAST_VARIANCE) * scatter
     aim[0] = expect_position(track, posterior.mean[DEPTH], variance, _DEPTH_NOISE) - x[0]
     x, step, share = _take_step(x, aim, before, share, expectation)
     after, depth = _find_x_model(touching, x)
@@ -486,6 +494,24 @@ def _follow_level(level, distances):
     """Return the variance of the noise over that in the tare, for what was expected and D^2 (m,) of the residuals."""
     seen = min(np.median(distances) / _MEDIAN_SQUARE, _LARGEST_CHANGE)
     return min(max(level * (1.0 + (seen - 1.0) / _LEVEL_IMAGES), 1.0), _LARGEST_LEVEL)
+
+
+@njit(**_OPTIONS)
+def _follow_scatter(scatter, before, z, R):
+    """Return the variance of the depths over that by the noise.
+
+    Second differences have six times that of a depth, whatever its speed; one that is far larger is no noise.
+
+    Args:
+        scatter: as it was expected.
+        before: the last two depths (2,) [m], NaN if there are none.
+        z: depth [m].
+        R: its variance, `scatter` included [m^2].
+    """
+    seen = (z - 2.0 * before[1] + before[0]) ** 2 / (6.0 * R)
+    if not seen <= _LARGEST_CHANGE:
+        return scatter
+    return min(max(scatter * (1.0 + (seen - 1.0) / _LEVEL_IMAGES), 1.0), _LARGEST_LEVEL)
 
 
 @njit(**_OPTIONS)

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from math import sqrt
+from math import hypot, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
 
 from finforce.camera import CameraIntrinsics
 from finforce.gripper_frames import jaw_in_camera
+from finforce.kalman import MotionNoise, Track
 from finforce.optional import import_cv2
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_keypoints.geometry.side_picture import PlaneGrid, SidePlane, map_picture, take_picture
@@ -33,8 +34,18 @@ SLIP = 1.5e-3  # [m] standard deviation of how far holder and camera give under 
 _ROUNDS = 6  # of reweighting
 _LEAST_NOISE = 0.05e-3  # [m] of a place by points near the base, from image to image
 _LEAST_BENT = 5  # points that tell the place of a jaw that may be bent
-_ORIGIN_GATE = 3.0  # standard deviations of an origin off the forecast, which mean that the speed has changed
-_ACCELERATION = 2e-3  # [m/s^1.5] random walk of the closing speed; what is more is noticed and followed
+_ORIGIN_GATE = 3.0  # standard deviations of an origin off the forecast, beyond which it is not the same
+# Process noise of a jaw: it stands, or closes at up to centimetres per second, and often starts; jumps are images that
+# were missed.
+_NOISE = MotionNoise(
+    drift=(0.01e-3) ** 2,
+    acceleration=0.004**2,
+    start=0.01**2,
+    rest_time=3.0,
+    motion_time=1.0,
+    jump=(5e-3) ** 2,
+    jump_probability=1e-3,
+)
 _LONGEST_STEP = 0.5  # [s] without an image, after which the trajectory starts anew
 SCALE = 0.25e-3  # [m] of a pixel of the patch
 HALF = 20  # [px] of the patch's width and height
@@ -317,13 +328,10 @@ class PatchMatcher:
 
 
 class OriginTrack:
-    """Kalman filter of a jaw's place and speed that follows changes of speed at once.
-
-    Constant speed under white acceleration, P' = F P F^T + Q. An origin farther off the forecast than the gate means
-    that the speed has changed: position and speed are opened to what was seen.
+    """The place of a jaw that stands or moves, see `finforce.kalman`, over images in which it may not be seen.
 
     What images in a row err by alike does not hold the place back: it is in what is stated, and what it changes by
-    from one image to the next is in the noise of this one, or in P where the last one was worse.
+    from one image to the next is in the noise of this one, or in that of the forecast where the last one was worse.
     """
 
     def __init__(self, settings: DetectorSettings, largest_stddev: float = _ORIGIN_STDDEV) -> None:
@@ -334,7 +342,7 @@ class OriginTrack:
     def reset(self) -> None:
         """Forget the jaw."""
         self._stamp: float | None = None
-        self._state, self._P = np.zeros(2), np.zeros((2, 2))
+        self._track = Track(_NOISE, 0.0, 0.0)
         self._aside: list[tuple[float, float]] = []
         self._missed, self._last, self._bias = 0, Origin(x=0.0, stddev=0.0), 0.0
 
@@ -346,18 +354,18 @@ class OriginTrack:
     @property
     def place(self) -> float:
         """The position of the jaw's origin on the closing axis [m]; NaN when it is lost."""
-        return float("nan") if self.is_lost else float(self._state[0])
+        return float("nan") if self.is_lost else self._track.x
 
     @property
     def speed(self) -> float:
         """The sliding speed of the jaw [m/s]."""
-        return float(self._state[1])
+        return self._track.speed
 
     def forecast(self, stamp: float) -> Origin | None:
         """Return where the jaw should be at a time [s]; None when it is lost."""
         if self._stamp is None or stamp - self._stamp > _LONGEST_STEP:
             return None
-        return self._tell(*self._predict(stamp))
+        return self._tell(self._track.after(stamp - self._stamp))
 
     def update(self, stamp: float, origin: Origin | None) -> Origin | None:
         """Take the origin seen in an image, None when it was not; return the best estimate, None when lost."""
@@ -366,27 +374,23 @@ class OriginTrack:
             return self._miss(stamp, forecast)
         if forecast is None:
             return self._begin(stamp, origin)
-        state, P = self._predict(stamp)
-        origin = self._take_bias(origin, forecast)
-        error, dt = origin.x - state[0], stamp - self._stamp
+        origin, dt = self._take_bias(origin, forecast), stamp - self._stamp
+        track = self._track.after(dt)
         variance = origin.stddev**2
         if origin.noise is not None or self._last.noise is not None:
             worse = origin.stddev - self._last.stddev
             variance = (origin.noise or origin.stddev) ** 2 + max(worse, 0.0) ** 2
-            P = P + np.diag([min(worse, 0.0) ** 2, 0.0])
-        spread = np.sqrt(P[0, 0] + variance)
-        if abs(error) > self._settings.largest_speed * dt + _ORIGIN_GATE * spread:
+            track.widen(min(worse, 0.0) ** 2)
+        before, farthest = track.variance, self._settings.largest_speed * dt
+        if abs(origin.x - track.x) > farthest + _ORIGIN_GATE * sqrt(before + variance):
             return self._set_aside(stamp, origin, forecast)
         self._missed, self._aside, self._last = 0, [], origin
-        if abs(error) > _ORIGIN_GATE * spread:
-            P = P + np.diag([error**2, (error / dt) ** 2])
-        gain = P[:, 0] / (P[0, 0] + variance)
-        self._stamp, self._state = stamp, state + gain * error
-        least = min(P[0, 0], origin.shared**2) if origin.noise is None else 0.0
-        self._P = P - np.outer(gain, P[0])
-        # a finger stays bent from image to image: no average of its points knows better where its base is
-        self._P[0, 0] = max(self._P[0, 0], least)
-        found = self._tell(self._state, self._P)
+        self._stamp, self._track = stamp, track
+        track.update(origin.x, variance)
+        if origin.noise is None:
+            # a finger stays bent from image to image: no average of its points knows better where its base is
+            track.widen(max(min(before, origin.shared**2) - track.variance, 0.0))
+        found = self._tell(track)
         return found if found.stddev <= self._largest_stddev else None
 
     def _take_bias(self, origin: Origin, forecast: Origin) -> Origin:
@@ -402,14 +406,14 @@ class OriginTrack:
     def rest(self, stamp: float) -> None:
         """Take it that the jaw has not moved since the last image."""
         if self._stamp is not None:
-            self._stamp, self._state[1] = stamp, 0.0
+            self._stamp = stamp
+            self._track.stop()
 
     def _begin(self, stamp: float, origin: Origin, speed: float = 0.0) -> Origin:
         """Start the trajectory at an origin."""
-        self._stamp, self._state = stamp, np.array([origin.x, speed])
-        self._P = np.diag([(origin.noise or origin.stddev) ** 2, 0.01**2])
+        self._stamp, self._track = stamp, Track(_NOISE, origin.x, (origin.noise or origin.stddev) ** 2, speed)
         self._aside, self._missed, self._last = [], 0, origin
-        return self._tell(self._state, self._P) if origin.stddev <= self._largest_stddev else None
+        return self._tell(self._track) if origin.stddev <= self._largest_stddev else None
 
     def _miss(self, stamp: float, forecast: Origin | None) -> Origin | None:
         """Go on without an origin for a few images."""
@@ -417,8 +421,7 @@ class OriginTrack:
         if forecast is None or self._missed >= self._settings.lost_images:
             self.reset()
             return None
-        self._state, self._P = self._predict(stamp)
-        self._stamp = stamp
+        self._stamp, self._track = stamp, self._track.after(stamp - self._stamp)
         return forecast if forecast.stddev <= self._largest_stddev else None
 
     def _set_aside(self, stamp: float, origin: Origin, forecast: Origin) -> Origin | None:
@@ -433,14 +436,7 @@ class OriginTrack:
             return self._begin(stamp, origin, speed=(end - begin) / (last - first))
         return self._miss(stamp, forecast)
 
-    def _predict(self, stamp: float) -> tuple[NDArray, NDArray]:
-        """Return position and speed (2,) at a time [s] and their covariance (2, 2)."""
-        dt, power = stamp - self._stamp, _ACCELERATION**2
-        F = np.array([[1.0, dt], [0.0, 1.0]])
-        Q = power * np.array([[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]])
-        return F @ self._state, F @ self._P @ F.T + Q
-
-    def _tell(self, state: NDArray, P: NDArray) -> Origin:
-        """Return the jaw's place by a state (2,) and its covariance (2, 2)."""
+    def _tell(self, track: Track) -> Origin:
+        """Return the jaw's place by a track."""
         shared = 0.0 if self._last.noise is None else self._last.shared
-        return Origin(x=float(state[0]), stddev=float(np.hypot(np.sqrt(P[0, 0]), shared)))
+        return Origin(x=track.x, stddev=hypot(sqrt(track.variance), shared))
