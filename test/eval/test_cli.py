@@ -17,6 +17,7 @@ from finforce_eval.cli import replay
 from finforce_eval.cli.main import COMMANDS, build_parser, main, parse
 from finforce_eval.cli.parser import CommandResult
 from finforce_eval.errors import SilentReplayError
+from finforce_eval.evaluation.keypoint_source import KeypointSource
 from finforce_eval.recordings.writer import write_entries, write_recording
 
 BENCH_KEYPOINTS = 15
@@ -233,6 +234,15 @@ def test_all_key_points_hidden_is_refused(capsys, tmp_path, monkeypatch):
     monkeypatch.setattr("finforce_eval.evaluation.setup.ForceEstimator", lambda *_, **__: FakeEstimator([None] * 60))
     bag = write_recording(bench_recording(), tmp_path / "bag")
     assert_refused(capsys, ["evaluate", bag], "none of the frames to be scored was solved")
+
+
+def test_what_was_noted_of_the_key_points_is_told_with_the_reason_of_a_failure(capsys, tmp_path, monkeypatch):
+    """The note may be the cause: depth in another unit lets nothing be solved."""
+    apply = KeypointSource.apply
+    monkeypatch.setattr(KeypointSource, "apply", lambda *given: replace(apply(*given), notes=("the depth is off",)))
+    monkeypatch.setattr("finforce_eval.evaluation.setup.ForceEstimator", lambda *_, **__: FakeEstimator([None] * 60))
+    bag = write_recording(bench_recording(), tmp_path / "bag")
+    assert_refused(capsys, ["evaluate", bag], "; the depth is off")
 
 
 def test_key_points_all_nan_are_refused_by_the_real_estimator(capsys, tmp_path):
