@@ -185,7 +185,9 @@ def test_a_clock_of_which_held_forces_tell_nothing_is_not_doubted(monkeypatch):
     monkeypatch.setattr(identification, "_track_force", lambda *given: history)
     best = min(identification._LEADS, key=lambda lead: identification._fit_branches([history], lead).cost)
     assert abs(best) > identification._ONE_CLOCK
-    identification.fit_force_history(load_jaw("bench"), [SimpleNamespace(name="held")], [FRAME], None, lambda cost: None)
+    identification.fit_force_history(
+        load_jaw("bench"), [SimpleNamespace(name="held")], [FRAME], None, lambda cost: None
+    )
 
 
 def test_only_so_many_plateaus_of_a_case_are_taken():
