@@ -530,7 +530,11 @@ def fit_force_history(
     histories = []
     for case, own in zip(cases, settings, strict=True):
         histories.append(_track_force(jaw, case, own, calibration))
-        _refuse_drift(case.name, histories[-1])
+        if drift := find_drift(histories[-1].true[histories[-1].elastic < _IDLE_FORCE]):
+            raise CalibrationError(
+                f"{case.name}: where nothing presses, the true force changes by {drift:+.2f} N from first to last: "
+                "does the sensor drift? Let it warm up, and tare it before each recording"
+            )
         progress(float("nan"))
     fits = {lead: _fit_branches(histories, lead) for lead in _LEADS}  # early forces look like relaxed ones
     lead, fit = min(fits, key=lambda lead: fits[lead].cost), fits[0.0]
@@ -552,19 +556,21 @@ def fit_force_history(
     )
 
 
-def _refuse_drift(name: str, history: _ForceHistory) -> None:
-    """Refuse true forces that change from the first to the last quarter of the frames in which nothing presses."""
-    idle = history.true[history.elastic < _IDLE_FORCE]
+def find_drift(idle: NDArray) -> float:
+    """Return by how much the force of a sensor drifts while nothing presses.
+
+    Args:
+        idle: (n,) [N] true forces of all frames in which nothing presses, in the order of time.
+
+    Returns:
+        [N] from the median of the first quarter to that of the last; 0 where noise, or too few frames, explain it.
+    """
     if len(idle) < _IDLE_FRAMES:
-        return
+        return 0.0
     first, *_, last = np.array_split(idle, 4)
-    drift = np.median(last) - np.median(first)
+    drift = float(np.median(last) - np.median(first))
     noise = 1.48 * np.median(np.abs(first - np.median(first)))
-    if abs(drift) > max(_DRIFT, 3.0 * noise):
-        raise CalibrationError(
-            f"{name}: where nothing presses, the true force changes by {drift:+.2f} N from first to last: does the "
-            "sensor drift? Let it warm up, and tare it before each recording"
-        )
+    return drift if abs(drift) > max(_DRIFT, 3.0 * noise) else 0.0
 
 
 def _fit_branches(histories: Sequence[_ForceHistory], lead: float = 0.0) -> OptimizeResult:

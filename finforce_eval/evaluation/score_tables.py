@@ -12,6 +12,7 @@ import pandas as pd
 from finforce_eval.evaluation.comparison import error_blocks
 from finforce_eval.evaluation.scoring import PHASES, CaseScore, Evaluation, Stats
 from finforce_eval.table import AXES, ForceSeries
+from finforce_ifea.identification import find_drift
 
 _CONTACT = (
     "Contact: distance from the true pressure centre along the undeformed surface above 0.2 N, of the contact given to "
@@ -174,6 +175,9 @@ def doubt_truth(case: ForceSeries) -> str:
             return f"{case.name}: the true forces are {factor:.3g} times the estimated ones: {unit}? expected newtons"
     if at_rest > BIAS:
         return f"{case.name}: the true force is {at_rest:.2f} N where no force is estimated: is the sensor tared?"
+    if drift := find_drift(true[idle]):
+        change = f"changes by {drift:+.2f} N where no force is estimated"
+        return f"{case.name}: the true force {change}: does the sensor drift?"
     return ""
 
 
