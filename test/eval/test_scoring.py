@@ -249,7 +249,7 @@ def test_answered_is_the_share_of_what_was_to_be_answered():
         (lambda force: 102.0 * (force + 0.5), "gram-force"),
         (lambda force: 0.225 * force, "pound-force"),
         (lambda force: force + 0.6, "is the sensor tared"),
-        (lambda force: force + np.linspace(0.0, 0.4, len(force)), "by +0.35 N where no force is estimated: does the"),
+        (lambda force: force + np.linspace(0.0, 0.8, len(force)), "by +0.70 N where no force is estimated: does the"),
         (lambda force: np.abs(force + np.random.default_rng(0).normal(scale=0.1, size=len(force))), ""),
     ],
 )
