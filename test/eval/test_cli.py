@@ -16,7 +16,7 @@ from eval_fakes import FakeEstimator, make_recording
 from finforce_eval.cli import replay
 from finforce_eval.cli.main import COMMANDS, build_parser, main, parse
 from finforce_eval.cli.parser import CommandResult
-from finforce_eval.errors import SilentReplayError
+from finforce_eval.errors import RecordingError, SilentReplayError
 from finforce_eval.evaluation.keypoint_source import KeypointSource
 from finforce_eval.recordings.writer import write_entries, write_recording
 
@@ -384,3 +384,17 @@ def test_a_shell_completes_commands_and_options(tmp_path):
         command = [sys.executable, "-m", "finforce_eval.cli.main"]
         subprocess.run(command, env=os.environ | told, check=True)
         assert expected in (tmp_path / "out").read_text()
+
+
+@pytest.mark.parametrize(("command", "plays"), [("trace", "play_to_nodes"), ("replay", "replay")])
+def test_what_is_noted_of_a_recording_is_told_before_it_is_played(command, plays, capsys, tmp_path, monkeypatch):
+    """As that it breaks off: the figures are those of a part."""
+
+    def play(*_, **__):
+        raise RecordingError("played")
+
+    read = KeypointSource.read
+    monkeypatch.setattr(KeypointSource, "read", lambda *given: replace(read(*given), notes=("it breaks off",)))
+    monkeypatch.setattr(f"finforce_eval.cli.{command}.{plays}", play)
+    assert main([command, str(write_recording(bench_recording(), tmp_path / "bag"))]) == 2
+    assert capsys.readouterr().err == "note: bag: it breaks off\nfinforce: played\n"
