@@ -82,7 +82,7 @@ class CameraIntrinsics:
         if self.width < 1 or self.height < 1 or not np.isfinite(numbers).all() or min(self.fx, self.fy) <= 0.0:
             raise IntrinsicsError(
                 f"intrinsics {self.width}x{self.height}, fx fy cx cy = {numbers.tolist()}: expected a positive size, "
-                "positive focal lengths and finite numbers [px]"
+                "positive focal lengths and finite numbers [px]" + ("" if numbers.any() else ": calibrate the camera")
             )
         if abs(self.cx) > FARTHEST_CENTRE * self.width or abs(self.cy) > FARTHEST_CENTRE * self.height:
             raise IntrinsicsError(
@@ -263,6 +263,7 @@ COLOR_ENCODINGS = {
     "rgba8": (_BYTE, 4, "RGBA2RGB"),
     "bgra8": (_BYTE, 4, "BGRA2RGB"),
     "mono8": (_BYTE, 1, "GRAY2RGB"),
+    "8UC1": (_BYTE, 1, "GRAY2RGB"),
     "rgb16": (_WORD, 3, ""),
     "bgr16": (_WORD, 3, "BGR2RGB"),
     "mono16": (_WORD, 1, "GRAY2RGB"),
@@ -282,7 +283,8 @@ def decode_color(data: NDArray | bytes, encoding: str, layout: ImageLayout | Non
 
     Args:
         data: the image (h, w, channels), (h, w) with one channel, or its bytes together with their layout.
-        encoding: one of `COLOR_ENCODINGS`, as in sensor_msgs/Image; 8UC3 is taken for bgr8, as OpenCV has it.
+        encoding: one of `COLOR_ENCODINGS`, as in sensor_msgs/Image; 8UC3 is taken for bgr8, as OpenCV has
+            it, 8UC1 for mono8.
         layout: layout of the bytes.
 
     Returns:

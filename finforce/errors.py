@@ -33,8 +33,13 @@ class SilentTopicError(FinforceError, RuntimeError):
 
 
 def one_line(error: BaseException, longest: int = 1000) -> str:
-    """Return what an error says as one line of so many characters, or its class where it says nothing."""
-    return " ".join(str(error).split())[:longest] or type(error).__name__
+    """Return what an error says as one line of so many characters, or its class where it says nothing.
+
+    Of a longer one the middle is left out: libraries say at the end what is wrong, after where in their code.
+    """
+    said = " ".join(str(error).split()) or type(error).__name__
+    half = longest // 2 - 2
+    return said if len(said) <= longest else f"{said[:half]} .. {said[len(said) - half :]}"
 
 
 def suggest(word: str, known: Iterable[str]) -> str:

@@ -32,6 +32,7 @@ _PLAIN = (".stl", ".obj", ".ply", ".off")
 _STL = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])  # after 80 bytes and a number
 _MEMORY = 2 << 30  # [bytes]
 _SECONDS = 60  # [s]
+_DECIMAL_COMMA = re.compile(rb"^\s*(?:vertex|v)?\s*[-+]?\d+,\d+[eE\s]", re.MULTILINE)
 
 
 def read_surface(path: Path) -> tuple[NDArray, NDArray]:
@@ -114,6 +115,8 @@ def _load_triangles(path: Path) -> tuple[NDArray, NDArray]:
     if not content:
         raise FileError(f"got 0 bytes, expected a whole .{kind} file: export it again")
     _refuse_other_kinds(content)
+    if b"\0" not in content[:4096] and _DECIMAL_COMMA.search(content[:4096]):  # text as some languages write numbers
+        content = content.replace(b",", b".")
     count = int.from_bytes(content[80:84], "little")
     if kind == "stl" and count and len(content) == 84 + count * _STL.itemsize:  # trimesh takes a second to load
         vertices = np.frombuffer(content, _STL, offset=84)["corners"].reshape(-1, 3).astype(float)

@@ -194,7 +194,8 @@ class ContactEstimator:
         if location is None or np.abs(section.origin).max() > _OUT_OF_REACH:
             away = f"its origin lies {1e3 * np.linalg.norm(pose.T[:3, 3]):.0f} mm from the jaw's"
             message = (
-                f"{self._mesh.name} does not stand before the inner surface: {away}; check its poses' unit and frame"
+                f"{self._mesh.name} does not stand before the inner surface: {away}; check its poses' unit and frame, "
+                "and that they are T_camera_object, not its inverse"
             )
             return self._give_up(stamp, "apart", message, "out_of_reach")
         self.counts["solved"] += 1

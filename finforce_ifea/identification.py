@@ -468,6 +468,9 @@ _CORRELATED_FRAMES = 30
 # Times [s] by which the true forces may lead the images: tried, tolerated; and the share of the cost that one has to
 # leave: forces that are held tell nothing of it.
 _LEADS, _ONE_CLOCK, _CLEARLY = np.arange(-6, 7) / 20.0, 0.05, 0.8
+# Elastic force [N] below which nothing presses, least number of such frames, and the rise of the true force over them
+# from which on the sensor drifts [N], where its noise is not larger.
+_IDLE_FORCE, _IDLE_FRAMES, _DRIFT = 0.05, 60, 0.1
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -521,11 +524,17 @@ def fit_force_history(
         progress: called after each recording.
 
     Raises:
-        CalibrationError: The estimator trusts hardly a loaded frame of the recordings, or there are two clocks.
+        CalibrationError: The estimator trusts hardly a loaded frame of the recordings, the force sensor drifts, or
+            there are two clocks.
     """
     histories = []
     for case, own in zip(cases, settings, strict=True):
         histories.append(_track_force(jaw, case, own, calibration))
+        if drift := find_drift(histories[-1].true[histories[-1].elastic < _IDLE_FORCE]):
+            raise CalibrationError(
+                f"{case.name}: where nothing presses, the true force changes by {drift:+.2f} N from first to last: "
+                "does the sensor drift? Let it warm up, and tare it before each recording"
+            )
         progress(float("nan"))
     fits = {lead: _fit_branches(histories, lead) for lead in _LEADS}  # early forces look like relaxed ones
     lead, fit = min(fits, key=lambda lead: fits[lead].cost), fits[0.0]
@@ -545,6 +554,23 @@ def fit_force_history(
         force_rms=float(np.sqrt(np.mean(errors[loaded] ** 2))),
         relative=float(1.48 * np.median(np.abs(errors[loaded] / true[loaded]))),
     )
+
+
+def find_drift(idle: NDArray) -> float:
+    """Return by how much the force of a sensor drifts while nothing presses.
+
+    Args:
+        idle: (n,) [N] true forces of all frames in which nothing presses, in the order of time.
+
+    Returns:
+        [N] from the median of the first quarter to that of the last; 0 where noise, or too few frames, explain it.
+    """
+    if len(idle) < _IDLE_FRAMES:
+        return 0.0
+    first, *_, last = np.array_split(idle, 4)
+    drift = float(np.median(last) - np.median(first))
+    noise = 1.48 * np.median(np.abs(first - np.median(first)))
+    return drift if abs(drift) > max(_DRIFT, 3.0 * noise) else 0.0
 
 
 def _fit_branches(histories: Sequence[_ForceHistory], lead: float = 0.0) -> OptimizeResult:

@@ -221,7 +221,7 @@ class MeshCheck:
         fitting = [(fit.gain, reading.text) for reading, fit in self._tried() if fit.fits]
         if fitting:
             return f"the mesh fits when {max(fitting, key=lambda each: each[0])[1]}"
-        return "no turn, scale or shift of it fits: is it the mesh of this object, in this frame?"
+        return "no turn, scale or shift of it fits: is it the mesh of this object, in this frame, and the depth right?"
 
     def _tried(self) -> Iterator[tuple[Reading, Fit]]:
         """Yield other readings of the mesh with their fits to the newest images."""

@@ -259,7 +259,8 @@ def explain_refusal(path: str, baud_rate: int, error: Exception) -> str:
     """Return why a port cannot be opened and what would help, in one line."""
     number = getattr(error, "errno", None)
     if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO, errno.ENOTDIR):
-        return f"there is no port {path!r}: ports here: {_name_ports()}; is the adapter plugged in?"
+        kernel = "" if "/" in path else " A channel of the kernel, as can0, needs the interface socketcan"
+        return f"there is no port {path!r}: ports here: {_name_ports()}; is the adapter plugged in?{kernel}"
     if number in (errno.EBUSY, errno.EAGAIN):
         return f"{path} is in use by another program: end that first (`fuser -v {path}` names it)"
     if number in (errno.EACCES, errno.EPERM):

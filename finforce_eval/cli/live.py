@@ -80,7 +80,8 @@ class Webcam:
         if not self._capture.isOpened():
             there = ", ".join(sorted(each.name for each in Path("/dev").glob("video*"))) or "none"
             raise RecordingError(
-                f"{self._name}: cannot be opened; expected a number of /dev/video* ({there}), or a file"
+                f"{self._name}: cannot be opened; expected a number of /dev/video* ({there}), a file, "
+                "or the address of a stream that can be reached from here"
             )
         if self._is_device:
             self._capture.set(cv2.CAP_PROP_FRAME_WIDTH, camera.width)

@@ -15,7 +15,7 @@ from finforce_eval.cli.parser import PLAYED_HELP, CommandResult, add_run_options
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.keypoint_source import parse_source
 from finforce_eval.evaluation.score_tables import evaluation_json
-from finforce_eval.evaluation.setup import make_setup
+from finforce_eval.evaluation.setup import make_setup, read_recordings
 from finforce_eval.recordings.images import ALONE
 from finforce_eval.replay.replay import Playing, Replay, replay
 
@@ -84,7 +84,7 @@ def run(options: argparse.Namespace) -> CommandResult:
     setup = make_setup(options)
     playing = Playing(rate=options.rate, domain=options.domain)
     keypoints, calibration = parse_source(options), options.calibration or ""
-    recording = keypoints.read(options.bag)
+    (recording,) = read_recordings([options.bag], keypoints)
     result = replay(recording, setup, calibration_file=calibration, playing=playing, keypoints=keypoints)
     summary = format_summary(result)
     print("\n".join(summary))

@@ -15,7 +15,7 @@ import pandas as pd
 from finforce_eval.cli.parser import PLAYED_HELP, CommandResult, add_run_options
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.keypoint_source import parse_source
-from finforce_eval.evaluation.setup import make_setup
+from finforce_eval.evaluation.setup import make_setup, read_recordings
 from finforce_eval.replay.replay import Playing, play_to_nodes
 
 
@@ -32,7 +32,7 @@ def run(options: argparse.Namespace) -> CommandResult:
         FinforceError: an option, the recording or a node fails.
     """
     keypoints = parse_source(options)
-    recording = keypoints.read(options.bag)
+    (recording,) = read_recordings([options.bag], keypoints)
     with TemporaryDirectory() as folder:
         playing = Playing(trace=folder)
         log = play_to_nodes(

@@ -211,14 +211,16 @@ def evaluate_task(name: str, path: str, target: str, options: argparse.Namespace
         FinforceError: the recording cannot be read or evaluated.
     """
     setup, source = share_setup(settings, options), parse_source(options)
+    noted: Sequence[str] = ()
     try:
         read = replace(source.read(path), name=name)
         truth_sides(read)
         setup.contacts.check(read)
         recording = source.apply(read)
+        noted = recording.notes
         results = evaluate_jaws(recording, setup)
     except FinforceError as error:
-        text = str(error)
+        text = "; ".join((str(error), *noted))
         raise RecordingError(text if name in text or path in text else f"{name}: {text}") from error
     names = list(setup.jaw.keypoint_names)
     cases = {case: asdict(score) for case, score in score_results(results, [recording]).scores.items()}

@@ -268,7 +268,10 @@ def _before_load(track: ObjectTrack, recording: Recording, side: str) -> ObjectT
 ESTIMATED = ("estimate", "closest", "paper")
 POSE_TOLERANCE = round(ContactParameters().pose_tolerance / SECOND)  # [ns]
 UNCOMPARED = "is not compared: that needs images, and /object_pose in their frame"
-UNSEEN = "is not seen where its poses have it: check their unit and frame, or give images that show it"
+UNSEEN = (
+    "is not seen where its poses have it: check their unit and frame, and that they are not inverted, or give images "
+    "that show it"
+)
 OUTLINED = "is compared with edges in colour, for want of depth: only turns by right angles are told"
 AUTOMATIC, FIXED = "automatic", "fixed"
 FROM_CASE = "case"

@@ -12,6 +12,7 @@ import pandas as pd
 from finforce_eval.evaluation.comparison import error_blocks
 from finforce_eval.evaluation.scoring import PHASES, CaseScore, Evaluation, Stats
 from finforce_eval.table import AXES, ForceSeries
+from finforce_ifea.identification import find_drift
 
 _CONTACT = (
     "Contact: distance from the true pressure centre along the undeformed surface above 0.2 N, of the contact given to "
@@ -172,6 +173,9 @@ def doubt_truth(case: ForceSeries) -> str:
         unit = min(UNITS_PER_NEWTON, key=lambda name: abs(np.log(max(factor, 1e-9) / UNITS_PER_NEWTON[name])))
         if abs(factor / UNITS_PER_NEWTON[unit] - 1.0) < UNIT_TOLERANCE:
             return f"{case.name}: the true forces are {factor:.3g} times the estimated ones: {unit}? expected newtons"
+    if drift := find_drift(true[idle]):
+        change = f"changes by {drift:+.2f} N where no force is estimated"
+        return f"{case.name}: the true force {change}: does the sensor drift?"
     if at_rest > BIAS:
         return f"{case.name}: the true force is {at_rest:.2f} N where no force is estimated: is the sensor tared?"
     return ""

@@ -368,7 +368,8 @@ def describe_depth(ratio: float) -> str:
     """Return what to say of depth that is so many times that of the jaw's place."""
     return (
         f"the depth at the jaw is {ratio:.3g} times that of its place by the colours: check the unit of the depth "
-        "images, depth_scale, and that they are aligned to the colours"
+        "images, depth_scale, that they are aligned to the colours, and that the jaws are not nearer than the camera "
+        "can measure"
     )
 
 

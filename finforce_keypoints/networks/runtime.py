@@ -61,7 +61,9 @@ def try_network(path: Path, runtime_version: str) -> None:
     try:
         run_limited(run_once, path, memory=MEMORY, seconds=SECONDS)
     except SandboxError as error:
-        raise ModelError(f"{path}: {error}; expected an ONNX network") from error
+        raise ModelError(
+            f"{path}: {error}; expected an ONNX network that onnxruntime {runtime_version} runs"
+        ) from error
     if mark is not None:
         with suppress(OSError):  # a cache that cannot be written costs the next start a second
             mark.parent.mkdir(parents=True, exist_ok=True)

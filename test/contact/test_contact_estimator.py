@@ -159,6 +159,7 @@ class TestWhatIsNotKnown:
         estimate = estimator.update(0.0)
         assert (estimate.status, len(estimate.contact.points)) == ("apart", 0)
         assert "does not stand before" in estimate.message and "lies 202 mm from the jaw's" in estimate.message
+        assert "T_camera_object, not its inverse" in estimate.message
 
     def test_open_mesh_does_for_all_modes_but_the_papers(self):
         pytest.importorskip("manifold3d")

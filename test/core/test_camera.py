@@ -183,3 +183,8 @@ def test_impossible_intrinsics_are_refused(change):
     CameraIntrinsics(**good)
     with pytest.raises(IntrinsicsError):
         CameraIntrinsics(**{**good, **change})
+
+
+def test_the_zeros_of_a_camera_that_was_never_calibrated_are_called_that():
+    with pytest.raises(IntrinsicsError, match="calibrate the camera"):
+        CameraIntrinsics(width=4, height=3, fx=0.0, fy=0.0, cx=0.0, cy=0.0)

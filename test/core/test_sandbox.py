@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from finforce.errors import one_line
 from finforce.files import FileError, parse_json
 from finforce.sandbox import SandboxError, run_limited
 
@@ -55,3 +56,9 @@ def test_a_budget_allows_more(monkeypatch):
 def test_files_of_a_process_that_did_not_remove_them_are_removed():
     left = Path(run_limited(tempfile.mkdtemp))
     assert left.parent.parent == Path(tempfile.gettempdir()) and not left.parent.exists()
+
+
+def test_of_a_long_error_both_ends_are_told():
+    said = one_line(ValueError("reader.cc:256 " + "detail " * 100 + "unsupported\nversion 15"), 60)
+    assert len(said) <= 60 and said.startswith("reader.cc:256") and said.endswith("unsupported version 15")
+    assert one_line(ValueError("a" * 60), 60) == "a" * 60 and one_line(ValueError()) == "ValueError"

@@ -148,11 +148,16 @@ def test_sound_files_are_read(tmp_path):
     assert len(read_surface(path)[1]) == 2 * len(sphere.faces)
 
 
-def test_a_binary_stl_is_read_as_trimesh_reads_it_and_without_it(tmp_path, monkeypatch):
+def test_a_binary_stl_is_read_as_trimesh_reads_it_and_without_it_and_text_with_decimal_commas(tmp_path, monkeypatch):
     sphere = import_trimesh().creation.icosphere(radius=0.02, subdivisions=1)
     (tmp_path / "binary.stl").write_bytes(sphere.export(file_type="stl"))
     (tmp_path / "text.stl").write_text(sphere.export(file_type="stl_ascii"))
     by_trimesh, triangles = read_surface(tmp_path / "text.stl")
+    for kind in ("stl_ascii", "obj"):  # as a German MeshLab writes numbers
+        path = tmp_path / f"commas.{kind[:3]}"
+        path.write_text(sphere.export(file_type=kind).replace(".", ","))
+        commas, own = read_surface(path)
+        np.testing.assert_allclose(commas[own], by_trimesh[triangles], rtol=1e-6, atol=1e-8)
     monkeypatch.setattr(surfaces, "import_trimesh", lambda: pytest.fail("trimesh was loaded"))
     vertices, own = read_surface(tmp_path / "binary.stl")
     np.testing.assert_allclose(vertices[own], by_trimesh[triangles], rtol=1e-6, atol=1e-9)  # single precision

@@ -23,8 +23,10 @@ def test_an_absent_port_names_those_that_exist(monkeypatch, tmp_path):
 
 def test_an_absent_port_among_none_says_so(monkeypatch, tmp_path):
     monkeypatch.setattr("serial.tools.list_ports.comports", list)
-    with pytest.raises(LinkError, match="ports here: none"):
+    with pytest.raises(LinkError, match=r"ports here: none; is the adapter plugged in\?$"):
         SerialBus(str(tmp_path / "ttyACM0")).open()
+    with pytest.raises(LinkError, match="there is no port 'can0'.*can0, needs the interface socketcan"):
+        SerialBus("can0").open()
 
 
 def test_a_port_without_permission_names_the_group(monkeypatch):

@@ -16,7 +16,8 @@ from eval_fakes import FakeEstimator, make_recording
 from finforce_eval.cli import replay
 from finforce_eval.cli.main import COMMANDS, build_parser, main, parse
 from finforce_eval.cli.parser import CommandResult
-from finforce_eval.errors import SilentReplayError
+from finforce_eval.errors import RecordingError, SilentReplayError
+from finforce_eval.evaluation.keypoint_source import KeypointSource
 from finforce_eval.recordings.writer import write_entries, write_recording
 
 BENCH_KEYPOINTS = 15
@@ -235,6 +236,15 @@ def test_all_key_points_hidden_is_refused(capsys, tmp_path, monkeypatch):
     assert_refused(capsys, ["evaluate", bag], "none of the frames to be scored was solved")
 
 
+def test_what_was_noted_of_the_key_points_is_told_with_the_reason_of_a_failure(capsys, tmp_path, monkeypatch):
+    """The note may be the cause: depth in another unit lets nothing be solved."""
+    apply = KeypointSource.apply
+    monkeypatch.setattr(KeypointSource, "apply", lambda *given: replace(apply(*given), notes=("the depth is off",)))
+    monkeypatch.setattr("finforce_eval.evaluation.setup.ForceEstimator", lambda *_, **__: FakeEstimator([None] * 60))
+    bag = write_recording(bench_recording(), tmp_path / "bag")
+    assert_refused(capsys, ["evaluate", bag], "; the depth is off")
+
+
 def test_key_points_all_nan_are_refused_by_the_real_estimator(capsys, tmp_path):
     recording = bench_recording()
     track = recording.jaws["left"]
@@ -374,3 +384,17 @@ def test_a_shell_completes_commands_and_options(tmp_path):
         command = [sys.executable, "-m", "finforce_eval.cli.main"]
         subprocess.run(command, env=os.environ | told, check=True)
         assert expected in (tmp_path / "out").read_text()
+
+
+@pytest.mark.parametrize(("command", "plays"), [("trace", "play_to_nodes"), ("replay", "replay")])
+def test_what_is_noted_of_a_recording_is_told_before_it_is_played(command, plays, capsys, tmp_path, monkeypatch):
+    """As that it breaks off: the figures are those of a part."""
+
+    def play(*_, **__):
+        raise RecordingError("played")
+
+    read = KeypointSource.read
+    monkeypatch.setattr(KeypointSource, "read", lambda *given: replace(read(*given), notes=("it breaks off",)))
+    monkeypatch.setattr(f"finforce_eval.cli.{command}.{plays}", play)
+    assert main([command, str(write_recording(bench_recording(), tmp_path / "bag"))]) == 2
+    assert capsys.readouterr().err == "note: bag: it breaks off\nfinforce: played\n"

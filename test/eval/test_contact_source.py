@@ -212,6 +212,7 @@ def test_a_mesh_of_which_nothing_is_seen_does_not_fit(sees, severity, monkeypatc
     monkeypatch.setattr(check, "check_mesh", lambda *arguments, **options: compared)
     (found,) = check.check_object(record_with(Images(has_depth=True)), CYLINDER, "m")
     assert found.severity == severity and (UNSEEN in found.text) != sees
+    assert "not inverted" in UNSEEN
 
 
 @pytest.mark.parametrize(("has_depth", "expected"), [(True, LEAST_IMAGES), (False, MOST_IMAGES)])

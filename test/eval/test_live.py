@@ -36,7 +36,7 @@ class FakeCapture:
         self.source, self.left = source, list(self.images)
 
     def isOpened(self):  # noqa: N802
-        return self.source != 7
+        return self.source not in (7, "rtsp://10.0.0.1/a")
 
     def set(self, name, value):
         return True
@@ -111,6 +111,7 @@ def test_ctrl_c_ends_it_and_the_forces_are_written(watch):
     ("images", "camera", "words"),
     [
         ((), "7", "camera 7: cannot be opened; expected a number of /dev/video"),
+        ((), "rtsp://10.0.0.1/a", " a file, or the address of a stream that can be reached"),
         ((), "0", "camera 0: no image for 0.0 s, after 0: unplugged, stalled"),
         ((make_image(9), STALLED), "0", "camera 0: no image for 0.0 s, after 1"),
         ((make_image(9), make_image(9, (72, 96))), "0", "camera 0: image 1 is 96 x 72; expected 64 x 48"),

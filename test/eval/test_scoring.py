@@ -249,9 +249,11 @@ def test_answered_is_the_share_of_what_was_to_be_answered():
         (lambda force: 102.0 * (force + 0.5), "gram-force"),
         (lambda force: 0.225 * force, "pound-force"),
         (lambda force: force + 0.6, "is the sensor tared"),
+        (lambda force: force + np.linspace(0.0, 0.8, len(force)), "by +0.70 N where no force is estimated: does the"),
+        (lambda force: np.abs(force + np.random.default_rng(0).normal(scale=0.1, size=len(force))), ""),
     ],
 )
-def test_true_forces_in_other_units_or_of_an_untared_sensor_are_doubted(change, words):
-    force = np.concatenate((np.zeros(30), np.linspace(0.1, 3.0, 60)))
+def test_true_forces_in_other_units_or_of_an_untared_or_drifting_sensor_are_doubted(change, words):
+    force = np.concatenate((np.zeros(30), np.linspace(0.1, 3.0, 60), np.zeros(40)))
     said = doubt_truth(make_result(truth=change(force), force=force))
     assert (words in said) if words else not said

@@ -1,6 +1,7 @@
 """Claims about the identification of a finger from recordings with true forces."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -150,13 +151,30 @@ def test_forces_of_another_clock_are_refused_instead_of_taken_for_relaxation(lat
     true = np.interp(stamps - late, stamps, apply_relaxation(elastic, stamps, TERMS))
     history = identification._ForceHistory(stamps=stamps, elastic=elastic, true=true)
     monkeypatch.setattr(identification, "_track_force", lambda *given: history)
-    given = load_jaw("bench"), [None], [FRAME], None, lambda cost: None
+    given = load_jaw("bench"), [SimpleNamespace(name="pressed")], [FRAME], None, lambda cost: None
     if words:
         with pytest.raises(CalibrationError, match=rf"the forces fit those 0.15 s {words} than the images.*one clock"):
             identification.fit_force_history(*given)
     else:
         terms = identification.fit_force_history(*given).terms
         assert [term.share for term in terms] == pytest.approx([0.12, 0.06], abs=0.1 * (late != 0) + 0.02)
+
+
+@pytest.mark.parametrize(("drift", "noise"), [(0.3, 0.03), (-0.3, 0.03), (0.05, 0.03), (0.0, 0.2)])
+def test_forces_of_a_sensor_that_drifts_are_refused_and_those_of_a_noisy_one_are_not(drift, noise, monkeypatch):
+    """The norm of noise along three axes is not 0, either, where nothing presses."""
+    stamps, rng = np.arange(0.0, 60.0, 1.0 / 30.0), np.random.default_rng(5)
+    elastic = np.interp(stamps % 20.0, [2.0, 3.0, 6.0, 7.0, 10.0, 11.0, 14.0], [0.0, 2.0, 2.0, 4.0, 4.0, 0.0, 0.0])
+    x = apply_relaxation(elastic, stamps, TERMS) + (0.4 if drift < 0.0 else 0.0) + drift * stamps / stamps[-1]
+    true = np.linalg.norm(np.outer(x, [1.0, 0.0, 0.0]) + rng.normal(scale=noise, size=(len(x), 3)), axis=1)
+    history = identification._ForceHistory(stamps=stamps, elastic=elastic, true=true)
+    monkeypatch.setattr(identification, "_track_force", lambda *given: history)
+    given = load_jaw("bench"), [SimpleNamespace(name="pressed")], [FRAME], None, lambda cost: None
+    if abs(drift) > 0.1:
+        with pytest.raises(CalibrationError, match="pressed: where nothing presses.*does the sensor drift"):
+            identification.fit_force_history(*given)
+    else:
+        identification.fit_force_history(*given)
 
 
 def test_a_clock_of_which_held_forces_tell_nothing_is_not_doubted(monkeypatch):
@@ -167,7 +185,9 @@ def test_a_clock_of_which_held_forces_tell_nothing_is_not_doubted(monkeypatch):
     monkeypatch.setattr(identification, "_track_force", lambda *given: history)
     best = min(identification._LEADS, key=lambda lead: identification._fit_branches([history], lead).cost)
     assert abs(best) > identification._ONE_CLOCK
-    identification.fit_force_history(load_jaw("bench"), [None], [FRAME], None, lambda cost: None)
+    identification.fit_force_history(
+        load_jaw("bench"), [SimpleNamespace(name="held")], [FRAME], None, lambda cost: None
+    )
 
 
 def test_only_so_many_plateaus_of_a_case_are_taken():

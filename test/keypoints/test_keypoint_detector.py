@@ -289,6 +289,7 @@ def test_depth_of_another_unit_is_warned_of():
     for n in range(10):
         detector.detect(replace(image, stamp=n / RATE, depth=1e3 * image.depth))
     assert "times that of its place" in detector.warnings["left"] and 900.0 < detector.depth_ratio < 1100.0
+    assert "nearer than the camera can measure" in detector.warnings["left"]
 
 
 def test_a_jaw_whose_reference_point_is_hidden_for_a_moment_goes_on():

@@ -76,6 +76,13 @@ SENT = {
     "bgr16": (PATCHES[..., ::-1].astype(int) * 256 + 99).astype(">u2"),
     "8UC3": PATCHES[..., ::-1],
 }
+GREY = PATCHES[..., 1]
+
+
+@pytest.mark.parametrize("encoding", ["mono8", "8UC1"])
+def test_grey_images_of_infrared_cameras_become_rgb(encoding):
+    found = decode_color(GREY.tobytes(), encoding, ImageLayout(height=16, width=16, step=16, is_bigendian=False))
+    np.testing.assert_array_equal(found, np.repeat(GREY[..., None], 3, axis=-1))
 
 
 @pytest.mark.parametrize("encoding", SENT)

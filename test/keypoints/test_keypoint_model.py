@@ -186,6 +186,13 @@ def test_files_that_are_missing_or_doubled_or_broken_are_named(tmp_path):
         KeypointModel(tmp_path)
     with pytest.raises(ModelError, match="other.onnx: made its reader fail.*expected an ONNX network"):
         KeypointModel(tmp_path / "other.onnx")
+    newer = onnx.load(tmp_path / "network.onnx")
+    newer.ir_version = 99
+    onnx.save(newer, tmp_path / "other.onnx")
+    with pytest.raises(
+        ModelError, match=r"IR version: 99, max supported.*expected an ONNX network that onnxruntime 1\."
+    ):
+        KeypointModel(tmp_path / "other.onnx")
     (tmp_path / "pytorch_config.yaml").unlink()
     with pytest.raises(ModelError, match="body parts"):
         KeypointModel(tmp_path / "network.onnx")
