@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from finforce.compiled import njit
 from finforce_ifea.errors import NotEnoughDataError, UnderLoadError
-from finforce_ifea.filter.measurement import NO_COMMON_NOISE, CommonNoise, weigh
 from finforce_ifea.settings import EstimatorSettings
 
 # Of a key point that no tare has seen: noise along one axis, and constant offset [m].
@@ -49,6 +48,21 @@ class PointNoise(NamedTuple):
     width_variance: NDArray
     trust: NDArray
     bias: NDArray
+
+
+class CommonNoise(NamedTuple):
+    """The part of an image's noise that all its key points share.
+
+    Attributes:
+        common: covariance of their shift along x and z [m] and of their turn [rad] in an image (3, 3).
+        independent: share of the variance of a key point that is its own [-].
+    """
+
+    common: NDArray
+    independent: float
+
+
+NO_COMMON_NOISE = CommonNoise(np.zeros((3, 3)), 1.0)
 
 
 def match_stated(scatter: NDArray, stddev: NDArray, floor: float) -> StatedNoise:
@@ -256,7 +270,7 @@ def measure_common_noise(scatter: NDArray, noise: PointNoise, keypoints: NDArray
 
         Q = Cov c_i - rho M^-1,
 
-    without what is negative or within a standard error of chance. Outliers get the filter's weights.
+    without what is negative or within a standard error of chance.
 
     Args:
         scatter: about each key point's mean (n, K, 3) [m], NaN where it was not used.
@@ -271,16 +285,14 @@ def measure_common_noise(scatter: NDArray, noise: PointNoise, keypoints: NDArray
         return NO_COMMON_NOISE
     information, still = np.linalg.inv(noise.plane), np.zeros(len(keypoints))
     modes = np.array([[still + 1.0, still, keypoints[:, 2]], [still, still + 1.0, -keypoints[:, 0]]]).transpose(2, 0, 1)
-    distances = np.einsum("nka,kab,nkb->nk", left, information, left)
-    weight = seen * weigh(distances.ravel()).reshape(distances.shape)
-    M = np.einsum("nk,kai,kab,kbj->nij", weight, modes, information, modes)
-    moved = np.linalg.solve(M, np.einsum("nk,kai,kab,nkb->ni", weight, modes, information, left)[..., None])[..., 0]
-    total, fitted = float((weight * distances).sum()), float(np.einsum("ni,nij,nj->", moved, M, moved))
-    rho = (total - fitted) / (2.0 * weight.sum() - 3.0 * count)
+    M = np.einsum("nk,kai,kab,kbj->nij", seen, modes, information, modes)
+    moved = np.linalg.solve(M, np.einsum("kai,kab,nkb->ni", modes, information, left)[..., None])[..., 0]
+    total = float(np.einsum("nka,kab,nkb->", left, information, left))
+    rho = (total - float(np.einsum("ni,nij,nj->", moved, M, moved))) / (2.0 * seen.sum() - 3.0 * count)
     L = np.linalg.cholesky(M.mean(axis=0))
     size, axes = np.linalg.eigh(np.cov((moved @ L).T))
     root = np.linalg.solve(L.T, axes * np.sqrt(np.maximum(size - rho * (1.0 + np.sqrt(2.0 / count)), 0.0)))
-    share = float(((L.T @ root) ** 2).sum()) * count / (2.0 * float(weight.sum()))
+    share = float(((L.T @ root) ** 2).sum()) * count / (2.0 * float(seen.sum()))
     return CommonNoise(root @ root.T, max(1.0 - share, _LEAST_INDEPENDENT))
 
 

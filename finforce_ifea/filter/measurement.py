@@ -46,21 +46,6 @@ _MEDIAN = 1.57
 LATERAL_ERROR = 0.1e-3
 
 
-class CommonNoise(NamedTuple):
-    """The part of an image's noise that all its key points share.
-
-    Attributes:
-        common: covariance of their shift along x and z [m] and of their turn [rad] in an image (3, 3).
-        independent: share of the variance of a key point that is its own [-].
-    """
-
-    common: NDArray
-    independent: float
-
-
-NO_COMMON_NOISE = CommonNoise(np.zeros((3, 3)), 1.0)
-
-
 class Measurement(NamedTuple):
     """Two rows, x and z, of each of m key points of an image, linearised about a state.
 
@@ -71,8 +56,8 @@ class Measurement(NamedTuple):
         z: measured positions less the part of the linearised ones that does not depend on x (2 m,) [m].
         R: noise (m, 2, 2) [m^2].
         square: squared normalised residuals along y (m,).
-        common: see `CommonNoise`.
-        independent: see `CommonNoise`.
+        common: see `finforce_ifea.tare.CommonNoise`.
+        independent: see the same.
     """
 
     H: NDArray
@@ -104,7 +89,7 @@ def observe(points, noise, seen, positions, motions, at, ratio):
 
     Args:
         points: all key points of the image (K,), see `KEYPOINT`.
-        noise: its variance over that in the tare, and see `CommonNoise` for what key points share of it.
+        noise: its variance over that in the tare, and see `CommonNoise` of the tare.
         seen: those that are used (m,).
         positions: of the mechanics (K, 3) [m].
         motions: their derivatives by depth, shape, height and traction ratio (K, 3, 4).

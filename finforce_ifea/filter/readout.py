@@ -17,8 +17,6 @@ _MISDIRECTED = 0.03
 _LARGEST_GROWTH = 10.0
 # The largest traction ratio that the mechanics is asked for [-].
 LARGEST_RATIO = 0.9
-# Weight at which a key point still agrees.
-AGREES = 0.25
 
 
 @njit(**_OPTIONS)
@@ -104,7 +102,7 @@ def judge_points(state, points, seen, mean, V, left, weight, expected_height):
         points[seen[i]].weight = weight[i] if weight[i] > NO_WEIGHT else 0.0
         squares += weight[i] * (left[i, 0] ** 2 + left[i, 1] ** 2)
     state.residual = np.sqrt(squares / (2.0 * weight.sum()))
-    state.known, state.used, state.agreed = len(seen), (weight > NO_WEIGHT).sum(), (weight > AGREES).sum()
+    state.used = (weight > NO_WEIGHT).sum()
     misfit, offsets = 0.0, 2 * len(points)
     for i in range(SHARED, SHARED + offsets):
         misfit += mean[i] ** 2 / V[i]

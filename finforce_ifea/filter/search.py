@@ -31,7 +31,7 @@ from finforce_ifea.filter.jump import (
     JumpWatch,
     correct,
 )
-from finforce_ifea.filter.measurement import NO_COMMON_NOISE, Measurement, find_seen, observe
+from finforce_ifea.filter.measurement import Measurement, find_seen, observe
 from finforce_ifea.filter.process import (
     BUMPED_SHIFT,
     BUMPED_TIME,
@@ -48,9 +48,10 @@ from finforce_ifea.filter.process import (
     advance,
     start,
 )
-from finforce_ifea.filter.readout import AGREES, find_upright_ratio, judge_points, read_out
+from finforce_ifea.filter.readout import find_upright_ratio, judge_points, read_out
 from finforce_ifea.filter.state import DEPTH, HEIGHT, SHAPE, TRACTION, state_size
 from finforce_ifea.settings import EstimatorSettings
+from finforce_ifea.tare import NO_COMMON_NOISE
 from finforce_ifea.tracking.contact_state import KEYPOINT, LEAST_DEPTH, LOADED_DEPTH, blank_contact_state
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
@@ -109,8 +110,10 @@ _EDGE = 0.5 * CELL
 # Least force at which the inclination of the faces is asked for [N].
 _LEAST_FORCE = 0.1
 _LEAST_VARIANCE = 1e-14
-# Share of the key points that has to agree, and the largest bump of a camera that is believed [sigma].
+# Weight at which a key point still agrees, and the share of them that has to.
+_AGREES = 0.25
 _MAJORITY = 0.5
+# The largest bump of a camera that is believed [sigma].
 _LARGEST_BUMP = 5.0
 # Variances (4,) of the camera's motion where nobody touches it, and where it was bumped.
 _STILL = np.array([CAMERA_SHIFT, CAMERA_SHIFT, CAMERA_TURN_STDDEV, 0.0]) ** 2
@@ -534,4 +537,4 @@ def _is_believed(mean, weight, V):
         entry = BUMPED.entries[i]
         if not abs(mean[entry]) < _LARGEST_BUMP * max(BUMPED.stddev[i], np.sqrt(V[entry])):
             return False
-    return (weight > AGREES).mean() > _MAJORITY
+    return (weight > _AGREES).mean() > _MAJORITY

@@ -33,8 +33,6 @@ CONTACT_STATE = np.dtype(
         ("depth_variance", float),  # [m^2]
         ("height_stddev", float),  # of the pressure centre [m]
         ("used", int),  # key points with a weight
-        ("known", int),  # key points that were measured
-        ("agreed", int),  # key points that agree with the forecast
         ("residual", float),  # weighted root mean square [m]
         ("misfit", float),  # averaged residuals over their standard deviations, about 1 where the model fits
         ("kkt", float),  # what is left of the objective's gradient, relative to its parts
@@ -94,7 +92,7 @@ def blank_contact_state() -> ContactState:
 
 _BLANK = np.zeros((), CONTACT_STATE)
 _BLANK["ambiguity"] = _BLANK["bearable"] = np.inf
-_BLANK["used"] = _BLANK["known"] = _BLANK["agreed"] = 1
+_BLANK["used"] = 1
 _BLANK_BYTES = _BLANK.tobytes()
 
 # An ambiguous state, as between two corners of an object, matters where the force changes by more than this [N].
@@ -104,8 +102,6 @@ _LARGEST_MISFIT = 2.0
 _VAGUE_SHARE = 0.25
 # Shapes so many times as far from the stored ones as they are good for.
 _FARTHEST_SHAPE = 2.0
-# Share of the key points that has to agree.
-_MAJORITY = 0.5
 # A location that is so surely wrong, and by at least so much [m].
 _MISTAKEN, _LEAST_OFFSET = 0.99, 4e-3
 # What is left over of the key points' places [m], and its share of the finger's length: the mechanics explain a finger
@@ -137,7 +133,7 @@ def find_rejection_reason(state: ContactState, *, largest_residual: float, large
         settles: True if the solver iterates until nothing changes, so that one that has not is rejected.
     """
     state = state[()]
-    magnitude, agreement = float(state["magnitude"]), int(state["agreed"]) / int(state["known"])
+    magnitude = float(state["magnitude"])
     if settles and not state["converged"] and state["ambiguity"] > _AMBIGUOUS:
         return f"the shape has not settled within {state['iterations']} iterations; is the contact location right?"
     if state["extrapolation"] > _FARTHEST_SHAPE:
@@ -145,8 +141,6 @@ def find_rejection_reason(state: ContactState, *, largest_residual: float, large
     if state["misfit"] > _LARGEST_MISFIT:
         misfit = f"{state['misfit']:.1f} standard deviations"
         return f"the key points do not fit this contact ({misfit}); is its location right?"
-    if agreement <= _MAJORITY:
-        return f"only {100 * agreement:.0f} % of the key points agree with the jaw's shape"
     if state["mistaken"] > _MISTAKEN and abs(state["offset"]) > _LEAST_OFFSET:
         return f"the contact is off its stated location: the key points have it {1e3 * state['offset']:+.0f} mm away"
     if magnitude > state["bearable"]:
