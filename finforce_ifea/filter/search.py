@@ -94,6 +94,8 @@ _LEVEL_IMAGES = 8.0
 _LARGEST_CHANGE = 9.0
 _LARGEST_LEVEL = 25.0
 _MEDIAN_SQUARE = 2.05
+# Images from which the scatter of the depths is learnt.
+_SCATTER_IMAGES = 15.0
 # Largest change of the height at once [m], and the changes that no longer matter [m].
 _LARGEST_SHIFT = 0.3e-3
 _SETTLED = 0.1e-3
@@ -503,7 +505,8 @@ def _follow_level(level, distances):
 def _follow_scatter(scatter, before, z, R):
     """Return the variance of the depths over that by the noise.
 
-    Second differences have six times that of a depth, whatever its speed; one that is far larger is no noise.
+    Noise sends the depth back after each step: the product of two steps is less than zero by its variance, while
+    steps of a motion have the same sign, or any. Those that are far larger are no noise.
 
     Args:
         scatter: as it was expected.
@@ -511,10 +514,10 @@ def _follow_scatter(scatter, before, z, R):
         z: depth [m].
         R: its variance, `scatter` included [m^2].
     """
-    seen = (z - 2.0 * before[1] + before[0]) ** 2 / (6.0 * R)
-    if not seen <= _LARGEST_CHANGE:
+    step, last = z - before[1], before[1] - before[0]
+    if not max(step * step, last * last) <= 2.0 * _LARGEST_LEVEL * R:
         return scatter
-    return min(max(scatter * (1.0 + (seen - 1.0) / _LEVEL_IMAGES), 1.0), _LARGEST_LEVEL)
+    return min(max(scatter * (1.0 - (1.0 + step * last / R) / _SCATTER_IMAGES), 1.0), _LARGEST_LEVEL)
 
 
 @njit(**_OPTIONS)

@@ -134,15 +134,25 @@ class TestJump:
         np.testing.assert_allclose(told[1.0], told[0.0] / 1.4)
 
 
+def learn_scatter(depths, R=1e-10):
+    """The mean variance over R that depths (n,) [m] show."""
+    scatter, seen = 1.0, []
+    for i in range(2, len(depths)):
+        scatter = _follow_scatter(scatter, depths[i - 2 : i], depths[i], scatter * R)
+        seen.append(scatter)
+    return np.mean(seen[100:])
+
+
 class TestScatter:
     @pytest.mark.parametrize("size", [1.0, 2.0, 3.0])
     def test_depths_that_scatter_more_than_their_noise_tells_are_believed_less(self, size):
-        random, R, scatter, seen = np.random.default_rng(0), 1e-10, 1.0, []
-        depths = 1e-4 * np.arange(600) + size * np.sqrt(R) * random.standard_normal(600)  # at 3 mm/s
-        for i in range(2, len(depths)):
-            scatter = _follow_scatter(scatter, depths[i - 2 : i], depths[i], scatter * R)
-            seen.append(scatter)
-        assert 0.7 * size**2 < np.mean(seen[100:]) < 1.4 * size**2
+        noise = 1e-5 * np.random.default_rng(0).standard_normal(3000)
+        assert 0.7 * size**2 < learn_scatter(1e-3 + size * noise) < 1.4 * size**2
+
+    def test_an_object_that_moves_is_no_noise(self):
+        noise, steps = 1e-5 * np.random.default_rng(0).standard_normal((2, 3000))
+        assert learn_scatter(1e-4 * np.arange(3000) + noise) < 1.4
+        assert learn_scatter(np.cumsum(5.0 * steps) + noise) < 4.0  # a random walk, of 25 R in each image
 
     def test_a_jump_is_no_noise(self):
         assert _follow_scatter(2.0, np.array([1e-3, 1e-3]), 3e-3, 1e-10) == 2.0
