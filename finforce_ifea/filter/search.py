@@ -515,7 +515,8 @@ def _follow_scatter(scatter, before, z, R):
         R: its variance, `scatter` included [m^2].
     """
     step, last = z - before[1], before[1] - before[0]
-    if not max(step * step, last * last) <= 2.0 * _LARGEST_LEVEL * R:
+    largest = np.sqrt(2.0 * _LARGEST_LEVEL * R)
+    if not (abs(step) <= largest and abs(last) <= largest):
         return scatter
     return min(max(scatter * (1.0 - (1.0 + step * last / R) / _SCATTER_IMAGES), 1.0), _LARGEST_LEVEL)
 

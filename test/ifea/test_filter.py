@@ -156,7 +156,10 @@ class TestScatter:
 
     def test_a_jump_is_no_noise(self):
         assert _follow_scatter(2.0, np.array([1e-3, 1e-3]), 3e-3, 1e-10) == 2.0
-        assert _follow_scatter(2.0, np.full(2, np.nan), 3e-3, 1e-10) == 2.0
+
+    @pytest.mark.parametrize("before", [[np.nan, np.nan], [np.nan, 1e-3]])
+    def test_the_first_depths_tell_nothing(self, before):
+        assert _follow_scatter(2.0, np.array(before), 1e-3, 1e-10) == 2.0
 
 
 class TestWeights:
