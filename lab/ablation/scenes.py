@@ -347,6 +347,13 @@ def build_rubbed(bench: Bench, random: np.random.Generator) -> Scene:
     return film(bench, pressed, tell_height(bench, pressed, 0.3e-3), random, friction=0.45, friction_stddev=0.25)
 
 
+def build_swaying(bench: Bench, random: np.random.Generator) -> Scene:
+    """See the whole jaw in each image shifted and turned by 0.04 mm and 1 mrad, by chance, and rub."""
+    scene, rest = build_rubbed(bench, random), bench.jaw.keypoints
+    way, turn = 0.04e-3 * random.normal(size=(len(scene.images), 1, 3)), random.normal(size=(len(scene.images), 1, 1))
+    return shift(scene, way + 1e-3 * turn * np.stack([rest[:, 2], 0.0 * rest[:, 2], -rest[:, 0]], axis=1))
+
+
 def build_probed(bench: Bench, random: np.random.Generator) -> Scene:
     """Press an object of friction 0.6, of which nothing is known, with a short way back, and hold it."""
     pressed = press(bench, ramp(3, 2.2, 6, hold=60), friction=0.6)
