@@ -86,6 +86,11 @@ class Track:
         """Take it that nothing moves."""
         self.state[[0, 3]] = 1.0, 0.0
 
+    def free(self, variance: float, speed_variance: float) -> None:
+        """Add variances to position and speed in motion, as where the speed has changed at once."""
+        self.state[5] += variance
+        self.state[7] += speed_variance
+
     def after(self, dt: float) -> Track:
         """Return the track a time [s] later."""
         later = copy(self)

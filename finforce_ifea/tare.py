@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import compress
 from typing import NamedTuple
@@ -48,21 +48,6 @@ class PointNoise(NamedTuple):
     width_variance: NDArray
     trust: NDArray
     bias: NDArray
-
-
-class CommonNoise(NamedTuple):
-    """The part of an image's noise that all its key points share.
-
-    Attributes:
-        common: covariance of their shift along x and z [m] and of their turn [rad] in an image (3, 3).
-        independent: share of the variance of a key point that is its own [-].
-    """
-
-    common: NDArray
-    independent: float
-
-
-NO_COMMON_NOISE = CommonNoise(np.zeros((3, 3)), 1.0)
 
 
 def match_stated(scatter: NDArray, stddev: NDArray, floor: float) -> StatedNoise:
@@ -154,10 +139,6 @@ def _enlarge_noise(covariance, usual, stddev):
 _FARTHEST_OFFSET = 3e-3
 _FARTHEST_FROM_MEDIAN = 1.8e-3
 _NOISE_FLOOR = 0.02e-3
-# Key points of an image that tell a shift and a turn from their own noise.
-_FEWEST_MOVED = 4
-# Least share of the noise that is a key point's own [-].
-_LEAST_INDEPENDENT = 0.1
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -169,14 +150,12 @@ class Tare:
         counts: (K,) frames behind each offset.
         noise: covariance of one key point in one frame (3, 3) [m^2], pooled over all of them.
         stated: that of each key point by the standard deviations that came with it; None without such.
-        common: the part of it that the key points of an image share.
     """
 
     offsets: NDArray
     counts: NDArray
     noise: NDArray
     stated: StatedNoise | None = None
-    common: CommonNoise = NO_COMMON_NOISE
 
     @cached_property
     def is_taken(self) -> bool:
@@ -252,48 +231,14 @@ def compute_tare(
         return None
     offsets = np.zeros_like(keypoints)
     offsets[often] = np.nanmean(deviations[:, often], axis=0)
-    scatter = np.where(often[:, None], deviations - offsets, np.nan)
+    scatter = deviations - offsets
     noise = scatter[:, often].reshape(-1, 3)
     noise = np.cov(noise[np.isfinite(noise[:, 0])].T) + _NOISE_FLOOR**2 * np.eye(3)
     stated = None
     if all(stddev is not None for stddev in stddevs):
+        scatter[:, ~often] = np.nan
         stated = match_stated(scatter, np.stack(stddevs), _NOISE_FLOOR)
-    tare = Tare(offsets=offsets, counts=np.where(often, counts, 0), noise=noise, stated=stated)
-    return replace(tare, common=measure_common_noise(scatter, tare.point_noise(None), keypoints))
-
-
-def measure_common_noise(scatter: NDArray, noise: PointNoise, keypoints: NDArray) -> CommonNoise:
-    """Return the part of the noise that all key points of an image share.
-
-    With c_i the shift and the turn that fit the key points of image i best, M^-1 their covariance where the noise of
-    all key points is independent, and rho the variance of what the fit leaves over that of the noise,
-
-        Q = Cov c_i - rho M^-1,
-
-    without what is negative or within a standard error of chance.
-
-    Args:
-        scatter: about each key point's mean (n, K, 3) [m], NaN where it was not used.
-        noise: of the key points.
-        keypoints: drawn (K, 3) [m].
-    """
-    left = scatter[..., ::2] - noise.gain * scatter[..., 1:2]
-    seen = np.isfinite(left[..., 0])
-    enough = seen.sum(axis=1) >= _FEWEST_MOVED
-    seen, left, count = seen[enough], np.where(seen[enough][..., None], left[enough], 0.0), int(enough.sum())
-    if count < _FEWEST_FRAMES:
-        return NO_COMMON_NOISE
-    information, still = np.linalg.inv(noise.plane), np.zeros(len(keypoints))
-    modes = np.array([[still + 1.0, still, keypoints[:, 2]], [still, still + 1.0, -keypoints[:, 0]]]).transpose(2, 0, 1)
-    M = np.einsum("nk,kai,kab,kbj->nij", seen, modes, information, modes)
-    moved = np.linalg.solve(M, np.einsum("kai,kab,nkb->ni", modes, information, left)[..., None])[..., 0]
-    total = float(np.einsum("nka,kab,nkb->", left, information, left))
-    rho = (total - float(np.einsum("ni,nij,nj->", moved, M, moved))) / (2.0 * seen.sum() - 3.0 * count)
-    L = np.linalg.cholesky(M.mean(axis=0))
-    size, axes = np.linalg.eigh(np.cov((moved @ L).T))
-    root = np.linalg.solve(L.T, axes * np.sqrt(np.maximum(size - rho * (1.0 + np.sqrt(2.0 / count)), 0.0)))
-    share = float(((L.T @ root) ** 2).sum()) * count / (2.0 * float(seen.sum()))
-    return CommonNoise(root @ root.T, max(1.0 - share, _LEAST_INDEPENDENT))
+    return Tare(offsets=offsets, counts=np.where(often, counts, 0), noise=noise, stated=stated)
 
 
 Significance = Callable[[Tare, float], float]

@@ -5,8 +5,6 @@ same H and R, so that P, S and K are the same for all, and only the means x_i an
 
     S = H P H^T + R,  K = P H^T S^-1,  x_i <- x_i + K nu_i,  P <- P - K S K^T,  w_i <- w_i N(nu_i; 0, S).
 
-R is that of each key point and of what all of an image share, see `CommonNoise`.
-
 See Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, ch. 11.6 (static
 multiple-model estimator).
 """
@@ -20,11 +18,9 @@ from numpy.typing import NDArray
 
 from finforce.compiled import njit
 from finforce_ifea.filter.measurement import measure_distances, weigh
-from finforce_ifea.filter.state import CAMERA_X, SHARED, TRACTION
+from finforce_ifea.filter.state import SHARED, TRACTION
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
-# Entries of the state, from `CAMERA_X` on, that the noise of an image shares with it.
-COMMON = 3
 # Log probability below which no hypothesis falls, so that it can come back.
 _LEAST_WEIGHT = -9.0
 
@@ -91,27 +87,15 @@ def project_columns(H, rows, u, A):
 
 
 @njit(**_OPTIONS)
-def innovate(measured, P):
-    """Return H P (2 m, n) and S = H P H^T + R (2 m, 2 m) for a `Measurement` and P (n, n)."""
-    H, R = measured.H, measured.R
-    HP = multiply_rows(H, measured.rows, measured.u, P)
-    S = project_columns(H, measured.rows, measured.u, HP)
-    moved = np.dot(_find_common(H), measured.common)
-    for i in range(len(S)):
-        for j in range(len(S)):
-            for c in range(COMMON):
-                S[i, j] += moved[i, c] * H[j, CAMERA_X + c]
+def innovate(H, rows, u, P, R):
+    """Return H P (2 m, n) and S = H P H^T + R (2 m, 2 m); see `Measurement` for the arguments."""
+    HP = multiply_rows(H, rows, u, P)
+    S = project_columns(H, rows, u, HP)
     for k in range(len(R)):
         for a in range(2):
             for b in range(2):
-                S[2 * k + a, 2 * k + b] += measured.independent * R[k, a, b]
+                S[2 * k + a, 2 * k + b] += R[k, a, b]
     return HP, S
-
-
-@njit(**_OPTIONS)
-def _find_common(H):
-    """Return the columns of H (2 m, SHARED) by what the noise of an image moves all key points along (2 m, COMMON)."""
-    return H[:, CAMERA_X : CAMERA_X + COMMON].copy()
 
 
 @njit(**_OPTIONS)
@@ -178,7 +162,7 @@ def update(measured, weight, ratios, x, log_weights, HP, S):
         A,
         L,
         np.dot(white, before),
-        _spread_noise(A, L, R, measured),
+        _spread_noise(A, L, R),
         left,
         distances,
         weigh(distances),
@@ -220,11 +204,8 @@ def reduce_covariance(P, A):
 
 
 @njit(**_OPTIONS)
-def _spread_noise(A, L, R, measured):
-    """Return the covariance of the first four entries by the noise of this image alone, K R K^T (4, 4).
-
-    R (m, 2, 2) is that of the `Measurement`, divided by the weights.
-    """
+def _spread_noise(A, L, R):
+    """Return the covariance of the first four entries by the noise of this image alone, K R K^T (4, 4)."""
     m, gains = len(L), A[:, :4].copy()
     for i in range(m - 1, -1, -1):
         for c in range(4):
@@ -232,13 +213,11 @@ def _spread_noise(A, L, R, measured):
         for j in range(i):
             for c in range(4):
                 gains[j, c] -= L[i, j] * gains[i, c]
-    moved = np.dot(np.ascontiguousarray(gains.T), _find_common(measured.H))
-    out, shared = np.dot(np.dot(moved, measured.common), moved.T.copy()), 1.0 - measured.independent
+    out = np.zeros((4, 4))
     for k in range(len(R)):
         for a in range(2):
             for b in range(2):
-                own = R[k, a, b] - shared * measured.R[k, a, b]
                 for c in range(4):
                     for d in range(4):
-                        out[c, d] += gains[2 * k + a, c] * own * gains[2 * k + b, d]
+                        out[c, d] += gains[2 * k + a, c] * R[k, a, b] * gains[2 * k + b, d]
     return out

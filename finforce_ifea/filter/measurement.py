@@ -4,8 +4,7 @@ In the plane of the jaw's motion, with what the noise along y tells of that alon
 
     z_k = p_k(d, s, h, kappa) + camera_k + o_k + r_k |u_k| + n_k,
 
-with p_k the mechanics' position and u_k its displacement. Part of the noise n_k is a shift and a turn of all key points
-of the image; the rest of it is Student's t, whose weights
+with p_k the mechanics' position and u_k its displacement. n_k is Student's t, whose weights
 
     w_k = (nu + 3) / (nu + D_k^2)
 
@@ -56,8 +55,6 @@ class Measurement(NamedTuple):
         z: measured positions less the part of the linearised ones that does not depend on x (2 m,) [m].
         R: noise (m, 2, 2) [m^2].
         square: squared normalised residuals along y (m,).
-        common: see `finforce_ifea.tare.CommonNoise`.
-        independent: see the same.
     """
 
     H: NDArray
@@ -66,8 +63,6 @@ class Measurement(NamedTuple):
     z: NDArray
     R: NDArray
     square: NDArray
-    common: NDArray
-    independent: float
 
 
 @njit(**_OPTIONS)
@@ -84,19 +79,19 @@ def find_seen(points):
 
 
 @njit(**_OPTIONS)
-def observe(points, noise, seen, positions, motions, at, ratio):
+def observe(points, seen, positions, motions, at, ratio, level):
     """Return the measurement by key points.
 
     Args:
         points: all key points of the image (K,), see `KEYPOINT`.
-        noise: its variance over that in the tare, and see `CommonNoise` of the tare.
         seen: those that are used (m,).
         positions: of the mechanics (K, 3) [m].
         motions: their derivatives by depth, shape, height and traction ratio (K, 3, 4).
         at: depth, shape and height at which the mechanics stands (3,).
         ratio: traction ratio at which it stands.
+        level: variance of the noise over that in the tare.
     """
-    m, (level, common, independent) = len(seen), noise
+    m = len(seen)
     H, rows, u, z = np.zeros((2 * m, SHARED)), np.empty(2 * m, np.int64), np.empty(2 * m), np.empty(2 * m)
     R, square = np.empty((m, 2, 2)), np.empty(m)
     for i in range(m):
@@ -119,7 +114,7 @@ def observe(points, noise, seen, positions, motions, at, ratio):
         H[2 * i, CAMERA_X], H[2 * i + 1, CAMERA_Z] = 1.0, 1.0
         H[2 * i, CAMERA_TURN], H[2 * i + 1, CAMERA_TURN] = p[2], -p[0]
         H[2 * i + 1, CAMERA_STRETCH] = p[2]
-    return Measurement(H, rows, u, z, R, square, level * common, independent)
+    return Measurement(H, rows, u, z, R, square)
 
 
 @njit(**_OPTIONS)

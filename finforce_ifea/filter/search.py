@@ -51,7 +51,6 @@ from finforce_ifea.filter.process import (
 from finforce_ifea.filter.readout import find_upright_ratio, judge_points, read_out
 from finforce_ifea.filter.state import DEPTH, HEIGHT, SHAPE, TRACTION, state_size
 from finforce_ifea.settings import EstimatorSettings
-from finforce_ifea.tare import NO_COMMON_NOISE
 from finforce_ifea.tracking.contact_state import KEYPOINT, LEAST_DEPTH, LOADED_DEPTH, blank_contact_state
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
@@ -135,7 +134,6 @@ class ContactSearch:
 
     Attributes:
         points: key points of the last image (K,), see `KEYPOINT`.
-        noise: the part of it that they share.
         state: of the contact in the last image in which it was found, see `CONTACT_STATE`.
         expectation: of the object, see `EXPECTATION`.
         q: unknowns of the jaw (size,).
@@ -151,7 +149,6 @@ class ContactSearch:
         """Prepare the filter for `count` key points."""
         self.settings = settings
         self.points, self.positions = np.zeros(count, KEYPOINT), np.zeros((count, 3))
-        self.noise = NO_COMMON_NOISE
         self.state, self.expectation = blank_contact_state(), np.zeros((), EXPECTATION)
         self._count = count
         self._watches = [JumpWatch(jump, state_size(count)) for jump in (NUDGED, OFFSET)]
@@ -307,7 +304,7 @@ class ContactSearch:
         settled, iteration, last = False, 0, (np.zeros(3), 1.0)
         posterior, found, jump, P = None, UNDECIDED, NO_JUMP, self.P.copy()
         reach, possible = np.full(len(q), contact.model.reach, dtype=float), self._find_possible_jumps()
-        image = points, (self._level, *self.noise), seen, expectation
+        image = points, seen, self._level, expectation
         known = contact.packed_object, reach, self.track.state, self._scatter
         prior = ratios, self.x, self.log_weights, P
         while iteration < iterations and not settled:
@@ -447,7 +444,7 @@ def _iterate(image, at, prior, weight, possible, known, x, last):
     """Return what one image makes of one linearisation: the step that it asks for.
 
     Args:
-        image: `points`, `noise` and `seen` of `observe`; see `EXPECTATION`.
+        image: `points`, `seen` and `level` of `observe`; see `EXPECTATION`.
         at: `positions`, `motions`, `at` and `ratio` of `observe`; modes (size, 4) and size of the `PressedState`.
         prior: `ratios`, `x`, `log_weights` and `P` of `correct`.
         weight: see `correct`.
@@ -461,9 +458,9 @@ def _iterate(image, at, prior, weight, possible, known, x, last):
         Measurement, posterior and jump; the next `_Place`; the motion of the mechanics (3,) and of its unknowns
         (size,); this step, and the next share; whether it changes nothing that matters.
     """
-    (points, noise, seen, expectation), (positions, motions, x_model, ratio, modes, size) = image, at
+    (points, seen, level, expectation), (positions, motions, x_model, ratio, modes, size) = image, at
     (touching, reach, track, scatter), (before, share) = known, last
-    measured = observe(points, noise, seen, positions, motions, x_model, ratio)
+    measured = observe(points, seen, positions, motions, x_model, ratio, level)
     posterior, found = correct(measured, weight, *prior, possible, x_model[DEPTH])
     aim, variance = posterior.mean[: HEIGHT + 1] - x, max(posterior.own[0, 0], _LEAST_VARIANCE) * scatter
     aim[0] = expect_position(track, posterior.mean[DEPTH], variance, _DEPTH_NOISE) - x[0]

@@ -210,7 +210,7 @@ class ContactTracker:
         """
         search, measured = self._search, points - tare.offsets
         if tare is not self._tare:
-            self._tare, search.noise = tare, tare.common
+            self._tare = tare
             search.restart()
         search.expectation["shared"] = observation.shared.shift
         search.expectation["mount"] = observation.shared.height if self._is_known else 0.0

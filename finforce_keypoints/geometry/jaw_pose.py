@@ -34,17 +34,14 @@ SLIP = 1.5e-3  # [m] standard deviation of how far holder and camera give under 
 _ROUNDS = 6  # of reweighting
 _LEAST_NOISE = 0.05e-3  # [m] of a place by points near the base, from image to image
 _LEAST_BENT = 5  # points that tell the place of a jaw that may be bent
-_ORIGIN_GATE = 3.0  # standard deviations of an origin off the forecast, beyond which it is not the same
-# Process noise of a jaw: it stands, or closes at up to centimetres per second, and often starts; jumps are images that
-# were missed.
+_ORIGIN_GATE = 3.0  # standard deviations of an origin off the forecast, which mean that the speed has changed
+# Process noise of a jaw that stands, or closes at some centimetres per second.
 _NOISE = MotionNoise(
     drift=(0.01e-3) ** 2,
     acceleration=0.004**2,
     start=0.01**2,
     rest_time=3.0,
     motion_time=1.0,
-    jump=(5e-3) ** 2,
-    jump_probability=1e-3,
 )
 _LONGEST_STEP = 0.5  # [s] without an image, after which the trajectory starts anew
 SCALE = 0.25e-3  # [m] of a pixel of the patch
@@ -330,6 +327,9 @@ class PatchMatcher:
 class OriginTrack:
     """The place of a jaw that stands or moves, see `finforce.kalman`, over images in which it may not be seen.
 
+    An origin farther off the forecast than the gate means that the speed has changed: position and speed of a jaw that
+    moves are opened to what was seen.
+
     What images in a row err by alike does not hold the place back: it is in what is stated, and what it changes by
     from one image to the next is in the noise of this one, or in that of the forecast where the last one was worse.
     """
@@ -381,9 +381,12 @@ class OriginTrack:
             worse = origin.stddev - self._last.stddev
             variance = (origin.noise or origin.stddev) ** 2 + max(worse, 0.0) ** 2
             track.widen(min(worse, 0.0) ** 2)
-        before, farthest = track.variance, self._settings.largest_speed * dt
-        if abs(origin.x - track.x) > farthest + _ORIGIN_GATE * sqrt(before + variance):
+        before, off = track.variance, origin.x - track.x
+        gate = _ORIGIN_GATE * sqrt(before + variance)
+        if abs(off) > self._settings.largest_speed * dt + gate:
             return self._set_aside(stamp, origin, forecast)
+        if abs(off) > gate:
+            track.free(off**2, (off / dt) ** 2)
         self._missed, self._aside, self._last = 0, [], origin
         self._stamp, self._track = stamp, track
         track.update(origin.x, variance)

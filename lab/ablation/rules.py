@@ -14,7 +14,6 @@ import numpy as np
 
 from finforce.compiled import njit
 from finforce_ifea.filter import jump, measurement, search
-from finforce_ifea.tare import NO_COMMON_NOISE
 
 _FILTER, _NEVER = "finforce_ifea.filter.", 1e-300
 _PATH, _CONTACT = _FILTER + "friction_path:", "finforce_ifea.tracking.contact_state:"
@@ -81,8 +80,6 @@ RULES = (
           {_FILTER + "jump:_NONLINEAR": 0.0}, "fast", "gross"),
     _rule("noise level", "`_LEVEL_IMAGES`", "noise above that of the tare",
           {_SEARCH + "_follow_level": lambda level, distances: 1.0}, "noisy", "gross"),
-    _rule("common noise", "`measure_common_noise`", "noise that averaging over key points does not reduce",
-          {"finforce_ifea.tare:measure_common_noise": lambda *_: NO_COMMON_NOISE}, "swaying"),
     _rule("scatter of the depth", "`_follow_scatter`", "depths noisier than their key points tell",
           {_SEARCH + "_follow_scatter": lambda scatter, before, z, R: 1.0}, "swaying", "noisy", "paused"),
     _rule("depth smoothing", "`_DEPTH_NOISE`", "averages the depth over images",

@@ -23,7 +23,7 @@ from finforce_ifea.filter.measurement import FREEDOM, NO_WEIGHT, Measurement, me
 from finforce_ifea.filter.process import CAMERA_TIME, FREE_DEPTH, Expectation, expect_state, find_decay, predict
 from finforce_ifea.filter.search import _follow_scatter
 from finforce_ifea.filter.slip_path import SlipPath
-from finforce_ifea.filter.state import CAMERA_TURN, CAMERA_X, CAMERA_Z, DEPTH, SHARED, TRACTION, state_size
+from finforce_ifea.filter.state import DEPTH, SHARED, TRACTION, state_size
 from finforce_ifea.jaw.calibration import Calibration, load_calibration
 from finforce_ifea.mechanics import build_chosen
 from finforce_ifea.observation import Observation
@@ -52,42 +52,40 @@ def draw(seed=0):
         full[row, SHARED + 2 * COUNT + entry] = u[row]
     root = random.standard_normal((SIZE, SIZE))
     R = np.stack([each @ each.T + 0.1 * np.eye(2) for each in random.standard_normal((3, 2, 2))])
-    shared = random.standard_normal((3, 3))
-    measured = Measurement(H, rows, u, random.standard_normal(6), R, np.zeros(3), shared @ shared.T, 0.7)
+    measured = Measurement(H, rows, u, random.standard_normal(6), R, np.zeros(3))
     return measured, full, root @ root.T, random.standard_normal((2, SIZE))
 
 
-def noise_of(measured):
-    """The covariance of an image's noise (2 m, 2 m): of each key point, and of what moves all of them alike."""
-    moves = measured.H[:, [CAMERA_X, CAMERA_Z, CAMERA_TURN]]
-    out = moves @ measured.common @ moves.T
-    for k, each in enumerate(measured.R):
-        out[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += measured.independent * each
+def block(R):
+    """A matrix of blocks (m, 2, 2) on the diagonal."""
+    out = np.zeros((2 * len(R), 2 * len(R)))
+    for k, each in enumerate(R):
+        out[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = each
     return out
 
 
 class TestUpdate:
     def test_it_is_the_textbooks(self):
         measured, full, P, x = draw()
-        S, ratios = full @ P @ full.T + noise_of(measured), np.array([-0.2, 0.3])
+        S, ratios = full @ P @ full.T + block(measured.R), np.array([-0.2, 0.3])
         K = P @ full.T @ np.linalg.inv(S)
         nu = measured.z - x @ full.T - np.outer(ratios, measured.H[:, TRACTION])
         np.testing.assert_allclose(expect_innovations(measured, ratios, x), nu, rtol=1e-9)
-        prior = innovate(measured, P)
+        prior = innovate(measured.H, measured.rows, measured.u, P, measured.R)
         post = update(measured, np.ones(3), ratios, x, np.log([0.3, 0.7]), *prior)
         np.testing.assert_allclose(post.x, x + nu @ K.T, rtol=1e-8)
         np.testing.assert_allclose(reduce_covariance(P, post.A), P - K @ S @ K.T, rtol=1e-7, atol=1e-7)
         np.testing.assert_allclose(post.L @ post.L.T, S, rtol=1e-9)
-        np.testing.assert_allclose(post.own, (K @ noise_of(measured) @ K.T)[:4, :4], rtol=1e-7, atol=1e-10)
+        np.testing.assert_allclose(post.own, (K @ block(measured.R) @ K.T)[:4, :4], rtol=1e-7, atol=1e-10)
         likelihoods = np.array([0.3, 0.7]) * np.exp(-0.5 * np.einsum("ia,ab,ib->i", nu, np.linalg.inv(S), nu))
         likelihoods = np.maximum(likelihoods / likelihoods.sum(), np.exp(-9.0))
         np.testing.assert_allclose(np.exp(post.log_weights), likelihoods / likelihoods.sum(), rtol=1e-6)
 
     def test_the_innovation_has_the_covariance_of_prediction_and_noise(self):
         measured, full, P, _ = draw(1)
-        HP, S = innovate(measured, P)
+        HP, S = innovate(measured.H, measured.rows, measured.u, P, measured.R)
         np.testing.assert_allclose(HP, full @ P, rtol=1e-10)
-        np.testing.assert_allclose(S, full @ P @ full.T + noise_of(measured), rtol=1e-10)
+        np.testing.assert_allclose(S, full @ P @ full.T + block(measured.R), rtol=1e-10)
 
 
 EXPECTED = Expectation(np.ones(2), np.full(2, 4.0), 0.01, np.ones(4), CAMERA_TIME)
@@ -123,7 +121,7 @@ class TestJump:
     def test_errors_that_are_alike_tell_less_of_one(self):
         """Three key points whose errors correlate by 0.2 tell of what moves all of them as 3 / 1.4 do."""
         measured, _, P, x = draw()
-        HP, S = innovate(measured, P)
+        HP, S = innovate(measured.H, measured.rows, measured.u, P, measured.R)
         posterior = update(measured, np.ones(3), np.zeros(2), x, np.log([0.5, 0.5]), HP, S)
         told = {}
         for sight in (0.0, 1.0):

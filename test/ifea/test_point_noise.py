@@ -102,35 +102,6 @@ def test_a_point_counts_less_when_it_states_more_than_in_the_tare_and_never_more
     assert noise.width_variance[2] == pytest.approx(9 * usual.covariance[2, 1, 1])
 
 
-def move_together(frames, stddev, seed=1):
-    """Motions (n, K, 3) [m] of all key points by shifts along x and z [m] and turns [rad] of some deviation (3,)."""
-    along_x, along_z, turn = stddev[:, None, None] * np.random.default_rng(seed).normal(size=(3, frames, 1))
-    x, z = BENCH.keypoints[:, 0], BENCH.keypoints[:, 2]
-    return np.stack([along_x + turn * z, 0.0 * turn * z, along_z - turn * x], axis=2)
-
-
-@pytest.mark.parametrize("stated", [False, True])
-def test_the_tare_tells_what_all_key_points_share_of_the_noise(stated):
-    own, shared = np.full((K, 3), 0.07e-3), np.array([0.04e-3, 0.03e-3, 1e-3])
-    frames = BENCH.keypoints + scatter_of(own, 300) + move_together(300, shared)
-    tare = compute_tare(list(frames), BENCH.keypoints, [own] * 300 if stated else [None])
-    told = np.sqrt(np.diag(tare.common.common))
-    assert (told > 0.6 * shared).all() and (told < 1.3 * shared).all()
-    # of the variance of a key point, its own part
-    total = own[0, 0] ** 2 + (move_together(4000, shared)[..., ::2] ** 2).mean()
-    assert tare.common.independent == pytest.approx(own[0, 0] ** 2 / total, abs=0.15)
-
-
-def test_independent_key_points_share_next_to_nothing_of_their_noise():
-    own = np.full((K, 3), 0.07e-3)
-    for seed in range(10):
-        tare = compute_tare(list(BENCH.keypoints + scatter_of(own, 45, seed)), BENCH.keypoints)
-        assert tare.common.independent > 0.95
-        assert np.sqrt(tare.common.common[0, 0]) < 0.3 * own[0, 0]
-    still = compute_tare([BENCH.keypoints] * 45, BENCH.keypoints)
-    assert not still.common.common.any() and still.common.independent == 1.0
-
-
 def test_nothing_stated_is_the_pooled_noise_for_all():
     tare = compute_tare(list(BENCH.keypoints + scatter_of(np.tile(OWN, (K, 1)), 60)), BENCH.keypoints)
     assert tare.stated is None
