@@ -83,7 +83,8 @@ class Track:
         self.state[4:6] += variance
 
     def stop(self) -> None:
-        """Take it that nothing moves."""
+        """Take it that nothing moves from where it is."""
+        self.state[1:3] = self.x
         self.state[[0, 3]] = 1.0, 0.0
 
     def free(self, variance: float, speed_variance: float) -> None:

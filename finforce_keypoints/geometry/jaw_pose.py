@@ -363,28 +363,33 @@ class OriginTrack:
 
     def forecast(self, stamp: float) -> Origin | None:
         """Return where the jaw should be at a time [s]; None when it is lost."""
+        track = self._predict(stamp)
+        return None if track is None else self._tell(track)
+
+    def _predict(self, stamp: float) -> Track | None:
+        """Return the track at a time [s]; None when the jaw is lost."""
         if self._stamp is None or stamp - self._stamp > _LONGEST_STEP:
             return None
-        return self._tell(self._track.after(stamp - self._stamp))
+        return self._track.after(stamp - self._stamp)
 
     def update(self, stamp: float, origin: Origin | None) -> Origin | None:
         """Take the origin seen in an image, None when it was not; return the best estimate, None when lost."""
-        forecast = self.forecast(stamp)
+        track = self._predict(stamp)
         if origin is None:
-            return self._miss(stamp, forecast)
-        if forecast is None:
+            return self._miss(stamp, track)
+        if track is None:
             return self._begin(stamp, origin)
-        origin, dt = self._take_bias(origin, forecast), stamp - self._stamp
-        track = self._track.after(dt)
-        variance = origin.stddev**2
+        origin, dt = self._take_bias(origin, self._tell(track)), stamp - self._stamp
+        variance, wider = origin.stddev**2, 0.0
         if origin.noise is not None or self._last.noise is not None:
             worse = origin.stddev - self._last.stddev
             variance = (origin.noise or origin.stddev) ** 2 + max(worse, 0.0) ** 2
-            track.widen(min(worse, 0.0) ** 2)
-        before, off = track.variance, origin.x - track.x
+            wider = min(worse, 0.0) ** 2
+        before, off = track.variance + wider, origin.x - track.x
         gate = _ORIGIN_GATE * sqrt(before + variance)
         if abs(off) > self._settings.largest_speed * dt + gate:
-            return self._set_aside(stamp, origin, forecast)
+            return self._set_aside(stamp, origin, track)
+        track.widen(wider)
         if abs(off) > gate:
             track.free(off**2, (off / dt) ** 2)
         self._missed, self._aside, self._last = 0, [], origin
@@ -418,16 +423,17 @@ class OriginTrack:
         self._aside, self._missed, self._last = [], 0, origin
         return self._tell(self._track) if origin.stddev <= self._largest_stddev else None
 
-    def _miss(self, stamp: float, forecast: Origin | None) -> Origin | None:
-        """Go on without an origin for a few images."""
+    def _miss(self, stamp: float, track: Track | None) -> Origin | None:
+        """Go on as predicted, without an origin, for a few images."""
         self._missed += 1
-        if forecast is None or self._missed >= self._settings.lost_images:
+        if track is None or self._missed >= self._settings.lost_images:
             self.reset()
             return None
-        self._stamp, self._track = stamp, self._track.after(stamp - self._stamp)
-        return forecast if forecast.stddev <= self._largest_stddev else None
+        self._stamp, self._track = stamp, track
+        found = self._tell(track)
+        return found if found.stddev <= self._largest_stddev else None
 
-    def _set_aside(self, stamp: float, origin: Origin, forecast: Origin) -> Origin | None:
+    def _set_aside(self, stamp: float, origin: Origin, track: Track) -> Origin | None:
         """Keep an origin that no jaw can reach; believe it once some in a row agree."""
         if self._aside and abs(origin.x - self._aside[-1][1]) > self._settings.largest_speed * (
             stamp - self._aside[-1][0]
@@ -437,7 +443,7 @@ class OriginTrack:
         if len(self._aside) >= _SET_ASIDE:
             (first, begin), (last, end) = self._aside[0], self._aside[-1]
             return self._begin(stamp, origin, speed=(end - begin) / (last - first))
-        return self._miss(stamp, forecast)
+        return self._miss(stamp, track)
 
     def _tell(self, track: Track) -> Origin:
         """Return the jaw's place by a track."""

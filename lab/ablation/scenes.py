@@ -199,6 +199,11 @@ def film(
     return Scene(images=images, contacts=contacts, forces=pressed.forces, settings={**SMOOTH, **settings})
 
 
+def turn_points(points: NDArray) -> NDArray:
+    """Return how points (K, 3) [m] move by a turn about y (K, 3) [m/rad]."""
+    return np.stack([points[:, 2], 0.0 * points[:, 2], -points[:, 0]], axis=1)
+
+
 def shift(scene: Scene, motions: NDArray, **more: Any) -> Scene:
     """Return a scene whose key points are moved by (n, K or 1, 3) [m], with more told in each image."""
     images = [replace(each, points=each.points + by, **more) for each, by in zip(scene.images, motions, strict=True)]
@@ -209,7 +214,7 @@ def see_bump(scene: Scene, start: int, way: NDArray, turn: float) -> Scene:
     """Return a scene whose camera is shifted (3,) [m] and turned about y [rad] from an image on."""
     motions = np.zeros((len(scene.images), len(scene.images[0].points), 3))
     rest = scene.images[0].points
-    motions[start:] = way + turn * np.stack([rest[:, 2], 0.0 * rest[:, 2], -rest[:, 0]], axis=1)
+    motions[start:] = way + turn * turn_points(rest)
     return shift(scene, motions)
 
 
@@ -288,7 +293,7 @@ def build_drifting(bench: Bench, random: np.random.Generator) -> Scene:
     scene = film(bench, pressed, tell_height(bench, pressed, 0.3e-3), random)
     share = np.linspace(-0.2, 1.0, len(scene.images)).clip(0.0)[:, None, None]
     rest = scene.images[0].points
-    turn = 1e-3 * np.stack([rest[:, 2], 0.0 * rest[:, 2], -rest[:, 0]], axis=1)
+    turn = 1e-3 * turn_points(rest)
     return shift(scene, share * (np.array([0.07e-3, 0.0, 0.07e-3]) + turn))
 
 
@@ -298,7 +303,7 @@ def build_unplaced(bench: Bench, random: np.random.Generator) -> Scene:
     time = np.arange(len(scene.images))[:, None, None] * PERIOD
     phase = np.cumsum(np.where(time < _TARE * PERIOD, 0.0, 1.0), axis=0) * PERIOD
     way, turn, stretch = (np.sin(rate * phase) for rate in (3.0, 4.0, 5.0))
-    turned = 0.035 * turn * np.stack([rest[:, 2], 0.0 * rest[:, 2], -rest[:, 0]], axis=1)
+    turned = 0.035 * turn * turn_points(rest)
     longer = 0.02 * stretch * rest * [0.0, 0.0, 1.0]
     return shift(scene, 1e-3 * way * [0.7, 0.0, 0.7] + turned + longer, shared=SharedStddev(shift=0.7e-3))
 
@@ -351,7 +356,7 @@ def build_swaying(bench: Bench, random: np.random.Generator) -> Scene:
     """See the whole jaw in each image shifted and turned by 0.04 mm and 1 mrad, by chance, and rub."""
     scene, rest = build_rubbed(bench, random), bench.jaw.keypoints
     way, turn = 0.04e-3 * random.normal(size=(len(scene.images), 1, 3)), random.normal(size=(len(scene.images), 1, 1))
-    return shift(scene, way + 1e-3 * turn * np.stack([rest[:, 2], 0.0 * rest[:, 2], -rest[:, 0]], axis=1))
+    return shift(scene, way + 1e-3 * turn * turn_points(rest))
 
 
 def build_probed(bench: Bench, random: np.random.Generator) -> Scene:

@@ -164,8 +164,7 @@ def test_a_forecast_goes_on_at_the_speed_and_ends_with_a_long_gap():
     track = OriginTrack(SETTINGS)
     for n in range(20):
         track.update(n / RATE, Origin(x=-0.05 + 0.03 * n / RATE, stddev=1e-5))
-    # less the chance that the jaw stops in this image, which takes a thirtieth of a second of a second
-    stops = 0.03 / RATE / RATE
+    stops = 0.03 / RATE / RATE  # less the chance that it stops in this image: it moves for a second in the mean
     assert track.forecast(20 / RATE).x == pytest.approx(-0.05 + 0.03 * 20 / RATE - stops, abs=1e-5)
     assert track.forecast(19 / RATE + 2.0) is None
 
@@ -174,6 +173,14 @@ def test_a_slow_jaw_that_stops_is_not_seen_farther_on():
     speeds = np.repeat([0.0, 0.004, 0.0], 30)
     errors = np.array([follow(speeds, seed, 0.02e-3) for seed in range(20)])[:, 60:]
     assert np.abs(errors.mean(axis=0)).max() < 0.05e-3  # of the 0.13 mm that it moved between two images
+
+
+def test_a_jaw_that_is_known_to_rest_stays_where_it_was():
+    track = OriginTrack(SETTINGS)
+    for n in range(20):
+        place = track.update(n / RATE, Origin(x=-0.05 + 0.002 * max(n - 16, 0) / RATE, stddev=4e-5)).x
+    track.rest(20 / RATE)
+    assert track.place == pytest.approx(place, abs=1e-9) and track.speed == 0.0
 
 
 def test_reset_forgets_the_jaw():
