@@ -12,6 +12,7 @@ from finforce.errors import PoseError
 from finforce.transforms import check_pose, invert_pose, move_pose, pose_from_quaternion
 
 SIDES = ("left", "right")
+FARTHEST_CAMERA = 3.0  # [m] from the gripper, where f = 430 px shows a finger of 80 mm in 11 px
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # about z: left and right change places
 
 
@@ -89,6 +90,17 @@ BENCH_CAMERA = jaw_in_gripper("left", BENCH_ORIGIN_X) @ invert_pose(_BENCH_JAW)
 CAMERAS = {"robot": ROBOT_CAMERA, "bench": BENCH_CAMERA, "turned": ROBOT_CAMERA @ HALF_TURN, "front": FRONT_CAMERA}
 
 
+def check_camera(T_gripper_camera: NDArray) -> NDArray:
+    """Return a camera's pose (4, 4); raises PoseError of one so far away that its unit is another."""
+    distance = float(np.linalg.norm(T_gripper_camera[:3, 3]))
+    if distance > FARTHEST_CAMERA:
+        raise PoseError(
+            f"T_gripper_camera: the camera is {distance:.3g} m from the gripper; expected {FARTHEST_CAMERA:g} m at "
+            "most: is it in millimetres?"
+        )
+    return T_gripper_camera
+
+
 def read_extrinsics(camera: str | ArrayLike) -> NDArray:
     """Return T_gripper_camera (4, 4) of a camera by its name, its matrix (4, 4), or x, y, z [m], qx, qy, qz, qw.
 
@@ -105,7 +117,7 @@ def read_extrinsics(camera: str | ArrayLike) -> NDArray:
     except (TypeError, ValueError):
         raise PoseError(f"extrinsics {camera!r}: expected {forms}") from None
     if numbers.shape == (7,):
-        return pose_from_quaternion(numbers[:3], numbers[3:])
+        return check_camera(pose_from_quaternion(numbers[:3], numbers[3:]))
     if numbers.shape != (4, 4):
         raise PoseError(f"extrinsics: {numbers.size} numbers; expected {forms}")
-    return check_pose(numbers, "extrinsics")
+    return check_camera(check_pose(numbers, "extrinsics"))

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.camera_topics import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC, OLD_COLOR_TOPIC, TRANSPORTS, relative
-from finforce.gripper_frames import ROBOT_CAMERA
+from finforce.gripper_frames import ROBOT_CAMERA, check_camera
 from finforce.settings import GripperParameters, check_bounds, setting
 from finforce.transforms import pose_from_quaternion, pose_numbers
 from finforce_keypoints.errors import DetectorSettingsError, GeometryError
@@ -118,7 +118,7 @@ class DetectorParameters(GripperParameters):
     @property
     def camera_pose(self) -> NDArray:
         """T_gripper_camera (4, 4); raises PoseError unless it is seven finite numbers with a unit quaternion."""
-        return pose_from_quaternion(self.T_gripper_camera[:3], self.T_gripper_camera[3:])
+        return check_camera(pose_from_quaternion(self.T_gripper_camera[:3], self.T_gripper_camera[3:]))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -132,7 +132,8 @@ def read_triangles(path: Path | str) -> tuple[NDArray, NDArray]:
     path = Path(path)
     formats = " ".join(FORMATS)
     if not os.path.isfile(path):  # of a name that no file can have Path raises an error
-        raise ObjectMeshError(f"{str(path)[:200]}: there is no such file, expected a mesh ({formats}); check the path")
+        remedy = "give a path, not a URI" if ":/" in str(path) else "check the path"
+        raise ObjectMeshError(f"{str(path)[:200]}: there is no such file, expected a mesh ({formats}); {remedy}")
     if path.suffix.lower() not in FORMATS:
         raise ObjectMeshError(f"{path.name}: got ending {path.suffix!r}, expected one of {formats}; convert the file")
     try:

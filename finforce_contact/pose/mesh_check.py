@@ -220,7 +220,7 @@ class MeshCheck:
         """Return which turn, scale or shift of the mesh fits best, in words."""
         fitting = [(fit.gain, reading.text) for reading, fit in self._tried() if fit.fits]
         if fitting:
-            return f"the mesh fits when {max(fitting, key=lambda each: each[0])[1]}"
+            return f"if the depth is right, the mesh fits when {max(fitting, key=lambda each: each[0])[1]}"
         return "no turn, scale or shift of it fits: is it the mesh of this object, in this frame, and the depth right?"
 
     def _tried(self) -> Iterator[tuple[Reading, Fit]]:

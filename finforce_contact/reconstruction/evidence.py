@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion, distance_transform_edt, maximum_filter, minimum_filter, uniform_filter
 from scipy.spatial import cKDTree
 
-from finforce.camera import CameraIntrinsics, check_depth, check_mask, compute_rays
+from finforce.camera import CameraIntrinsics, ImageError, check_depth, check_mask, compute_rays
 from finforce_contact.errors import ReconstructionError
 from finforce_contact.mesh.object_mesh import LARGEST, ObjectMesh
 from finforce_contact.mesh.views import MeshView
@@ -73,8 +73,10 @@ def collect_evidence(depth: NDArray, mask: NDArray, camera: CameraIntrinsics) ->
     """
     check_depth(depth, camera)
     depth = np.where(np.nan_to_num(depth) > 0.0, depth, np.nan).astype(float)
-    check_mask(mask, depth, least=LEAST_POINTS)
     mask = np.asarray(mask, dtype=bool)
+    if mask.ndim == 2 and mask.size and mask[[0, 0, -1, -1], [0, -1, 0, -1]].all():
+        raise ImageError("mask: all four corners of the image are in it; expected the object alone: is it inverted?")
+    check_mask(mask, depth, least=LEAST_POINTS)
     points = _smooth_points(depth, mask, camera)
     away, across = float(np.median(points[:, 2])), float(np.ptp(points[:, :2], axis=0).max())
     if away > FARTHEST_OBJECT or across > LARGEST:

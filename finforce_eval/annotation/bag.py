@@ -22,6 +22,7 @@ from finforce.files import FileError, check_inside
 from finforce.messages import read_stamp
 from finforce_eval.annotation.video import write_video
 from finforce_eval.errors import OptionError, RecordingError, UnseenError
+from finforce_eval.evaluation.at_rest import doubt_intrinsics
 from finforce_eval.evaluation.check import explain_camera
 from finforce_eval.evaluation.forces import (
     describe_contradictions,
@@ -51,6 +52,7 @@ from finforce_eval.tasks import Task, hash_settings
 
 GRIPPER_FRAME = "gripper_base"
 NOTE, TABLE, VIDEO = "annotation.json", "forces.parquet", "forces.mp4"
+FEW = 0.5  # share of the images with a force, below which the camera is judged by the first images
 _OK, _WARN = 0, 1
 
 
@@ -90,13 +92,17 @@ def annotate_bag(source: Path, target: Path, options: argparse.Namespace, settin
         recording = keypoints.apply(recording)
     except UnseenError as error:
         why = explain_unseen(recording, keypoints) or explain_camera(recording, keypoints)
-        raise RecordingError("; ".join((str(error), *why))) from error
+        doubts = doubt_intrinsics(recording.images.camera)
+        raise RecordingError("; ".join((str(error), *doubts, *why))) from error
     tare = parse_tare_source(options.tare_from)
     other = None if tare is None or tare.episode is None else _read_episode(source, tare.episode, keypoints)
     tares, compared = borrow_tares(tare, recording, other, keypoints, setup)
     jaws = estimate_forces(recording, setup, tares=tares)
     why = why_unanswered(jaws.values())
-    notes = [*describe_unseen(recording, keypoints, jaws), *recording.notes, *compared]
+    seen = all(track.detection is not None for track in recording.jaws.values())
+    few = seen and any(forces.solved.mean() < FEW for forces in jaws.values())
+    notes = describe_unseen(recording, keypoints, jaws) or (explain_camera(recording, keypoints) if few else [])
+    notes += [*recording.notes, *compared]
     notes += [*setup.contacts.describe_comparison(recording), *describe_contradictions(jaws.values())]
     if why:
         raise RecordingError(f"{target.name}: {'; '.join((*notes, why))}")

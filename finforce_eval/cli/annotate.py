@@ -11,7 +11,7 @@ from shutil import rmtree
 from typing import Any
 
 from finforce.errors import FinforceError, one_line
-from finforce_eval.annotation.bag import bag_task, new_folder
+from finforce_eval.annotation.bag import FEW, bag_task, new_folder
 from finforce_eval.annotation.buffer_copy import write_buffer
 from finforce_eval.annotation.dataset_copy import write_copy
 from finforce_eval.annotation.dataset_forces import episode_tasks, plain_columns, write_dataset
@@ -188,4 +188,6 @@ def _print_outcome(line: dict[str, Any]) -> None:
             words.append(
                 f"key points {jaw['residual_mm']:.2f} mm off, {100 * jaw['within_reach']:.0f} % within the jaw's reach"
             )
+        if jaw["answered"] < FEW * jaw["images"] and jaw.get("unanswered"):
+            words.append(f"without: {', '.join(f'{count} {word}' for word, count in jaw['unanswered'].items())}")
         print("; ".join(words))

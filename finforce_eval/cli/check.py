@@ -100,7 +100,7 @@ def _check(options: argparse.Namespace) -> CommandResult:
     source, recording = read_at_rest(options)
     with progress_bar(ROUNDS * len(recording.images), "image") as bar:
         found, picture = check_recording(recording, source, bar.update)
-    found += check_object(*read_recordings(options.bags, source), options.object, options.object_unit)
+    found += check_object(*read_recordings(options.bags, source), options.object, options.object_unit, found)
     if options.rig is not None:
         found += check_rig(recording, source)
     for line in found:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce.camera import CameraIntrinsics
 from finforce.transforms import pose_numbers
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.keypoint_source import KeypointSource
@@ -32,6 +33,22 @@ def first_images(recording: Recording, count: int) -> Recording:
     if len(images) < count:
         raise RecordingError(f"{recording.name}: {len(images)} images, expected at least {count} of jaws at rest")
     return replace(recording, images=images.at(images.stamps_ns[:count]))
+
+
+def doubt_intrinsics(camera: CameraIntrinsics) -> list[str]:
+    """Return what speaks against the intrinsics of images, whatever these show."""
+    doubts, aspect = [], camera.fx / camera.fy
+    if not 0.97 < aspect < 1.03:
+        doubts.append(f"fx / fy is {aspect:.3f}; expected 1: are the intrinsics those of another image size?")
+    aside = np.hypot(camera.cx - 0.5 * (camera.width - 1), camera.cy - 0.5 * (camera.height - 1))
+    turned = np.hypot(camera.cx - 0.5 * (camera.height - 1), camera.cy - 0.5 * (camera.width - 1))
+    if aside > 0.1 * camera.width:
+        likely = "turned by 90 degrees" if turned < 0.25 * aside else "cropped or scaled"
+        doubts.append(
+            f"principal point {aside:.0f} px off the middle, as in images of {2 * camera.cx + 1:.0f} x "
+            f"{2 * camera.cy + 1:.0f}: was the image {likely}, but not the intrinsics?"
+        )
+    return doubts
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

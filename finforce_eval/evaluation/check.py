@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from finforce.camera import EQUIDISTANT, CameraIntrinsics, ImageError
+from finforce.camera import EQUIDISTANT, PLUMB_BOB, CameraIntrinsics, ImageError
 from finforce.errors import FinforceError, one_line
 from finforce.gripper_frames import HALF_TURN, OpeningRange, jaw_in_camera
 from finforce.optional import import_cv2
 from finforce.transforms import invert_pose, pose_numbers, rotation_between
 from finforce_contact.mesh.object_mesh import load_object_mesh
 from finforce_eval.errors import RecordingError
-from finforce_eval.evaluation.at_rest import JawsAtRest, approach
+from finforce_eval.evaluation.at_rest import JawsAtRest, approach, doubt_intrinsics
 from finforce_eval.evaluation.contact_source import OUTLINED, UNCOMPARED, UNSEEN, check_mesh
 from finforce_eval.evaluation.keypoint_source import KeypointSource, build_records, choose_images
 from finforce_eval.evaluation.unseen import explain_unseen
@@ -27,7 +27,7 @@ from finforce_eval.recordings.tracks import Recording
 from finforce_ifea.jaw.jaw import Jaw, list_shipped_jaws, load_jaw
 from finforce_keypoints.errors import KeypointError
 from finforce_keypoints.geometry.extrinsics import Extrinsics
-from finforce_keypoints.geometry.jaw_localizer import DEPTH_OFF, describe_depth
+from finforce_keypoints.geometry.jaw_localizer import DEPTH_OFF, DEPTH_WORDS, describe_depth
 from finforce_keypoints.geometry.side_picture import find_side, project_plane
 from finforce_keypoints.geometry.template import find_shape
 from finforce_keypoints.images import RgbdImage
@@ -44,6 +44,7 @@ FLAT = 1.5  # of 255, contrast of a part without detail
 BLACK, BAR = 12.0, 0.03  # of 255, brightest pixel of black rows; share of the picture from which on they are a bar
 TILES = 12  # parts along each side of the image
 GOOD_RESIDUAL = 1.0  # [px] left over when jaws at rest are laid on what is seen
+LESS = 0.5  # of what is left over, from which on another lens explains the images better
 FAR = 3e-3  # [m], tolerated error of the stated camera position
 TURNED = np.radians(1.5)  # [rad], tolerated error of the stated camera rotation
 # Share of a jaw's key points that have to be seen for another reading to be named: pictures of fingers that are none of
@@ -91,7 +92,7 @@ def check_recording(
     for side, jaw in look.jaws.items():
         seen = np.isfinite(jaw.pixels).all(axis=1)
         findings.append(Finding(OK, f"{side} jaw: {seen.sum()} of {len(seen)} key points seen"))
-    findings += _judge_pose(found, look, recording, parameters.camera_pose)
+    findings += _judge_camera(found, recording, source, parameters.camera_pose)
     if abs(look.depth_ratio - 1.0) > DEPTH_OFF:
         findings.append(Finding(FAULT, describe_depth(look.depth_ratio)))
     if found.residual > GOOD_RESIDUAL:
@@ -106,15 +107,19 @@ def explain_camera(recording: Recording, source: KeypointSource) -> list[str]:
     first = replace(recording, images=images.at(images.stamps_ns[:AT_REST]))
     jaws = {side: load_jaw(source.jaw_file, side) for side in recording.jaws}
     try:
-        found, look = approach(first, source, jaws, parameters.camera_pose)
+        found, _ = approach(first, source, jaws, parameters.camera_pose)
     except FinforceError:
         return []
-    findings = _judge_pose(found, look, recording, parameters.camera_pose)
+    findings = _judge_camera(found, first, source, parameters.camera_pose)
     return [each.text for each in findings if each.severity == FAULT]
 
 
-def check_object(recording: Recording, object_file: str | None, unit: str) -> list[Finding]:
+def check_object(
+    recording: Recording, object_file: str | None, unit: str, findings: Sequence[Finding] = ()
+) -> list[Finding]:
     """Return whether the images show the mesh of the object where its poses say; empty without a mesh.
+
+    A mesh is not compared with a depth that is among the `findings`.
 
     Raises:
         FinforceError: the mesh or an image cannot be used.
@@ -123,6 +128,8 @@ def check_object(recording: Recording, object_file: str | None, unit: str) -> li
     if path is None:
         return []
     mesh = load_object_mesh(path, unit=unit)
+    if any(text.startswith(DEPTH_WORDS) for _, text in findings):
+        return [Finding(WARNING, f"{mesh.name} is not compared with a depth that is wrong")]
     check = check_mesh(recording, mesh, at_once=True)
     if check is None or not check.is_sure:
         return [Finding(WARNING, f"{mesh.name} {UNCOMPARED}")]
@@ -221,39 +228,46 @@ def _describe_camera(recording: Recording, depth: str) -> Iterator[Finding]:
     yield Finding(
         OK, f"camera {camera.width}x{camera.height}, {camera.model}, {across:.0f} degrees, {rate:.0f} Hz, {kind}"
     )
-    aspect = camera.fx / camera.fy
-    if not 0.97 < aspect < 1.03:
-        yield Finding(WARNING, f"fx / fy is {aspect:.3f}; expected 1: are the intrinsics those of another image size?")
-    aside = np.hypot(camera.cx - 0.5 * (camera.width - 1), camera.cy - 0.5 * (camera.height - 1))
-    turned = np.hypot(camera.cx - 0.5 * (camera.height - 1), camera.cy - 0.5 * (camera.width - 1))
-    if aside > 0.1 * camera.width:
-        likely = "turned by 90 degrees" if turned < 0.25 * aside else "cropped"
-        text = f"principal point {aside:.0f} px off the middle: was the image {likely}, but not the intrinsics?"
-        yield Finding(WARNING, text)
+    yield from (Finding(WARNING, text) for text in doubt_intrinsics(camera))
 
 
-def _judge_pose(found: Extrinsics, look: JawsAtRest, recording: Recording, guess: NDArray) -> list[Finding]:
+def _judge_camera(found: Extrinsics, recording: Recording, source: KeypointSource, guess: NDArray) -> list[Finding]:
+    """Return how the camera's pose by what is seen compares with the one given, or that its lens is another one."""
+    judged, images, camera = _judge_pose(found, guess), recording.images, recording.images.camera
+    if judged.severity == OK or not (camera.model == EQUIDISTANT or camera.distortion.any()):
+        return [judged]
+    straight = replace(camera, model=PLUMB_BOB, distortion=np.zeros(0))
+    jaws = {side: load_jaw(source.jaw_file, side) for side in recording.jaws}
+    try:
+        other, _ = approach(replace(recording, images=replace(images, camera=straight)), source, jaws, guess)
+    except FinforceError:
+        return [judged]
+    if _judge_pose(other, guess).severity != OK or other.residual > LESS * found.residual:
+        return [judged]
+    text = (
+        f"without the distortion of the intrinsics ({camera.model}) {other.residual:.2f} px are left over in place of "
+        f"{found.residual:.2f}, and the camera is where T_gripper_camera says: are "
+        "the images rectified, or of a lens setting without it? give fx fy cx cy alone"
+    )
+    return [Finding(FAULT, text)]
+
+
+def _judge_pose(found: Extrinsics, guess: NDArray) -> Finding:
     """Return how the camera's pose by what is seen compares with the one given."""
-    findings = []
     moved = float(np.linalg.norm(found.T_gripper_camera[:3, 3] - guess[:3, 3]))
     turned = rotation_between(guess, found.T_gripper_camera)
     shown = f"{1e3 * moved:.1f} mm and {np.degrees(turned):.2f} degrees"
     if found.residual > GOOD_RESIDUAL:
-        findings.append(
-            Finding(
-                FAULT,
-                f"key points lie {found.residual:.2f} px off the jaw file, wherever the camera is; expected at most "
-                f"{GOOD_RESIDUAL:g} px: another finger, a bent one, or other intrinsics",
-            )
+        return Finding(
+            FAULT,
+            f"key points lie {found.residual:.2f} px off the jaw file, wherever the camera is; expected at most "
+            f"{GOOD_RESIDUAL:g} px: another finger, a bent one, or other intrinsics",
         )
-    elif moved > FAR or turned > TURNED:
+    if moved > FAR or turned > TURNED:
         numbers = ", ".join(f"{number:.6f}" for number in pose_numbers(found.T_gripper_camera))
-        findings.append(
-            Finding(FAULT, f"the camera is {shown} from where T_gripper_camera says; set T_gripper_camera: [{numbers}]")
-        )
-    else:
-        findings.append(Finding(OK, f"extrinsics within {shown}, {found.residual:.2f} px left over"))
-    return findings
+        text = f"the camera is {shown} from where T_gripper_camera says; set T_gripper_camera: [{numbers}]"
+        return Finding(FAULT, text)
+    return Finding(OK, f"extrinsics within {shown}, {found.residual:.2f} px left over")
 
 
 def _find_reasons(mean: RgbdImage, source: KeypointSource, recording: Recording, guess: NDArray) -> list[Finding]:

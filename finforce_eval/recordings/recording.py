@@ -51,6 +51,7 @@ for _side in SIDES:
 DEMO = Path(__file__).parents[1] / "data" / "bench_cyl25_middle"  # a loading cycle of the bench
 
 
+SPIKE, LEAST_SPIKE = 3.0, 1.0  # of what lasts [-], and beyond [N], from which on a force is none; impacts show twice it
 _CHECKED = 10_000  # messages after which their number is looked at
 
 
@@ -105,6 +106,9 @@ def read_recording(
     if images and not known:
         known = SIDES
         notes.append("no topic states which jaws its images show: looking for both; --jaws left or right selects one")
+    for topic in (f"/{side}/ground_truth_wrench" for side in known):
+        samples[topic], said = _without_spikes(samples.get(topic, []), topic)
+        notes += said
     jaws = {side: _jaw_track(samples, side, name) for side in known}
     if not jaws:
         what = "/left/keypoints and /right/keypoints have no messages; no colour images either"
@@ -235,6 +239,24 @@ def _wrench_track(samples: Sequence[Any], side: str, name: str) -> WrenchTrack:
     if not np.isfinite(force).all():
         raise RecordingError(f"{name}: {topic} holds forces that are not finite")
     return WrenchTrack(stamps_ns=stamps, force=force, torque=torque)
+
+
+def _without_spikes(samples: list[Any], topic: str) -> tuple[list[Any], list[str]]:
+    """Return readings of a force sensor without those of errors in their transmission, and a note of these.
+
+    A spike is a force (of one reading or two) far beyond all that three readings in a row show.
+    """
+    forces = [sample.wrench.force for sample in samples]
+    size = np.array([np.hypot(np.hypot(force.x, force.y), force.z) for force in forces])
+    lasting = float(np.min([size[2:], size[1:-1], size[:-2]], axis=0).max()) if len(size) > 2 else np.inf
+    spikes = np.isfinite(size) & (size > SPIKE * lasting + LEAST_SPIKE)
+    if not spikes.any():
+        return samples, []
+    note = (
+        f"{topic}: {spikes.sum()} of {len(size)} forces left out, up to {size[spikes].max():.3g} N where three in a "
+        f"row show {lasting:.3g} N at most: errors of the sensor's transmission?"
+    )
+    return [sample for sample, is_spike in zip(samples, spikes, strict=True) if not is_spike], [note]
 
 
 def _pose_track(samples: Sequence[Any], topic: str, name: str) -> PoseTrack:

@@ -243,7 +243,8 @@ def check_stamps(stamps: Iterable[int], topic: str, name: str, *, strict: bool =
     if wrong.size:
         what, message = "go back" if steps[wrong[0]] < 0 else "stand still", wrong[0] + 1
         where = f"message {message}, {times[message] / NANOSECONDS:.3f} s"
-        raise RecordingError(f"{name}: the stamps of {topic}, in the order of receipt, {what} at {where}")
+        unset = "" if times[message] else ": 0 is no time: leave out what was recorded before its clock, /clock, ran"
+        raise RecordingError(f"{name}: the stamps of {topic}, in the order of receipt, {what} at {where}{unset}")
     return times
 
 

@@ -37,6 +37,7 @@ GATES = (5e-3, 2e-3)  # [m] off the known side plane, then off the one found, be
 LEAST_DEPTHS, LEAST_SHARE = 6, 0.4  # samples of the finger with depth that a key point needs, and their share of all
 DEPTH_NOISE = 0.06e-3  # [m] error of the depth that the samples of one point share
 DEPTH_IMAGES = 5  # with depth at the jaw, over which that is compared with the jaw's place
+DEPTH_WORDS = "the depth at the jaw is"
 DEPTH_OFF = 0.2  # [-] of depth at the jaw by its place, above which it is of another unit or another picture
 MISFIT = 5.0  # standard deviations of its depth off the fit, above which a key point is not there
 TAGGED_STDDEV = 0.5e-3  # [m] of a shift that all points share beside a tag: holder and network give by so much
@@ -367,7 +368,7 @@ class JawLocalizer:
 def describe_depth(ratio: float) -> str:
     """Return what to say of depth that is so many times that of the jaw's place."""
     return (
-        f"the depth at the jaw is {ratio:.3g} times that of its place by the colours: check the unit of the depth "
+        f"{DEPTH_WORDS} {ratio:.3g} times that of its place by the colours: check the unit of the depth "
         "images, depth_scale, that they are aligned to the colours, and that the jaws are not nearer than the camera "
         "can measure"
     )
