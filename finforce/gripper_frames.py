@@ -95,7 +95,7 @@ def check_camera(T_gripper_camera: NDArray) -> NDArray:
     distance = float(np.linalg.norm(T_gripper_camera[:3, 3]))
     if distance > FARTHEST_CAMERA:
         raise PoseError(
-            f"T_gripper_camera: the camera is {distance:.3g} m from the gripper; expected {FARTHEST_CAMERA:g} m at "
+            f"extrinsics: T_gripper_camera is {distance:.3g} m from the gripper; expected {FARTHEST_CAMERA:g} m at "
             "most: is it in millimetres?"
         )
     return T_gripper_camera

@@ -74,7 +74,7 @@ def collect_evidence(depth: NDArray, mask: NDArray, camera: CameraIntrinsics) ->
     check_depth(depth, camera)
     depth = np.where(np.nan_to_num(depth) > 0.0, depth, np.nan).astype(float)
     mask = np.asarray(mask, dtype=bool)
-    if mask.ndim == 2 and mask.size and mask[[0, 0, -1, -1], [0, -1, 0, -1]].all():
+    if mask.shape == depth.shape and mask[[0, 0, -1, -1], [0, -1, 0, -1]].all():
         raise ImageError("mask: all four corners of the image are in it; expected the object alone: is it inverted?")
     check_mask(mask, depth, least=LEAST_POINTS)
     points = _smooth_points(depth, mask, camera)

@@ -99,9 +99,7 @@ def annotate_bag(source: Path, target: Path, options: argparse.Namespace, settin
     tares, compared = borrow_tares(tare, recording, other, keypoints, setup)
     jaws = estimate_forces(recording, setup, tares=tares)
     why = why_unanswered(jaws.values())
-    seen = all(track.detection is not None for track in recording.jaws.values())
-    few = seen and any(forces.solved.mean() < FEW for forces in jaws.values())
-    notes = describe_unseen(recording, keypoints, jaws) or (explain_camera(recording, keypoints) if few else [])
+    notes = [*(describe_unseen(recording, keypoints, jaws) or _explain_few(recording, keypoints, jaws))]
     notes += [*recording.notes, *compared]
     notes += [*setup.contacts.describe_comparison(recording), *describe_contradictions(jaws.values())]
     if why:
@@ -123,6 +121,13 @@ def annotate_bag(source: Path, target: Path, options: argparse.Namespace, settin
         if _read_figures(target, key) is None:  # else a worker that was taken for dead has done the same meanwhile
             raise
     return figures
+
+
+def _explain_few(recording: Recording, source: KeypointSource, jaws: Mapping[str, ForceSeries]) -> list[str]:
+    """Return what is wrong with the camera where few images of a detector have a force; empty if nothing is."""
+    seen = all(track.detection is not None for track in recording.jaws.values())
+    few = any(forces.solved.mean() < FEW for forces in jaws.values())
+    return explain_camera(recording, source) if seen and few else []
 
 
 def _read_figures(target: Path, key: str) -> dict[str, Any] | None:

@@ -242,14 +242,13 @@ def _judge_camera(found: Extrinsics, recording: Recording, source: KeypointSourc
         other, _ = approach(replace(recording, images=replace(images, camera=straight)), source, jaws, guess)
     except FinforceError:
         return [judged]
-    if _judge_pose(other, guess).severity != OK or other.residual > LESS * found.residual:
+    if other.residual > LESS * found.residual:
         return [judged]
     text = (
-        f"without the distortion of the intrinsics ({camera.model}) {other.residual:.2f} px are left over in place of "
-        f"{found.residual:.2f}, and the camera is where T_gripper_camera says: are "
-        "the images rectified, or of a lens setting without it? give fx fy cx cy alone"
+        f"{other.residual:.2f} px are left over without the distortion of the intrinsics ({camera.model}), "
+        f"{found.residual:.2f} px with it: are the images rectified, or of another lens setting? give fx fy cx cy alone"
     )
-    return [Finding(FAULT, text)]
+    return [Finding(FAULT, text), _judge_pose(other, guess)]
 
 
 def _judge_pose(found: Extrinsics, guess: NDArray) -> Finding:

@@ -219,8 +219,9 @@ def _require_jaw_poses(recording: Recording, side: str, frame: str) -> PoseTrack
         )
     if poses.frame_id.lstrip("/") != frame.lstrip("/"):
         raise RecordingError(
-            f"{recording.name}: the {side} jaw is seen in the frame '{poses.frame_id}', /object_pose is in '{frame}'; "
-            "expected the same: transform the poses with /tf before, or give --contact fixed:Z_MM"
+            f"{recording.name}: the {side} jaw, by /{side}/jaw_pose or the images, is in '{poses.frame_id}' and "
+            f"/object_pose in '{frame}'; expected one frame: transform the poses with /tf before, or give "
+            "--contact fixed:Z_MM"
         )
     return poses
 

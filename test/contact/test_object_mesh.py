@@ -134,6 +134,8 @@ def test_file_that_is_no_mesh_is_refused(tmp_path, name, content, problem):
 
 
 def test_missing_file_and_folder_are_refused(tmp_path):
+    with pytest.raises(ObjectMeshError, match="give a path, not a URI"):
+        load_object_mesh("package://my_robot/meshes/can.stl")
     for path in (tmp_path / "none.stl", tmp_path):
         with pytest.raises(ObjectMeshError, match="no such file"):
             load_object_mesh(path)

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,12 +18,13 @@ from rosbags.typesys import Stores, get_typestore
 from task_fakes import squares
 
 from finforce_eval.annotation import bag as annotated_bag
+from finforce_eval.cli import annotate as annotate_command
 from finforce_eval.cli.main import main
 from finforce_eval.evaluation.setup import make_setup
 from finforce_eval.recordings.objects import read_friction
 from finforce_eval.recordings.recording import DEMO, read_recording
 from finforce_eval.recordings.writer import write_recording
-from finforce_eval.tasks import EngineOptions, Manifest, run_tasks
+from finforce_eval.tasks import OK, EngineOptions, Manifest, run_tasks
 
 TYPES = get_typestore(Stores.ROS2_JAZZY)
 SECONDS = 4
@@ -112,6 +114,25 @@ def options_of(source):
     from finforce_eval.cli.main import parse
 
     return parse(["evaluate", str(source)])
+
+
+@pytest.mark.parametrize(
+    ("solved", "detection", "told"), [(0.4, "found", True), (0.6, "found", False), (0.4, None, False)]
+)
+def test_the_camera_is_looked_at_where_few_images_have_a_force(solved, detection, told, monkeypatch):
+    monkeypatch.setattr(annotated_bag, "explain_camera", lambda recording, source: ["another lens"])
+    jaws = {"left": SimpleNamespace(solved=np.arange(10) < 10 * solved)}
+    recording = SimpleNamespace(jaws={"left": SimpleNamespace(detection=detection)})
+    assert annotated_bag._explain_few(recording, None, jaws) == (["another lens"] if told else [])
+
+
+def test_where_few_images_have_a_force_it_is_said_why_the_others_have_none(capsys):
+    jaw = {"images": 100, "answered": 20, "largest_N": 2.0, "unanswered": {"waiting": 78, "diverged": 2}}
+    for answered, words in ((20, "; without: 78 waiting, 2 diverged\n"), (80, "2.00 N at most\n")):
+        annotate_command._print_outcome(
+            {"name": "a", "error": "", "status": OK, "figures": {"jaws": {"left": jaw | {"answered": answered}}}}
+        )
+        assert capsys.readouterr().out.endswith(words)
 
 
 def test_an_sqlite_recording_stays_one(tmp_path):

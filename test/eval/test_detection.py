@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from rgbd_fakes import FakeDetector, FakeGripper, FakePhotographer, make_footage
 
+from finforce.errors import PoseError
 from finforce_eval.cli.main import main
 from finforce_eval.cli.twin import write_footage
 from finforce_eval.errors import OptionError, RecordingError
@@ -17,6 +18,7 @@ from finforce_eval.recordings.objects import track_object
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.writer import write_recording
 from finforce_keypoints.images import check_image
+from finforce_keypoints.parameters import DetectorParameters
 
 
 @pytest.fixture(scope="module")
@@ -180,6 +182,10 @@ def test_extrinsics_are_a_name_or_seven_numbers():
     assert len(parse_source(options(extrinsics="bench")).parameters["T_gripper_camera"]) == 7
     given = parse_source(options(extrinsics="0,0,0.1,0,0,0,1")).parameters["T_gripper_camera"]
     assert given == [0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0]
+    with pytest.raises(OptionError, match="--extrinsics: T_gripper_camera is 105 m from .* in millimetres?"):
+        parse_source(options(extrinsics="0,95,-45,0,0,0,1"))
+    with pytest.raises(PoseError, match="in millimetres?"):
+        _ = DetectorParameters(T_gripper_camera=(0.0, 95.0, -45.0, 0.0, 0.0, 0.0, 1.0)).camera_pose
     with pytest.raises(OptionError, match="expected robot, bench"):
         parse_source(options(extrinsics="here"))
 

@@ -53,6 +53,11 @@ def test_object_is_found_in_the_jaw_frame_from_two_poses_in_the_camera_frame():
     np.testing.assert_allclose(track.cameras @ T_CAMERA_JAW[:3, :3].T + T_CAMERA_JAW[:3, 3], 0.0, atol=1e-12)
 
 
+def test_poses_in_another_frame_than_the_jaws_are_to_be_transformed():
+    with pytest.raises(RecordingError, match="the images, is in 'camera.*in 'base_link'.*transform .* with /tf"):
+        track_object(seen([START], [START], object="base_link"), "left")
+
+
 def test_pose_in_the_jaw_frame_needs_no_pose_of_the_jaw():
     recording = seen([START], [START])
     alone = replace(recording.jaws["left"], pose=None)
@@ -84,7 +89,7 @@ def test_poses_of_another_time_are_refused():
 
 
 def test_poses_of_two_cameras_are_refused():
-    with pytest.raises(RecordingError, match="/left/jaw_pose is in 'other' and /object_pose in 'camera_color"):
+    with pytest.raises(RecordingError, match="/left/jaw_pose .* is in 'other' and /object_pose in 'camera_color"):
         track_object(seen([START], [START], jaw="other"), "left")
 
 

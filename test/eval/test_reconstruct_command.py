@@ -93,6 +93,14 @@ def test_images_with_nothing_in_them_end_with_one_line(files, capsys):
     Image.fromarray(np.zeros(SHAPE, dtype=np.uint16)).save(blank)
     assert "no pixel has a depth" in complain(capsys, files, "--depth", blank)
     assert "nothing in it" in complain(capsys, files, "--mask", blank)
+    for depth in (np.full(SHAPE, 300, dtype=np.uint16), np.zeros(SHAPE, dtype=np.uint16)):
+        depth[100, 150] = 300
+        Image.fromarray(depth).save(files / "full.png")
+        inverted = np.full(SHAPE, 255, dtype=np.uint8)
+        inverted[90:120, 140:180] = 0
+        Image.fromarray(inverted).save(files / "inverted.png")
+        said = complain(capsys, files, "--mask", files / "inverted.png", "--depth", files / "full.png")
+        assert "is it inverted?" in said
     small = files / "small.png"
     Image.fromarray(np.full((10, 10), 255, dtype=np.uint8)).save(small)
     assert "(10, 10)" in complain(capsys, files, "--mask", small)

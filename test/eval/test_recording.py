@@ -14,7 +14,7 @@ from finforce_eval.recordings.frames import FrameImages
 from finforce_eval.recordings.images import ImageTrack
 from finforce_eval.recordings.objects import ObjectTrack, iter_frames
 from finforce_eval.recordings.recording import read_recording
-from finforce_eval.recordings.tracks import DetectionTrack, DetectionTruth, Timed, parse_phases
+from finforce_eval.recordings.tracks import DetectionTrack, DetectionTruth, Timed, check_stamps, parse_phases
 from finforce_eval.recordings.writer import (
     Entry,
     cloud_message,
@@ -227,6 +227,27 @@ def test_spoilt_key_points_are_refused(tmp_path, entries, change, reason):
     write_entries(spoil(entries, "/left/keypoints", 7, change), tmp_path / "bag")
     with pytest.raises(RecordingError, match=reason):
         read_recording(tmp_path / "bag")
+
+
+def test_stamps_of_0_are_named_as_none():
+    with pytest.raises(RecordingError, match="stand still at message 1, 0.000 s: 0 is no time"):
+        check_stamps([0, 0, START], "/camera", "bag")
+
+
+@pytest.mark.parametrize(("peak", "count", "left_out"), [(50.0, 2, 2), (50.0, 3, 0), (4.0, 1, 0), (np.inf, 1, None)])
+def test_forces_that_a_sensor_never_measured_are_left_out_with_a_note(tmp_path, entries, peak, count, left_out):
+    readings = [entry.message for entry in entries if entry.topic == "/left/ground_truth_wrench"]
+    for message in readings[20 : 20 + count]:
+        message.wrench.force.y = peak
+    write_entries(entries, tmp_path / "bag")
+    if left_out is None:
+        with pytest.raises(RecordingError, match="not finite"):
+            read_recording(tmp_path / "bag")
+        return
+    read = read_recording(tmp_path / "bag")
+    assert len(read.jaw("left").truth.stamps_ns) == len(readings) - left_out
+    said = f"{left_out} of {len(readings)} forces left out, up to 50 N where three in a row show "
+    assert any(said in note for note in read.notes) == bool(left_out)
 
 
 def test_truth_in_another_frame_is_refused(tmp_path, entries):

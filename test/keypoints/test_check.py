@@ -100,6 +100,25 @@ def test_depth_of_another_unit_is_named(still, capsys, tmp_path):
     assert status == 1 and "the depth at the jaw is 10 times that of its place" in said and "depth_scale" in said
 
 
+@pytest.mark.parametrize(("off", "faults"), [(0.0, 1), (0.01, 2)])
+def test_a_lens_that_the_images_do_not_have_is_named(still, off, faults, capsys, tmp_path):
+    fisheye = {"image_width": 640, "image_height": 480, "camera_name": "gopro", "distortion_model": "equidistant"}
+    matrix = {"rows": 3, "cols": 3, "data": [431.2, 0.0, 319.6, 0.0, 430.0, 241.3, 0.0, 0.0, 1.0]}
+    fisheye |= {"camera_matrix": matrix, "distortion_coefficients": {"data": [0.0348, 0.0571, -0.0541, 0.0133]}}
+    (tmp_path / "fisheye.yaml").write_text(json.dumps(fisheye))
+    T = ROBOT_CAMERA.copy()
+    T[1, 3] += off
+    status, said = check(still, capsys, tmp_path, "--intrinsics", str(tmp_path / "fisheye.yaml"), as_option(T))
+    assert status == 1 and said.count("fault") == faults and "give fx fy cx cy alone" in said
+    assert ("set T_gripper_camera" in said) == (faults == 2)
+
+
+def test_intrinsics_of_another_size_are_doubted_where_no_jaw_is_found(still, capsys):
+    words = ["extrinsics", str(still), "--images", str(IMAGES), "--intrinsics", "862.4", "860", "639.2", "362"]
+    assert main(words) == 2
+    assert "as in images of 1279 x 725: was the image cropped or scaled" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(("off", "words"), [(0.0, []), (0.05, ["finds no jaw"])])
 def test_a_rig_is_tried_on_the_pictures_that_it_was_made_from(still, off, words):
     source = KeypointSource(source="images", jaw_file="bench", sides=SIDES)
