@@ -125,9 +125,9 @@ def annotate_bag(source: Path, target: Path, options: argparse.Namespace, settin
 
 def _explain_few(recording: Recording, source: KeypointSource, jaws: Mapping[str, ForceSeries]) -> list[str]:
     """Return what is wrong with the camera where few images of a detector have a force; empty if nothing is."""
-    seen = all(track.detection is not None for track in recording.jaws.values())
     few = any(forces.solved.mean() < FEW for forces in jaws.values())
-    return explain_camera(recording, source) if seen and few else []
+    is_detected = all(track.detection is not None for track in recording.jaws.values())
+    return explain_camera(recording, source) if few and is_detected else []
 
 
 def _read_figures(target: Path, key: str) -> dict[str, Any] | None:

@@ -15,12 +15,13 @@ from finforce_eval.cli.extrinsics import read_at_rest
 from finforce_eval.cli.parser import BAG_HELP, CommandResult, add_rest_options
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.at_rest import ROUNDS
-from finforce_eval.evaluation.check import FAULT, WARNING, check_object, check_recording, check_rig
+from finforce_eval.evaluation.check import FAULT, WARNING, Finding, check_object, check_recording, check_rig
 from finforce_eval.evaluation.setup import read_recordings
 from finforce_eval.recordings.bags import COMPRESSED
 from finforce_eval.recordings.images import CAMERA_INFO, IMAGE
 from finforce_eval.recordings.writer import Entry, typestore, write_entries
 from finforce_eval.tasks import progress_bar
+from finforce_keypoints.geometry.jaw_localizer import DEPTH_WORDS
 
 PICTURE = "check.png"
 TIMEOUT = 15.0  # [s] after which no more images are waited for
@@ -100,7 +101,10 @@ def _check(options: argparse.Namespace) -> CommandResult:
     source, recording = read_at_rest(options)
     with progress_bar(ROUNDS * len(recording.images), "image") as bar:
         found, picture = check_recording(recording, source, bar.update)
-    found += check_object(*read_recordings(options.bags, source), options.object, options.object_unit, found)
+    if any(line.text.startswith(DEPTH_WORDS) for line in found):
+        found.append(Finding(WARNING, "the object's mesh is not compared with a depth that is wrong"))
+    else:
+        found += check_object(*read_recordings(options.bags, source), options.object, options.object_unit)
     if options.rig is not None:
         found += check_rig(recording, source)
     for line in found:

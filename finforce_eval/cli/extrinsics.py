@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from finforce.transforms import pose_numbers, rotation_between
 from finforce_eval.cli.parser import BAG_HELP, CommandResult, add_rest_options
-from finforce_eval.errors import OptionError, RecordingError
-from finforce_eval.evaluation.at_rest import ROUNDS, approach, doubt_intrinsics, first_images
+from finforce_eval.errors import OptionError
+from finforce_eval.evaluation.at_rest import ROUNDS, approach, doubt_lens, first_images
 from finforce_eval.evaluation.keypoint_source import KeypointSource, build_records, choose_images, parse_source
-from finforce_eval.evaluation.setup import read_recordings
+from finforce_eval.evaluation.setup import print_notes, read_recordings
 from finforce_eval.recordings.tracks import Recording
 from finforce_eval.tasks import progress_bar
 from finforce_ifea.jaw.jaw import load_jaw
@@ -33,11 +33,8 @@ def run(options: argparse.Namespace) -> CommandResult:
     recording = replace(recording, images=choose_images(recording, start.depth))
     jaws = {side: load_jaw(options.jaw, side) for side in recording.jaws}
     with progress_bar(ROUNDS * len(recording.images), "image") as bar:
-        try:
-            found, _ = approach(recording, source, jaws, start.camera_pose, bar.update)
-        except RecordingError as error:
-            doubts = doubt_intrinsics(recording.images.camera)
-            raise RecordingError("; ".join((str(error), *doubts))) from error
+        found, _ = approach(recording, source, jaws, start.camera_pose, bar.update)
+    print_notes(recording.name, doubt_lens(found, recording, source, start.camera_pose))
     print(format_extrinsics(found, start.camera_pose))
     pose, stddev = pose_numbers(found.T_gripper_camera), found.stddev.tolist()
     return CommandResult(

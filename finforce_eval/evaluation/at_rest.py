@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce.camera import CameraIntrinsics
+from finforce.camera import EQUIDISTANT, PLUMB_BOB, CameraIntrinsics
+from finforce.errors import FinforceError
 from finforce.transforms import pose_numbers
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.keypoint_source import KeypointSource
 from finforce_eval.recordings.tracks import Recording
-from finforce_ifea.jaw.jaw import Jaw
+from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_keypoints.detector import KeypointDetector
 from finforce_keypoints.geometry.extrinsics import Extrinsics, SeenJaw, find_extrinsics
 
@@ -22,6 +23,7 @@ ROUNDS = 4  # of finding the key points with the camera pose found before
 # [m]; a guess is allowed to be far off
 LOOSE = {"detector.reference_tolerance": 0.02, "detector.largest_offset": 0.5, "detector.lost_images": 1000}
 STILL = 0.05e-3  # [m] below which another round changes nothing
+LENS_IMAGES, LESS = 10, 0.5  # images of another lens, and of what is left over, from which on it is that of the images
 OFTEN = 0.5  # share of the images in which a jaw, and a key point, has to be seen
 
 
@@ -84,10 +86,11 @@ def average_at_rest(
         progress(1)
     for side, seen in pixels.items():
         if len(seen) < OFTEN * len(recording.images):
-            raise RecordingError(
+            told = (
                 f"{recording.name}: the {side} jaw was found in {len(seen)} of {len(recording.images)} images: are the "
                 "jaws in view and is the guess, --extrinsics, within some 10 mm and 5 degrees?"
             )
+            raise RecordingError("; ".join((told, *doubt_intrinsics(recording.images.camera))))
     seen = {
         side: SeenJaw(points=jaw.keypoints, pixels=_average(np.array(pixels[side])), turn=detector.mounts[side].turn)
         for side, jaw in jaws.items()
@@ -133,3 +136,26 @@ def approach(
         if moved < STILL:
             break
     return found, look
+
+
+def doubt_lens(found: Extrinsics, recording: Recording, source: KeypointSource, guess: NDArray) -> list[str]:
+    """Return, in a sentence, that images do not have the distortion of their intrinsics; empty if they may have it.
+
+    `found` is by these intrinsics, `guess` the T_gripper_camera (4, 4) that it began with; see `approach`.
+    """
+    images, camera = recording.images, recording.images.camera
+    if camera.model != EQUIDISTANT and not camera.distortion.any():
+        return []
+    straight = replace(camera, model=PLUMB_BOB, distortion=np.zeros(0))
+    first = replace(images.at(images.stamps_ns[:LENS_IMAGES]), camera=straight)
+    jaws = {side: load_jaw(source.jaw_file, side) for side in recording.jaws}
+    try:
+        other, _ = approach(replace(recording, images=first), source, jaws, guess)
+    except FinforceError:
+        return []
+    if other.residual > LESS * found.residual:
+        return []
+    return [
+        f"{other.residual:.2f} px are left over without the distortion of the intrinsics ({camera.model}), "
+        f"{found.residual:.2f} px with it: are the images rectified, or of another lens setting? give fx fy cx cy alone"
+    ]

@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from finforce.camera import EQUIDISTANT, PLUMB_BOB, CameraIntrinsics, ImageError
+from finforce.camera import EQUIDISTANT, CameraIntrinsics, ImageError
 from finforce.errors import FinforceError, one_line
 from finforce.gripper_frames import HALF_TURN, OpeningRange, jaw_in_camera
 from finforce.optional import import_cv2
 from finforce.transforms import invert_pose, pose_numbers, rotation_between
 from finforce_contact.mesh.object_mesh import load_object_mesh
 from finforce_eval.errors import RecordingError
-from finforce_eval.evaluation.at_rest import JawsAtRest, approach, doubt_intrinsics
+from finforce_eval.evaluation.at_rest import JawsAtRest, approach, doubt_intrinsics, doubt_lens
 from finforce_eval.evaluation.contact_source import OUTLINED, UNCOMPARED, UNSEEN, check_mesh
 from finforce_eval.evaluation.keypoint_source import KeypointSource, build_records, choose_images
 from finforce_eval.evaluation.unseen import explain_unseen
@@ -27,7 +27,7 @@ from finforce_eval.recordings.tracks import Recording
 from finforce_ifea.jaw.jaw import Jaw, list_shipped_jaws, load_jaw
 from finforce_keypoints.errors import KeypointError
 from finforce_keypoints.geometry.extrinsics import Extrinsics
-from finforce_keypoints.geometry.jaw_localizer import DEPTH_OFF, DEPTH_WORDS, describe_depth
+from finforce_keypoints.geometry.jaw_localizer import DEPTH_OFF, describe_depth
 from finforce_keypoints.geometry.side_picture import find_side, project_plane
 from finforce_keypoints.geometry.template import find_shape
 from finforce_keypoints.images import RgbdImage
@@ -44,7 +44,6 @@ FLAT = 1.5  # of 255, contrast of a part without detail
 BLACK, BAR = 12.0, 0.03  # of 255, brightest pixel of black rows; share of the picture from which on they are a bar
 TILES = 12  # parts along each side of the image
 GOOD_RESIDUAL = 1.0  # [px] left over when jaws at rest are laid on what is seen
-LESS = 0.5  # of what is left over, from which on another lens explains the images better
 FAR = 3e-3  # [m], tolerated error of the stated camera position
 TURNED = np.radians(1.5)  # [rad], tolerated error of the stated camera rotation
 # Share of a jaw's key points that have to be seen for another reading to be named: pictures of fingers that are none of
@@ -92,7 +91,7 @@ def check_recording(
     for side, jaw in look.jaws.items():
         seen = np.isfinite(jaw.pixels).all(axis=1)
         findings.append(Finding(OK, f"{side} jaw: {seen.sum()} of {len(seen)} key points seen"))
-    findings += _judge_camera(found, recording, source, parameters.camera_pose)
+    findings.append(_judge_camera(found, recording, source, parameters.camera_pose))
     if abs(look.depth_ratio - 1.0) > DEPTH_OFF:
         findings.append(Finding(FAULT, describe_depth(look.depth_ratio)))
     if found.residual > GOOD_RESIDUAL:
@@ -110,16 +109,12 @@ def explain_camera(recording: Recording, source: KeypointSource) -> list[str]:
         found, _ = approach(first, source, jaws, parameters.camera_pose)
     except FinforceError:
         return []
-    findings = _judge_camera(found, first, source, parameters.camera_pose)
-    return [each.text for each in findings if each.severity == FAULT]
+    judged = _judge_camera(found, first, source, parameters.camera_pose)
+    return [judged.text] if judged.severity == FAULT else []
 
 
-def check_object(
-    recording: Recording, object_file: str | None, unit: str, findings: Sequence[Finding] = ()
-) -> list[Finding]:
+def check_object(recording: Recording, object_file: str | None, unit: str) -> list[Finding]:
     """Return whether the images show the mesh of the object where its poses say; empty without a mesh.
-
-    A mesh is not compared with a depth that is among the `findings`.
 
     Raises:
         FinforceError: the mesh or an image cannot be used.
@@ -128,8 +123,6 @@ def check_object(
     if path is None:
         return []
     mesh = load_object_mesh(path, unit=unit)
-    if any(text.startswith(DEPTH_WORDS) for _, text in findings):
-        return [Finding(WARNING, f"{mesh.name} is not compared with a depth that is wrong")]
     check = check_mesh(recording, mesh, at_once=True)
     if check is None or not check.is_sure:
         return [Finding(WARNING, f"{mesh.name} {UNCOMPARED}")]
@@ -231,24 +224,11 @@ def _describe_camera(recording: Recording, depth: str) -> Iterator[Finding]:
     yield from (Finding(WARNING, text) for text in doubt_intrinsics(camera))
 
 
-def _judge_camera(found: Extrinsics, recording: Recording, source: KeypointSource, guess: NDArray) -> list[Finding]:
+def _judge_camera(found: Extrinsics, recording: Recording, source: KeypointSource, guess: NDArray) -> Finding:
     """Return how the camera's pose by what is seen compares with the one given, or that its lens is another one."""
-    judged, images, camera = _judge_pose(found, guess), recording.images, recording.images.camera
-    if judged.severity == OK or not (camera.model == EQUIDISTANT or camera.distortion.any()):
-        return [judged]
-    straight = replace(camera, model=PLUMB_BOB, distortion=np.zeros(0))
-    jaws = {side: load_jaw(source.jaw_file, side) for side in recording.jaws}
-    try:
-        other, _ = approach(replace(recording, images=replace(images, camera=straight)), source, jaws, guess)
-    except FinforceError:
-        return [judged]
-    if other.residual > LESS * found.residual:
-        return [judged]
-    text = (
-        f"{other.residual:.2f} px are left over without the distortion of the intrinsics ({camera.model}), "
-        f"{found.residual:.2f} px with it: are the images rectified, or of another lens setting? give fx fy cx cy alone"
-    )
-    return [Finding(FAULT, text), _judge_pose(other, guess)]
+    judged = _judge_pose(found, guess)
+    doubts = [] if judged.severity == OK else doubt_lens(found, recording, source, guess)
+    return Finding(FAULT, doubts[0]) if doubts else judged
 
 
 def _judge_pose(found: Extrinsics, guess: NDArray) -> Finding:
