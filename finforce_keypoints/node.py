@@ -263,19 +263,20 @@ class KeypointDetectorNode(ros.ImageNode):
         if T_gripper_camera is None:
             self._complain(f"/tf has no transform {arrow}: using the default T_gripper_camera")
             return
-        self._mounting = False
         if self._mount_trouble and self._tared:
             self._complain(
                 f"/tf has a transform {arrow} only since the tare, which was made with the default T_gripper_camera: "
                 "that stays; restart the nodes"
             )
+            self._mounting = False
             return
-        self._mount_trouble = ""
-        self.get_logger().info(f"camera pose taken from /tf, {arrow}")
-        if not np.allclose(T_gripper_camera, self.parameters.camera_pose, atol=1e-6):
-            self.parameters = replace(self.parameters, T_gripper_camera=pose_numbers(T_gripper_camera))
-            self.detector = self._build(self.parameters, settings=self._settings)
+        parameters = replace(self.parameters, T_gripper_camera=pose_numbers(T_gripper_camera))
+        if not np.allclose(parameters.camera_pose, self.parameters.camera_pose, atol=1e-6):
+            self.detector = self._build(parameters, settings=self._settings)  # where refused, the default is not taken
+            self.parameters = parameters
             self.detector.warm_up()
+        self._mounting, self._mount_trouble = False, ""
+        self.get_logger().info(f"camera pose taken from /tf, {arrow}")
 
     def _complain(self, trouble: str) -> None:
         """Say once in the log, and from now on in the diagnostics, what is wrong with the camera's pose."""

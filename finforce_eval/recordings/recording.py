@@ -51,6 +51,7 @@ for _side in SIDES:
 DEMO = Path(__file__).parents[1] / "data" / "bench_cyl25_middle"  # a loading cycle of the bench
 
 
+SLOW = 110_000_000  # [ns] between readings of slow load cells; more is a reading per photograph
 SPIKE, LEAST_SPIKE = 3.0, 1.0  # of what lasts [-], and beyond [N], from which on a force is none; impacts show twice it
 _CHECKED = 10_000  # messages after which their number is looked at
 
@@ -244,17 +245,20 @@ def _wrench_track(samples: Sequence[Any], side: str, name: str) -> WrenchTrack:
 def _without_spikes(samples: list[Any], topic: str) -> tuple[list[Any], list[str]]:
     """Return readings of a force sensor without those of errors in their transmission, and a note of these.
 
-    A spike is a force (of one reading or two) far beyond all that three readings in a row show.
+    A spike, of one reading or two, is far beyond all medians of five in a row, if these follow each other closely.
     """
-    forces = [sample.wrench.force for sample in samples]
-    size = np.array([np.hypot(np.hypot(force.x, force.y), force.z) for force in forces])
-    lasting = float(np.min([size[2:], size[1:-1], size[:-2]], axis=0).max()) if len(size) > 2 else np.inf
+    forces, stamps = [sample.wrench.force for sample in samples], [stamp_of(sample) for sample in samples]
+    if len(samples) < 5 or np.median(np.diff(stamps)) > SLOW:
+        return samples, []
+    size = np.array([np.linalg.norm((force.x, force.y, force.z)) for force in forces])
+    lasting = float(np.median(np.lib.stride_tricks.sliding_window_view(size, 5), axis=1).max())
     spikes = np.isfinite(size) & (size > SPIKE * lasting + LEAST_SPIKE)
+    spikes[[0, 1, -2, -1]] = False  # a load may begin or end there
     if not spikes.any():
         return samples, []
     note = (
-        f"{topic}: {spikes.sum()} of {len(size)} forces left out, up to {size[spikes].max():.3g} N where three in a "
-        f"row show {lasting:.3g} N at most: errors of the sensor's transmission?"
+        f"{topic}: {spikes.sum()} of {len(size)} forces left out, up to {size[spikes].max():.3g} N where three of five "
+        f"in a row show {lasting:.3g} N at most: errors of the sensor's transmission?"
     )
     return [sample for sample, is_spike in zip(samples, spikes, strict=True) if not is_spike], [note]
 

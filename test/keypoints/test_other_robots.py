@@ -26,6 +26,7 @@ from finforce.messages import stamp_of
 from finforce.transforms import pose_from_quaternion
 from finforce_eval.recordings.images import compress_depth
 from finforce_keypoints import node as detector_node
+from finforce_keypoints.errors import GeometryError
 from finforce_keypoints.node import KeypointDetectorNode
 
 CAMERA = pose_from_quaternion((0.1, -0.2, 0.3), (0.0, 0.6, 0.0, 0.8))
@@ -88,6 +89,20 @@ def test_a_pose_on_tf_that_comes_late_is_taken_before_the_tare_and_not_after_it(
     else:
         np.testing.assert_allclose(bench.node.parameters.camera_pose, CAMERA, atol=1e-9)
         bench.diagnosis(level=Level.OK)
+
+
+@pytest.mark.parametrize(("y", "reason"), [(95.0, "is it in millimetres?"), (0.2, "on the other side")])
+def test_a_pose_on_tf_that_is_refused_is_not_replaced_by_the_default(probe, tf, monkeypatch, y, reason):
+    def refuse(*arguments, **options):
+        raise GeometryError("on the other side")
+
+    tf["gripper_base", FRAME] = pose_from_quaternion((0.0, y, 0.0), (0.0, 0.6, 0.0, 0.8))
+    bench = CameraBench(probe)
+    monkeypatch.setattr(bench.node, "_build", refuse)
+    for _ in range(3):
+        bench.shoot()
+        bench.refused(reason, Level.ERROR)
+        probe.got["/diagnostics"].clear()
 
 
 @pytest.mark.parametrize("transport", ["compressed", "auto"])
