@@ -253,7 +253,7 @@ def _without_spikes(samples: list[Any], topic: str) -> tuple[list[Any], list[str
     size = np.array([np.linalg.norm((force.x, force.y, force.z)) for force in forces])
     lasting = float(np.median(np.lib.stride_tricks.sliding_window_view(size, 5), axis=1).max())
     spikes = np.isfinite(size) & (size > SPIKE * lasting + LEAST_SPIKE)
-    spikes[[0, 1, -2, -1]] = False  # a load may begin or end there
+    spikes[-2:] = False  # a load may begin there
     if not spikes.any():
         return samples, []
     note = (

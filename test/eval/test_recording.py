@@ -240,7 +240,8 @@ def test_stamps_of_0_are_named_as_none():
         (50.0, 20, 2, 2, PERIOD),
         (50.0, 20, 3, 0, PERIOD),  # lasts
         (4.0, 20, 1, 0, PERIOD),
-        (50.0, 0, 2, 0, PERIOD),
+        (50.0, 0, 2, 2, PERIOD),
+        (50.0, 58, 2, 0, PERIOD),  # a load may begin at the end
         (50.0, 20, 1, 0, 10 * PERIOD),  # a reading per photograph
     ],
 )
