@@ -127,7 +127,7 @@ class PressedJaw:
         shear = np.zeros(len(points))
         if load is not None:
             shear = measure_shear(self._press(q, load).forces, self._press(q, load, FRICTIONLESS).forces)
-        self._traction = Traction(0.0, self._roughness, shear, points, np.zeros(2))
+        self._traction = Traction(0.0, np.full(len(points), self._roughness), shear, points, np.zeros(2))
         self._origin = None if load is None else load.origin
 
     def meet(self, polygons: tuple[NDArray, ...]) -> None:

@@ -206,7 +206,7 @@ def rub_jaw(contact: RigidContact, states: Sequence[NDArray], coefficient: float
         ContactError: No equilibrium is found; the message says at which depth.
     """
     q, rest = contact.begin(float(states[0][2])), contact.surface.points
-    traction = Traction(0.0, coefficient, np.zeros(len(rest)), rest, np.zeros(2))
+    traction = Traction(0.0, np.full(len(rest), coefficient), np.zeros(len(rest)), rest, np.zeros(2))
     last, results = np.asarray(states[0], float), []
     for x in states:
         # towards the jaw is along -x, and the height along z
@@ -234,7 +234,7 @@ def keep_shear(contact: RigidContact, q: NDArray, x: NDArray, traction: Traction
     """Return what the next step has to know of the tangential forces at unknowns q (size,) and state x (3,)."""
     points = contact.place_points(q)
     pressure, total = (contact.press(points, x, each).forces for each in (FRICTIONLESS, traction))
-    return Traction(0.0, coefficient, measure_shear(total, pressure), points, np.zeros(2))
+    return Traction(0.0, np.full(len(points), coefficient), measure_shear(total, pressure), points, np.zeros(2))
 
 
 def _snaps(before: PressState, after: PressState) -> bool:

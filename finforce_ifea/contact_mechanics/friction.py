@@ -52,25 +52,25 @@ class Traction(NamedTuple):
 
     Attributes:
         ratio: of tangential to normal force at all points [-], where friction is not followed.
-        coefficient: of friction; below zero where it is not followed.
+        coefficient: of friction at each point (p,) [-]; none where it is not followed.
         shear: of each point before (p,) [N].
         before: where each point was then (p, 3) [m]; none of them where nothing has moved yet.
         moved: of the object since then (x, z) [m].
     """
 
     ratio: float
-    coefficient: float
+    coefficient: NDArray
     shear: NDArray
     before: NDArray
     moved: NDArray
 
 
-_NO_HISTORY = np.zeros(0), np.zeros((0, 3)), np.zeros(2)
+_NO_HISTORY = np.zeros(0), np.zeros(0), np.zeros((0, 3)), np.zeros(2)
 
 
 def constant_traction(ratio: float) -> Traction:
     """Return tangential forces that are one share of all normal forces, as where everything slides the same way."""
-    return Traction(ratio, -1.0, *_NO_HISTORY)
+    return Traction(ratio, *_NO_HISTORY)
 
 
 FRICTIONLESS = constant_traction(0.0)
@@ -101,7 +101,7 @@ def add_traction(traction, touch, p, x, z, stiffness, out):
     out[1, 0], out[1, 1], out[1, 2] = fz, touch.kxz, touch.kzz
     out[0, 3], out[0, 4], out[0, 5], out[0, 6] = -touch.kxx, touch.bx, touch.kxz, fz
     out[1, 3], out[1, 4], out[1, 5], out[1, 6] = -touch.kxz, touch.bz, touch.kzz, -fx
-    if traction.coefficient < 0.0:
+    if len(traction.coefficient) == 0:
         _add_ratio(traction.ratio, touch, out)
         out[0, 0] += traction.ratio * fz
         out[1, 0] -= traction.ratio * fx
@@ -113,8 +113,8 @@ def add_traction(traction, touch, p, x, z, stiffness, out):
     slip, before = 0.0, traction.before
     if len(before) > 0:
         slip = tx * (x - before[p, 0] - traction.moved[0]) + tz * (z - before[p, 2] - traction.moved[1])
-    shear, limit = traction.shear[p] - stiffness * slip, traction.coefficient * normal
-    if abs(shear) > limit:
+    shear, limit = traction.shear[p] - stiffness * slip, traction.coefficient[p] * normal
+    if abs(shear) > limit or limit == 0.0:
         shear = limit if shear > 0.0 else -limit
         _add_ratio(shear / normal, touch, out)
     else:

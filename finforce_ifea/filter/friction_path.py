@@ -13,7 +13,7 @@ from finforce.kalman import Track, find_variance
 from finforce_ifea.contact_mechanics.friction import Coefficient
 from finforce_ifea.contact_mechanics.pressed_jaw import RigidContact
 from finforce_ifea.filter.readout import LARGEST_RATIO
-from finforce_ifea.filter.slip_path import SlipPath, find_turn, turn_path
+from finforce_ifea.filter.slip_path import PathState, SlipPath, find_turn, turn_path
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
 # Coefficients of friction that are weighed against each other, and the deviation of a coefficient up to which one is
@@ -48,12 +48,12 @@ _LEAST_PROBABILITY = 1e-6
 _BRANCH = 1e-3
 
 
-class _Branch(NamedTuple):
-    """Part of the path in one direction: places (M, 2) [m] and traction ratios (M,) at its start, direction before."""
+class _Mark(NamedTuple):
+    """Where the path was: places (M, 2) [m], its state there, and the direction in which it came."""
 
-    start: NDArray
-    ratios: NDArray
-    before: float
+    places: NDArray
+    path: PathState
+    direction: float
 
 
 class TractionHypotheses:
@@ -96,7 +96,7 @@ class TractionHypotheses:
         self._path.reset()
         self._anchor: NDArray | None = None
         self._anchor_stddev, self._direction, self.stddev, self.doubt = _TOUCH_STDDEV, 1.0, 0.0, 0.0
-        self._branch: _Branch | None = None
+        self._marks: list[_Mark] = []
 
     @property
     def prior(self) -> NDArray:
@@ -129,7 +129,7 @@ class TractionHypotheses:
             self.doubt = float(self._share(weights) @ self.mu)
             return self.ratios
         known = self._direction, self._anchor_stddev, self.stddev
-        path = self.mu, self._path.ratios, self._path.turns, self._anchor
+        path = self.mu, self._path.parts, self._path.shares, self._path.rates, self._anchor
         ratios, self.doubt = _preview(path, known, places, weights, track.state)
         return self._bound(ratios)
 
@@ -171,7 +171,8 @@ class TractionHypotheses:
         """Count the depth `change` [m] more."""
         if self._anchor is not None:
             self._anchor[:, 0] += change
-            self._branch.start[:, 0] += change
+            for mark in self._marks:
+                mark.places[:, 0] += change
 
     def follow(
         self, contact: RigidContact, q: NDArray, x: NDArray, places: NDArray, track: Track, weights: NDArray
@@ -191,8 +192,7 @@ class TractionHypotheses:
         """
         if self._anchor is None:
             self._anchor = places[: len(self.mu)].copy()
-            self._path.begin(contact, q, x)
-            self._begin_branch(self._direction)
+            self._path.measure(contact, q, x)
         own, motion, deeper, is_along = _find_motion(self._anchor, places, weights)
         stddev = sqrt(max(track.variance, 0.0))
         if not is_along:
@@ -204,31 +204,30 @@ class TractionHypotheses:
             if abs(deeper) < _SHORTEST:
                 return
         before, self._anchor_stddev, self._direction = self._direction, stddev, float(np.sign(deeper))
-        if (
-            self._direction != before
-            or is_along
-            or own @ np.abs(self._anchor[:, 0] - self._branch.start[:, 0]) > _BRANCH
-        ):
-            self._begin_branch(before)
+        if self._direction != before or is_along:
+            self._marks = []
+        elif self._marks and own @ np.abs(self._anchor[:, 0] - self._marks[0].places[:, 0]) > _BRANCH:
+            del self._marks[0]
+        self._marks.append(_Mark(self._anchor, self._path.state, before))
         self._anchor = self._anchor + motion
         self.motion += abs(deeper)
         self._path.move(contact, q, x, motion)
-        self.stddev = _find_stddev(self._path.ratios, self.mu, own, self._path.turns, stddev)
-
-    def _begin_branch(self, before: float) -> None:
-        """Keep the path up to here, where the object had the direction `before`."""
-        self._branch = _Branch(self._anchor.copy(), self._path.ratios.copy(), before)
+        self.stddev = _find_stddev(self._path.ratios, self.mu, own, self._path.rates, self._path.shares, stddev)
 
     def _take_back(self, contact: RigidContact, q: NDArray, x: NDArray, places: NDArray, own: NDArray) -> None:
-        """Follow the path anew from the start of its branch to the places (M, 2); see `follow` for the arguments."""
-        start, ratios, before = self._branch
-        motion = np.zeros_like(places)
-        motion[:, 0] = places[:, 0] - start[:, 0]
-        self._path.ratios, self._anchor = ratios.copy(), places.copy()
-        if own @ motion[:, 0] * self._direction < 0.0:
-            self._direction = before
-        if own @ motion[:, 0] * self._direction > 0.0:
-            self._path.move(contact, q, x, motion)
+        """Follow the path anew from its last mark before the places (M, 2); see `follow` for the arguments."""
+        while self._marks:
+            mark = self._marks.pop()
+            motion = (places - mark.places) * [1.0, 0.0]
+            ahead = own @ motion[:, 0]
+            self._path.resume(mark.path)
+            if not self._marks and ahead * self._direction < 0.0:
+                self._direction = mark.direction
+            if ahead * self._direction > 0.0:
+                self._path.move(contact, q, x, motion)
+                self._marks.append(mark)
+                break
+        self._anchor = places.copy()
 
 
 @njit(**_OPTIONS)
@@ -280,10 +279,10 @@ def _is_chance(deeper, direction, stddev, anchor_stddev, rests):
 
 
 @njit(**_OPTIONS)
-def _find_stddev(ratios, mu, own, turns, stddev):
+def _find_stddev(ratios, mu, own, rates, shares, stddev):
     """Return the standard deviation of the traction ratio by that of the depth [m], at ratios of the path (M,)."""
     slides = ((np.abs(np.abs(ratios) - mu) < _AT_CONE) * own).sum()
-    return (_SLIDING if slides > _MOST else 1.0) * find_turn(turns, (own * ratios).sum()) * stddev
+    return (_SLIDING if slides > _MOST else 1.0) * find_turn(rates, shares, (own * ratios).sum()) * stddev
 
 
 @njit(**_OPTIONS)
@@ -291,16 +290,17 @@ def _preview(path, known, places, weights, track):
     """Return ratios of the path (M,) with the object in other places, and the doubt; see `TractionHypotheses`.
 
     Args:
-        path: coefficients (M,), ratios (M,), turns, and the path's end (M, 2) [m].
+        path: coefficients (M,), see `SlipPath` for parts, shares and rates, and the path's end (M, 2) [m].
         known: direction of the path, standard deviation of its end [m], and of the traction ratio by its errors.
         places: see `_find_motion`.
         weights: see `_find_motion`.
         track: state of the depth, see `Track`.
     """
-    (mu, ratios, turns, anchor), (direction, anchor_stddev, before) = path, known
+    (mu, parts, shares, rates, anchor), (direction, anchor_stddev, before) = path, known
     own, motion, deeper, is_along = _find_motion(anchor, places, weights)
     stddev = np.sqrt(max(find_variance(track), 0.0))
     if not is_along and _is_chance(deeper, direction, stddev, anchor_stddev, track[0]):
-        return ratios, find_turn(turns, (own * ratios).sum()) * abs(deeper)
-    ratios = turn_path(ratios, mu, turns, motion)
-    return ratios, np.sqrt(max(_find_stddev(ratios, mu, own, turns, stddev) ** 2 - before**2, 0.0))
+        ratios = parts @ shares
+        return ratios, find_turn(rates, shares, (own * ratios).sum()) * abs(deeper)
+    ratios = turn_path(parts, mu, rates, motion) @ shares
+    return ratios, np.sqrt(max(_find_stddev(ratios, mu, own, rates, shares, stddev) ** 2 - before**2, 0.0))

@@ -1,37 +1,50 @@
 """Mobilized friction of an object, for several coefficients at once, from its path.
 
-While the contact sticks, a motion of the object turns the force by the angle that the tangential stiffness of jaw and
-surface tells; it slides once the traction ratio kappa reaches the cone. For each coefficient mu,
+The two edges of a flat object stick and slide in turn, often against each other: a contact with a gap has two parts,
+any other has one. While a part sticks, the stiffness of jaw and surface tells how a motion of the object changes its
+force F. Its traction ratio kappa then changes, for each coefficient mu, as
 
-    kappa <- clamp(kappa + (1 + kappa^2) s(kappa) . delta, -mu, mu),
+    kappa <- clamp(kappa + (t . dF - kappa n . dF) / N - (1 + kappa^2) dnu, -mu, mu),
 
-with the motion delta of the object in depth and height, and the turn s [1/m] of the force by it, relative to the force
-of an object that slides without friction. An object that touches first sticks, however little it presses: its path
-begins with the ratio at which a stuck contact gives way, within the cone. This is the play operator of Prandtl; see
-Visintin, Differential Models of Hysteresis, 1994, ch. III.
+with the normal force N along n, its turn dnu, and the tangent t. The force also depends on whether the other part
+sticks, or slides at its cone. A part that touches first sticks, however little it presses: its path begins with the
+ratio at which it gives way while all sticks, within the cone. Each part is a play operator of Prandtl; see Visintin,
+Differential Models of Hysteresis, 1994, ch. III.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from finforce.compiled import njit
 from finforce_ifea.contact_mechanics.friction import FRICTIONLESS, Traction
+from finforce_ifea.contact_mechanics.indenter import PenaltyContact
 from finforce_ifea.contact_mechanics.pressed_jaw import RigidContact
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
 # Coefficient of friction of a contact that does not slide [-].
 _STICKS = 1e3
-# Traction ratios at which the turn of the force is measured [-].
-_RATIOS = np.array([-0.4, 0.0, 0.4])
-# The one of them with which nothing acts along the surface.
-_UPRIGHT = 1
-# Motion after which the turn is measured again [m].
+# Motion after which the rates are measured again [m].
 _FRESH = 0.3e-3
 # Longest step of the path at once [m].
-_STEP = 0.1e-3
-_NO_TURNS, _NOWHERE = np.zeros((2, 3)), (np.inf, np.inf)
+_STEP = 0.02e-3
+# Motion by which derivatives are measured [m].
+_SMALL = 1e-6
+# Gap between two parts of a contact [m].
+_GAP = 4e-3
+# Of `measure_rates`: which of the parts stick.
+_BOTH, _LOWER, _UPPER = 0, 1, 2
+_NO_RATES, _NOWHERE = np.zeros((3, 2, 3, 2)), (np.inf, np.inf)
+
+
+class PathState(NamedTuple):
+    """Traction ratios of the contact's parts (N, 2) [-], and their heights (2,) [m], infinite where there is none."""
+
+    parts: NDArray
+    heights: NDArray
 
 
 class SlipPath:
@@ -39,8 +52,9 @@ class SlipPath:
 
     Attributes:
         coefficients: of friction (N,) [-].
-        ratios: traction ratio of each (N,) [-].
-        turns: of the force by the motion, see `measure_turns`; zero before anything touches.
+        parts: traction ratio of the lower and the upper part of the contact, of each coefficient (N, 2) [-].
+        shares: of the parts in the normal force (2,) [-].
+        rates: of the ratios by the motion, see `measure_rates`; zero before anything touches.
     """
 
     def __init__(self, coefficients: NDArray) -> None:
@@ -50,8 +64,13 @@ class SlipPath:
 
     def reset(self) -> None:
         """Forget the path."""
-        self.ratios = np.zeros(len(self.coefficients))
-        self.turns, self._stuck, self._at = _NO_TURNS, 0.0, _NOWHERE
+        self.parts, self.shares = np.zeros((len(self.coefficients), 2)), np.array([1.0, 0.0])
+        self.rates, self._heights, self._at = _NO_RATES, np.full(2, np.inf), _NOWHERE
+
+    @property
+    def ratios(self) -> NDArray:
+        """Traction ratio of the whole contact for each coefficient (N,) [-]."""
+        return self.parts @ self.shares
 
     def move(self, contact: RigidContact, q: NDArray, x: NDArray, motion: NDArray) -> None:
         """Take the motion of the object.
@@ -62,73 +81,106 @@ class SlipPath:
             x: state of the contact (3,).
             motion: in depth and height for each coefficient (N, 2) [m].
         """
-        self._measure(contact, q, x)
-        self.ratios = self.preview(motion)
+        self.measure(contact, q, x)
+        self.parts = turn_path(self.parts, self.coefficients, self.rates, motion)
 
-    def begin(self, contact: RigidContact, q: NDArray, x: NDArray) -> None:
-        """Begin with an object that has just touched; see `move` for the arguments."""
-        self._measure(contact, q, x)
-        self.ratios = np.clip(np.full(len(self.coefficients), self._stuck), -self.coefficients, self.coefficients)
+    def measure(self, contact: RigidContact, q: NDArray, x: NDArray) -> None:
+        """Measure the rates anew where an object that may stick has moved; see `move` for the arguments."""
+        if max(abs(x[0] - self._at[0]), abs(x[2] - self._at[1])) > _FRESH and self.coefficients.any():
+            before = self.state
+            self.rates, self.shares, self._heights = measure_rates(contact, q, x)
+            self._at = _NOWHERE if np.isinf(self._heights).all() else (x[0], x[2])
+            self.resume(before)
 
-    def _measure(self, contact: RigidContact, q: NDArray, x: NDArray) -> None:
-        """Measure the turns anew where an object that may stick has moved."""
-        if not max(abs(x[0] - self._at[0]), abs(x[2] - self._at[1])) > _FRESH or not self.coefficients.any():
-            return
-        turns, self._stuck = measure_turns(contact, q, x)
-        self.turns, self._at = (_NO_TURNS, _NOWHERE) if turns is None else (turns, (x[0], x[2]))
+    @property
+    def state(self) -> PathState:
+        """What `resume` goes on from."""
+        return PathState(self.parts.copy(), self._heights)
 
-    def preview(self, motion: NDArray) -> NDArray:
-        """Return the traction ratios (N,) after a motion in depth and height (N, 2) [m], by the last turn."""
-        return turn_path(self.ratios, self.coefficients, self.turns, motion)
+    def resume(self, state: PathState) -> None:
+        """Go on from another state; a part of the contact that is new begins where it gives way while all sticks."""
+        along, ahead, turned = self.rates[_BOTH, :, :, 0].T
+        stuck = np.divide(along - turned, ahead, out=np.zeros(2), where=ahead != 0.0)
+        self.parts = np.clip(stuck, -self.coefficients[:, None], self.coefficients[:, None])
+        for i in np.flatnonzero(np.isfinite(self._heights)):
+            nearest = int(np.abs(state.heights - self._heights[i]).argmin())
+            if abs(state.heights[nearest] - self._heights[i]) < _GAP:
+                self.parts[:, i] = state.parts[:, nearest]
 
 
 @njit(**_OPTIONS)
-def find_turn(turns, ratio):
-    """Return the size of the turn by depth [1/m] at a traction ratio; see `measure_turns`."""
-    return abs(np.interp(ratio, _RATIOS, turns[0]))
+def find_turn(rates, shares, ratio):
+    """Return the size of the change of a traction ratio by depth [1/m] while all of the contact sticks."""
+    turn = 0.0
+    for h in range(2):
+        turn += shares[h] * _find_rate(rates[_BOTH, h], ratio, 1.0, 0.0)
+    return abs(turn)
 
 
 @njit(**_OPTIONS)
-def turn_path(ratios, coefficients, turns, motion):
-    """Return the ratios (N,) after a motion (N, 2) [m]; see the module and `measure_turns`."""
-    out, largest = ratios.copy(), 0.0
-    for i in range(len(motion)):
-        largest = max(largest, abs(motion[i, 0]), abs(motion[i, 1]))
-    steps = max(1, int(np.ceil(largest / _STEP)))
+def _find_rate(rates, ratio, depth, height):
+    """Return the change of a traction ratio by a motion in depth and height [m] for rates (3, 2) [1/m]."""
+    along = rates[0, 0] * depth + rates[0, 1] * height
+    ahead = rates[1, 0] * depth + rates[1, 1] * height
+    turned = rates[2, 0] * depth + rates[2, 1] * height
+    return along - ratio * ahead - (1.0 + ratio**2) * turned
+
+
+@njit(**_OPTIONS)
+def turn_path(parts, coefficients, rates, motion):
+    """Return the ratios of both parts (N, 2) after a motion (N, 2) [m]; see the module and `measure_rates`."""
+    out = parts.copy()
     for i in range(len(out)):
+        mu, (depth, height) = coefficients[i], motion[i]
+        steps = max(1, int(np.ceil(max(abs(depth), abs(height)) / _STEP)))
+        depth, height = depth / steps, height / steps
         for _ in range(steps):
-            change = 0.0
-            for a in range(2):
-                change += motion[i, a] / steps * np.interp(out[i], _RATIOS, turns[a])
-            change *= 1.0 + out[i] ** 2
-            out[i] = min(max(out[i] + change, -coefficients[i]), coefficients[i])
+            lower = out[i, 0] + _find_rate(rates[_BOTH, 0], out[i, 0], depth, height)
+            upper = out[i, 1] + _find_rate(rates[_BOTH, 1], out[i, 1], depth, height)
+            if abs(upper) > mu >= abs(lower):
+                lower = out[i, 0] + _find_rate(rates[_LOWER, 0], out[i, 0], depth, height)
+            elif abs(lower) > mu >= abs(upper):
+                upper = out[i, 1] + _find_rate(rates[_UPPER, 1], out[i, 1], depth, height)
+            out[i, 0], out[i, 1] = min(max(lower, -mu), mu), min(max(upper, -mu), mu)
     return out
 
 
-def measure_turns(contact: RigidContact, q: NDArray, x: NDArray) -> tuple[NDArray | None, float]:
-    """Return the turn of the force by depth and height of an object that sticks (2, 3) [1/m], None without contact.
+def measure_rates(contact: RigidContact, q: NDArray, x: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    """Return rates of the parts' forces (3, 2, 3, 2) [1/m], the parts' shares (2,), and their heights (2,) [m].
 
-    It is that at three traction ratios, less the turn of an object that slides without friction. With it comes the
-    traction ratio of a contact that has stuck since it began.
+    The rates are those if both parts stick, the lower one, or the upper one; of the lower and the upper part; along
+    the surface and ahead, relative to the part's normal force, and of the turn of the latter; by depth and height. A
+    part that is missing has none, and an infinite height.
     """
-    points = contact.place_points(q)
-    forces = contact.press(points, x, FRICTIONLESS).forces
-    normal = np.hypot(forces[:, 0], forces[:, 2])
-    if not normal.any():
-        return None, 0.0
-    smooth = contact.linearize(q, x, FRICTIONLESS)
-    slides, turns, by_depth = _measure_turn(smooth.force, smooth.force_modes), [], []
-    for ratio in _RATIOS:
-        stuck = contact.linearize(q, x, Traction(0.0, _STICKS, ratio * normal, points, np.zeros(2)))
-        force = np.array([smooth.force[0] + ratio * smooth.force[2], 0.0, smooth.force[2] - ratio * smooth.force[0]])
-        turns.append(slides - _measure_turn(force, stuck.force_modes))
-        by_depth.append(stuck.force_modes[:, 0])
-    ahead, along = smooth.force[[0, 2]], smooth.force[[2, 0]] * [1.0, -1.0]
-    gained = by_depth[_UPRIGHT][[0, 2]]
-    return np.array(turns).T.copy(), float(gained @ along / (gained @ ahead))
+    points, rates, shares, heights = contact.place_points(q), _NO_RATES.copy(), np.zeros(2), np.full(2, np.inf)
+    smooth = contact.press(points, x, FRICTIONLESS)
+    size, rest = np.hypot(smooth.forces[:, 0], smooth.forces[:, 2]), contact.surface.points[:, 2]
+    parts = _split(size, rest)
+    for i, sticking in enumerate((np.flatnonzero(size), *parts) if len(parts) > 1 else parts):
+        traction = Traction(0.0, np.zeros(len(points)), np.zeros(len(points)), points, np.zeros(2))
+        traction.coefficient[sticking] = _STICKS
+        modes = contact.linearize(q, x, traction).modes[:, [0, 2]]
+        motions = np.stack([contact.place_points(q + _SMALL * mode) - points for mode in modes.T], axis=2) / _SMALL
+        pressed = contact.press(points, x, traction)
+        for part, rate in zip(parts, rates[i], strict=False):
+            normal = smooth.forces[part].sum(0)
+            across, ways = np.array([normal[2], 0.0, -normal[0]]), motions[part]
+            change, turned = (_find_change(each, part, ways) for each in (pressed, smooth))
+            rate[:] = np.stack([across @ change, normal @ change, across @ turned]) / (normal @ normal)
+    for i, part in enumerate(parts):
+        shares[i], heights[i] = size[part].sum() / size.sum(), np.average(rest[part], weights=size[part])
+    return rates, shares, heights
 
 
-def _measure_turn(force: NDArray, modes: NDArray) -> NDArray:
-    """Return the turn (2,) [rad/m] of a force (3,) by depth and height, for its derivatives (3, 4)."""
-    square = force[0] ** 2 + force[2] ** 2
-    return (force[0] * modes[2, [0, 2]] - force[2] * modes[0, [0, 2]]) / square
+def _split(size: NDArray, heights: NDArray) -> list[NDArray]:
+    """Return the indices of the points in each part, the lower one first, for forces and heights (p,) [N, m]."""
+    touching = np.flatnonzero(size)
+    gaps = np.diff(heights[touching], prepend=heights[touching[:1]])
+    if not touching.size:
+        return []
+    return np.split(touching, [gaps.argmax()]) if gaps.max() >= _GAP else [touching]
+
+
+def _find_change(pressed: PenaltyContact, part: NDArray, motions: NDArray) -> NDArray:
+    """Return how the force on points of a part changes by depth and height (3, 2) [N/m] as they move (k, 3, 2)."""
+    return pressed.changes[part][:, :, [0, 2]].sum(0) - np.einsum("kij,kjm->im", pressed.springs[part], motions)

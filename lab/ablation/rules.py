@@ -128,6 +128,8 @@ RULES = (
           {_SEARCH + "PLACE_TIME": 20.0}, "unplaced"),
     _rule("friction path", "`TractionHypotheses`", "the share of its friction that an object uses",
           {_PATH + "TractionHypotheses.follow": _nothing}, "rubbed", "probed", "paused"),
+    _rule("two edges", "`_GAP`", "edges of a flat object that stick and slide in turn",
+          {_FILTER + "slip_path:_GAP": 1.0}, "rubbed box", "wide box", "rubbed"),
     _rule("path correction", "`_take_back`", "motions that ended earlier than they seemed to",
           {_PATH + "TractionHypotheses._take_back": _nothing}, "paused", "rubbed", "probed"),
     _rule("reversal threshold", "`_REVERSAL`, `_REVERSAL_AT_REST`", "keeps noise from counting as a reversal",

@@ -352,6 +352,14 @@ def build_rubbed(bench: Bench, random: np.random.Generator) -> Scene:
     return film(bench, pressed, tell_height(bench, pressed, 0.3e-3), random, friction=0.45, friction_stddev=0.25)
 
 
+def build_rubbed_box(bench: Bench, random: np.random.Generator) -> Scene:
+    """Press a box of friction 0.6, of which nothing is known, near the tip, there and back and on again."""
+    outline = OutlineIndenter((BOX,))
+    pressed = press(bench, ramp(3, 2, 4, 2), indenter=outline, shape=0.0, height=0.055, friction=0.6)
+    told = tell_outline(bench, pressed, random, BOX)
+    return film(bench, pressed, told, random, 0.3, friction=0.45, friction_stddev=0.25)
+
+
 def build_swaying(bench: Bench, random: np.random.Generator) -> Scene:
     """See the whole jaw in each image shifted and turned by 0.04 mm and 1 mrad, by chance, and rub."""
     scene, rest = build_rubbed(bench, random), bench.jaw.keypoints

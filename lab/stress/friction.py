@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
-from finforce_ifea.contact_mechanics.indenter import RoundIndenter
+from finforce_ifea.contact_mechanics.indenter import OutlineIndenter, RoundIndenter
 from finforce_ifea.errors import ContactError
+from finforce_ifea.observation import Contact, ObjectOutline
 from finforce_ifea.settings import EstimatorSettings
 from lab.presses import PressHistory, rub_jaw
+from lab.stress.objects import rectangle
 from lab.stress.session import Bench, open_session
 from lab.stress.stress import Family, Plan, Trial
 
@@ -23,24 +27,57 @@ _SPEED = 4e-3
 _HOLD = 10
 # Distance of the places at which the path is kept [m].
 _SPACING = 0.05e-3
+# Standard deviation of a tracked pose: x, z [m] and turn [rad].
+_POSE = np.array([0.5e-3, 0.5e-3, 5e-3])
+# Height [m] above which the lower edge of a box stays: what leans on the clamp is another family's.
+_CLAMPED = 0.012
 
 
-def rub(bench: Bench, random: np.random.Generator, coefficient: float) -> tuple[PressHistory, np.ndarray]:
-    """Return a drawn path in and out of a cylinder, by its length, and the lengths at which it turns (t,) [m].
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RubbedObject:
+    """A drawn path in and out of an object.
+
+    Attributes:
+        history: of the press, by the length of the path.
+        turns: lengths at which the path turns (t,) [m].
+        polygon: outline of a box (n, 2) [m]; None for a cylinder, of which only the height is told.
+        states: of the contact (p, 3), and their lengths (p,) [m].
+        front: distance from the box's origin to its leading point [m].
+    """
+
+    history: PressHistory
+    turns: NDArray
+    polygon: NDArray | None
+    states: tuple[NDArray, NDArray]
+    front: float
+
+    def tell(self, face: float, length: float, off: NDArray) -> Contact:
+        """Return the outline at a length of the path [m], its pose off by x, z [m] and turn [rad] (3,)."""
+        depth, tilt, height = (np.interp(length, self.states[1], column) for column in self.states[0].T)
+        origin = np.array([face + self.front - depth, height]) + off[:2]
+        outline = ObjectOutline(polygons=(self.polygon,), origin=origin, tilt=tilt + off[2], stddev=_POSE)
+        return Contact(points=np.array([[face, 0.0, height]]), weights=np.ones(1), outline=outline)
+
+
+def rub(bench: Bench, random: np.random.Generator, coefficient: float, *, flat: bool) -> RubbedObject:
+    """Return a drawn path in and out of a box, if it is flat, or of a cylinder.
 
     The truth is the estimator's own mechanics. A path without equilibrium is drawn anew.
     """
     contact = bench.estimator.mechanics.contact
     probe = contact.model.attach(bench.jaw.keypoints, max_distance=1.0)
-    contact.set_indenter(RoundIndenter())
     while True:
-        height, radius = bench.find_height(random.uniform(0.022, 0.060)), random.uniform(6e-3, 20e-3)
+        height, shape, polygon = bench.find_height(random.uniform(0.022, 0.060)), random.uniform(6e-3, 20e-3), None
+        if flat:
+            polygon, shape = _draw_box(random, height), random.uniform(-0.05, 0.05)
+        contact.set_indenter(OutlineIndenter((polygon,)) if flat else RoundIndenter())
         turns = bench.find_depth(random.uniform(2e-3, 7e-3)) * np.array(_TURNS)
         lengths = np.concatenate([[0.0], np.abs(np.diff(turns)).cumsum()])
         path = np.unique(np.r_[np.arange(0.0, lengths[-1], _SPACING), lengths])
-        depths = np.interp(path, lengths, turns)
+        touch = contact.find_touch(np.array([0.0, shape, height]))
+        states = np.array([[touch + depth, shape, height] for depth in np.interp(path, lengths, turns)])
         try:
-            rubbed = rub_jaw(contact, [np.array([depth, radius, height]) for depth in depths], coefficient)
+            rubbed = rub_jaw(contact, states, coefficient)
         except ContactError:
             continue
         forces = np.array([pressed.force if pressed.touches else np.zeros(3) for _, pressed in rubbed])
@@ -48,29 +85,41 @@ def rub(bench: Bench, random: np.random.Generator, coefficient: float) -> tuple[
         keypoints = [contact.model.positions(probe, q) for q, _ in rubbed]
         history = PressHistory(
             height=height,
-            radius=radius,
+            radius=shape,
             depth=float(lengths[-1]),
             keypoints=PchipInterpolator(path, keypoints),
             forces=PchipInterpolator(path, forces),
             torques=PchipInterpolator(path, np.cross(centres, forces)),
         )
-        return history, lengths
+        front = contact.indenter.pressed.front
+        return RubbedObject(history=history, turns=lengths, polygon=polygon, states=(states, path), front=front)
+
+
+def _draw_box(random: np.random.Generator, height: float) -> NDArray:
+    """Return the outline (4, 2) [m] of a box at a height [m]."""
+    return rectangle(random.uniform(0.012, min(2.0 * (height - _CLAMPED), 0.045)), random.uniform(0.020, 0.045))
 
 
 def run_friction(plan: Plan) -> Iterator[Trial]:
     """Yield grasps of objects whose friction is not stated, each of them new."""
     stated = EstimatorSettings()
     bench = Bench(plan, friction=stated.friction, friction_stddev=stated.friction_stddev)
-    for seed in range(plan.share(2 * len(_LEVELS))):
-        low, high = _LEVELS[seed % len(_LEVELS)]
+    for seed in range(plan.share(4 * len(_LEVELS))):
+        (low, high), flat = _LEVELS[seed % len(_LEVELS)], seed // len(_LEVELS) % 2 == 1
         random = plan.random("friction", seed)
-        history, lengths = rub(bench, random, float(random.uniform(low, high)))
+        rubbed = rub(bench, random, float(random.uniform(low, high)), flat=flat)
         bench.estimator.forget()
-        session = open_session(bench, random, history=history, level=f"friction {low:g} to {high:g}")
-        yield from session.play(seed, session.steps(_plan_images(lengths)))
+        level = f"friction {low:g} to {high:g}, {'box' if flat else 'cylinder'}"
+        session = open_session(bench, random, history=rubbed.history, level=level)
+        images, off = _plan_images(rubbed.turns), _POSE * random.normal(size=3)
+        steps = session.steps(images)
+        if flat:
+            face = bench.jaw.inner_face_x
+            steps = [replace(s, contact=rubbed.tell(face, w, off)) for s, w in zip(steps, images, strict=True)]
+        yield from session.play(seed, steps)
 
 
-def _plan_images(lengths: np.ndarray) -> np.ndarray:
+def _plan_images(lengths: NDArray) -> NDArray:
     """Return the way of each image (n,) [m] along a path that is held where it turns."""
     parts = [np.zeros(3)]
     for start, end in zip(lengths[:-1], lengths[1:], strict=True):

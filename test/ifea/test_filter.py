@@ -4,16 +4,18 @@ data/rubbed_bench.npz holds key points [mm] and forces [N] of CalculiX 2.20 for 
 and back with a coefficient of friction of 0.3.
 """
 
+import itertools
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from estimator_fakes import BENCH, PERIOD, circle, contact_with
+from estimator_fakes import BENCH, PERIOD, box, circle, contact_with
 
 from finforce.kalman import MotionNoise, Track
-from finforce_ifea.contact_mechanics.friction import Coefficient, constant_traction
-from finforce_ifea.contact_mechanics.indenter import RoundIndenter
+from finforce_ifea.contact_mechanics.friction import FRICTIONLESS, Coefficient, constant_traction
+from finforce_ifea.contact_mechanics.indenter import OutlineIndenter, RoundIndenter
 from finforce_ifea.contact_mechanics.pressed_jaw import limit_step
 from finforce_ifea.estimator import ForceEstimator
 from finforce_ifea.filter.filter import expect_innovations, innovate, reduce_covariance, update
@@ -22,7 +24,7 @@ from finforce_ifea.filter.jump import BUMPED, MISPLACED, NUDGED, JumpWatch, weig
 from finforce_ifea.filter.measurement import FREEDOM, NO_WEIGHT, Measurement, measure_distances, weigh
 from finforce_ifea.filter.process import CAMERA_TIME, FREE_DEPTH, Expectation, expect_state, find_decay, predict
 from finforce_ifea.filter.search import _follow_scatter
-from finforce_ifea.filter.slip_path import SlipPath
+from finforce_ifea.filter.slip_path import PathState, SlipPath, turn_path
 from finforce_ifea.filter.state import DEPTH, SHARED, TRACTION, state_size
 from finforce_ifea.jaw.calibration import Calibration, load_calibration
 from finforce_ifea.mechanics import build_chosen
@@ -220,8 +222,41 @@ class TestSlipPath:
             smooth = contact.linearize(q, states[-1]).force
             leans = np.tan(np.radians(incline(smooth) - incline(pressed.force)))
             seen = SlipPath(np.array([coefficient]))
-            seen.begin(contact, q, states[-1])
+            seen.measure(contact, q, states[-1])
             assert seen.ratios[0] == pytest.approx(leans, abs=0.1)
+
+    @pytest.mark.parametrize("height", [0.040, 0.058])
+    def test_the_edges_of_a_box_stick_and_slide_by_themselves(self, height):
+        contact, coefficient = mechanics().contact, 0.7
+        contact.set_indenter(OutlineIndenter(box(0.015, 0.015)))
+        turns = ((0.0, 4e-3), (4e-3, 2.5e-3), (2.5e-3, 5e-3))
+        depths = np.concatenate([np.linspace(a, b, round(abs(b - a) / 0.1e-3) + 1)[1:] for a, b in turns])
+        states = [np.array([contact.find_touch(np.array([0.0, 0.0, height])) + d, 0.0, height]) for d in depths]
+        path, errors = SlipPath(np.array([coefficient])), []
+        path.measure(contact, rub_jaw(contact, states[:1], coefficient)[0][0], states[0])
+        for before, x, (q, pressed) in zip(states, states[1:], rub_jaw(contact, states, coefficient)[1:], strict=False):
+            path.move(contact, q, x, np.array([[x[0] - before[0], 0.0]]))
+            pressure = contact.press(contact.place_points(q), x, FRICTIONLESS).forces.sum(0)
+            leans = np.tan(np.radians(incline(pressure) - incline(pressed.force)))
+            errors.append((path.ratios[0] - leans) if x[0] - states[0][0] > 0.5e-3 else 0.0)
+        assert np.sqrt(np.mean(np.square(errors))) < 0.12  # one ratio for both edges is 0.2 off
+        contact.set_indenter(RoundIndenter())
+
+    def test_a_part_that_is_elsewhere_begins_anew_and_one_that_stays_goes_on(self):
+        contact, path = mechanics().contact, SlipPath(np.array([0.5]))
+        contact.set_indenter(OutlineIndenter(box(0.015, 0.015)))
+        q, x = contact.begin(0.040), np.array([0.0, 0.0, 0.040])
+        for depth in (0.5e-3, 1e-3, 1.5e-3, 2e-3):
+            x[0] = contact.find_touch(x) + depth
+            q, _ = press(contact, x, 0.0, q)
+        path.measure(contact, q, x)
+        begun = path.parts.copy()
+        path.resume(PathState(np.array([[0.11, 0.22]]), path.state.heights))
+        np.testing.assert_array_equal(path.parts, [[0.11, 0.22]])
+        upper = path.state.heights[1]
+        path.resume(PathState(np.array([[0.33, 0.0]]), np.array([upper, np.inf])))  # it was the only one
+        np.testing.assert_array_equal(path.parts, [[begun[0, 0], 0.33]])
+        contact.set_indenter(RoundIndenter())
 
     def test_a_look_ahead_is_where_the_path_will_be(self):
         contact, path = mechanics().contact, SlipPath(np.array([0.3, 0.9]))
@@ -230,11 +265,10 @@ class TestSlipPath:
         for depth in (0.5e-3, 1e-3, 1.5e-3, 2e-3):
             x = np.array([depth, 12.5e-3, 0.040])
             q, _ = press(contact, x, 0.0, q)
-        path.ratios[:] = -0.2
-        path.move(contact, q, x, np.zeros((2, 2)))  # measures the turns
+        path.measure(contact, q, x)
+        path.parts[:] = -0.2
         motion = np.full((2, 2), [0.2e-3, 0.0])
-        ahead, before = path.preview(motion), path.ratios.copy()
-        np.testing.assert_array_equal(path.ratios, before)
+        ahead, before = turn_path(path.parts, path.coefficients, path.rates, motion) @ path.shares, path.ratios
         path.move(contact, q, x, motion)
         np.testing.assert_allclose(path.ratios, ahead)
         assert (ahead > before).any()
@@ -269,6 +303,26 @@ class TestHypotheses:
         small = unknown.doubt
         unknown.preview(places - [0.1e-3, 0.0], track, weights)
         assert 0.0 < small < unknown.doubt
+
+    @pytest.mark.parametrize("images", [12, 2])
+    @pytest.mark.parametrize("ways", [(2e-3,), (2e-3, 1.4e-3)])
+    def test_what_stopped_earlier_than_it_seemed_is_where_it_would_be_without_going_on(self, ways, images):
+        contact, results = mechanics().contact, []
+        contact.set_indenter(RoundIndenter())
+        for beyond in (0.0, 0.1e-3):
+            known = TractionHypotheses(Coefficient(0.5, 0.03), "no")
+            moving, resting = (SimpleNamespace(variance=each**2, rests=rests) for each, rests in ((4e-5, 0), (1e-5, 1)))
+            turns, q = [0.02e-3, *ways], contact.begin(0.040)
+            there = turns[-1] + np.sign(turns[-1] - turns[-2]) * beyond
+            way = [np.linspace(a, b, 12) for a, b in itertools.pairwise(turns[:-1])]
+            way = np.concatenate([*way, np.linspace(turns[-2], there, images), turns[-1:]])
+            for i, depth in enumerate(way):
+                x = np.array([depth, 12.5e-3, 0.040])
+                q, _ = press(contact, x, 0.0, q)
+                track = resting if i == len(way) - 1 else moving
+                known.follow(contact, q, x, np.array([[depth, 0.040]]), track, np.ones(1))
+            results.append(float(known.ratios[0]))
+        assert results[1] == pytest.approx(results[0], abs=0.06)
 
     def test_friction_is_known_as_it_was_stated(self):
         stated = TractionHypotheses(Coefficient(0.5, 0.1), "no")

@@ -35,7 +35,7 @@ def drag(coefficient, *, shift=0.0, moved=0.0, before=0.0):
     """
     rest = np.zeros((5, 3))
     rest[:, 2] = 1e-3 * np.arange(5)
-    traction = Traction(0.0, coefficient, np.full(5, before), rest, np.array([0.0, moved]))
+    traction = Traction(0.0, np.full(5, coefficient), np.full(5, before), rest, np.array([0.0, moved]))
     block, x = OutlineIndenter(box(0.02, 0.02)), np.array([1.1e-4, 0.0, moved])
     return block.press(rest + [0.0, 0.0, shift], np.full(5, 1e4), 0.0, x, traction).forces
 
