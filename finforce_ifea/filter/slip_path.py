@@ -21,14 +21,13 @@ from numpy.typing import NDArray
 
 from finforce.compiled import njit
 from finforce_ifea.contact_mechanics.friction import FRICTIONLESS, Traction
-from finforce_ifea.contact_mechanics.indenter import PenaltyContact
 from finforce_ifea.contact_mechanics.pressed_jaw import RigidContact
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
 # Coefficient of friction of a contact that does not slide [-].
 _STICKS = 1e3
 # Motion after which the rates are measured again [m].
-_FRESH = 0.3e-3
+_FRESH = 0.15e-3
 # Longest step of the path at once [m].
 _STEP = 0.02e-3
 # Motion by which derivatives are measured [m].
@@ -160,12 +159,15 @@ def measure_rates(contact: RigidContact, q: NDArray, x: NDArray) -> tuple[NDArra
         traction = Traction(0.0, np.zeros(len(points)), np.zeros(len(points)), points, np.zeros(2))
         traction.coefficient[sticking] = _STICKS
         modes = contact.linearize(q, x, traction).modes[:, [0, 2]]
-        motions = np.stack([contact.place_points(q + _SMALL * mode) - points for mode in modes.T], axis=2) / _SMALL
-        pressed = contact.press(points, x, traction)
+        moved = [contact.place_points(q + _SMALL * mode) for mode in modes.T]
         for part, rate in zip(parts, rates[i], strict=False):
+            motions = np.stack([each[part] - points[part] for each in moved], axis=2) / _SMALL
+            own = Traction(0.0, traction.coefficient[part], traction.shear[part], points[part], traction.moved)
+            pressed = contact.indenter.press(points[part], contact.surface.stiffness[part], contact.face_x, x, own)
+            change = _find_change(pressed.changes, pressed.springs, motions)
+            turned = _find_change(smooth.changes[part], smooth.springs[part], motions)
             normal = smooth.forces[part].sum(0)
-            across, ways = np.array([normal[2], 0.0, -normal[0]]), motions[part]
-            change, turned = (_find_change(each, part, ways) for each in (pressed, smooth))
+            across = np.array([normal[2], 0.0, -normal[0]])
             rate[:] = np.stack([across @ change, normal @ change, across @ turned]) / (normal @ normal)
     for i, part in enumerate(parts):
         shares[i], heights[i] = size[part].sum() / size.sum(), np.average(rest[part], weights=size[part])
@@ -181,6 +183,9 @@ def _split(size: NDArray, heights: NDArray) -> list[NDArray]:
     return np.split(touching, [gaps.argmax()]) if gaps.max() >= _GAP else [touching]
 
 
-def _find_change(pressed: PenaltyContact, part: NDArray, motions: NDArray) -> NDArray:
-    """Return how the force on points of a part changes by depth and height (3, 2) [N/m] as they move (k, 3, 2)."""
-    return pressed.changes[part][:, :, [0, 2]].sum(0) - np.einsum("kij,kjm->im", pressed.springs[part], motions)
+def _find_change(changes: NDArray, springs: NDArray, motions: NDArray) -> NDArray:
+    """Return how the force on points changes by depth and height (3, 2) [N/m] as they move (k, 3, 2).
+
+    Changes (k, 3, 4) and springs (k, 3, 3) as of `PenaltyContact`.
+    """
+    return changes[:, :, [0, 2]].sum(0) - np.tensordot(springs, motions, axes=((0, 2), (0, 1)))
