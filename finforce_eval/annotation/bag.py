@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import replace
-from glob import escape
 from pathlib import Path
-from tempfile import mkdtemp
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce.errors import FinforceError, one_line
 from finforce.files import FileError, check_inside
 from finforce.messages import read_stamp
 from finforce_eval.annotation.video import write_video
@@ -43,6 +39,7 @@ from finforce_eval.recordings.writer import (
     Entry,
     cloud_message,
     force_markers,
+    new_folder,
     status_message,
     typestore,
     wrench_message,
@@ -311,29 +308,3 @@ def _copy_others(source: Path, folder: Path) -> None:
     for path in source.iterdir():
         if path.is_file() and path.suffix not in (".mcap", ".db3", ".zstd") and path.name != "metadata.yaml":
             shutil.copy2(path, folder / path.name)
-
-
-@contextmanager
-def new_folder(target: Path) -> Iterator[Path]:
-    """Yield the path of a folder to be made, which takes its place under its own name once it is whole.
-
-    Raises:
-        RecordingError: the target exists.
-        OSError: it cannot be made.
-    """
-    if target.exists():
-        raise RecordingError(f"{target}: exists already; a recording is written to a new folder")
-    target.parent.mkdir(parents=True, exist_ok=True)
-    part = Path(mkdtemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent))
-    try:
-        yield part / target.name
-        os.replace(part / target.name, target)
-        for left in target.parent.glob(f".{escape(target.name)}.{'?' * 8}.part"):  # of attempts that were killed
-            shutil.rmtree(left, ignore_errors=True)
-    except (FinforceError, OSError, KeyboardInterrupt):
-        raise
-    except Exception as error:  # sqlite3 has its own classes for a full disk
-        raise OSError(f"{target}: cannot be written: {one_line(error)}") from error
-    finally:
-        with suppress(OSError):
-            shutil.rmtree(part)

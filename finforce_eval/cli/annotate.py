@@ -11,7 +11,7 @@ from shutil import rmtree
 from typing import Any
 
 from finforce.errors import FinforceError, one_line
-from finforce_eval.annotation.bag import FEW, bag_task, new_folder
+from finforce_eval.annotation.bag import FEW, bag_task
 from finforce_eval.annotation.buffer_copy import write_buffer
 from finforce_eval.annotation.dataset_copy import write_copy
 from finforce_eval.annotation.dataset_forces import episode_tasks, plain_columns, write_dataset
@@ -23,6 +23,7 @@ from finforce_eval.policy import COLUMNS, FEATURE, FORCE, INTO, NONE, PREFIX
 from finforce_eval.recordings.bags import is_buffer, name_recordings
 from finforce_eval.recordings.dataset import is_dataset, open_dataset
 from finforce_eval.recordings.umi import count_episodes, is_replay_buffer
+from finforce_eval.recordings.writer import new_folder
 from finforce_eval.tasks import OK, Line, Manifest, Task, run_tasks
 
 

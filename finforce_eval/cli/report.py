@@ -15,7 +15,7 @@ from finforce_eval.cli.parser import CommandResult
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.batch import read_evaluations
 from finforce_eval.evaluation.scoring import match_truth
-from finforce_eval.figures.report import write_html, write_page
+from finforce_eval.figures.report import PageHead, write_html, write_page
 from finforce_eval.machine import version
 from finforce_eval.recordings.bags import bag_source, check_types, open_bag
 from finforce_eval.recordings.dataset import Dataset, is_dataset, open_dataset, read_parquet, rows_of
@@ -56,9 +56,9 @@ def run(options: argparse.Namespace) -> CommandResult:
         raise OptionError("recordings and folders of evaluations: expected the one or the other")
     if tables:
         evaluation, about = read_evaluations(tables)
-        write_page(evaluation, page, about=about, title=options.title)
+        write_page(evaluation, page, PageHead(options.title, about))
     else:
-        write_html(recorded, page, title=options.title, about={"version": version()})
+        write_html(recorded, page, PageHead(options.title, {"version": version()}))
     count = len(recorded) or len(evaluation.results)
     print(f"Page: {page}: {count} plots")
     return CommandResult({"page": str(page), "plots": count})

@@ -19,7 +19,13 @@ from finforce.rig import read_rig
 from finforce.transforms import pose_numbers
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.contact_source import choose_contact
-from finforce_eval.evaluation.forces import describe_contradictions, estimate_forces, evaluate_jaws, truth_sides
+from finforce_eval.evaluation.forces import (
+    ImageRun,
+    describe_contradictions,
+    estimate_forces,
+    evaluate_jaws,
+    truth_sides,
+)
 from finforce_eval.evaluation.keypoint_source import KeypointSource, parse_source, pose_of
 from finforce_eval.evaluation.scoring import Evaluation, score_results, score_series, true_range
 from finforce_eval.evaluation.setup import (
@@ -130,7 +136,7 @@ def _tabulate(name: str, path: Path, keypoints: KeypointSource, setup: Evaluatio
     print_notes(name, recording.notes)
     frames = sum(len(track.keypoints.stamps_ns) for track in recording.jaws.values())
     with progress_bar(frames, "frame", name) as bar:
-        found = estimate_forces(recording, setup, progress=bar.update)
+        found = estimate_forces(recording, setup, run=ImageRun(progress=bar.update))
     return pd.concat([each.table for each in found.values()])
 
 

@@ -91,9 +91,9 @@ def test_a_report_is_a_status_of_its_node():
 
 
 def test_a_marker_without_points_is_deleted():
-    style = {"color": (1.0, 0.0, 0.0, 1.0), "scale": (1.0, 1.0, 1.0)}
-    assert ros.points_marker(Header(), "m", "spheres", (), **style).action == Marker.DELETE
-    marker = ros.points_marker(Header(), "m", "arrow", [[0, 0, 0], [0, 0, 1]], **style)
+    look = (1.0, 0.0, 0.0, 1.0), (1.0, 1.0, 1.0)
+    assert ros.points_marker(Header(), "m", ros.MarkerStyle("spheres", *look), ()).action == Marker.DELETE
+    marker = ros.points_marker(Header(), "m", ros.MarkerStyle("arrow", *look), [[0, 0, 0], [0, 0, 1]])
     assert (marker.action, marker.type, marker.points[1].z) == (Marker.ADD, Marker.ARROW, 1.0)
 
 
