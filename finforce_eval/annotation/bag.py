@@ -272,7 +272,9 @@ def _write(bag: BagReader, recording: Recording, forces: ForceMessages, folder: 
     types, colors = typestore(), {recording.images.topics[0]} if recording.images is not None else set()
     # the topics whose messages have the stamps of the forces
     triggers = (colors | {f"/{side}/keypoints" for side in recording.jaws}) & bag.types.keys()
-    plugin = StoragePlugin.SQLITE3 if _is_sqlite(recording.path) else StoragePlugin.MCAP
+    path = recording.path
+    is_sqlite = path.suffix == ".db3" or (path.is_dir() and not any(path.glob("*.mcap*")) and any(path.glob("*.db3*")))
+    plugin = StoragePlugin.SQLITE3 if is_sqlite else StoragePlugin.MCAP
     with Writer(folder, version=9, storage_plugin=plugin) as writer:
         known = {} if side_file else {each.id: _copy_connection(writer, each) for each in bag.connections}
         added: dict[str, Any] = {}
@@ -284,11 +286,6 @@ def _write(bag: BagReader, recording: Recording, forces: ForceMessages, folder: 
                 if entry.topic not in added:
                     added[entry.topic] = writer.add_connection(entry.topic, kind, typestore=types)
                 writer.write(added[entry.topic], time, types.serialize_cdr(entry.message, kind))
-
-
-def _is_sqlite(path: Path) -> bool:
-    """Say whether a bag is of SQLite; what is written is of the same kind."""
-    return path.suffix == ".db3" or (path.is_dir() and not any(path.glob("*.mcap*")) and any(path.glob("*.db3*")))
 
 
 def _copy_connection(writer: Any, connection: Any) -> Any:

@@ -67,8 +67,8 @@ def run(options: argparse.Namespace) -> CommandResult:
     named = name_recordings(options.bags, "_")
     if options.remove:
         return _remove_forces(named, out)
-    if options.source in (None, IMAGES):
-        _set_unless_given(options, "threads=1")  # a core for each recording, whatever the engine
+    if options.source in (None, IMAGES) and not any(given.startswith("threads=") for given in options.detector):
+        options.detector = [*options.detector, "threads=1"]  # a core for each recording, whatever the engine
     datasets = {name: path for name, path in named if is_dataset(path)}
     if datasets:
         if options.video:
@@ -123,13 +123,6 @@ def _write_buffers(named: Sequence[tuple[str, Path]], out: Path, options: argpar
 def _has_force(line: Line) -> bool:
     """Say whether a task found forces."""
     return line["status"] == OK and not line["figures"].get("without_force")
-
-
-def _set_unless_given(options: argparse.Namespace, change: str) -> None:
-    """Change a parameter of the detector, unless it was given."""
-    name = change.partition("=")[0]
-    if not any(given.startswith(f"{name}=") for given in options.detector):
-        options.detector = [*options.detector, change]
 
 
 def _run_dataset(name: str, path: Path, options: argparse.Namespace, manifest: Manifest) -> list[Line]:

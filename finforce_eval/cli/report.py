@@ -20,9 +20,9 @@ from finforce_eval.machine import version
 from finforce_eval.recordings.bags import bag_source, check_types, open_bag
 from finforce_eval.recordings.dataset import Dataset, is_dataset, open_dataset, read_parquet, rows_of
 from finforce_eval.recordings.recording import WRENCH
-from finforce_eval.recordings.tracks import WrenchTrack
+from finforce_eval.recordings.tracks import WrenchTrack, stack_vectors
 from finforce_eval.recordings.writer import STATUS
-from finforce_eval.table import AXES, ForceSeries, stddev_along
+from finforce_eval.table import ForceSeries, stddev_along
 from finforce_eval.tasks import is_manifest
 
 
@@ -134,8 +134,5 @@ def _make_series(name: str, side: str, samples: Mapping[str, list[Any]]) -> Forc
 def _stack(messages: list[Any]) -> WrenchTrack:
     """Return wrenches as arrays, in the order of their stamps."""
     messages = sorted(messages, key=stamp_of)
-    force, torque = (
-        np.array([[getattr(part, axis) for axis in AXES] for part in parts], dtype=np.float64).reshape(-1, 3)
-        for parts in ([each.wrench.force for each in messages], [each.wrench.torque for each in messages])
-    )
+    force, torque = (stack_vectors([getattr(each.wrench, name) for each in messages]) for name in ("force", "torque"))
     return WrenchTrack(stamps_ns=np.array([stamp_of(each) for each in messages], np.int64), force=force, torque=torque)
