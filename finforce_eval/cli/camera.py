@@ -24,6 +24,7 @@ from finforce_eval.evaluation.keypoint_source import (
     choose_images,
     detect_keypoints,
     parse_source,
+    spread,
 )
 from finforce_eval.evaluation.setup import read_recordings
 from finforce_eval.recordings.tracks import Recording
@@ -194,11 +195,6 @@ def choose_pictures(recording: Recording, count: int) -> list[NDArray]:
     if not len(images):
         raise OptionError(f"{recording.name}: no images; expected pictures of jaws that are open and unloaded")
     return [image.color for _, image in images.at(spread(images.stamps_ns[:count], PICTURES))]
-
-
-def spread(stamps: NDArray[np.int64], count: int) -> NDArray[np.int64]:
-    """Return at most `count` of stamps (n,) [ns], evenly chosen."""
-    return stamps[np.unique(np.linspace(0, len(stamps) - 1, count).round().astype(int))]
 
 
 def find_tags(colors: list[NDArray], options: argparse.Namespace) -> list[dict[int, NDArray]]:

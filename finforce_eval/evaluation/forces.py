@@ -50,9 +50,7 @@ def evaluate_jaws(recording: Recording, setup: EvaluationSetup) -> list[ForceSer
         FinforceError: the contact cannot be known, or the estimator refuses a frame.
     """
     sides = truth_sides(recording)
-    frames = sum(len(recording.jaw(side).keypoints.stamps_ns) for side in sides)
-    with progress_bar(frames, "frame", recording.name) as bar:
-        found = estimate_forces(recording, setup, sides, ImageRun(strict=True, progress=bar.update))
+    found = estimate_shown(recording, setup, sides, ImageRun(strict=True))
     results = [each.renamed(f"{recording.name}/{side}") if len(sides) > 1 else each for side, each in found.items()]
     for result in results:
         check_solved(result, recording)
@@ -123,6 +121,15 @@ def estimate_forces(
             estimator.adopt_tare(tares[side])
         found[side] = find_forces(recording, own.jaw, source, estimator, side, run)
     return with_distances(found, recording) if both else found
+
+
+def estimate_shown(
+    recording: Recording, setup: EvaluationSetup, sides: Collection[str] = (), run: ImageRun | None = None
+) -> dict[str, ForceSeries]:
+    """Return the same under a progress bar; see `estimate_forces`."""
+    frames = sum(len(recording.jaw(side).keypoints.stamps_ns) for side in sides or recording.jaws)
+    with progress_bar(frames, "frame", recording.name) as bar:
+        return estimate_forces(recording, setup, sides, replace(run or ImageRun(), progress=bar.update))
 
 
 def _is_unseen(recording: Recording, side: str) -> bool:

@@ -34,7 +34,7 @@ def scene(tmp_path_factory):
         return found
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(view, "estimate_forces", estimate)
+        patch.setattr(view, "estimate_shown", estimate)
         assert main(["view", str(source), "--save", str(file), "--from", "images", "--calibration", "twin"]) == 0
     chunk, rows = pytest.importorskip("rerun.chunk"), {}
     for piece in chunk.RrdReader(str(file)).stream().to_chunks():
