@@ -236,9 +236,8 @@ class IfeaSolverNode(ros.ImageNode):
             self.stage.subscription(WrenchStamped, f"{peer}/wrench", self._on_peer, ros.RESULT)
             for jaw in SIDES:
                 self.stage.subscription(PoseStamped, f"{jaw}/jaw_pose", partial(self._on_jaw_pose, jaw), ros.SENSOR)
-        if (
-            self.gravity is not None and not self.parameters.gravity_frame
-        ):  # of what one jaw presses, friction tells nothing of its weight
+        # of what one jaw presses, friction tells nothing of its weight
+        if self.gravity is not None and not self.parameters.gravity_frame:
             self.stage.subscription(Vector3Stamped, "gravity", self._on_gravity, ros.SENSOR)
         self.stage.subscription(PointCloud2, f"{side}/keypoints", self._on_keypoints, ros.NEWEST)
 
