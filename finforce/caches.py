@@ -136,7 +136,8 @@ def name_sources(root: Path) -> str:
 @cache
 def _read_sources(root: Path) -> tuple[str, dict[str, tuple[int, int]]]:
     """Return the name, and for each of the files when it was written, and its size."""
-    paths = {_name_module(path, root): path for package in COMPILED for path in (root / package).rglob("*.py")}
+    files = [path for package in COMPILED for path in (root / package).rglob("*.py")]
+    paths = {".".join(path.relative_to(root).with_suffix("").parts).removesuffix(".__init__"): path for path in files}
     states = {name: _find_state(str(path)) for name, path in paths.items()}
     sources = {name: path.read_text(encoding="utf-8") for name, path in paths.items()}
     found, pending = set(), [name for name, source in sources.items() if "numba" in source or "njit" in source]
@@ -156,11 +157,6 @@ def _find_state(path: str) -> tuple[int, int]:
         state = os.stat(path)
         return state.st_mtime_ns, state.st_size
     return 0, 0
-
-
-def _name_module(path: Path, root: Path) -> str:
-    """Return the name of the module in a file below a folder."""
-    return ".".join(path.relative_to(root).with_suffix("").parts).removesuffix(".__init__")
 
 
 def _find_imports(source: str) -> Iterator[str]:

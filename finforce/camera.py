@@ -20,6 +20,9 @@ SHORTEST_FOCAL, LONGEST_FOCAL = 0.01, 1000.0  # of a focal length, in sizes of t
 PLUMB_BOB, RATIONAL, EQUIDISTANT = "plumb_bob", "rational_polynomial", "equidistant"
 # how many coefficients each has, filled up with zeros to the last number; the names are those of ROS (REP 104)
 COEFFICIENTS = {PLUMB_BOB: (0, 4, 5), RATIONAL: (0, 5, 8), EQUIDISTANT: (0, 4)}
+# what files and drivers call them; realsense2_camera, too, takes its device's inverse coefficients for plumb_bob's
+_LENSES = dict.fromkeys(("radtan", "none", "pinhole", "brown_conrady", "inverse_brown_conrady"), PLUMB_BOB)
+_LENSES |= dict.fromkeys(("fisheye", "equi", "kannala_brandt4", "opencv_fisheye", "kannalabrandt8"), EQUIDISTANT)
 WIDEST = np.radians(88.0)  # from the optical axis; farther out a ray has no place on the plane z = 1
 
 
@@ -29,6 +32,11 @@ class ImageError(FinforceError, ValueError):
 
 class IntrinsicsError(FinforceError, ValueError):
     """Intrinsics that no camera has."""
+
+
+def name_lens(model: str) -> str:
+    """Return our name of a lens, or the name as it is where it is none that is known."""
+    return _LENSES.get(model.lower().removeprefix("distortion.").replace(" ", "_"), model)
 
 
 def name_matrix(matrix: Sequence[float]) -> dict[str, float]:

@@ -11,7 +11,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from finforce.camera import EQUIDISTANT, PLUMB_BOB, RATIONAL, CameraIntrinsics, IntrinsicsError, name_matrix
+from finforce.camera import EQUIDISTANT, PLUMB_BOB, RATIONAL, CameraIntrinsics, IntrinsicsError, name_lens, name_matrix
 from finforce.files import LARGEST_YAML, FileError, parse_json, parse_yaml, read_text
 
 INTRINSICS_FORMS = (
@@ -19,8 +19,6 @@ INTRINSICS_FORMS = (
     "or with the names fx, fy, cx, cy"
 )
 _NAMES = ("fx", "fy", "cx", "cy")
-_MODELS = {"radtan": PLUMB_BOB, "none": PLUMB_BOB, "pinhole": PLUMB_BOB, "fisheye": EQUIDISTANT, "equi": EQUIDISTANT}
-_MODELS |= {"kannala_brandt4": EQUIDISTANT, "opencv_fisheye": EQUIDISTANT, "kannalabrandt8": EQUIDISTANT}
 _MATRICES = ("K", "k", "camera_matrix", "Camera_Matrix", "cameraMatrix", "cam_K", "intrinsic_matrix")
 _LENS = re.compile(r"d|coeffs|dist(?!ance).*|(?!undist).*distortion.*", re.IGNORECASE)
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -85,7 +83,7 @@ def build_camera(named: Mapping[str, Any], shape: tuple[int, int] | None) -> Cam
             "are these the intrinsics of images of another size?"
         )
     model = str(named.get("model") or (RATIONAL if distortion.size > 5 else PLUMB_BOB))
-    return CameraIntrinsics(**size, **values, distortion=distortion, model=_name_model(model))
+    return CameraIntrinsics(**size, **values, distortion=distortion, model=name_lens(model))
 
 
 def cut_camera(camera: CameraIntrinsics, shape: tuple[int, int], scale: float | None = None) -> CameraIntrinsics:
@@ -182,17 +180,12 @@ def _name_entries(entries: Mapping[str, Any]) -> dict[str, Any]:
             raise IntrinsicsError(f"camera_model {entries.get('camera_model')}: expected pinhole, with fu fv pu pv")
         named |= zip(_NAMES, intrinsics, strict=True)
     # else that of the device, or what the coefficients say
-    if EQUIDISTANT in [_name_model(str(entries.get(name))) for name in ("model", "type")]:
+    if EQUIDISTANT in [name_lens(str(entries.get(name))) for name in ("model", "type")]:
         lens = EQUIDISTANT
     lens = entries.get("distortion_model") or lens
     named["model"] = EQUIDISTANT if entries.get("fisheye_model") else lens
-    named["distortion"] = _find_lens(entries, _name_model(str(named["model"])) == EQUIDISTANT)
+    named["distortion"] = _find_lens(entries, name_lens(str(named["model"])) == EQUIDISTANT)
     return named
-
-
-def _name_model(model: str) -> str:
-    """Return our name of a lens, or the name as it is where it is none that is known."""
-    return _MODELS.get(model.lower().removeprefix("distortion."), model)
 
 
 def _find_lens(entries: Mapping[str, Any], is_fisheye: bool) -> list[Any]:

@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from finforce.camera import (
-    EQUIDISTANT,
     MILLIMETRE,
     PACKET,
     PLUMB_BOB,
@@ -28,6 +27,7 @@ from finforce.camera import (
     decode_color,
     decode_depth,
     decode_picture,
+    name_lens,
     name_matrix,
     open_picture,
     unpack_rows,
@@ -305,9 +305,6 @@ def _stack(columns: Mapping[str, NDArray], names: Sequence[str]) -> NDArray[np.f
 
 
 MASKS = ("mono8", "8UC1")
-# what some drivers call the lenses; realsense2_camera, too, takes its device's inverse coefficients for plumb_bob's
-LENSES = {"fisheye": EQUIDISTANT, "kannala_brandt4": EQUIDISTANT, "Kannala Brandt4": EQUIDISTANT}
-LENSES |= dict.fromkeys(("Brown Conrady", "Inverse Brown Conrady", "None"), PLUMB_BOB)
 
 
 def stamp_of(message: Any) -> int:
@@ -388,7 +385,7 @@ def camera_from_info(info: Any, frame: str, images: str = "") -> CameraIntrinsic
         IntrinsicsError: the numbers are no camera's, its axes are skew, or its distortion model is not known.
     """
     check_frame(info, frame, "the camera info")
-    model = LENSES.get(info.distortion_model, info.distortion_model) or PLUMB_BOB
+    model = name_lens(info.distortion_model) or PLUMB_BOB
     matrix, distortion = np.ravel(info.k), np.array(info.d)
     rectified = np.reshape(info.p, (3, 4))[:, :3].ravel()
     if "/image_rect" in images and rectified.any() and not np.allclose(rectified, matrix):  # RealSense's P is its K

@@ -148,7 +148,7 @@ class ContactEstimatorNode(ros.ImageNode):
             if self._follows_surface:
                 stage.subscription(ros.PointCloud2, f"{side}/surface", partial(self._on_surface, side), ros.SENSOR)
             find = partial(self._on_jaw_pose, side)
-            stage.subscription(ros.PoseStamped, f"{side}/jaw_pose", find, ros.BUFFERED, can_wait=True)
+            stage.subscription(ros.PoseStamped, f"{side}/jaw_pose", find, ros.BUFFERED).can_wait = True
 
     def _subscribe_to_check(self, check: MeshFeed) -> None:
         """Subscribe to depth images, while one is due, for the comparison with the mesh."""

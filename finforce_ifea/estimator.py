@@ -406,8 +406,8 @@ class ForceEstimator:
         extrapolated = _EXTRAPOLATED * state["extrapolation"]
         error = hypot(self._force_error, self._scale_error, state["location_error"], extrapolated)
         vectors, dt = np.empty((7, 3)), self._pass_time(state["force"], np.zeros(3))
-        relaxation, untold = self._relaxation.packed, self._untold.overstress
-        magnitude, stddev = compute_force(state, relaxation, untold, dt, error, self._modulus_error, vectors)
+        relaxation, untold, errors = self._relaxation.packed, self._untold.overstress, (error, self._modulus_error)
+        magnitude, stddev = compute_force(state, relaxation, untold, dt, errors, vectors)
         force, torque, force_stddev, torque_stddev, point, location, normal = vectors
         return Solution(
             stamp=self._stamp,

@@ -94,14 +94,13 @@ class ForcePairing:
     Args:
         side: the jaw whose wrenches come first-hand.
         depth: images that may wait for the other jaw.
-        max_age: of the jaws' poses in the image of a force [s].
 
     Attributes:
         distance: between the jaws.
     """
 
-    def __init__(self, side: Side, depth: int = 16, max_age: float = 0.5) -> None:
-        self.distance = JawDistance(max_age)
+    def __init__(self, side: Side, depth: int = 16) -> None:
+        self.distance = JawDistance(max_age=0.5)
         self._own, self._other = side, "right" if side == "left" else "left"
         self._wrenches = Synchronizer({self._own: depth, self._other: depth})
         self._heard = -float("inf")

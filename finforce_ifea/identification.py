@@ -409,9 +409,7 @@ def _plateaus_of_case(number: int, case: CalibrationCase, jaw: Jaw, settings: Es
             f"{case.name}: {start} frames without load at the start; expected {settings.tare_frames // 2}, for the "
             "tare, or none, as of stills"
         )
-    if (
-        tare is None
-    ):  # stills: key points are taken to be where the jaw file has them, within the offset of untared ones
+    if tare is None:  # stills: key points are where the jaw file has them, within the offset of untared ones
         rest, noise, rest_variance = jaw.keypoints, _STILL_NOISE**2, OFFSET_STDDEV**2
     else:
         rest = np.where(tare.counts[:, None] > 0, jaw.keypoints + tare.offsets, np.nan)

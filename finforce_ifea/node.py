@@ -19,7 +19,7 @@ from finforce.gripper_frames import SIDES
 from finforce.health import IDLE, Health, Idling, Level, Outcome, Report, Skips, StampGate
 from finforce.messages import pose_from_message, stamp_of, wrench_from_message
 from finforce.ros import node as ros
-from finforce.ros.messages import points_marker
+from finforce.ros.messages import MarkerStyle, points_marker
 from finforce_ifea.grasp_force import ForcePairing, Grasp, Wrench, single_jaw_grasp
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.messages import (
@@ -96,10 +96,12 @@ class _SolverOutputs:
             self.markers.publish(ros.MarkerArray(markers=markers))
 
 
-_SURFACE = (0.45, 0.55, 0.65, 0.6)
 _USED = (0.1, 0.8, 0.2, 1.0)
 _UNUSED = (0.9, 0.2, 0.1, 1.0)
-_KEYPOINT_DIAMETER = 0.003
+_SURFACE = MarkerStyle("triangles", (0.45, 0.55, 0.65, 0.6), (1.0, 1.0, 1.0))
+_KEYPOINTS = MarkerStyle("spheres", _USED, (0.003,) * 3)
+_CONTACT = MarkerStyle("spheres", CONTACT, (CONTACT_DIAMETER,) * 3)
+_FORCE = MarkerStyle("arrow", FORCE, ARROW)
 
 
 def _build_markers(header: Any, observation: Observation, solution: Solution, estimator: ForceEstimator) -> list[Any]:
@@ -112,25 +114,10 @@ def _build_markers(header: Any, observation: Observation, solution: Solution, es
     # the arrow ends on the surface that the object presses on
     arrow = np.stack([place - np.asarray(solution.force) / NEWTONS_PER_METRE, place]) if touched else ()
     return [
-        points_marker(header, "surface", "triangles", triangles, color=_SURFACE, scale=(1.0, 1.0, 1.0)),
-        points_marker(
-            header,
-            "keypoints",
-            "spheres",
-            observation.points[seen],
-            color=_USED,
-            colors=colors,
-            scale=(_KEYPOINT_DIAMETER,) * 3,
-        ),
-        points_marker(
-            header,
-            "contact",
-            "spheres",
-            place if touched else (),
-            color=CONTACT,
-            scale=(CONTACT_DIAMETER,) * 3,
-        ),
-        points_marker(header, "force", "arrow", arrow, color=FORCE, scale=ARROW),
+        points_marker(header, "surface", _SURFACE, triangles),
+        points_marker(header, "keypoints", _KEYPOINTS, observation.points[seen], colors),
+        points_marker(header, "contact", _CONTACT, place if touched else ()),
+        points_marker(header, "force", _FORCE, arrow),
     ]
 
 
@@ -249,9 +236,8 @@ class IfeaSolverNode(ros.ImageNode):
             self.stage.subscription(WrenchStamped, f"{peer}/wrench", self._on_peer, ros.RESULT)
             for jaw in SIDES:
                 self.stage.subscription(PoseStamped, f"{jaw}/jaw_pose", partial(self._on_jaw_pose, jaw), ros.SENSOR)
-        if (
-            self.gravity is not None and not self.parameters.gravity_frame
-        ):  # of what one jaw presses, friction tells nothing of its weight
+        # of what one jaw presses, friction tells nothing of its weight
+        if self.gravity is not None and not self.parameters.gravity_frame:
             self.stage.subscription(Vector3Stamped, "gravity", self._on_gravity, ros.SENSOR)
         self.stage.subscription(PointCloud2, f"{side}/keypoints", self._on_keypoints, ros.NEWEST)
 

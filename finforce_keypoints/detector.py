@@ -136,11 +136,6 @@ class KeypointDetector:
         return self._pixel_detector.sha256
 
     @property
-    def lost_sides(self) -> tuple[str, ...]:
-        """The jaws that have to be looked for everywhere."""
-        return tuple(side for side, jaw in self._jaws.items() if jaw.is_lost)
-
-    @property
     def warnings(self) -> Mapping[str, str]:
         """Warnings of a jaw, by side, in a sentence."""
         said = {side: [jaw.warning] if jaw.warning else [] for side, jaw in self._jaws.items()}

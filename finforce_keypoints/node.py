@@ -150,7 +150,7 @@ class KeypointDetectorNode(ros.ImageNode):
         self.feed = RgbdFeed(parameters)
         self.frames, self._settings = ros.Frames(self), settings
         self._build = partial(build, jaws, dots=dots, rests=self.skips.allows(STILL))
-        self._mounting = not ros.is_given(self, "T_gripper_camera") and self.frames.listen()
+        self._mounting = "T_gripper_camera" not in self._parameter_overrides and self.frames.listen()
         self._asked, self._tared, self._mount_trouble = float("inf"), False, ""
         self.gate = StampGate(parameters.max_age)
         source, age = self.feed.source, parameters.max_age

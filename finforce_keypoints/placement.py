@@ -239,46 +239,36 @@ def count_steps(images: int, is_guessed: bool) -> int:
 
 
 def find_placement(
-    images: Sequence[NDArray],
-    camera: CameraIntrinsics,
-    jaws: Mapping[str, Jaw],
-    locator: AnyFinger,
+    task: PlacementTask,
     guess: NDArray | None = None,
     guess_stddev: NDArray = GUESS_STDDEV,
-    opening: float | None = None,
     progress: Callable[[int], Any] = lambda steps: None,
 ) -> CameraPlacement:
     """Return where the camera is and how the jaws are mounted.
 
     Args:
-        images: (h, w, 3) uint8 RGB, of open and unloaded jaws that may stand elsewhere in each.
-        camera: intrinsics.
-        jaws: by side.
-        locator: finds the points in pictures of their sides.
+        task: jaws, and pictures of them.
         guess: T_gripper_camera (4, 4); None: it is searched for.
         guess_stddev: its standard deviations, three in m and three in rad (6,).
-        opening: gap between the inner faces of both jaws where they are widest open [m]; None: not known.
         progress: called with the number of steps done since its last call.
 
     Raises:
         GeometryError: there are no such jaws in the pictures.
     """
-    half = None if opening is None else 0.5 * opening + next(iter(jaws.values())).inner_face_x
-    task = _Task(images=images, camera=camera, jaws=jaws, locator=locator, half_opening=half)
     if guess is None:
         fits = _pull_starts(task, progress)
     else:
-        fits = [_Refinement(task, guess, half or HALF_OPENING, guess_stddev)]
+        fits = [_Refinement(task, guess, task.half_opening or HALF_OPENING, guess_stddev)]
         fits[0].polish()
     found = _try_fits(fits, task, progress)
     best = max(found, key=lambda each: each.evidence)
-    stddev = {side: _widen_stddev(best, found, side, jaw) for side, jaw in jaws.items()}
+    stddev = {side: _widen_stddev(best, found, side, jaw) for side, jaw in task.jaws.items()}
     return replace(best, mounts={side: replace(mount, stddev=stddev[side]) for side, mount in best.mounts.items()})
 
 
-def _pull_starts(task: _Task, progress: Callable[[int], Any]) -> list[_Refinement]:
+def _pull_starts(task: PlacementTask, progress: Callable[[int], Any]) -> list[_Refinement]:
     """Return the likeliest of the places to which the first picture pulls random ones, in all pictures."""
-    one, pulled = replace(task, images=task.images[:1], half_opening=None), []
+    one, pulled = replace(task, images=task.images[:1], opening=None), []
     for T, half in search_camera(task.images[0], task.camera, task.jaws, progress):
         fit = _Refinement(one, T, half, OUTLINE_STDDEV)
         likely, shows = fit.pull(), True
@@ -293,7 +283,9 @@ def _pull_starts(task: _Task, progress: Callable[[int], Any]) -> list[_Refinemen
     return [fit.widen(task) for *_, fit in pulled[:KEPT]]
 
 
-def _try_fits(fits: Sequence[_Refinement], task: _Task, progress: Callable[[int], Any]) -> list[CameraPlacement]:
+def _try_fits(
+    fits: Sequence[_Refinement], task: PlacementTask, progress: Callable[[int], Any]
+) -> list[CameraPlacement]:
     """Return the places to which fits lead; on ribs farther off only while ribs speak against the best.
 
     Raises:
@@ -349,7 +341,7 @@ def _widen_stddev(best: CameraPlacement, found: Sequence[CameraPlacement], side:
     return tuple(np.sqrt(variance).tolist())
 
 
-def _add_ribs(found: CameraPlacement, task: _Task) -> CameraPlacement:
+def _add_ribs(found: CameraPlacement, task: PlacementTask) -> CameraPlacement:
     """Return a placement with where its ribs may be."""
     poses = {side: [found.pose(side, number) for number in range(len(task.images))] for side in task.jaws}
     return replace(found, ribs=compare_ribs(task.patterns, task.images, poses, task.camera))
@@ -410,18 +402,27 @@ class _Setup(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Task:
-    """Jaws and the pictures in which they are looked for; see `find_placement`.
+class PlacementTask:
+    """Jaws and the pictures in which they are looked for.
 
     Attributes:
-        half_opening: half the distance of the jaws' origins where they are widest open [m]; None: not known.
+        images: (h, w, 3) uint8 RGB, of open and unloaded jaws that may stand elsewhere in each.
+        camera: intrinsics.
+        jaws: by side.
+        locator: finds the points in pictures of their sides.
+        opening: gap between the inner faces of both jaws where they are widest open [m]; None: not known.
     """
 
     images: Sequence[NDArray]
     camera: CameraIntrinsics
     jaws: Mapping[str, Jaw]
     locator: AnyFinger
-    half_opening: float | None
+    opening: float | None = None
+
+    @property
+    def half_opening(self) -> float | None:
+        """Half the distance of the jaws' origins where they are widest open [m]; None: not known."""
+        return None if self.opening is None else 0.5 * self.opening + next(iter(self.jaws.values())).inner_face_x
 
     @cached_property
     def points(self) -> dict[str, NDArray]:
@@ -447,7 +448,7 @@ class _Task:
 class _Refinement:
     """Camera, turns and origins by least squares over the pixels that a network finds, again and again."""
 
-    def __init__(self, task: _Task, T: NDArray, half: float, stddev: NDArray) -> None:
+    def __init__(self, task: PlacementTask, T: NDArray, half: float, stddev: NDArray) -> None:
         """Begin with T_gripper_camera (4, 4) of standard deviations (6,), and half an opening [m]."""
         self._task, self._start, self._stddev = task, T, stddev
         count, sides = len(task.images), len(task.jaws)
@@ -459,7 +460,7 @@ class _Refinement:
         self._best = (-1.0, self._x)
         self._kept = (-np.inf, self._x)
 
-    def widen(self, task: _Task) -> _Refinement:
+    def widen(self, task: PlacementTask) -> _Refinement:
         """Return the same for other pictures, in which jaws stand as in the first of these."""
         T, turns, origins = self._split(self._x)
         wider = _Refinement(task, T, 0.0, self._stddev)

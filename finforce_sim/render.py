@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -386,7 +387,7 @@ class RenderedScene:
     def _shade(self, rays: NDArray, hits: _Hits) -> NDArray:
         """Return the linear colours (n, 3) that come along rays."""
         look, R, on = self._look, self._R, np.flatnonzero(hits.owner >= 0)
-        normals, starts, places = _meet(on, rays, *vars(hits).values(), self._triangles, self._rest)
+        normals, starts, places = _meet(on, rays, hits, self._triangles, self._rest)
         lamps = np.array([(R @ lamp.direction, lamp.color) for lamp in look.lights]).reshape(-1, 2, 3)
         lit = np.maximum(normals @ lamps[:, 0].T, 0.0)
         for lamp, towards, share in zip(look.lights, lamps[:, 0], lit.T, strict=True):
@@ -396,7 +397,7 @@ class RenderedScene:
         light = (SKY + (1.0 - SKY) * normals @ R[:, 1])[:, None] * look.ambient
         gloss = np.array([(body.paint.gloss, body.paint.sharpness) for body in self._bodies])[hits.owner[on]]
         color = np.empty((len(rays), 3))
-        _light_up(on, rays, normals, self._paint(hits.owner[on], places), gloss, light, lamps, lit, color)
+        _light_up(on, rays, (normals, self._paint(hits.owner[on], places), gloss), light, (lamps, lit), color)
         off = np.flatnonzero(hits.owner < 0)
         across = self._R[:, :2].T @ (rays[off] * hits.depth[off, None] - self._base).T
         column, row = np.floor(across / TEXTURE_SPAN * TEXTURE_SIZE).astype(np.int32) % TEXTURE_SIZE
@@ -422,9 +423,20 @@ class RenderedScene:
         return facing[self._scene.test_occlusions(self._tensor(packed), nthreads=1).numpy()]
 
 
+class _Hits(NamedTuple):
+    """The hits of rays: depth (n,) [m], body (n,), triangle (n,), weights in it (n, 2), its normal (n, 3)."""
+
+    depth: NDArray
+    owner: NDArray
+    surface: NDArray
+    weights: NDArray
+    normals: NDArray
+
+
 @njit(**_OPTIONS)
-def _meet(on, rays, depth, owner, surface, weights, normals, triangles, rest):
+def _meet(on, rays, hits, triangles, rest):
     """Return at the hits `on` normals towards the camera, points [m] just above, and places [m] at rest (3, n, 3)."""
+    depth, surface, weights, normals = hits.depth, hits.surface, hits.weights, hits.normals
     met = np.empty((3, len(on), 3))
     for i, hit in enumerate(on):
         along = 0.0
@@ -439,8 +451,18 @@ def _meet(on, rays, depth, owner, surface, weights, normals, triangles, rest):
 
 
 @njit(**_OPTIONS)
-def _light_up(on, rays, normals, albedo, gloss, light, lamps, lit, color):
-    """Write the light (n, 3) that the hits `on` send back: albedo times light, and highlights (Blinn-Phong)."""
+def _light_up(on, rays, surface, light, lights, color):
+    """Write the light (n, 3) that the hits `on` send back: albedo times light, and highlights (Blinn-Phong).
+
+    Args:
+        on: hits (k,) among the rays.
+        rays: (n, 3).
+        surface: at the hits normals (k, 3), albedo (k, 3), gloss and sharpness (k, 2).
+        light: from everywhere (k, 3), to which that of the lamps is added.
+        lights: direction and colour of the lamps (l, 2, 3), and how much of each falls on the hits (k, l).
+        color: (n, 3), written at the hits.
+    """
+    (normals, albedo, gloss), (lamps, lit) = surface, lights
     for i, hit in enumerate(on):
         length = np.sqrt(rays[hit, 0] ** 2 + rays[hit, 1] ** 2 + rays[hit, 2] ** 2)
         color[hit] = 0.0
@@ -456,17 +478,6 @@ def _light_up(on, rays, normals, albedo, gloss, light, lamps, lit, color):
                     color[hit, channel] += shine * lamps[lamp, 1, channel]
         for channel in range(3):
             color[hit, channel] += albedo[i, channel] * light[i, channel]
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Hits:
-    """The hits of rays: depth (n,) [m], body (n,), triangle (n,), weights in it (n, 2), its normal (n, 3)."""
-
-    depth: NDArray
-    owner: NDArray
-    surface: NDArray
-    weights: NDArray
-    normals: NDArray
 
 
 def _find_edges(depth: NDArray, surface: NDArray, owner: NDArray) -> NDArray:

@@ -6,7 +6,7 @@ units, so that one function prints them and one writes them.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -40,17 +40,17 @@ PARTS = {
 }
 
 
-def select_parts(names: str | None) -> tuple[str, ...]:
-    """Return the parts of a comma-separated list, all of them without a list.
+def choose_names(option: str, names: str | None, known: Collection[str], between: str = ",") -> tuple[str, ...]:
+    """Return the names in the text of an option, all known ones without it.
 
     Raises:
-        OptionError: a name is none of a part.
+        OptionError: a name is not known.
     """
-    wanted = [name.strip() for name in names.split(",") if name.strip()] if names else PARTS
-    for name in wanted:
-        if name not in PARTS:
-            raise OptionError(f"--parts: there is no part {name!r}, expected some of {', '.join(PARTS)}")
-    return tuple(dict.fromkeys(wanted))
+    chosen = [name.strip() for name in names.split(between) if name.strip()] if names else known
+    for name in chosen:
+        if name not in known:
+            raise OptionError(f"{option} {name}: expected some of {f'{between} '.join(known)}")
+    return tuple(dict.fromkeys(chosen))
 
 
 def percentiles(seconds: Sequence[float] | NDArray, label: str = "") -> dict[str, float]:

@@ -7,11 +7,10 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from shutil import rmtree
-from tempfile import mkdtemp
 from typing import TYPE_CHECKING, Any
 
 from finforce.caches import cache_folder
+from finforce_eval.recordings.writer import new_folder
 
 if TYPE_CHECKING:
     from finforce_sim.scenarios import Scenario
@@ -64,16 +63,12 @@ def find_scene(scene: TwinScene, folder: Path | None = None) -> Path:
     path = folder / f"{scene.scenario}_{scene.seed}_{fingerprint(scene)}"
     if path.exists():
         return path
-    folder.mkdir(parents=True, exist_ok=True)
-    unfinished = Path(mkdtemp(dir=folder))
     try:
-        _render(scene, unfinished / path.name)
-        (unfinished / path.name).replace(path)
+        with new_folder(path) as new:
+            _render(scene, new)
     except OSError:
         if not path.exists():  # else another process was faster
             raise
-    finally:
-        rmtree(unfinished, ignore_errors=True)
     return path
 
 

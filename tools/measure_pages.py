@@ -78,28 +78,6 @@ def measure(part: str, given: Mapping[str, str]) -> None:
             return
 
 
-def list_stale(known: Mapping[str, Any], repository: Path = DOCS.parent) -> list[str]:
-    """Return the sources of kept figures that are not of the last release or later; none before the first release."""
-    tag = _ask_git(repository, "describe", "--tags", "--abbrev=0")
-    named = {source: figures["machine"].partition("at commit ")[2] for source, figures in known.items()}
-    commits = {source: text.partition(" ")[0].partition("-dirty")[0] for source, text in named.items()}
-    return [
-        source
-        for source, name in commits.items()
-        if tag and (not name or _ask_git(repository, "merge-base", "--is-ancestor", tag, name) is None)
-    ]
-
-
-def _ask_git(repository: Path, *words: str) -> str | None:
-    """Return what git says, None where it fails or is absent."""
-    try:
-        return subprocess.run(
-            ["git", *words], cwd=repository, capture_output=True, check=True, text=True
-        ).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        return None
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure the parts that are not of this commit, and fill the pages with those that are."""
     parser = argparse.ArgumentParser(prog="python -m tools.measure_pages", description=__doc__)

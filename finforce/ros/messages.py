@@ -6,7 +6,7 @@ import array
 import math
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -162,35 +162,34 @@ def status_message(name: str, source: str, report: Report) -> DiagnosticStatus:
     )
 
 
+class MarkerStyle(NamedTuple):
+    """The look of a marker: "triangles", "spheres" or "arrow"; red, green, blue, opacity; its size, by its kind [m]."""
+
+    kind: str
+    color: Sequence[float]
+    scale: Sequence[float]
+
+
 def points_marker(
-    header: Header,
-    name: str,
-    kind: str,
-    points: ArrayLike,
-    *,
-    color: Sequence[float],
-    scale: Sequence[float],
-    colors: Sequence[Sequence[float]] = (),
+    header: Header, name: str, style: MarkerStyle, points: ArrayLike, colors: Sequence[Sequence[float]] = ()
 ) -> Marker:
     """Return a marker of points (n, 3) [m]: triangles, spheres or an arrow from the first to the second.
 
     Args:
         header: stamp and frame.
         name: the marker's namespace; each holds one marker.
-        kind: "triangles", "spheres" or "arrow".
+        style: kind, colour and size.
         points: in the frame of the header; none of them deletes the marker.
-        color: red, green, blue, opacity.
-        scale: size of the marker, by its kind [m].
-        colors: one per point, in place of `color`.
+        colors: one per point, in place of that of the style.
     """
     known = [Point(x=x, y=y, z=z) for x, y, z in np.asarray(points, dtype=np.float64).reshape(-1, 3).tolist()]
     return Marker(
         header=header,
         ns=name,
-        type=MARKERS[kind],
+        type=MARKERS[style.kind],
         action=Marker.ADD if known else Marker.DELETE,
         points=known,
-        color=ColorRGBA(**dict(zip("rgba", color, strict=True))),
+        color=ColorRGBA(**dict(zip("rgba", style.color, strict=True))),
         colors=[ColorRGBA(**dict(zip("rgba", entry, strict=True))) for entry in colors],
-        scale=_vector(scale),
+        scale=_vector(style.scale),
     )

@@ -143,11 +143,6 @@ def name_unknown_parameters(node: Node) -> None:
             node.get_logger().warning(f"there is no parameter '{name}'; it is ignored")
 
 
-def is_given(node: Node, name: str) -> bool:
-    """Say whether somebody has set a parameter, in a file or on the command line."""
-    return name in node._parameter_overrides
-
-
 def follow_settings(node: Node, record: RecordT, apply: Callable[[RecordT], None], prefix: str = "") -> None:
     """Call back with a record, as `declare_record` returned it, after settable parameters of it were changed.
 

@@ -206,9 +206,9 @@ class Port:
         topic: its full name.
         callback: takes messages, guarded.
         subscribe: makes the subscription to what comes from outside.
-        can_wait: True if the process goes on without it where it takes too long.
         is_contested: says whether several nodes outside publish the topic, whose messages are then dropped.
         is_wanted: says whether messages are wanted now.
+        can_wait: True if a process of several nodes may go on without it where it takes too long.
         is_open: True if they were when that was last asked.
         outside: the subscription to what comes from outside; None while there is none.
     """
@@ -217,9 +217,9 @@ class Port:
     topic: str
     callback: Callable
     subscribe: Callable[[], Subscription]
-    can_wait: bool = False
-    is_contested: Callable[[], bool] = lambda: False
-    is_wanted: Callable[[], bool] = lambda: True
+    is_contested: Callable[[], bool]
+    is_wanted: Callable[[], bool]
+    can_wait: bool = field(default=False, init=False)
     is_open: bool = field(default=False, init=False)
     outside: Subscription | None = field(default=None, init=False)
     _times: deque[float] = field(default_factory=lambda: deque(maxlen=WATCHED), init=False)
@@ -448,7 +448,6 @@ class Stage:
         callback: Callable,
         qos: QoSProfile,
         *,
-        can_wait: bool = False,
         is_exclusive: bool = True,
         is_wanted: Callable[[], bool] | None = None,
         **options: Any,
@@ -460,7 +459,6 @@ class Stage:
             topic: of the messages.
             callback: takes them.
             qos: that is asked for.
-            can_wait: a process of several nodes may go on without this one where it takes long.
             is_exclusive: messages are dropped while several nodes publish the topic: they may contradict each other.
             is_wanted: says whether messages are wanted now; None: while the node's answers are needed.
             options: of the subscription, as its callback group.
@@ -478,7 +476,7 @@ class Stage:
             )
 
         name, is_wanted = self.node.resolve_topic_name(topic), is_wanted or (lambda: self.is_needed)
-        return self.pipeline.add(Port(self, name, guarded, subscribe, can_wait, is_contested, is_wanted))
+        return self.pipeline.add(Port(self, name, guarded, subscribe, is_contested, is_wanted))
 
     def large_subscription(self, kind: type, topic: str, callback: Callable, **options: Any) -> Callable[[], None]:
         """Subscribe to messages of a megabyte from outside, whose lost pieces come again, unless nobody keeps them.

@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import replace
-from glob import escape
 from pathlib import Path
-from tempfile import mkdtemp
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce.errors import FinforceError, one_line
 from finforce.files import FileError, check_inside
 from finforce.messages import read_stamp
 from finforce_eval.annotation.video import write_video
@@ -43,6 +39,7 @@ from finforce_eval.recordings.writer import (
     Entry,
     cloud_message,
     force_markers,
+    new_folder,
     status_message,
     typestore,
     wrench_message,
@@ -275,7 +272,9 @@ def _write(bag: BagReader, recording: Recording, forces: ForceMessages, folder: 
     types, colors = typestore(), {recording.images.topics[0]} if recording.images is not None else set()
     # the topics whose messages have the stamps of the forces
     triggers = (colors | {f"/{side}/keypoints" for side in recording.jaws}) & bag.types.keys()
-    plugin = StoragePlugin.SQLITE3 if _is_sqlite(recording.path) else StoragePlugin.MCAP
+    path = recording.path
+    is_sqlite = path.suffix == ".db3" or (path.is_dir() and not any(path.glob("*.mcap*")) and any(path.glob("*.db3*")))
+    plugin = StoragePlugin.SQLITE3 if is_sqlite else StoragePlugin.MCAP
     with Writer(folder, version=9, storage_plugin=plugin) as writer:
         known = {} if side_file else {each.id: _copy_connection(writer, each) for each in bag.connections}
         added: dict[str, Any] = {}
@@ -287,11 +286,6 @@ def _write(bag: BagReader, recording: Recording, forces: ForceMessages, folder: 
                 if entry.topic not in added:
                     added[entry.topic] = writer.add_connection(entry.topic, kind, typestore=types)
                 writer.write(added[entry.topic], time, types.serialize_cdr(entry.message, kind))
-
-
-def _is_sqlite(path: Path) -> bool:
-    """Say whether a bag is of SQLite; what is written is of the same kind."""
-    return path.suffix == ".db3" or (path.is_dir() and not any(path.glob("*.mcap*")) and any(path.glob("*.db3*")))
 
 
 def _copy_connection(writer: Any, connection: Any) -> Any:
@@ -311,29 +305,3 @@ def _copy_others(source: Path, folder: Path) -> None:
     for path in source.iterdir():
         if path.is_file() and path.suffix not in (".mcap", ".db3", ".zstd") and path.name != "metadata.yaml":
             shutil.copy2(path, folder / path.name)
-
-
-@contextmanager
-def new_folder(target: Path) -> Iterator[Path]:
-    """Yield the path of a folder to be made, which takes its place under its own name once it is whole.
-
-    Raises:
-        RecordingError: the target exists.
-        OSError: it cannot be made.
-    """
-    if target.exists():
-        raise RecordingError(f"{target}: exists already; a recording is written to a new folder")
-    target.parent.mkdir(parents=True, exist_ok=True)
-    part = Path(mkdtemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent))
-    try:
-        yield part / target.name
-        os.replace(part / target.name, target)
-        for left in target.parent.glob(f".{escape(target.name)}.{'?' * 8}.part"):  # of attempts that were killed
-            shutil.rmtree(left, ignore_errors=True)
-    except (FinforceError, OSError, KeyboardInterrupt):
-        raise
-    except Exception as error:  # sqlite3 has its own classes for a full disk
-        raise OSError(f"{target}: cannot be written: {one_line(error)}") from error
-    finally:
-        with suppress(OSError):
-            shutil.rmtree(part)

@@ -11,7 +11,7 @@ from shutil import rmtree
 from typing import Any
 
 from finforce.errors import FinforceError, one_line
-from finforce_eval.annotation.bag import FEW, bag_task, new_folder
+from finforce_eval.annotation.bag import FEW, bag_task
 from finforce_eval.annotation.buffer_copy import write_buffer
 from finforce_eval.annotation.dataset_copy import write_copy
 from finforce_eval.annotation.dataset_forces import episode_tasks, plain_columns, write_dataset
@@ -23,6 +23,7 @@ from finforce_eval.policy import COLUMNS, FEATURE, FORCE, INTO, NONE, PREFIX
 from finforce_eval.recordings.bags import is_buffer, name_recordings
 from finforce_eval.recordings.dataset import is_dataset, open_dataset
 from finforce_eval.recordings.umi import count_episodes, is_replay_buffer
+from finforce_eval.recordings.writer import new_folder
 from finforce_eval.tasks import OK, Line, Manifest, Task, run_tasks
 
 
@@ -66,8 +67,8 @@ def run(options: argparse.Namespace) -> CommandResult:
     named = name_recordings(options.bags, "_")
     if options.remove:
         return _remove_forces(named, out)
-    if options.source in (None, IMAGES):
-        _set_unless_given(options, "threads=1")  # a core for each recording, whatever the engine
+    if options.source in (None, IMAGES) and not any(given.startswith("threads=") for given in options.detector):
+        options.detector = [*options.detector, "threads=1"]  # a core for each recording, whatever the engine
     datasets = {name: path for name, path in named if is_dataset(path)}
     if datasets:
         if options.video:
@@ -122,13 +123,6 @@ def _write_buffers(named: Sequence[tuple[str, Path]], out: Path, options: argpar
 def _has_force(line: Line) -> bool:
     """Say whether a task found forces."""
     return line["status"] == OK and not line["figures"].get("without_force")
-
-
-def _set_unless_given(options: argparse.Namespace, change: str) -> None:
-    """Change a parameter of the detector, unless it was given."""
-    name = change.partition("=")[0]
-    if not any(given.startswith(f"{name}=") for given in options.detector):
-        options.detector = [*options.detector, change]
 
 
 def _run_dataset(name: str, path: Path, options: argparse.Namespace, manifest: Manifest) -> list[Line]:

@@ -24,6 +24,7 @@ from finforce_eval.evaluation.keypoint_source import (
     choose_images,
     detect_keypoints,
     parse_source,
+    spread,
 )
 from finforce_eval.evaluation.setup import read_recordings
 from finforce_eval.recordings.tracks import Recording
@@ -38,6 +39,7 @@ from finforce_keypoints.placement import (
     LEAST_SEEN,
     TURN_STDDEV,
     CameraPlacement,
+    PlacementTask,
     count_steps,
     find_placement,
 )
@@ -92,20 +94,18 @@ def run(options: argparse.Namespace) -> CommandResult:
     colors = choose_pictures(recording, options.images)
     seen = find_tags(colors, options)
     jaws = {side: load_jaw(options.jaw, side) for side in SIDES if side in recording.jaws}
-    locator = AnyFinger(SideNetwork(source.parameters.get("model") or ANY_FINGER), jaws)
+    task = PlacementTask(
+        images=colors,
+        camera=recording.images.camera,
+        jaws=jaws,
+        locator=AnyFinger(SideNetwork(source.parameters.get("model") or ANY_FINGER), jaws),
+        opening=options.opening,
+    )
     guess = source.node_parameters(recording).get("T_gripper_camera")
     guess = None if guess is None else read_extrinsics(guess)
     with progress_bar(count_steps(len(colors), guess is not None), "step") as bar:
-        found = find_placement(
-            colors,
-            recording.images.camera,
-            jaws,
-            locator,
-            guess,
-            np.repeat((1e-3, np.radians(1.0)) * np.array(options.extrinsics_stddev), 3),
-            options.opening,
-            progress=bar.update,
-        )
+        stddev = np.repeat((1e-3, np.radians(1.0)) * np.array(options.extrinsics_stddev), 3)
+        found = find_placement(task, guess, stddev, progress=bar.update)
     found = add_tags(found, seen, recording.images.camera, jaws, options)
     output = Path(options.output)
     picture = output.with_suffix(".png")
@@ -195,11 +195,6 @@ def choose_pictures(recording: Recording, count: int) -> list[NDArray]:
     if not len(images):
         raise OptionError(f"{recording.name}: no images; expected pictures of jaws that are open and unloaded")
     return [image.color for _, image in images.at(spread(images.stamps_ns[:count], PICTURES))]
-
-
-def spread(stamps: NDArray[np.int64], count: int) -> NDArray[np.int64]:
-    """Return at most `count` of stamps (n,) [ns], evenly chosen."""
-    return stamps[np.unique(np.linspace(0, len(stamps) - 1, count).round().astype(int))]
 
 
 def find_tags(colors: list[NDArray], options: argparse.Namespace) -> list[dict[int, NDArray]]:

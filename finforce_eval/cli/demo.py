@@ -12,7 +12,6 @@ from shutil import rmtree, which
 from typing import Any
 
 from finforce.systems.launch import find_share
-from finforce_eval.annotation.bag import new_folder
 from finforce_eval.cli.main import parse
 from finforce_eval.cli.parser import CONTACT_HELP, CommandResult
 from finforce_eval.cli.replay import ENOUGH
@@ -102,7 +101,6 @@ def prepare_recording(folder: Path) -> Path:
     if folder.exists():
         rmtree(folder)
     print(f"Rendering the scene {SCENE} into {folder}, once ...", flush=True)
-    with new_folder(folder) as new:
-        scenario = build_scenario(SCENE)
-        record_footage(build_footage(scenario, SEED, parse_size(SIZE)), scenario, SEED, new)
+    scenario = build_scenario(SCENE)
+    record_footage(build_footage(scenario, SEED, parse_size(SIZE)), scenario, SEED, folder)
     return folder

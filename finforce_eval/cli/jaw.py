@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from dataclasses import fields
 from pathlib import Path
 
 from finforce_eval.cli.parser import CommandResult, length_mm, picture_file
@@ -26,6 +27,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--material", default="tpu95a", choices=tuple(MATERIALS), help="material (tpu95a)")
     parser.add_argument(
         "--clamp",
+        dest="clamp_z",
         type=length_mm,
         metavar="MM",
         help="height of the clamp at the inner face, parallel to a tilted base [mm]",
@@ -60,16 +62,9 @@ def run(options: argparse.Namespace) -> CommandResult:
     files, notes = make_jaw(
         options.file,
         output,
-        name=options.name or options.file.stem,
+        Overrides(**{entry.name: getattr(options, entry.name) for entry in fields(Overrides)}),
         material=options.material,
-        unit=options.unit,
-        body=options.body,
-        width=options.width,
-        overrides=Overrides(
-            flip=options.flip, other_face=options.other_face, clamp_z=options.clamp, face_x=options.face_x
-        ),
         picture=options.picture,
-        solid=options.solid,
         measure_warping=measure_warping,
     )
     for note in notes:

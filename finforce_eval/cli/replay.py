@@ -17,7 +17,8 @@ from finforce_eval.evaluation.keypoint_source import parse_source
 from finforce_eval.evaluation.score_tables import evaluation_json
 from finforce_eval.evaluation.setup import make_setup, read_recordings
 from finforce_eval.recordings.images import ALONE
-from finforce_eval.replay.replay import Playing, Replay, replay
+from finforce_eval.replay.node_run import Playing
+from finforce_eval.replay.replay import Replay, replay
 
 GRASP = "grasp.png"  # picture on top of the report
 

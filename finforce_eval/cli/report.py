@@ -15,14 +15,14 @@ from finforce_eval.cli.parser import CommandResult
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.batch import read_evaluations
 from finforce_eval.evaluation.scoring import match_truth
-from finforce_eval.figures.report import write_html, write_page
+from finforce_eval.figures.report import PageHead, write_html, write_page
 from finforce_eval.machine import version
 from finforce_eval.recordings.bags import bag_source, check_types, open_bag
 from finforce_eval.recordings.dataset import Dataset, is_dataset, open_dataset, read_parquet, rows_of
 from finforce_eval.recordings.recording import WRENCH
-from finforce_eval.recordings.tracks import WrenchTrack
+from finforce_eval.recordings.tracks import WrenchTrack, stack_vectors
 from finforce_eval.recordings.writer import STATUS
-from finforce_eval.table import AXES, ForceSeries, stddev_along
+from finforce_eval.table import ForceSeries, stddev_along
 from finforce_eval.tasks import is_manifest
 
 
@@ -56,9 +56,9 @@ def run(options: argparse.Namespace) -> CommandResult:
         raise OptionError("recordings and folders of evaluations: expected the one or the other")
     if tables:
         evaluation, about = read_evaluations(tables)
-        write_page(evaluation, page, about=about, title=options.title)
+        write_page(evaluation, page, PageHead(options.title, about))
     else:
-        write_html(recorded, page, title=options.title, about={"version": version()})
+        write_html(recorded, page, PageHead(options.title, {"version": version()}))
     count = len(recorded) or len(evaluation.results)
     print(f"Page: {page}: {count} plots")
     return CommandResult({"page": str(page), "plots": count})
@@ -134,8 +134,5 @@ def _make_series(name: str, side: str, samples: Mapping[str, list[Any]]) -> Forc
 def _stack(messages: list[Any]) -> WrenchTrack:
     """Return wrenches as arrays, in the order of their stamps."""
     messages = sorted(messages, key=stamp_of)
-    force, torque = (
-        np.array([[getattr(part, axis) for axis in AXES] for part in parts], dtype=np.float64).reshape(-1, 3)
-        for parts in ([each.wrench.force for each in messages], [each.wrench.torque for each in messages])
-    )
+    force, torque = (stack_vectors([getattr(each.wrench, name) for each in messages]) for name in ("force", "torque"))
     return WrenchTrack(stamps_ns=np.array([stamp_of(each) for each in messages], np.int64), force=force, torque=torque)

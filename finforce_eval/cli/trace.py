@@ -16,7 +16,8 @@ from finforce_eval.cli.parser import PLAYED_HELP, CommandResult, add_run_options
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.keypoint_source import parse_source
 from finforce_eval.evaluation.setup import make_setup, read_recordings
-from finforce_eval.replay.replay import Playing, play_to_nodes
+from finforce_eval.replay.node_run import Playing
+from finforce_eval.replay.replay import play_to_nodes
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

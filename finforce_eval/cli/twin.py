@@ -7,7 +7,6 @@ import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields
 from pathlib import Path
-from shutil import rmtree
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,6 @@ from finforce.messages import DEPTH_FORMAT
 from finforce.optional import import_trimesh
 from finforce.transforms import pose_numbers, quaternion_from_pose
 from finforce_eval.cli.parser import CommandResult, Parser, add_output_options, whole_number
-from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.keypoint_source import parse_changes
 from finforce_eval.recordings.images import (
     CAMERA_INFO,
@@ -33,6 +31,7 @@ from finforce_eval.recordings.writer import (
     cloud_message,
     header,
     make_message,
+    new_folder,
     pose_message,
     wrench_message,
     write_entries,
@@ -109,31 +108,15 @@ def run_record(options: argparse.Namespace) -> CommandResult:
         FinforceError: an option or the scene cannot be used, or the folder exists.
     """
     folder = Path(options.output)
-    check_new(folder)
-    scenario = scenario_from_options(options)
-    camera, step = parse_size(options.size, options.lens), 1e-3 * options.depth_step
-    footage = build_footage(scenario, options.seed, camera, finger=options.finger, depth_step=step)
-    record_footage(footage, scenario, options.seed, folder, compressed=not options.raw, finger=options.finger)
+    with new_folder(folder) as new:
+        scenario = scenario_from_options(options)
+        camera, step = parse_size(options.size, options.lens), 1e-3 * options.depth_step
+        footage = build_footage(scenario, options.seed, camera, finger=options.finger, depth_step=step)
+        record_footage(footage, scenario, options.seed, new, compressed=not options.raw, finger=options.finger)
     size = sum(path.stat().st_size for path in folder.iterdir()) / 1e6
     print(f"Recording: {folder} ({size:.1f} MB)")
     print(f"Score it with: finforce evaluate {folder} --from images")
     return CommandResult({"recording": str(folder), "megabytes": size})
-
-
-def check_new(folder: Path) -> None:
-    """Refuse a folder that exists, or that cannot be made, before the work that would fill it.
-
-    Raises:
-        RecordingError: it is one of these.
-    """
-    try:
-        folder.mkdir(parents=True)
-        folder.rmdir()
-    except OSError as error:
-        if isinstance(error, FileExistsError) and folder.exists():
-            raise RecordingError(f"{folder}: exists already; a recording is written to a new folder") from error
-        what = f"cannot be made ({error.strerror}); expected a new folder where one may be written"
-        raise RecordingError(f"-o {folder}: {what}") from error
 
 
 def scenario_from_options(options: argparse.Namespace) -> Scenario:
@@ -181,23 +164,16 @@ def write_footage(
         RecordingError: the folder exists.
         FinforceError: the footage cannot be made.
     """
-    folder = Path(folder)
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    is_new = not folder.exists()
-    try:
-        write_entries(footage_entries(footage, compressed, seen), folder)
-    except BaseException:
-        if is_new:  # half a recording would look like a whole one
-            rmtree(folder, ignore_errors=True)
-        raise
-    content = dict(case or {})
-    if footage.mesh is not None:
-        mesh = import_trimesh().Trimesh(vertices=footage.mesh.vertices, faces=footage.mesh.triangles, process=False)
-        mesh.export(folder / MESH)
-        content["mesh"] = f"{folder.name}/{MESH}"
-    content["depth_scale"] = footage.depth_step
-    content["T_gripper_camera"] = list(pose_numbers(footage.T_gripper_camera))
-    (folder / "case.json").write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    folder, content = Path(folder), dict(case or {})
+    with new_folder(folder) as new:
+        write_entries(footage_entries(footage, compressed, seen), new)
+        if footage.mesh is not None:
+            mesh = import_trimesh().Trimesh(vertices=footage.mesh.vertices, faces=footage.mesh.triangles, process=False)
+            mesh.export(new / MESH)
+            content["mesh"] = f"{folder.name}/{MESH}"
+        content["depth_scale"] = footage.depth_step
+        content["T_gripper_camera"] = list(pose_numbers(footage.T_gripper_camera))
+        (new / "case.json").write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
     return folder
 
 

@@ -15,12 +15,11 @@ from finforce.optional import import_cv2, import_library, import_trimesh
 from finforce_eval.annotation.video import REFUSED, USED, to_bytes
 from finforce_eval.cli.parser import BAG_HELP, CommandResult, add_run_options
 from finforce_eval.errors import OptionError
-from finforce_eval.evaluation.forces import estimate_forces
+from finforce_eval.evaluation.forces import ImageRun, estimate_shown
 from finforce_eval.evaluation.gripper import combine_jaws
 from finforce_eval.evaluation.setup import make_setup, read_keypoints
 from finforce_eval.recordings.tracks import JawTrack, Recording
 from finforce_eval.table import ForceSeries
-from finforce_eval.tasks import progress_bar
 from finforce_ifea.estimator import ForceEstimator
 from finforce_ifea.messages import ARROW, CONTACT, CONTACT_DIAMETER, FORCE, NEWTONS_PER_METRE
 
@@ -40,9 +39,8 @@ def run(options: argparse.Namespace) -> CommandResult:
     setup = make_setup(options)
     (recording,) = read_keypoints(options)
     view = _RerunView(recording.name, Path(options.save) if options.save else None)
-    frames = sum(len(track.keypoints.stamps_ns) for track in recording.jaws.values())
-    with progress_bar(frames, "image", recording.name) as bar:
-        jaws = estimate_forces(recording, setup, progress=bar.update, watch=view.show_shape)
+    jaws = estimate_shown(recording, setup, run=ImageRun(watch=view.show_shape))
+    frames = sum(map(len, jaws.values()))
     view.show_images(recording)
     view.show_poses(recording)
     view.show_forces(jaws, combine_jaws(jaws), recording)

@@ -18,9 +18,8 @@ from finforce_eval.calibration.weighing import (
 )
 from finforce_eval.cli.parser import BAG_HELP, FORCE_HELP, CommandResult, add_run_options
 from finforce_eval.errors import OptionError
-from finforce_eval.evaluation.forces import estimate_forces
+from finforce_eval.evaluation.forces import ImageRun, estimate_shown
 from finforce_eval.evaluation.setup import make_setup, print_notes, read_keypoints
-from finforce_eval.tasks import progress_bar
 from finforce_ifea.jaw.calibration import save_calibration
 
 
@@ -49,8 +48,7 @@ def run(options: argparse.Namespace) -> CommandResult:
     options.jaws = options.side
     (recording,) = read_keypoints(options)
     stamps = recording.jaw(options.side).keypoints.stamps
-    with progress_bar(len(stamps), "frame", recording.name) as bar:
-        forces = estimate_forces(recording, setup, [options.side], strict=True, progress=bar.update)[options.side]
+    forces = estimate_shown(recording, setup, [options.side], ImageRun(strict=True))[options.side]
     pressed = stamps - stamps[0], np.abs(forces.force[:, 0])
     holds = find_holds(*pressed)
     short = [hold for hold in find_holds(*pressed, SHORT_HOLD) if hold.end - hold.start < LEAST_HOLD]

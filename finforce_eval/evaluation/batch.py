@@ -19,7 +19,12 @@ from finforce.rig import read_rig
 from finforce.transforms import pose_numbers
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.contact_source import choose_contact
-from finforce_eval.evaluation.forces import describe_contradictions, estimate_forces, evaluate_jaws, truth_sides
+from finforce_eval.evaluation.forces import (
+    describe_contradictions,
+    estimate_shown,
+    evaluate_jaws,
+    truth_sides,
+)
 from finforce_eval.evaluation.keypoint_source import KeypointSource, parse_source, pose_of
 from finforce_eval.evaluation.scoring import Evaluation, score_results, score_series, true_range
 from finforce_eval.evaluation.setup import (
@@ -34,7 +39,7 @@ from finforce_eval.recordings.images import ImageChoice
 from finforce_eval.recordings.recording import find_recordings, stated_jaw
 from finforce_eval.recordings.tracks import Recording
 from finforce_eval.table import ForceSeries, read_table, unit_of, write_table
-from finforce_eval.tasks import OK, EngineOptions, Manifest, Task, hash_settings, progress_bar, run_tasks
+from finforce_eval.tasks import OK, EngineOptions, Manifest, Task, hash_settings, run_tasks
 from finforce_ifea.jaw.calibration import Calibration, load_calibration
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.settings import EstimatorSettings
@@ -128,10 +133,7 @@ def _tabulate(name: str, path: Path, keypoints: KeypointSource, setup: Evaluatio
     setup.contacts.check(read)
     recording = keypoints.apply(read)
     print_notes(name, recording.notes)
-    frames = sum(len(track.keypoints.stamps_ns) for track in recording.jaws.values())
-    with progress_bar(frames, "frame", name) as bar:
-        found = estimate_forces(recording, setup, progress=bar.update)
-    return pd.concat([each.table for each in found.values()])
+    return pd.concat([each.table for each in estimate_shown(recording, setup).values()])
 
 
 def evaluate_all(recordings: Sequence[Recording], setup: EvaluationSetup) -> Evaluation:

@@ -19,7 +19,7 @@ from finforce_contact.mesh.object_mesh import load_object_mesh
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.at_rest import JawsAtRest, approach, doubt_intrinsics, doubt_lens
 from finforce_eval.evaluation.contact_source import OUTLINED, UNCOMPARED, UNSEEN, check_mesh
-from finforce_eval.evaluation.keypoint_source import KeypointSource, build_records, choose_images
+from finforce_eval.evaluation.keypoint_source import KeypointSource, build_records, choose_images, spread
 from finforce_eval.evaluation.unseen import explain_unseen
 from finforce_eval.recordings.frames import STILL_RATE, FrameImages
 from finforce_eval.recordings.objects import find_mesh
@@ -143,11 +143,10 @@ def check_rig(recording: Recording, source: KeypointSource) -> list[Finding]:
     """
     records = build_records(source.node_parameters(recording))
     images = choose_images(recording, NO_DEPTH)
-    chosen = np.unique(np.linspace(0, len(images) - 1, RIG_PICTURES).round().astype(int))
     jaws = {side: load_jaw(source.jaw_file, side) for side in recording.jaws}
     compared = compare_rig(
         jaws,
-        [image.color for _, image in images.at(images.stamps_ns[chosen])],
+        [image.color for _, image in images.at(spread(images.stamps_ns, RIG_PICTURES))],
         images.camera,
         records.parameters.camera_pose,
         find_mounts(records.parameters, jaws),

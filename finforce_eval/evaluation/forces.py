@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from math import ceil
 from typing import TYPE_CHECKING, Any
 
@@ -50,9 +50,7 @@ def evaluate_jaws(recording: Recording, setup: EvaluationSetup) -> list[ForceSer
         FinforceError: the contact cannot be known, or the estimator refuses a frame.
     """
     sides = truth_sides(recording)
-    frames = sum(len(recording.jaw(side).keypoints.stamps_ns) for side in sides)
-    with progress_bar(frames, "frame", recording.name) as bar:
-        found = estimate_forces(recording, setup, sides, strict=True, progress=bar.update)
+    found = estimate_shown(recording, setup, sides, ImageRun(strict=True))
     results = [each.renamed(f"{recording.name}/{side}") if len(sides) > 1 else each for side, each in found.items()]
     for result in results:
         check_solved(result, recording)
@@ -71,25 +69,39 @@ def truth_sides(recording: Recording) -> list[str]:
     return sides
 
 
+@dataclass(frozen=True, kw_only=True)
+class ImageRun:
+    """How the images of a recording are run through.
+
+    Attributes:
+        strict: an image that is refused ends the run, else it has no force and says why.
+        as_live: the images that the solver's node passes over are left out.
+        stills: nothing of one image is known in the next.
+        progress: called with the number of images done since its last call.
+        watch: called with side, stamp [ns] and estimator after every image.
+    """
+
+    strict: bool = False
+    as_live: bool = False
+    stills: bool = False
+    progress: Callable[[int], Any] = lambda images: None
+    watch: Callable[[str, int, ForceEstimator], Any] = lambda side, stamp, estimator: None
+
+
 def estimate_forces(
     recording: Recording,
     setup: EvaluationSetup,
     sides: Collection[str] = (),
-    *,
-    strict: bool = False,
-    progress: Callable[[int], Any] = lambda images: None,
-    watch: Callable[[str, int, ForceEstimator], Any] | None = None,
+    run: ImageRun | None = None,
     tares: Mapping[str, Tare] | None = None,
 ) -> dict[str, ForceSeries]:
     """Return the forces on some jaws of a recording that has key points, and the distance of two.
 
     Args:
         recording: with key points, recorded or found.
-        setup: jaw, settings, calibration and contact.
+        setup: jaw, settings, calibration and contact, and which images count.
         sides: of the jaws; all without.
-        strict: an image that is refused ends the run, else it has no force and says why.
-        progress: called with the number of images done since its last call.
-        watch: called with side, stamp [ns] and estimator after every image.
+        run: how refused images are taken, and who watches.
         tares: offsets of the key points by side, where others than those of the first images are wanted.
 
     Raises:
@@ -99,7 +111,7 @@ def estimate_forces(
     for side in sides:
         check_keypoint_count(recording, side, setup.jaw)
     both, found, friction = len(sides) == len(SIDES), {}, read_friction(recording)
-    how = {"strict": strict, "as_live": setup.as_live, "stills": setup.stills, "progress": progress, "watch": watch}
+    run = replace(run or ImageRun(), as_live=setup.as_live, stills=setup.stills)
     for side in sides:
         own = setup.side(side)
         source = GivenContact(None) if _is_unseen(recording, side) else own.source(recording)
@@ -107,8 +119,17 @@ def estimate_forces(
         estimator.expect_friction(friction)
         if tares:
             estimator.adopt_tare(tares[side])
-        found[side] = find_forces(recording, own.jaw, source, estimator, side, **how)
+        found[side] = find_forces(recording, own.jaw, source, estimator, side, run)
     return with_distances(found, recording) if both else found
+
+
+def estimate_shown(
+    recording: Recording, setup: EvaluationSetup, sides: Collection[str] = (), run: ImageRun | None = None
+) -> dict[str, ForceSeries]:
+    """Return the same under a progress bar; see `estimate_forces`."""
+    frames = sum(len(recording.jaw(side).keypoints.stamps_ns) for side in sides or recording.jaws)
+    with progress_bar(frames, "frame", recording.name) as bar:
+        return estimate_forces(recording, setup, sides, replace(run or ImageRun(), progress=bar.update))
 
 
 def _is_unseen(recording: Recording, side: str) -> bool:
@@ -171,13 +192,8 @@ def find_forces(
     jaw: Any,
     source: ContactSource,
     estimator: ForceEstimator,
-    side: str = "left",
-    *,
-    strict: bool = True,
-    as_live: bool = False,
-    stills: bool = False,
-    progress: Callable[[int], Any] = lambda steps: None,
-    watch: Callable[[str, int, ForceEstimator], Any] | None = None,
+    side: str,
+    how: ImageRun,
 ) -> ForceSeries:
     """Return the force on one jaw in every image that has key points, and where it was measured, the true one.
 
@@ -189,22 +205,18 @@ def find_forces(
         source: where the contact of each image comes from; a fresh one.
         estimator: one that knows of no recording.
         side: "left" or "right".
-        strict: an image that is refused ends the run, else it has no force and says why.
-        as_live: True if the images that the solver's node passes over are left out.
-        stills: True if nothing of one image is known in the next.
-        progress: called with the number of images done since its last call.
-        watch: called with side, stamp [ns] and estimator after every image.
+        how: images are run through.
 
     Raises:
         RecordingError: a pose or an image is refused.
         ObservationError: the estimator refuses an image.
     """
     stamps = recording.jaw(side).keypoints.stamps_ns
-    run, rows = _JawRun(recording, side, jaw, ForceLoop(source, estimator), stills), []
+    run, rows = _JawRun(recording, side, jaw, ForceLoop(source, estimator), how.stills), []
     idling, passed = Idling(), np.zeros(len(stamps), dtype=bool)
     unseen = _is_unseen(recording, side)
     for index, stamp in enumerate(stamps.tolist()):
-        progress(1)
+        how.progress(1)
         if unseen:
             rows.append(run.row(NOT_FOUND, f"the {side} jaw is in none of the images"))
             continue
@@ -213,16 +225,15 @@ def find_forces(
             source.contact_at(stamp, estimator.surface)  # its node has rules of its own
             rows.append(run.row("", ""))
             continue
-        rows.append(run.answer(index, strict))
-        idling.note(stamp, as_live and rows[-1]["status"] != REFUSED and estimator.is_idle)
-        if watch is not None:
-            watch(side, stamp, estimator)
+        rows.append(run.answer(index, how.strict))
+        idling.note(stamp, how.as_live and rows[-1]["status"] != REFUSED and estimator.is_idle)
+        how.watch(side, stamp, estimator)
     columns = _stack_rows(rows, source)
     columns |= recording.phases_at(stamps) | truth_columns(recording, side) | sight_columns(recording, side)
     if "detector_ms" in columns:
         columns["latency_ms"] = columns["step_ms"] + columns["detector_ms"]
     series = ForceSeries.build(recording.name, side, stamps, **columns)
-    return series.at(~passed) if as_live else series
+    return series.at(~passed) if how.as_live else series
 
 
 def _stack_rows(rows: Sequence[Mapping[str, Any]], source: ContactSource) -> dict[str, Any]:
@@ -248,7 +259,7 @@ class _JawRun:
         stills: True if nothing of one image is known in the next.
     """
 
-    def __init__(self, recording: Recording, side: str, jaw: Any, loop: ForceLoop, stills: bool = False) -> None:
+    def __init__(self, recording: Recording, side: str, jaw: Any, loop: ForceLoop, stills: bool) -> None:
         self._name, self._stills, self._seen = recording.name, stills, None
         self._loop, self._track = loop, recording.jaw(side).keypoints
         self._lines = None

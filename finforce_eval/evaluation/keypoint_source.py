@@ -182,6 +182,11 @@ def choose_images(recording: Recording, depth: str) -> ImageTrack:
     return images
 
 
+def spread(stamps: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+    """Return at most `count` of stamps (n,) [ns], evenly chosen."""
+    return stamps[np.unique(np.linspace(0, len(stamps) - 1, count).round().astype(int))]
+
+
 def build_records(given: Mapping[str, Any]) -> DetectorRecords:
     """Return the records of a detector with parameters by their ROS names; the others have their defaults.
 

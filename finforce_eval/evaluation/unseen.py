@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from finforce.gripper_frames import OpeningRange
 from finforce.messages import NANOSECONDS
 from finforce_eval.evaluation.forces import NOT_FOUND
-from finforce_eval.evaluation.keypoint_source import KeypointSource, build_records, choose_images
+from finforce_eval.evaluation.keypoint_source import KeypointSource, build_records, choose_images, spread
 from finforce_eval.recordings.tracks import Recording
 from finforce_eval.table import ForceSeries
 from finforce_keypoints.build import ANY_FINGER
@@ -43,7 +43,6 @@ def explain_unseen(
     parameters, settings, _ = build_records(source.node_parameters(recording))
     images, jaws = choose_images(recording, NO_DEPTH), load_jaws(parameters)
     stamps = images.stamps_ns if stamps is None else stamps
-    chosen = stamps[np.unique(np.linspace(0, len(stamps) - 1, pictures).round().astype(int))]
     mounts = find_mounts(parameters, jaws)
     changes = PictureChanges(
         images.camera,
@@ -53,7 +52,7 @@ def explain_unseen(
         OpeningRange(nearest=settings.opening_min, farthest=settings.opening_max),
         AnyFinger(SideNetwork(ANY_FINGER, threads=parameters.threads), jaws, mounts),
     )
-    said = changes.explain([image.color for _, image in images.at(chosen)])
+    said = changes.explain([image.color for _, image in images.at(spread(stamps, pictures))])
     return [said] if said else []
 
 

@@ -6,7 +6,7 @@ import json
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,10 +19,19 @@ from finforce_eval.table import WAITING, ForceSeries
 TITLE, PAGE = "Force from key points", "report.html"
 
 
+class PageHead(NamedTuple):
+    """What stands above the plots of a page: its title, settings of the run by name, first sentence, PNG files."""
+
+    title: str
+    about: Mapping[str, str]
+    headline: str = ""
+    pictures: Sequence[Path] = ()
+
+
 def write_overview(
     evaluation: Evaluation, folder: str | Path, *, about: Mapping[str, str], headline: str = "", picture: str = ""
 ) -> Path:
-    """Write the page of a report with a picture of all errors, and return it; see `write_html`.
+    """Write the page of a report with a picture of all errors, and return it; see `write_page`.
 
     Args:
         evaluation: scores and time series.
@@ -40,26 +49,16 @@ def write_overview(
     folder.mkdir(parents=True, exist_ok=True)
     draw_errors(list(evaluation.results.values())).savefig(folder / "errors.png")
     pictures = [folder / name for name in (picture, "errors.png") if name]
-    return write_page(evaluation, folder / PAGE, about=about, title=TITLE, headline=headline, pictures=pictures)
+    return write_page(evaluation, folder / PAGE, PageHead(TITLE, about, headline, pictures))
 
 
-def write_page(
-    evaluation: Evaluation,
-    path: Path,
-    *,
-    about: Mapping[str, str],
-    title: str,
-    headline: str = "",
-    pictures: Sequence[Path] = (),
-) -> Path:
+def write_page(evaluation: Evaluation, path: Path, head: PageHead) -> Path:
     """Write the scores of an evaluation, and its series, as one page; see `write_html`."""
     table, results = score_table(evaluation), list(evaluation.results.values())
     columns = ["case", *(" ".join(filter(None, names)) for names in table.columns)]
     rows = [[name, *row] for name, row in zip(table.index, table.to_numpy().tolist(), strict=True)]
-    headline = headline or f"{mean_rmse(evaluation)} {describe_answers(results)}"
-    return write_html(
-        results, path, title=title, headline=headline, about=about, columns=columns, rows=rows, pictures=pictures
-    )
+    headline = head.headline or f"{mean_rmse(evaluation)} {describe_answers(results)}"
+    return write_html(results, path, head._replace(headline=headline), columns, rows)
 
 
 TEMPLATE = Path(__file__).parents[1] / "data" / "page" / "report.html"
@@ -70,25 +69,18 @@ _MOST_WORDS = 255
 def write_html(
     series: Sequence[ForceSeries],
     path: Path,
-    *,
-    title: str,
-    about: Mapping[str, str],
+    head: PageHead,
     columns: Sequence[str] = (),
     rows: Sequence[Sequence[str]] = (),
-    headline: str = "",
-    pictures: Sequence[Path] = (),
 ) -> Path:
     """Write the page and return its path.
 
     Args:
         series: one plot each.
         path: of the page.
-        title: its heading.
-        about: settings of the run, by name.
+        head: above the plots; without a headline, errors, forces and answers of the series.
         columns: of a table above the plots; the first holds names.
         rows: of the table: one for each series, in their order, and any after them; without one, images and answers.
-        headline: its first sentence; errors, forces and answers of the series without.
-        pictures: PNG files.
 
     Raises:
         OSError: it cannot be written.
@@ -96,10 +88,10 @@ def write_html(
     if not rows:
         columns, rows = _count_answers(series)
     content = {
-        "title": title,
-        "headline": headline or describe_series(series),
-        "pictures": ["data:image/png;base64," + b64encode(picture.read_bytes()).decode() for picture in pictures],
-        "about": dict(about),
+        "title": head.title,
+        "headline": head.headline or describe_series(series),
+        "pictures": ["data:image/png;base64," + b64encode(picture.read_bytes()).decode() for picture in head.pictures],
+        "about": dict(head.about),
         "columns": list(columns),
         "rows": [list(row) for row in rows],
         "items": [_describe(each) for each in series],

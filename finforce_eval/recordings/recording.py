@@ -28,6 +28,7 @@ from finforce_eval.recordings.tracks import (
     WrenchTrack,
     check_stamps,
     parse_phases,
+    stack_vectors,
 )
 from finforce_eval.recordings.umi import read_buffer
 
@@ -235,8 +236,7 @@ def _wrench_track(samples: Sequence[Any], side: str, name: str) -> WrenchTrack:
     _check_frame(samples, topic, side, name)
     stamps = check_stamps(map(stamp_of, samples), topic, name, strict=False)
     wrenches = [sample.wrench for sample in samples]
-    force = np.array([[w.force.x, w.force.y, w.force.z] for w in wrenches])
-    torque = np.array([[w.torque.x, w.torque.y, w.torque.z] for w in wrenches])
+    force, torque = (stack_vectors([getattr(each, name) for each in wrenches]) for name in ("force", "torque"))
     if not np.isfinite(force).all():
         raise RecordingError(f"{name}: {topic} holds forces that are not finite")
     return WrenchTrack(stamps_ns=stamps, force=force, torque=torque)
@@ -273,8 +273,8 @@ def _pose_track(samples: Sequence[Any], topic: str, name: str) -> PoseTrack:
     poses = [sample.pose for sample in samples]
     return PoseTrack(
         stamps_ns=np.array([stamp_of(sample) for sample in samples], dtype=np.int64),
-        position=np.array([[p.position.x, p.position.y, p.position.z] for p in poses]),
-        quaternion=np.array([[getattr(p.orientation, axis) for axis in "xyzw"] for p in poses]),
+        position=stack_vectors([pose.position for pose in poses]),
+        quaternion=stack_vectors([pose.orientation for pose in poses], "xyzw"),
         frame_id=frames[0],
     )
 

@@ -235,6 +235,12 @@ class Recording:
         }
 
 
+def stack_vectors(vectors: Iterable[Any], axes: str = "xyz") -> NDArray[np.float64]:
+    """Return vectors, points or quaternions of messages as rows (n, 3) or (n, 4)."""
+    rows = [[getattr(vector, axis) for axis in axes] for vector in vectors]
+    return np.array(rows, dtype=np.float64).reshape(-1, len(axes))
+
+
 def check_stamps(stamps: Iterable[int], topic: str, name: str, *, strict: bool = True) -> NDArray[np.int64]:
     """Return the stamps of a topic (n,) [ns]; raises RecordingError where they go back or, if `strict`, stand still."""
     times = np.array(list(stamps), dtype=np.int64)

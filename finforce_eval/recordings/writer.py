@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
+import sqlite3
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from functools import lru_cache
+from glob import escape
 from pathlib import Path
+from tempfile import mkdtemp
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from finforce.errors import one_line
 from finforce.messages import NANOSECONDS, STDDEV_COLUMNS, SharedStddev, encode_cloud, shared_columns
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.recording import CLOUD, POSE, STRING, WRENCH
@@ -124,6 +131,34 @@ def force_markers(stamp: int, frame_id: str, point: np.ndarray, force: np.ndarra
         for name, shape, points, scale, color in shapes
     ]
     return make_message(MARKERS, markers=markers)
+
+
+@contextmanager
+def new_folder(target: Path) -> Iterator[Path]:
+    """Yield the path of a folder to be made, which takes its place under its own name once it is whole.
+
+    Raises:
+        RecordingError: the target exists, or cannot be made.
+        OSError: it cannot be written.
+    """
+    try:
+        if target.exists():
+            raise RecordingError(f"{target}: exists already; a recording is written to a new folder")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        part = Path(mkdtemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent))
+    except OSError as error:
+        what = f"cannot be made ({error.strerror}); expected a new folder where one may be written"
+        raise RecordingError(f"{target}: {what}") from error
+    try:
+        yield part / target.name
+        os.replace(part / target.name, target)
+        for left in target.parent.glob(f".{escape(target.name)}.{'?' * 8}.part"):  # of attempts that were killed
+            shutil.rmtree(left, ignore_errors=True)
+    except sqlite3.Error as error:  # of a full disk
+        raise OSError(f"{target}: cannot be written: {one_line(error)}") from error
+    finally:
+        with suppress(OSError):
+            shutil.rmtree(part)
 
 
 def write_recording(

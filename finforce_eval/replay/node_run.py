@@ -13,6 +13,7 @@ import psutil
 
 from finforce.camera_topics import COLOR_TOPIC, INFO_TOPIC
 from finforce.optional import import_ros
+from finforce.ros.tracing import FOLDER
 from finforce.ros.transport import free_domain
 from finforce.systems.processes import PIPELINE, executables_of
 from finforce_eval.replay.answers import ReplayLog
@@ -39,6 +40,33 @@ def describe_load(others: Iterable[float]) -> str:
     return (
         f"THE MACHINE WAS BUSY: everything else took up to {largest:.0f} % of a core; repeat it when nothing else runs."
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Playing:
+    """The options of playing a recording.
+
+    Attributes:
+        rate: speed; at 1 the stamps are shifted to now, else they stay and the nodes take their time from /clock.
+        domain: ROS_DOMAIN_ID; None takes one by chance.
+        trace: folder in which the nodes note when they were at work; empty for none. Then only the grasp
+            force is received: more would add work.
+    """
+
+    rate: float = 1.0
+    domain: int | None = None
+    trace: str = ""
+
+    @property
+    def environment(self) -> dict[str, str]:
+        """Variables of the nodes' processes."""
+        domain = str(free_domain() if self.domain is None else self.domain)
+        return {"ROS_DOMAIN_ID": domain} | ({FOLDER: self.trace} if self.trace else {})
+
+    @property
+    def has_clock(self) -> bool:
+        """True if the nodes take their time from /clock."""
+        return self.rate != 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,13 +116,10 @@ def run_nodes(
     processes: Sequence[Process],
     messages: Playback,
     sides: Sequence[str],
-    awaited: Collection[str] = (),
     *,
     heard: Sequence[str] | None = None,
     detector: bool = False,
-    rate: float = 1.0,
-    has_clock: bool = False,
-    environment: Mapping[str, str] | None = None,
+    playing: Playing | None = None,
 ) -> NodeRun:
     """Play messages to processes in real time; nothing outlives the call.
 
@@ -102,32 +127,28 @@ def run_nodes(
         processes: to be started, and ended.
         messages: the recording to play.
         sides: jaws that are played.
-        awaited: topics that somebody has to listen to before it begins; without any those of our own nodes.
         heard: jaws whose own results are heard in addition to the grasp force, at a cost to the nodes; all without.
         detector: True if the results of a key point detector are heard, too.
-        rate: speed.
-        has_clock: keep the stamps, and give the time on /clock; else stamps are shifted to now.
-        environment: variables of the processes; without ROS_DOMAIN_ID they have a domain by chance.
+        playing: rate, domain and trace; at the recorded speed on a domain by chance without.
 
     Raises:
         ProcessError: a process cannot be started, ended early, or does not listen.
         MissingDependencyError: ROS 2 is not installed.
     """
     open_player = import_ros("finforce_eval.replay.node", "running nodes").open_player
-    log = ReplayLog(tuple(sides))
-    environment = dict(environment or {})
-    domain = environment.setdefault("ROS_DOMAIN_ID", str(free_domain()))
+    log, playing = ReplayLog(tuple(sides)), playing or Playing()
+    environment = playing.environment
     with ExitStack() as stack:
-        player = stack.enter_context(open_player(int(domain)))
+        player = stack.enter_context(open_player(int(environment["ROS_DOMAIN_ID"])))
         nodes = stack.enter_context(ProcessGroup(processes, environment))
         player.offer(messages)
         player.listen(sides if heard is None else heard, log, detector=detector)
-        _await_listeners(player, nodes, awaited or awaited_topics(processes, sides))
+        _await_listeners(player, nodes, awaited_topics(processes, sides))
         player.spin_until(monotonic() + LINGER)
-        log.offset = 0 if has_clock else time_ns() - messages.begin
+        log.offset = 0 if playing.has_clock else time_ns() - messages.begin
         meters = begin_shares({**nodes.pids, PLAYER: getpid()})
         psutil.cpu_percent()
-        _play(player, nodes, messages, log, rate, has_clock=has_clock)
+        _play(player, nodes, messages, log, playing)
         busy, shares = psutil.cpu_percent() * psutil.cpu_count(), end_shares(meters)
         memory = {name: resident_bytes(pid) for name, pid in nodes.pids.items()}
         log.end()
@@ -141,9 +162,7 @@ def run_nodes(
     )
 
 
-def _play(
-    player: PlayerNode, nodes: ProcessGroup, messages: Playback, log: ReplayLog, rate: float, *, has_clock: bool
-) -> None:
+def _play(player: PlayerNode, nodes: ProcessGroup, messages: Playback, log: ReplayLog, playing: Playing) -> None:
     """Play messages as long as all processes run, and log when each left."""
     with progress_bar(len(messages), "msg", "replay") as bar:
 
@@ -152,4 +171,4 @@ def _play(
             log.take_sent(message.topic, message.stamp, monotonic())
             bar.update()
 
-        player.play(messages, rate=rate, offset=None if has_clock else log.offset, sent=note)
+        player.play(messages, rate=playing.rate, offset=None if playing.has_clock else log.offset, sent=note)

@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 from finforce.camera_topics import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 from finforce.gripper_frames import SIDES
 from finforce.health import IDLE, STILL
-from finforce.ros.tracing import FOLDER
 from finforce.systems.processes import Process, ReplayOptions, compose, replay_processes
 from finforce_eval.errors import RecordingError, SilentReplayError
 from finforce_eval.evaluation.contact_source import FIXED, ContactChoice
@@ -33,32 +32,11 @@ from finforce_eval.recordings.objects import find_mesh, read_friction, require_m
 from finforce_eval.recordings.tracks import Recording
 from finforce_eval.recordings.writer import write_recording
 from finforce_eval.replay.answers import ReplayLog, live_result, with_heard_keypoints
-from finforce_eval.replay.node_run import run_nodes
+from finforce_eval.replay.node_run import Playing, run_nodes
 from finforce_eval.replay.playback import Playback
 from finforce_ifea.jaw.jaw import Jaw
 
 RESULTS = ("wrench", "wrench_stddev", "surface", "markers", "contact", "object_outline")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Playing:
-    """The options of playing a recording.
-
-    Attributes:
-        rate: speed; at 1 the stamps are shifted to now, else they stay and the nodes take their time from /clock.
-        domain: ROS_DOMAIN_ID; None takes one by chance.
-        trace: folder in which the nodes note when they were at work; empty for none. Then only the grasp
-            force is received: more would add work.
-    """
-
-    rate: float = 1.0
-    domain: int | None = None
-    trace: str = ""
-
-    @property
-    def has_clock(self) -> bool:
-        """True if the nodes take their time from /clock."""
-        return self.rate != 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,17 +128,8 @@ def play_to_nodes(
         options = _graph_options(recording, setup, calibration_file, playing)
         processes = replay_processes(replace(options, images=from_images, composed=False), Path())
         processes = _for_scores(processes, recording, setup, keypoints)
-        environment = {} if playing.domain is None else {"ROS_DOMAIN_ID": str(playing.domain)}
-        run = run_nodes(
-            compose(processes),
-            messages,
-            sides,
-            heard=() if playing.trace else sides,
-            detector=from_images,
-            rate=playing.rate,
-            has_clock=playing.has_clock,
-            environment=environment | ({FOLDER: playing.trace} if playing.trace else {}),
-        )
+        heard = () if playing.trace else sides
+        run = run_nodes(compose(processes), messages, sides, heard=heard, detector=from_images, playing=playing)
     return Played(recording, run.log, from_images)
 
 

@@ -64,9 +64,8 @@ class SparsePlan:
 
         Positive definite ones never do.
         """
-        pointer, index = self._pattern
-        values, pivots = np.empty(len(self.rows[1])), np.empty(len(pointer) - 1)
-        _eliminate(pointer, index, upper, *self.rows, *self.columns, self._twins, values, pivots)
+        values, pivots = np.empty(len(self.rows[1])), np.empty(len(self._twins))
+        _eliminate((*self._pattern, upper), self.rows, self.columns, self._twins, values, pivots)
         factor = DiagonalFactor(self, values, pivots)
         is_exact = factor.positive or np.abs(values).max(initial=0.0) < _LARGEST_GROWTH
         return factor if is_exact else None
@@ -134,8 +133,12 @@ def _find_twins(pointer, index):
 
 
 @njit(**_OPTIONS)
-def _eliminate(pointer, index, data, row_pointer, row_index, first, rows, twins, values, pivots):
-    """Write L's values (k,) by columns, and 1 / D (n,), by rows: those of one node, `twins` (n,), two at a time."""
+def _eliminate(upper, by_rows, by_columns, twins, values, pivots):
+    """Write L's values (k,) by columns, and 1 / D (n,), by rows: those of one node, `twins` (n,), two at a time.
+
+    The upper triangle comes by columns, the pattern of L by rows and by columns: pointers, indices, and values.
+    """
+    (pointer, index, data), (row_pointer, row_index), (first, rows) = upper, by_rows, by_columns
     n = len(pivots)
     row, end = np.zeros((n + 1, 2)), first[:n].copy()
     k = 0

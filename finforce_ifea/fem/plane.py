@@ -55,11 +55,12 @@ class PlaneModel(SolidModel):
         if distance.max() > _SAME or len(points) < len(plane.points):
             raise MeshError("the mesh is not the section extruded along y")
         self._elements = np.ascontiguousarray(standing[plane.triangles])
-        self._gradients, volumes = _differentiate(plane.points[plane.triangles])
-        self._volumes = section.read_width(_place_points(plane.points[plane.triangles])) * volumes
+        gradients, volumes = _differentiate(plane.points[plane.triangles])
+        volumes = section.read_width(_place_points(plane.points[plane.triangles])) * volumes
+        self._points = gradients, volumes
         nu = material.poisson_ratio
-        self._shear = 0.5 * material.young_modulus / (1.0 + nu)
-        self._lame = 2.0 * self._shear * nu / (1.0 - 2.0 * nu)
+        shear = 0.5 * material.young_modulus / (1.0 + nu)
+        self._moduli = 2.0 * shear * nu / (1.0 - 2.0 * nu), shear
         self._Ke = np.zeros((len(self._elements), 18, 18))
         free = np.ones((len(mesh.nodes), 3), bool)
         free[:, 1] = False
@@ -70,16 +71,8 @@ class PlaneModel(SolidModel):
     def linearize(self, q: NDArray) -> Linearization:
         """Evaluate internal force, energy and tangent stiffness at q (size,) [m]."""
         f = np.zeros(self._moves.shape)
-        energy, smallest = _add_triangles(
-            np.append(q, 0.0)[self._moves],
-            self.plane.triangles,
-            self._gradients,
-            self._volumes,
-            self._lame,
-            self._shear,
-            f,
-            self._Ke,
-        )
+        u = np.append(q, 0.0)[self._moves]
+        energy, smallest = _add_triangles(u, self.plane.triangles, self._points, self._moduli, f, self._Ke)
         force = np.bincount(self._moves.ravel(), f.ravel(), self.size + 1)[: self.size]
         return Linearization(force=force, energy=energy, smallest_det=smallest, tangent=self._assemble())
 
@@ -104,13 +97,22 @@ def _differentiate(corners: NDArray) -> tuple[NDArray, NDArray]:
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz", "arcp"})
-def _add_triangles(u, elements, gradients, volumes, lame, shear, force, K):
-    """Add nodal forces (n, 3) and fill lower blocks of stiffnesses K (t, 18, 18).
+def _add_triangles(u, elements, points, moduli, force, K):
+    """Add nodal forces (n, 2) and fill lower blocks of stiffnesses K (t, 18, 18).
+
+    Args:
+        u: displacements (n, 2) [m].
+        elements: nodes of each triangle (t, 6).
+        points: gradients (t, 3, 6, 2) [1/m] and volumes (t, 3) [m^3] at three points of each.
+        moduli: Lame's first parameter and the shear modulus [Pa].
+        force: of the nodes (n, 2) [N], added to.
+        K: overwritten [N/m].
 
     Returns:
         Energy [J] and the smallest det F.
     """
     energy, smallest = 0.0, 1e300
+    (gradients, volumes), (lame, shear) = points, moduli
     a = np.empty((6, 2))
     for e in range(len(elements)):
         K[e] = 0.0

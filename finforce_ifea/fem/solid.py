@@ -41,6 +41,22 @@ class _Probe(NamedTuple):
     transposed: sparse.csc_matrix
 
 
+class _Undeformed(NamedTuple):
+    """The elements of a solid at rest.
+
+    Attributes:
+        nodes: of each element (m, k).
+        X: coordinates about the centroid (m, k, 3) [m].
+        g: shape function gradients at the centre (m, k, 3) [1/m].
+        K0: stiffness (m, 3 k, 3 k) [N/m].
+    """
+
+    nodes: NDArray
+    X: NDArray
+    g: NDArray
+    K0: NDArray
+
+
 class SolidModel:
     """A co-rotational solid; see `finforce_ifea.fem.model.JawModel` for what its methods take and return.
 
@@ -72,10 +88,13 @@ class SolidModel:
         corners = mesh.nodes[self._elements]
         D = elasticity_matrix(material.young_modulus, material.poisson_ratio)
         stiffness = hex_stiffness(corners, D) if corners.shape[1] == 8 else tet_stiffness(corners, D)
-        self._K0 = np.ascontiguousarray(stiffness * (2.0 if self.symmetric else 1.0))
-        self._X = np.ascontiguousarray(corners - corners.mean(1, keepdims=True))
-        self._g = np.ascontiguousarray(centre_gradient(corners))
-        self._Ke = np.zeros_like(self._K0)
+        self._undeformed = _Undeformed(
+            self._elements,
+            np.ascontiguousarray(corners - corners.mean(1, keepdims=True)),
+            np.ascontiguousarray(centre_gradient(corners)),
+            np.ascontiguousarray(stiffness * (2.0 if self.symmetric else 1.0)),
+        )
+        self._Ke = np.zeros_like(self._undeformed.K0)
         self.sign = np.ones((len(mesh.nodes), 3))
         self._mirror_unknowns(mirror)
         self._plan_assembly()
@@ -132,7 +151,7 @@ class SolidModel:
     def linearize(self, q: NDArray) -> Linearization:
         """Evaluate internal force, energy and tangent stiffness at q (size,) [m]."""
         f = np.zeros_like(self.mesh.nodes)
-        energy, smallest = _add_elements(self.expand(q), self._elements, self._X, self._K0, self._g, f, self._Ke)
+        energy, smallest = _add_elements(self.expand(q), self._undeformed, f, self._Ke)
         force = np.bincount(self.dof.ravel(), f.ravel(), self.size + 1)[: self.size]
         return Linearization(force=force, energy=energy, smallest_det=smallest, tangent=self._assemble())
 
@@ -173,8 +192,8 @@ class SolidModel:
     def stiffen(self, tangent: NDArray, probe: _Probe, q: NDArray, blocks: NDArray) -> None:
         """Add springs blocks (p, 3, 3) [N/m] at a probe's points to a stored tangent, in place."""
         matrix = probe.matrix
-        where = self._pointer, self._index
-        _add_springs(matrix.indptr, matrix.indices, matrix.data, blocks, *where, tangent)
+        rows, upper = (matrix.indptr, matrix.indices, matrix.data), (self._pointer, self._index, tangent)
+        _add_springs(rows, blocks, upper)
 
 
 def find_mirror_nodes(mesh: VolumeMesh) -> NDArray | None:
@@ -236,10 +255,42 @@ def _rotate(F, R, inverse):
     return det
 
 
+class _Element(NamedTuple):
+    """The working arrays of one element, named as in the equations above.
+
+    Attributes:
+        F: deformation gradient (3, 3).
+        R: its rotation (3, 3).
+        H: (tr(U) I - U)^-1 (3, 3).
+        B: see `_couplings` (3, 3).
+        scratch: (3, 3).
+        x: turned-back coordinates (k, 3) [m].
+        d: deformation (3 k,) [m].
+        fl: f' (3 k,) [N].
+        p: f' - G^T m (3 k,) [N].
+        G: (3, 3 k) [1/m].
+        L: see `_couplings` (3 k, 3) [N].
+        T: tangent before it is turned (3 k, 3 k) [N/m].
+    """
+
+    F: NDArray
+    R: NDArray
+    H: NDArray
+    B: NDArray
+    scratch: NDArray
+    x: NDArray
+    d: NDArray
+    fl: NDArray
+    p: NDArray
+    G: NDArray
+    L: NDArray
+    T: NDArray
+
+
 @njit(**_OPTIONS)
-def _shape(u, nodes, X, g, F, R, scratch, x, d):
-    """Write F, R, the turned-back coordinates x (k, 3) and the deformation d (3 k); return det F."""
-    k = len(nodes)
+def _shape(u, nodes, X, g, element):
+    """Write F, R, the turned-back coordinates x and the deformation d of an element; return det F."""
+    k, F, R, x, d = len(nodes), element.F, element.R, element.x, element.d
     F[:] = 0.0
     F[0, 0] = F[1, 1] = F[2, 2] = 1.0
     mean0 = mean1 = mean2 = 0.0
@@ -250,7 +301,7 @@ def _shape(u, nodes, X, g, F, R, scratch, x, d):
             F[1, b] += u1 * g[i, b]
             F[2, b] += u2 * g[i, b]
         mean0, mean1, mean2 = mean0 + u0 / k, mean1 + u1 / k, mean2 + u2 / k
-    det = _rotate(F, R, scratch)
+    det = _rotate(F, R, element.scratch)
     for i in range(k):
         w0, w1, w2 = X[i, 0] + u[nodes[i], 0], X[i, 1] + u[nodes[i], 1], X[i, 2] + u[nodes[i], 2]
         w0, w1, w2 = w0 - mean0, w1 - mean1, w2 - mean2
@@ -273,8 +324,9 @@ def _spin_matrix(F, R, U, H):
 
 
 @njit(**_OPTIONS)
-def _forces(K0, x, d, g, H, fl, p):
-    """Write f' = K0 d and p = f' - G^T m, both (3 k); return the energy."""
+def _forces(K0, g, element):
+    """Write f' = K0 d and p = f' - G^T m of an element; return the energy."""
+    x, d, H, fl, p = element.x, element.d, element.H, element.fl, element.p
     k, energy = len(x), 0.0
     for i in range(3 * k):
         s = 0.0
@@ -309,8 +361,9 @@ def _spins(g, H, G):
 
 
 @njit(**_OPTIONS)
-def _couplings(K0, x, d, fl, p, L, B):
-    """Write L = K0 S + ([p] + [f']) / 2, (3 k, 3), and B = S^T K0 S + (sum x f'^T symmetrised) - (sum x.f') I."""
+def _couplings(K0, element):
+    """Write L = K0 S + ([p] + [f']) / 2 and B = S^T K0 S + (sum x f'^T symmetrised) - (sum x.f') I of an element."""
+    x, d, fl, p, L, B = element.x, element.d, element.fl, element.p, element.L, element.B
     k = len(x)
     B[:] = 0.0
     for i in range(3 * k):
@@ -341,8 +394,9 @@ def _couplings(K0, x, d, fl, p, L, B):
 
 
 @njit(**_OPTIONS)
-def _tangent(K0, G, L, B, R, T, scratch, Ke):
+def _tangent(K0, element, Ke):
     """Write R (K0 + (G^T B - L) G - G^T L^T) R^T, lower 3 x 3 blocks only."""
+    G, L, B, R, T, scratch = element.G, element.L, element.B, element.R, element.T, element.scratch
     n = len(K0)
     for i in range(n):
         l0, l1, l2 = G[0, i], G[1, i], G[2, i]
@@ -363,46 +417,42 @@ def _tangent(K0, G, L, B, R, T, scratch, Ke):
 
 
 @njit(**_OPTIONS)
-def _add_elements(
-    u: NDArray, conn: NDArray, X: NDArray, K0: NDArray, g: NDArray, f: NDArray, Ke: NDArray
-) -> tuple[float, float]:
+def _add_elements(u: NDArray, undeformed: _Undeformed, f: NDArray, Ke: NDArray) -> tuple[float, float]:
     """Add internal forces to f and write element tangents.
 
     Args:
         u: displacements (n, 3) [m].
-        conn: element nodes (m, k).
-        X: element node coordinates about their centroid (m, k, 3) [m].
-        K0: element stiffness (m, 3 k, 3 k) [N/m].
-        g: shape function gradients at the centre (m, k, 3) [1/m].
+        undeformed: the elements.
         f: internal forces (n, 3) [N], added to.
         Ke: element tangents (m, 3 k, 3 k) [N/m], overwritten (lower 3 x 3 blocks only).
 
     Returns:
         Elastic energy [J] and the smallest det F of all elements.
     """
-    m, k = conn.shape
+    nodes, X, g, K0 = undeformed
+    m, k = nodes.shape
     n = 3 * k
-    F, R, U, H = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    scratch, B = np.empty((3, 3)), np.empty((3, 3))
-    x, d, fl, p = np.empty((k, 3)), np.empty(n), np.empty(n), np.empty(n)
-    G, L, T = np.empty((3, n)), np.empty((n, 3)), np.empty((n, n))
+    F, R, H, B = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    scratch, x, d, fl, p = np.empty((3, 3)), np.empty((k, 3)), np.empty(n), np.empty(n), np.empty(n)
+    element = _Element(F, R, H, B, scratch, x, d, fl, p, np.empty((3, n)), np.empty((n, 3)), np.empty((n, n)))
     energy, smallest = 0.0, 1e300
     for e in range(m):
-        smallest = min(smallest, _shape(u, conn[e], X[e], g[e], F, R, scratch, x, d))
-        _spin_matrix(F, R, U, H)
-        energy += _forces(K0[e], x, d, g[e], H, fl, p)
+        smallest = min(smallest, _shape(u, nodes[e], X[e], g[e], element))
+        _spin_matrix(F, R, scratch, H)
+        energy += _forces(K0[e], g[e], element)
         for i in range(k):
             for a in range(3):
-                f[conn[e, i], a] += R[a, 0] * p[3 * i] + R[a, 1] * p[3 * i + 1] + R[a, 2] * p[3 * i + 2]
-        _spins(g[e], H, G)
-        _couplings(K0[e], x, d, fl, p, L, B)
-        _tangent(K0[e], G, L, B, R, T, scratch, Ke[e])
+                f[nodes[e, i], a] += R[a, 0] * p[3 * i] + R[a, 1] * p[3 * i + 1] + R[a, 2] * p[3 * i + 2]
+        _spins(g[e], H, element.G)
+        _couplings(K0[e], element)
+        _tangent(K0[e], element, Ke[e])
     return energy, smallest
 
 
 @njit(cache=True, error_model="numpy")
-def _add_springs(start, column, weight, blocks, pointer, index, values):
-    """Add springs blocks (p, 3, 3) of points, each three rows of a sparse matrix, to the upper triangle's values."""
+def _add_springs(rows, blocks, upper):
+    """Add springs blocks (p, 3, 3) of points, each three rows of a sparse matrix, to the upper triangle of another."""
+    (start, column, weight), (pointer, index, values) = rows, upper
     for p in range(len(blocks)):
         for a in range(3):
             for b in range(3):

@@ -133,11 +133,6 @@ class Drawing:
         outer = np.stack([self.outer.centre_x(outer_z), outer_z], axis=1)
         return np.stack([inner, outer])
 
-    @property
-    def tip_point(self) -> tuple[float, float]:
-        """The middle of the tip's end, (x, z) [m]."""
-        return 0.5 * (self.inner.face_x(self.length) + self.outer.face_x(self.length)), self.length
-
     def rib_edges(self, rib: Rib) -> NDArray:
         """Compute where the two edges of a rib meet the backs of the bands.
 

@@ -266,8 +266,8 @@ class JunctionRule(FileModel):
             for number, (x, z) in enumerate(ends, start=1):
                 points[f"{name}_{number}"] = np.array([x, self.side_y, z])
         if drawing.tip_z is not None if self.tip is None else self.tip:
-            x, z = drawing.tip_point
-            points["tip"] = np.array([x, self.side_y, z])
+            x = 0.5 * (drawing.inner.face_x(drawing.length) + drawing.outer.face_x(drawing.length))
+            points["tip"] = np.array([x, self.side_y, drawing.length])
         if not points:
             raise JawFileError("keypoints: rib_junctions gives none, because the drawing has no ribs")
         return points

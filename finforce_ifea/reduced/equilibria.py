@@ -132,9 +132,10 @@ def _find_cell(table, m):
 
 
 @njit(**_OPTIONS)
-def blend(table, m, low, high, first, last, out):
-    """Write rows low to high, columns first to last of a table (T, Z, p, q), linear between grid points, to out."""
+def blend(table, m, rows, columns, out):
+    """Write rows from one to another, and columns, of a table (T, Z, p, q), linear between grid points, to out."""
     t, z, w00, w01, w10, w11 = _find_cell(table, m)
+    (low, high), (first, last) = rows, columns
     for i in range(high - low):
         c00, c01 = table[t, z, low + i], table[t, z + 1, low + i]
         c10, c11 = table[t + 1, z, low + i], table[t + 1, z + 1, low + i]
@@ -144,12 +145,13 @@ def blend(table, m, low, high, first, last, out):
 
 
 @njit(**_OPTIONS)
-def add_product(table, m, vector, first, last, step, out):
+def add_product(table, m, vector, step, out):
     """Add the product of a table (T, Z, p, q), linear between grid points, with a vector (q,) to out (p,).
 
-    The vector is zero outside first to last; every `step`-th pair of rows is added to.
+    The vector may be zero at its ends; every `step`-th pair of rows is added to.
     """
     t, z, w00, w01, w10, w11 = _find_cell(table, m)
+    first, last = find_ends(vector)
     for pair in range(0, len(out), 2 * step):
         for i in range(pair, min(pair + 2, len(out))):
             c00, c01, c10, c11 = table[t, z, i], table[t, z + 1, i], table[t + 1, z, i], table[t + 1, z + 1, i]
@@ -213,8 +215,7 @@ def _measure_miss(tables, loads, m):
     interpolate(tables[2], m, extra)
     for k in range(count):
         extra[k] = loads[k] - extra[k]
-    first, last = find_ends(extra)
-    add_product(tables[1], m, extra, first, last, WATCHED, miss)
+    add_product(tables[1], m, extra, WATCHED, miss)
     square = 0.0
     for k in range(count):
         square += miss[k] * miss[k]

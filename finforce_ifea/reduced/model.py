@@ -6,7 +6,7 @@ rigid object it is the same as `RigidContact`, at the price of a look-up.
 """
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -347,6 +347,14 @@ class _Gathered(NamedTuple):
     location: NDArray
 
 
+class _PlacedObject(NamedTuple):
+    """An object `PressedObject`, its pose by `pose_object`, and the `Traction` between it and a jaw."""
+
+    pressed: Any
+    pose: Any
+    traction: Any
+
+
 @njit(**_OPTIONS)
 def _follow(moves, compliance, loads, q):
     """Return motions (k,) [m] of a table moves (T, Z, k) with its compliance (T, Z, k, 2 n) for unknowns q."""
@@ -356,8 +364,7 @@ def _follow(moves, compliance, loads, q):
     for k in range(count):
         extra[k] = q[k] - extra[k]
     interpolate(moves, m, out)
-    first, last = find_ends(extra)
-    add_product(compliance, m, extra, first, last, 1, out)
+    add_product(compliance, m, extra, 1, out)
     return out
 
 
@@ -383,7 +390,7 @@ def _move_points(compliance, q, modes):
     first = min(first, last)
     size = compliance.shape[2]
     part = np.empty((size, last - first))
-    blend(compliance, q[count:], 0, size, first, last, part)
+    blend(compliance, q[count:], (0, size), (first, last), part)
     out = np.zeros((size, k))
     for i in range(size):
         for j in range(last - first):
@@ -430,9 +437,9 @@ def _add_to_clamp(out, weight, share, held, grip):
 
 
 @njit(**_OPTIONS)
-def _gather(jaw, pressed, pose, traction, points):
+def _gather(jaw, placed, points):
     """Return the contact of an object with contact points (p, 3) [m] at the rows."""
-    count = jaw.loads.shape[2]
+    count, (pressed, pose, traction) = jaw.loads.shape[2], placed
     loads, stiffness, held, grip = np.zeros((count, 5)), np.zeros((count, 7)), np.zeros((2, 5)), np.zeros((2, 2))
     total, point, location = 0.0, np.zeros(3), np.zeros(3)
     out = np.zeros(POINT_SHAPE)
@@ -484,7 +491,7 @@ def _solve_rows(q, compliance, loads, stiffness):
     if size == 0:
         return out, 0.0
     C, A = np.empty((size, size)), np.zeros((size, size))
-    blend(compliance, q[len(loads) :], first, last, first, last, C)
+    blend(compliance, q[len(loads) :], (first, last), (first, last), C)
     for i in range(size):
         A[i, i] = 1.0
         for c in range(5):
@@ -505,8 +512,9 @@ def _solve_rows(q, compliance, loads, stiffness):
 
 
 @njit(**_OPTIONS)
-def _change_energy(jaw, pressed, pose, traction, points, motion, share, work):
+def _change_energy(jaw, placed, points, motion, share, work):
     """Return by how much the energy changes along a step of which a share has been made; see `_find_share`."""
+    pressed, pose, traction = placed
     out, change = np.zeros(POINT_SHAPE), work[0] + share * work[1]
     for p in range(len(points)):
         x, z = points[p, 0] + share * motion[p, 0], points[p, 2] + share * motion[p, 2]
@@ -520,7 +528,7 @@ def _change_energy(jaw, pressed, pose, traction, points, motion, share, work):
 
 
 @njit(**_OPTIONS)
-def _find_share(jaw, pressed, pose, traction, points, moves, q, step):
+def _find_share(jaw, placed, points, moves, q, step):
     """Return the share of a step up to which the energy of jaw and object falls; corners make it rise again.
 
     Along a step of the loads that moves the rows by du and contact points (p, 3) by dx, it changes by
@@ -532,7 +540,7 @@ def _find_share(jaw, pressed, pose, traction, points, moves, q, step):
     for k in range(len(moves)):
         work[0] += q[k] * (moved[k] - moves[k])
         work[1] += step[k] * (moved[k] - moves[k])
-    parts = (jaw, pressed, pose, traction, points, motion)
+    parts = (jaw, placed, points, motion)
     share, low, high = 1.0, 0.0, 1.0
     if _change_energy(*parts, 1.0, work) <= _TOO_FAR * abs(_change_energy(*parts, 0.0, work)):
         return 1.0
@@ -563,8 +571,7 @@ def _step_grid(jaw, q, moves, steps, size, contact):
     after, change, there = np.empty(count), np.empty(count), np.empty(count)
     for k in range(count):
         after[k], change[k], there[k] = moves[k], steps[k, 0], q[k] + steps[k, 0]
-    first, last = find_ends(change)
-    add_product(jaw.compliance, q[count:], change, first, last, WATCHED, after)
+    add_product(jaw.compliance, q[count:], change, WATCHED, after)
     nearest = find_grid_step(jaw.moves, after, q[count:])
     left = approach_grid(tables, there, q[count:], nearest) if size <= _CALM else 0.0
     if q[count] < _SHALLOW and contact.size > 0.0:
@@ -603,8 +610,9 @@ def linearize_reduced(jaw, pressed, traction, q, x, probe):
     jaw, pressed, traction = _Jaw(*jaw), PressedObject(*pressed), Traction(*traction)
     count = jaw.loads.shape[2]
     moves = _follow(jaw.moves, jaw.compliance, jaw.loads, q)
-    points, pose = _place_contact(jaw.points, jaw.low, jaw.share, moves), pose_object(pressed, jaw.face_x, x)
-    contact = _gather(jaw, pressed, pose, traction, points)
+    points = _place_contact(jaw.points, jaw.low, jaw.share, moves)
+    placed = _PlacedObject(pressed, pose_object(pressed, jaw.face_x, x), traction)
+    contact = _gather(jaw, placed, points)
     touches = contact.size > 0.0
     steps, moved = _solve_rows(q, jaw.compliance, contact.loads, contact.stiffness)
     size = moved / LARGEST_MOVE
@@ -627,7 +635,7 @@ def linearize_reduced(jaw, pressed, traction, q, x, probe):
             modes[k, c] = steps[k, c + 1]
             force_modes[axis, c] += steps[k, c + 1]
     if touches and size > _LARGE_STEP and correction[count] == 0.0 and correction[count + 1] == 0.0:
-        share = _find_share(jaw, pressed, pose, traction, points, moves, q, correction)
+        share = _find_share(jaw, placed, points, moves, q, correction)
         for k in range(len(correction)):
             correction[k] *= share
         for axis in range(0, 3, 2):
@@ -636,8 +644,8 @@ def linearize_reduced(jaw, pressed, traction, q, x, probe):
     where = contact.point, contact.location
     state = PressedState(touches, correction, modes, force, force_modes, *where, 1.0, size, far)
     (material, shapes, compliance), q = probe, q + correction
-    placed = _move_tables(material, shapes, compliance, jaw.loads, q)
-    return state, placed, _move_points(compliance, q, modes)
+    places = _move_tables(material, shapes, compliance, jaw.loads, q)
+    return state, places, _move_points(compliance, q, modes)
 
 
 @njit(**_OPTIONS)
@@ -647,7 +655,7 @@ def _hold_base(jaw, q, contact, steps, force, force_modes):
         return
     count = len(steps)
     rows, moved = np.empty((2, count)), np.zeros((2, 5))
-    blend(jaw.compliance, q[count:], 0, 2, 0, count, rows)
+    blend(jaw.compliance, q[count:], (0, 2), (0, count), rows)
     for a in range(2):
         for k in range(count):
             for c in range(5):

@@ -196,7 +196,7 @@ _CURVED = 0.87
 
 
 @njit(**_OPTIONS)
-def compute_force(state, relaxation, untold, dt, error, stiffness_error, out):
+def compute_force(state, relaxation, untold, dt, errors, out):
     """Write the force that the material gives now, and what belongs to it, to out (7, 3).
 
     The rows are force [N], torque about the jaw frame's origin [N m], their standard deviations, contact point [m],
@@ -207,14 +207,15 @@ def compute_force(state, relaxation, untold, dt, error, stiffness_error, out):
         relaxation: the finger's, see `Relaxation.packed`, which is advanced by dt.
         untold: standard deviation of what forces that were not told have left in it (3,) [N].
         dt: time since the last force [s].
-        error: relative standard deviation of the mechanics, in magnitude and direction alike.
-        stiffness_error: relative standard deviation of the material's modulus, which leaves the direction as it is.
+        errors: relative standard deviations, of the mechanics, in magnitude and direction alike, and of the material's
+            modulus, which leaves the direction as it is.
         out: (7, 3).
 
     Returns:
         The magnitude and its standard deviation [N].
     """
     force, torque, stddev, torque_stddev, arm, undeformed, normal = out
+    error, stiffness_error = errors
     state = state[()]
     modes, covariance = state.force_modes, state.covariance
     fit, before = measure_along(state.force, modes, covariance), _measure_length(state.force)

@@ -320,28 +320,27 @@ def fit_side(model: SideModel, measured: NDArray, stddev: NDArray, lever: NDArra
     """
     beforehand = np.array([model.offset, model.tilt, model.tilt, model.bow, scale.stddev])
     places = np.ascontiguousarray(model.places)
-    (y, spread, misfit), error, left = _fit_shape(
-        places, model.relief, beforehand, measured, stddev, lever, scale.error
-    )
-    return SideFit(y=y, stddev=spread, misfit=misfit, scale=DepthScale(error=float(error), stddev=float(left)))
+    known = measured - lever * scale.error
+    (y, spread, misfit), change, left = _fit_shape(places, model.relief, beforehand, known, stddev, lever)
+    scale = DepthScale(error=float(scale.error + change), stddev=float(left))
+    return SideFit(y=y, stddev=spread, misfit=misfit, scale=scale)
 
 
 @njit(**_OPTIONS)
-def _fit_shape(places, relief, beforehand, measured, stddev, lever, error):
-    """Return y, stddev and misfit (3, K + 1), and the scale's error and its stddev; see `fit_side`.
+def _fit_shape(places, relief, beforehand, known, stddev, lever):
+    """Return y, stddev and misfit (3, K + 1), and the change of the scale's error and its stddev; see `fit_side`.
 
     Args:
         places: (K + 1, 2) x and z at rest [m], the reference point last.
         relief: of single key points [m].
         beforehand: (5,) standard deviations of offset, tilts, bow and scale.
-        measured: (K + 1,) [m], NaN without depth.
+        known: (K + 1,) measured y, at the scale so far [m], NaN without depth.
         stddev: (K + 1,) [m].
         lever: (K + 1,) [m].
-        error: of the scale, so far.
     """
-    count = len(measured)
-    seen, noise, own = np.isfinite(measured), np.ones(count), np.zeros(count)
-    rows, known, left = np.zeros((count, 5)), measured - lever * error, np.full(count, np.nan)
+    count = len(known)
+    seen, noise, own = np.isfinite(known), np.ones(count), np.zeros(count)
+    rows, left = np.zeros((count, 5)), np.full(count, np.nan)
     own[:-1] = relief**2
     rows[:-1, 0], rows[:-1, 1], rows[:-1, 2], rows[:-1, 3] = 1.0, places[:-1, 0], places[:-1, 1], places[:-1, 1] ** 2
     rows[:, 4] = lever
@@ -362,7 +361,7 @@ def _fit_shape(places, relief, beforehand, measured, stddev, lever, error):
         found[1, i] = np.sqrt((spread * (covariance * spread).sum(axis=1)).sum() + (1.0 - share) * own[i])
         if seen[i]:
             found[2, i] = left[i] / np.sqrt(own[i] + variance[i])
-    return found, error + theta[4], np.sqrt(covariance[4, 4])
+    return found, theta[4], np.sqrt(covariance[4, 4])
 
 
 @njit(**_OPTIONS)

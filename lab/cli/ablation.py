@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 
 from finforce_eval.cli.parser import CommandResult
-from finforce_eval.errors import OptionError
 from finforce_eval.machine import describe_machine
-from lab.ablation.rules import RULES, Rule
+from lab.ablation.rules import RULES
 from lab.ablation.run import ablate
-from lab.harness import figures_json, format_figures
+from lab.harness import choose_names, figures_json, format_figures
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -23,23 +21,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--calibration", default="bench", metavar="FILE", help=text)
 
 
-def choose_rules(names: str | None) -> Sequence[Rule]:
-    """Return the rules of a list, all without one.
-
-    Raises:
-        OptionError: a name is not known.
-    """
-    known = {rule.name: rule for rule in RULES}
-    chosen = [name.strip() for name in names.split(";")] if names else list(known)
-    for name in chosen:
-        if name not in known:
-            raise OptionError(f"--rules {name}: expected some of {'; '.join(known)}")
-    return [known[name] for name in chosen]
-
-
 def run(options: argparse.Namespace) -> CommandResult:
     """Switch off the rules, print the table."""
-    rules, machine = choose_rules(options.rules), describe_machine()
+    known, machine = {rule.name: rule for rule in RULES}, describe_machine()
+    rules = [known[name] for name in choose_names("--rules", options.rules, known, ";")]
     print(f"{machine['processor']}, {machine['commit']}")
     figures = ablate(rules, options.recordings, options.calibration)
     print(format_figures(figures))

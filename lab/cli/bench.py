@@ -11,7 +11,7 @@ from typing import Any
 from finforce.errors import FinforceError
 from finforce_eval.cli.parser import CommandResult, picture_file
 from finforce_eval.machine import describe_machine, write_figures
-from lab.harness import PARTS, figures_json, format_figures, select_parts
+from lab.harness import PARTS, choose_names, figures_json, format_figures
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -26,7 +26,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> CommandResult:
     """Measure the parts and print each one's tables."""
     machine, content = describe_machine(), {}
-    for part in select_parts(options.parts):
+    for part in choose_names("--parts", options.parts, PARTS):
         content[part] = _run_part(part, options.quick, options.figure)
         if options.json:  # what comes next may fail
             write_figures(options.json, content)

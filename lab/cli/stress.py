@@ -11,8 +11,8 @@ from typing import Any
 from tqdm import tqdm
 
 from finforce_eval.cli.parser import MESHES, SOLVERS, CommandResult, whole_number
-from finforce_eval.errors import OptionError
 from finforce_eval.machine import describe_machine
+from lab.harness import choose_names
 from lab.stress import friction, inputs, objects
 from lab.stress.stress import (
     AXES,
@@ -49,19 +49,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--solver", default="default", choices=SOLVERS, help="mechanics of the solver")
     parser.add_argument("--mesh", default="default", choices=MESHES, help="mesh density")
     parser.add_argument("--jaw", default="bench", metavar="FILE", help="jaw file, or name of an included jaw (bench)")
-
-
-def choose_families(names: str | None) -> list[Family]:
-    """Return the families of a comma-separated list, all without one.
-
-    Raises:
-        OptionError: A name is not known.
-    """
-    chosen = list(FAMILIES) if not names else [name.strip() for name in names.split(",")]
-    for name in chosen:
-        if name not in FAMILIES:
-            raise OptionError(f"--families {name}: expected one of {', '.join(FAMILIES)}")
-    return [FAMILIES[name] for name in chosen]
 
 
 def run_families(families: Sequence[Family], plan: Plan) -> dict[str, list[Trial]]:
@@ -108,7 +95,7 @@ def run(options: argparse.Namespace) -> CommandResult:
     Returns:
         The figures, and status 0; 1 when a rule is broken by a family that it is asked of, or by one of its levels.
     """
-    families = choose_families(options.families)
+    families = [FAMILIES[name] for name in choose_names("--families", options.families, FAMILIES)]
     plan = Plan(seed=options.seed, solver=options.solver, mesh=options.mesh, count=options.count, jaw=options.jaw)
     machine = describe_machine()
     print(f"seed {plan.seed}, jaw {plan.jaw}, solver {plan.solver}, {machine['processor']}, {machine['commit']}")

@@ -15,7 +15,7 @@ from finforce_eval.figures.figures import BLACK, BLUE, GREEN, ORANGE
 from finforce_sim.gripper import PressedGrasp
 from finforce_sim.scenarios import build_scenario
 from lab.experiments.experiment import Case, Experiment, RunOptions, draw_panels, tabulate
-from lab.experiments.grasp_world import EstimatorSensor, GraspCase, ImageSensor, NoisySensor, World, build_plant
+from lab.experiments.grasp_world import EstimatorSensor, GraspCase, ImageSensor, NoisySensor, Plant, World
 from lab.harness import Figures
 
 BEARS = 5.0  # [N]
@@ -56,7 +56,8 @@ def run(options: RunOptions, case: Case, folder: Path) -> dict[str, Any]:
     """Return the figures of a grasp."""
     way, seed, told, untold = case.settings["way"], case.settings["seed"], [], []
     pressed = _lay(seed)
-    grasp = GraspCase(plant=build_plant(pressed), force=BEARS, speed=SPEED, latency=LATENCY, seed=seed)
+    plant = Plant(force_at=pressed.elastic_force, touch_opening=pressed.touch_opening, terms=pressed.material.terms)
+    grasp = GraspCase(plant=plant, force=BEARS, speed=SPEED, latency=LATENCY, seed=seed)
     if way == "force":
         make = ImageSensor if case.settings["source"] == "images" else EstimatorSensor
         more = {"size": case.settings["size"]} if make is ImageSensor else {}
@@ -141,7 +142,7 @@ def draw_chips(figures: Mapping[str, Mapping[str, Any]]) -> Any:
         axes.axhline(BEARS, color=GREEN, linewidth=0.9, dashes=(4, 2))
         axes.set_xlim(-0.5, 8.0)
 
-    return draw_panels(list(titles), len(titles), "after first touch [s]", "true force [N]", draw)
+    return draw_panels(list(titles), len(titles), "true force [N]", draw)
 
 
 CHIP = Experiment(

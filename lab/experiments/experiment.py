@@ -87,9 +87,9 @@ class RunOptions:
         made = {"scene": scene, "changes": dict(changes), "seed": self.seed + number, "size": self.size}
         return Case(name=name, settings=self.shared | made | more)
 
-    def bag_cases(self, needed: Sequence[str] = SIDES) -> list[Case]:
+    def bag_cases(self) -> list[Case]:
         """Return the recordings of one's own as cases; see `read_bags`."""
-        return [case for case, _ in self.read_bags(needed)]
+        return [case for case, _ in self.read_bags()]
 
     def read_bags(self, needed: Sequence[str] = SIDES) -> list[tuple[Case, Recording]]:
         """Return the recordings of one's own, each as a case and as it was read.
@@ -297,13 +297,12 @@ def _write_page(experiment: Experiment, findings: Figures, cases: int, failed: M
     return "\n".join(lines) + "\n"
 
 
-def draw_panels(titles: Sequence[str], columns: int, across: str, up: str, draw: Callable[[Any, str], None]) -> Any:
-    """Return a figure with a panel for each title, `columns` side by side.
+def draw_panels(titles: Sequence[str], columns: int, up: str, draw: Callable[[Any, str], None]) -> Any:
+    """Return a figure with a panel over time for each title, `columns` side by side.
 
     Args:
         titles: of the panels.
         columns: panels in a row.
-        across: label of the lowest panels' axes.
         up: label of the first panels' axes.
         draw: draws into the axes of a title.
     """
@@ -319,5 +318,5 @@ def draw_panels(titles: Sequence[str], columns: int, across: str, up: str, draw:
     for axes in grid[:, 0]:
         axes.set_ylabel(up)
     for axes in grid[-1]:
-        axes.set_xlabel(across)
+        axes.set_xlabel("after first touch [s]")
     return figure

@@ -195,7 +195,7 @@ def draw_grasps(figures: Mapping[str, Mapping[str, Any]]) -> Any:
 
     shapes, places = (list(dict.fromkeys(row[key] for row in figures.values())) for key in ("object", "place"))
     titles = [f"{shape}, {place}" for shape, place in product(shapes, places)]
-    return draw_panels(titles, len(places), "after first touch [s]", "grasp force [N]", draw)
+    return draw_panels(titles, len(places), "grasp force [N]", draw)
 
 
 GRASP = Experiment(

@@ -238,11 +238,6 @@ class World:
         return now > self.trace.held_at + self._holding
 
 
-def build_plant(pressed: PressedGrasp) -> Plant:
-    """Return the twin's fingers as a plant."""
-    return Plant(force_at=pressed.elastic_force, touch_opening=pressed.touch_opening, terms=pressed.material.terms)
-
-
 def observe_found(stamp: float, keypoints: JawKeypoints) -> Observation:
     """Return what a solver is told of found key points: of those that are not valid no place."""
     points = np.where(keypoints.valid[:, None], keypoints.points, np.nan)

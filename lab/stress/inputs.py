@@ -54,9 +54,7 @@ def press_family(
             return
         settings = list(levels(bench).items())
         for seed in range(plan.share(rounds * len(settings))):
-            level, setting = settings[
-                (seed + plan.seed) % len(settings)
-            ]  # a few trials of another seed see other levels
+            level, setting = settings[(seed + plan.seed) % len(settings)]  # few trials of another seed see others
             session = open_session(bench, plan.random(name, seed), tare=tare(setting), level=level)
             yield from session.play(seed, disturb(session, setting))
 

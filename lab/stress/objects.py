@@ -52,7 +52,7 @@ def press_scene(bench: Bench, scene: HardScene) -> list[PressedImage]:
     c, s = np.cos(scene.tilt), np.sin(scene.tilt)
     R, jaw, surface = np.array([[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]]), bench.jaw, bench.mechanics.contact.surface
     height = bench.find_height(scene.height)
-    polygons = cut_outline(scene.mesh, R, float(surface.high[0]), scene.across)
+    polygons = cut_outline(scene.mesh, R, float(surface.high[0]), 0.0)
     try:
         rigid = RigidOutline(polygons, float(surface.high[1]))
     except ContactError:
@@ -69,7 +69,7 @@ def press_scene(bench: Bench, scene: HardScene) -> list[PressedImage]:
         T[:3, :3] = R
         flat = jaw.inner_face_x - leading - depth
         x = flat if rigid is None else rigid.find_origin(jaw.inner_face_x, depth, height)
-        T[:3, 3] = x, scene.across, height
+        T[:3, 3] = x, 0.0, height
         frames.append(_frame_of(bench, T, presses.get(depth)))
     return frames
 
@@ -161,7 +161,6 @@ class HardScene:
         height: of its origin along the jaw [m].
         tilt: its turn from x to z [rad].
         depth: of the press below the undeformed surface [m]; negative: it stays away.
-        across: of its origin along the width [m].
         is_impossible: True if no press is like this: the jaw stays at rest, whatever the poses say.
     """
 
@@ -170,7 +169,6 @@ class HardScene:
     height: float = 0.04
     tilt: float = 0.0
     depth: float = 3e-3
-    across: float = 0.0
     is_impossible: bool = False
 
 

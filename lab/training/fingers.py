@@ -89,7 +89,7 @@ def _try_finger(rng: np.random.Generator) -> Finger | None:
     solid = length * rng.uniform(0.86, 0.97)
     tip = rng.uniform(2.0, 8.0) * 1e-3 * scale * (1.0 if not steel else 0.4)
     front, back = _draw_bands(rng, length, base, tip, scale, steel)
-    ribs = _draw_ribs(rng, front, back, clamped, solid, scale, steel)
+    ribs = _draw_ribs(rng, (front, back), (clamped, solid), scale, steel)
     if ribs is None:
         return None
     polygon = _draw_section(rng, (front, back, *ribs), base, (clamped, solid), scale, steel)
@@ -172,9 +172,10 @@ def _draw_section(
 
 
 def _draw_ribs(
-    rng: np.random.Generator, front: Member, back: Member, low: float, high: float, scale: float, steel: bool
+    rng: np.random.Generator, bands: tuple[Member, Member], ends: tuple[float, float], scale: float, steel: bool
 ) -> list[Member] | None:
     """Return ribs between two bands, from a height to another; None when they cross or crowd."""
+    (front, back), (low, high) = bands, ends
     length = front.line[-1, 1]
     count = int(rng.integers(3, 7 if steel else 21))
     thickness = (rng.uniform(0.5, 1.9) * 1e-3 * scale) if not steel else rng.uniform(2.0, 6.0) * 1e-3

@@ -108,7 +108,7 @@ def find_ends(path: Path) -> list[str]:
 
 def _record_inputs(folder: Path, pictures: FingerPictures) -> tuple[list[dict[str, NDArray]], list[dict[str, NDArray]]]:
     """Return what goes into the coarse and the fine part for some of the pictures."""
-    network = _RecordingNetwork(folder, threads=1)
+    network = _RecordingNetwork(folder)
     for row in np.random.default_rng(0).permutation(len(pictures))[:PICTURES]:
         rest = pictures.rest[row, : pictures.keypoints[row]]
         network.locate(pictures.middle[[row]], [network.prepare(pictures.template[pictures.finger[row]], rest)])
@@ -118,8 +118,8 @@ def _record_inputs(folder: Path, pictures: FingerPictures) -> tuple[list[dict[st
 class _RecordingNetwork(SideNetwork):
     """A network that keeps what goes into its parts."""
 
-    def __init__(self, path: Path, threads: int) -> None:
-        super().__init__(path, threads)
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, threads=1)
         self.inputs: tuple[list[dict[str, NDArray]], list[dict[str, NDArray]]] = ([], [])
 
     def _run(self, session, names: tuple[str, ...], inputs: tuple[NDArray, ...]) -> list[NDArray]:

@@ -305,7 +305,9 @@ class FingerScenes:
         rng = self._rng
         look = draw_look(rng, "dim" if rng.random() < (0.5 if held else 0.2) else "any")
         if rng.random() < 0.6:
-            look = replace(look, background=_fill_square(_draw_texture(rng)))
+            texture = np.ascontiguousarray(_draw_texture(rng))  # as large as backgrounds are
+            cv2 = import_cv2()
+            look = replace(look, background=cv2.resize(texture, (384, 384), interpolation=cv2.INTER_AREA))
         if rng.random() < 0.15:  # light that does not come from single lamps
             look = replace(look, lights=look.lights[1:], ambient=look.ambient * 2.0)
         R = R_CAMERA_JAW
@@ -401,11 +403,6 @@ def _mirror(body: Body, middle: float) -> Body:
 def _load_objects() -> list:
     """Return the meshes of household things."""
     return [build_object(name) for name in OBJECT_NAMES]
-
-
-def _fill_square(image: NDArray) -> NDArray:
-    """Return a picture (384, 384, 3), as large as backgrounds are."""
-    return import_cv2().resize(np.ascontiguousarray(image), (384, 384), interpolation=import_cv2().INTER_AREA)
 
 
 def write_shard(seeds: Sequence[int], path: str, held: float = HELD) -> dict[str, int]:

@@ -270,7 +270,8 @@ def test_nobody_waits_for_a_stage_that_takes_longer_than_its_budget(probe, monke
     monkeypatch.setattr(topics, "WATCHED", 3)
     pipeline, order = Pipeline(), []
     source = Relay(pipeline, "source", "", "one", context=probe.context)
-    slow = Relay(pipeline, "slow", "one", context=probe.context, can_wait=True)
+    slow = Relay(pipeline, "slow", "one", context=probe.context)
+    slow.port.can_wait = True
     quick = Relay(pipeline, "quick", "one", context=probe.context)
     for node in (slow, quick):
         node.port.callback = partial(lambda name, message: order.append(name), node.get_name())

@@ -24,6 +24,7 @@ from finforce.errors import FinforceError, ObservationError
 from finforce.health import Level, Report
 from finforce.messages import decode_keypoints, stamp_of
 from finforce.ros import node as ros
+from finforce.ros.messages import MarkerStyle
 from finforce_contact.parameters import ContactParameters, ContactSettings, TrackerSettings
 from finforce_driver.settings import DriverParameters, GraspSettings, GripperSettings
 from finforce_eval.replay.node import PlayerParameters
@@ -91,9 +92,9 @@ def test_a_report_is_a_status_of_its_node():
 
 
 def test_a_marker_without_points_is_deleted():
-    style = {"color": (1.0, 0.0, 0.0, 1.0), "scale": (1.0, 1.0, 1.0)}
-    assert ros.points_marker(Header(), "m", "spheres", (), **style).action == Marker.DELETE
-    marker = ros.points_marker(Header(), "m", "arrow", [[0, 0, 0], [0, 0, 1]], **style)
+    look = (1.0, 0.0, 0.0, 1.0), (1.0, 1.0, 1.0)
+    assert ros.points_marker(Header(), "m", MarkerStyle("spheres", *look), ()).action == Marker.DELETE
+    marker = ros.points_marker(Header(), "m", MarkerStyle("arrow", *look), [[0, 0, 0], [0, 0, 1]])
     assert (marker.action, marker.type, marker.points[1].z) == (Marker.ADD, Marker.ARROW, 1.0)
 
 

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from finforce_eval.evaluation.forces import check_keypoint_count, check_solved, find_forces
+from finforce_eval.evaluation.forces import ImageRun, check_keypoint_count, check_solved, find_forces
 from finforce_eval.recordings.tracks import JawTrack, KeypointTrack, PoseTrack, Recording, WrenchTrack, parse_phases
 from finforce_ifea.errors import ContactError
 from finforce_ifea.jaw.section import FaceLine
@@ -293,7 +293,7 @@ def evaluate_recording(recording, jaw, source, estimator, side="left"):
     """The forces on one jaw of a recording with ground truth, by an estimator and a contact that a test gives."""
     recording.truth(side)
     check_keypoint_count(recording, side, jaw)
-    result = find_forces(recording, jaw, source, estimator, side)
+    result = find_forces(recording, jaw, source, estimator, side, ImageRun(strict=True))
     check_solved(result, recording)
     return result
 

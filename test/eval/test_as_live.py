@@ -16,7 +16,7 @@ from finforce_contact.loop import GivenContact
 from finforce_eval.cli.main import parse
 from finforce_eval.cli.twin import write_footage
 from finforce_eval.evaluation.contact_source import RecordedContact
-from finforce_eval.evaluation.forces import find_forces
+from finforce_eval.evaluation.forces import ImageRun, find_forces
 from finforce_eval.evaluation.keypoint_source import detect_keypoints, parse_source
 from finforce_eval.evaluation.setup import make_setup
 from finforce_eval.recordings.objects import ObjectTrack
@@ -63,10 +63,10 @@ def test_images_that_the_solver_passes_over_have_no_row(probe):
     recording = make_recording(phases=False)
     recording = replace(recording, jaws={"left": replace(recording.jaw("left"), keypoints=keypoints, truth=None)})
     jaw, source = FakeJaw(keypoints=KEYPOINTS), GivenContact(CONTACT)
-    found = find_forces(recording, jaw, source, IdleAt(first, idle), as_live=True)
+    found = find_forces(recording, jaw, source, IdleAt(first, idle), "left", ImageRun(strict=True, as_live=True))
     assert found.stamps_ns.tolist() == live
     assert len(live) < 14 and found.solved.all()
-    assert len(find_forces(recording, jaw, source, IdleAt(first, idle))) == 18
+    assert len(find_forces(recording, jaw, source, IdleAt(first, idle), "left", ImageRun(strict=True))) == 18
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from finforce_eval.cli.main import main
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.batch import read_evaluations
 from finforce_eval.evaluation.scoring import score_results, true_range
-from finforce_eval.figures.report import describe_series, write_html, write_page
+from finforce_eval.figures.report import PageHead, describe_series, write_html, write_page
 from finforce_eval.recordings.writer import write_recording
 from finforce_eval.table import ForceSeries, read_table, write_table
 
@@ -72,7 +72,7 @@ def window(canvas):
 
 
 def test_plots_zoom_move_and_say_what_was_found(browser, tmp_path):
-    page_file = write_html([make_course(), make_course("other", truth=False)], tmp_path / "r.html", title="T", about={})
+    page_file = write_html([make_course(), make_course("other", truth=False)], tmp_path / "r.html", PageHead("T", {}))
     page, asked, said = look_at(browser, page_file)
     assert page.title() == "T" and page.locator("canvas").count() == 2
     canvas = page.locator("#case0 canvas")
@@ -109,7 +109,7 @@ def test_plots_zoom_move_and_say_what_was_found(browser, tmp_path):
 
 def test_numbers_arrive_as_they_are(browser, tmp_path):
     course = make_course(count=7)
-    page, *_ = look_at(browser, write_html([course], tmp_path / "r.html", title="T", about={"jaw": "bench"}))
+    page, *_ = look_at(browser, write_html([course], tmp_path / "r.html", PageHead("T", {"jaw": "bench"})))
     found = np.array([np.nan if v is None else v for v in page.evaluate("Array.from(plots[0].x)")], dtype=float)
     assert np.allclose(found, course.force[:, 0].astype(np.float32), equal_nan=True)
     phases = np.where(course.scored, np.where(course.column("direction") == "unload", 2, 1), 0)
@@ -120,7 +120,7 @@ def test_numbers_arrive_as_they_are(browser, tmp_path):
 
 def test_names_are_words_never_markup(browser, tmp_path):
     courses = [make_course(EVIL).with_columns(status=np.full(600, EVIL))]
-    page, asked, said = look_at(browser, write_html(courses, tmp_path / "r.html", title=EVIL, about={EVIL: EVIL}))
+    page, asked, said = look_at(browser, write_html(courses, tmp_path / "r.html", PageHead(EVIL, {EVIL: EVIL})))
     assert page.title() == EVIL and page.locator("img").count() == 0
     assert page.locator("#table tbody a").inner_text() == EVIL
     assert len(asked) == 1 and said == []
@@ -131,7 +131,7 @@ def test_a_click_on_a_head_sorts(browser, tmp_path):
     rows = [["b", "10"], ["a", "9"], ["c", "-"]]
     courses = [make_course(name) for name in "bac"]
     page, *_ = look_at(
-        browser, write_html(courses, tmp_path / "r.html", title="T", about={}, columns=["case", "n"], rows=rows)
+        browser, write_html(courses, tmp_path / "r.html", PageHead("T", {}), columns=["case", "n"], rows=rows)
     )
 
     def names():
@@ -155,7 +155,7 @@ def evaluated(name="pressed"):
 def test_the_page_of_an_evaluation_has_its_scores(browser, tmp_path):
     recording, result = evaluated()
     evaluation = score_results([result], [recording])
-    page, asked, said = look_at(browser, write_page(evaluation, tmp_path / "r.html", about={}, title="T"))
+    page, asked, said = look_at(browser, write_page(evaluation, tmp_path / "r.html", PageHead("T", {})))
     assert page.locator("#table tbody tr").count() == 2
     assert f"{evaluation.total.all.bias_N:.2f}" in page.locator("#table tbody").inner_text()
     assert said == [] and len(asked) == 1

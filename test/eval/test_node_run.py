@@ -12,7 +12,7 @@ from finforce_eval.replay.playback import RawMessage
 from finforce_eval.replay.process_group import ProcessError
 from lab.bench.chain import SyntheticStream
 
-TOPIC = "/left/jaw_pose"
+TOPIC = "/left/keypoints"
 
 LISTENER = """
 import sys
@@ -60,7 +60,7 @@ def test_a_busy_machine_is_said_and_a_quiet_one_too():
 
 def test_a_listener_is_played_to_measured_and_ended():
     pytest.importorskip("rclpy")
-    run = run_nodes([Listener()], make_film(30), ("left",), [TOPIC])
+    run = run_nodes([Listener()], make_film(30), ("left",))
     assert 0.0 <= run.cpu["listener"] < 200.0
     assert 20e6 < run.memory["listener"] < 400e6  # a Python with rclpy
     assert run.others >= 0.0
@@ -70,4 +70,4 @@ def test_a_process_that_ends_early_is_said_with_its_last_words():
     pytest.importorskip("rclpy")
     broken = Listener("no_such_msgs/msg/Nothing")
     with pytest.raises(ProcessError, match="no_such_msgs"):
-        run_nodes([broken], make_film(3), ("left",), [TOPIC])
+        run_nodes([broken], make_film(3), ("left",))

@@ -18,7 +18,7 @@ from finforce_eval.cli.main import main
 from finforce_eval.cli.twin import footage_entries, write_footage
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.comparison import compare_evaluations
-from finforce_eval.evaluation.forces import check_solved, find_forces, why_unanswered
+from finforce_eval.evaluation.forces import ImageRun, check_solved, find_forces, why_unanswered
 from finforce_eval.evaluation.keypoint_source import detect_keypoints
 from finforce_eval.recordings.dataset import open_dataset, read_parquet
 from finforce_eval.recordings.images import ImageChoice
@@ -50,7 +50,7 @@ def test_a_jaw_that_is_never_seen_has_no_force_and_the_other_keeps_its_own(tmp_p
     left, right = (found.jaws[side].keypoints for side in ("left", "right"))
     assert right.points.shape == left.points.shape and np.isnan(right.points).all() and not right.likelihood.any()
     assert "the right jaw is in none of the images" in found.notes
-    series = find_forces(found, None, GivenContact(None), FakeEstimator([]), "right")
+    series = find_forces(found, None, GivenContact(None), FakeEstimator([]), "right", ImageRun(strict=True))
     assert len(series) == 12 and not series.solved.any()
     assert set(series.column("status")) == {"not found"} and "none of the images" in series.column("message")[0]
 
@@ -74,7 +74,7 @@ class TaringEstimator(FakeEstimator):
 def test_pictures_too_few_for_a_tare_are_told_to_be_taken_as_stills(estimator, hinted):
     recording = make_recording(phases=False)
     forces = [None] * len(recording.jaw("left").keypoints.stamps_ns)
-    series = find_forces(recording, FakeJaw(), GivenContact(None), estimator(forces), "left")
+    series = find_forces(recording, FakeJaw(), GivenContact(None), estimator(forces), "left", ImageRun(strict=True))
     assert ("--stills" in why_unanswered([series])) == hinted
 
 

@@ -17,7 +17,7 @@ from finforce_eval.annotation import video
 from finforce_eval.cli.main import main
 from finforce_eval.errors import DamagedError, OptionError, RecordingError
 from finforce_eval.evaluation import unseen
-from finforce_eval.evaluation.forces import STILL_UPDATES, find_forces, share_reached
+from finforce_eval.evaluation.forces import STILL_UPDATES, ImageRun, find_forces, share_reached
 from finforce_eval.evaluation.keypoint_source import detect_keypoints
 from finforce_eval.recordings import frames
 from finforce_eval.recordings.frames import FrameImages, read_picture
@@ -195,9 +195,8 @@ def test_nothing_of_one_still_is_known_in_the_next():
             return super().update(observation, contact)
 
     forces = [(-float(n), 0.0, 0.0) for n in range(STILL_UPDATES)]
-    found = find_forces(
-        recording, FakeJaw(keypoints=np.zeros((4, 3))), GivenContact(None), Watched(forces), stills=True
-    )
+    jaw, how = FakeJaw(keypoints=np.zeros((4, 3))), ImageRun(strict=True, stills=True)
+    found = find_forces(recording, jaw, GivenContact(None), Watched(forces), "left", how)
     assert [number for number, _ in seen] == 4 * list(range(STILL_UPDATES))  # each begins anew
     np.testing.assert_allclose(found.magnitude, STILL_UPDATES - 1)  # and settles
     times = np.array([stamp for _, stamp in seen]).reshape(4, -1)

@@ -1,5 +1,6 @@
 """Claims about `finforce view`: the file holds pictures, jaws and forces as they were found, at their times."""
 
+from dataclasses import replace
 from importlib.util import find_spec
 from types import SimpleNamespace
 
@@ -24,16 +25,16 @@ def scene(tmp_path_factory):
     file = tmp_path_factory.mktemp("view") / "grasp.rrd"
     shapes, found = {"left": [], "right": []}, {}
 
-    def estimate(recording, setup, *, watch, **options):
+    def estimate(recording, setup, *, run):
         def see(side, stamp, estimator):
             shapes[side].append(np.array(estimator.surface()))
-            watch(side, stamp, estimator)
+            run.watch(side, stamp, estimator)
 
-        found.update(estimate_forces(recording, setup, watch=see, **options))
+        found.update(estimate_forces(recording, setup, run=replace(run, watch=see)))
         return found
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(view, "estimate_forces", estimate)
+        patch.setattr(view, "estimate_shown", estimate)
         assert main(["view", str(source), "--save", str(file), "--from", "images", "--calibration", "twin"]) == 0
     chunk, rows = pytest.importorskip("rerun.chunk"), {}
     for piece in chunk.RrdReader(str(file)).stream().to_chunks():

@@ -131,7 +131,7 @@ def test_a_floor_and_a_slot_are_named_with_their_place(tmp_path, surface):
         with pytest.raises(JawFileError, match=f"have another section.*{word}"):
             read_mesh(tmp_path, mesh)
     with pytest.raises(JawFileError, match="its usual section is drawn in"):
-        make_jaw(tmp_path / "finger.stl", tmp_path / "out" / "jaw.yaml", name="slotted", overrides=Overrides())
+        make_jaw(tmp_path / "finger.stl", tmp_path / "out" / "jaw.yaml", Overrides(name="slotted"))
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["jaw.png"]
 
 
@@ -154,7 +154,7 @@ def test_a_fork_in_the_base_is_held(tmp_path, surface, top):
 def test_a_fork_that_reaches_beside_cells_is_refused(tmp_path, surface):
     cut_fork(surface, 22.0).export(tmp_path / "finger.stl")
     with pytest.raises(JawFileError, match="is not prismatic along.*have another section.*section is drawn in"):
-        make_jaw(tmp_path / "finger.stl", tmp_path / "jaw.yaml", name="fork", overrides=Overrides())
+        make_jaw(tmp_path / "finger.stl", tmp_path / "jaw.yaml", Overrides(name="fork"))
 
 
 def test_a_fork_across_half_of_the_base_leaves_its_whole_edge(tmp_path, surface):
@@ -188,7 +188,7 @@ def test_ribs_in_two_layers_are_refused_however_the_finger_is_turned(tmp_path, t
     mesh.apply_transform(frame)
     mesh.export(tmp_path / "finger.stl")
     with pytest.raises(JawFileError, match="have another section"):
-        make_jaw(tmp_path / "finger.stl", tmp_path / "jaw.yaml", name="layers", overrides=Overrides())
+        make_jaw(tmp_path / "finger.stl", tmp_path / "jaw.yaml", Overrides(name="layers"))
 
 
 def test_a_floor_of_one_cell_is_no_base(tmp_path, surface):
@@ -196,7 +196,7 @@ def test_a_floor_of_one_cell_is_no_base(tmp_path, surface):
     floor = boxes_joined(surface, ((20.0, 1.0, 8.0), [high[0] - 10.5, low[1] + 0.5, low[2] + 18.0]))
     floor.export(tmp_path / "finger.stl")
     with pytest.raises(JawFileError, match="is not prismatic along.*a floor"):
-        make_jaw(tmp_path / "finger.stl", tmp_path / "jaw.yaml", name="floor", overrides=Overrides())
+        make_jaw(tmp_path / "finger.stl", tmp_path / "jaw.yaml", Overrides(name="floor"))
 
 
 def test_marks_raised_on_a_side_are_left_out_and_a_rim_is_refused(tmp_path, surface):
@@ -228,8 +228,8 @@ def test_shells_that_overlap_are_printed_as_one_and_those_that_touch_are_not(tmp
 
 def make_layered(folder, **stated):
     """The jaw of a folder's finger.stl, taken as a solid, and what was found."""
-    options = {"name": "layered", "overrides": Overrides(**stated), "solid": True, "measure_warping": measure_warping}
-    _, notes = make_jaw(folder / "finger.stl", folder / "jaw.yaml", **options)
+    overrides = Overrides(name="layered", solid=True, **stated)
+    _, notes = make_jaw(folder / "finger.stl", folder / "jaw.yaml", overrides, measure_warping=measure_warping)
     return load_jaw(folder / "jaw.yaml"), notes
 
 
@@ -254,7 +254,7 @@ def test_a_solid_that_is_no_prism_is_taken_in_layers(tmp_path, surface, kind):
     # a finger of which one side alone is stiffer twists
     assert jaw.model == ("solid" if kind == "floor" else "plane")
     assert any("layers move apart" in note for note in notes) == (kind == "floor")
-    make_jaw(tmp_path / "jaw.section.json", tmp_path / "again.yaml", name="again", overrides=Overrides())
+    make_jaw(tmp_path / "jaw.section.json", tmp_path / "again.yaml", Overrides(name="again"))
     again = load_jaw(tmp_path / "again.yaml").section
     assert [layer.low for layer in again.layers] == pytest.approx([layer.low for layer in jaw.section.layers], abs=1e-6)
     parted = [
@@ -282,7 +282,7 @@ def test_layers_of_a_section_file_that_are_apart_are_refused(tmp_path):
     file = tmp_path / "apart.json"
     file.write_text(json.dumps({"unit": "mm", "loops": squares[:1], "layers": layers}))
     with pytest.raises(JawFileError, match=r"apart\.json.*2 separate areas"):
-        make_jaw(file, tmp_path / "jaw.yaml", name="apart", overrides=Overrides())
+        make_jaw(file, tmp_path / "jaw.yaml", Overrides(name="apart"))
 
 
 def test_layers_that_are_alike_are_as_stiff_as_one():
@@ -304,7 +304,7 @@ def test_a_finger_without_ribs_is_taken_as_a_solid(tmp_path):
     wedge = shapely.Polygon([(14.0, 0.0), (14.0, 70.0), (10.0, 70.0), (-14.0, 0.0)])
     trimesh.creation.extrude_polygon(wedge, WIDTH).export(tmp_path / "finger.stl")
     with pytest.raises(JawFileError, match="0 cells"):
-        make_jaw(tmp_path / "finger.stl", tmp_path / "jaw.yaml", name="wedge", overrides=Overrides())
+        make_jaw(tmp_path / "finger.stl", tmp_path / "jaw.yaml", Overrides(name="wedge"))
     jaw, _ = make_layered(tmp_path)
     assert jaw.section.polygon.area == pytest.approx(wedge.area * MILLIMETRE**2, rel=1e-3)
     assert len(jaw.keypoints) > 10
@@ -333,7 +333,7 @@ def test_ribs_that_cross_are_taken_as_a_solid(tmp_path):
             polygon = polygon.union(rib.intersection(shapely.Polygon(polygon.exterior)))
     trimesh.creation.extrude_polygon(polygon, WIDTH).export(tmp_path / "finger.stl")
     with pytest.raises(JawFileError, match="ribs cross next to its cells .*take a closed solid as it is"):
-        make_jaw(tmp_path / "finger.stl", tmp_path / "jaw.yaml", name="lattice", overrides=Overrides())
+        make_jaw(tmp_path / "finger.stl", tmp_path / "jaw.yaml", Overrides(name="lattice"))
     jaw, notes = make_layered(tmp_path)
     assert "no ribs found: key points stand at even heights, as if there were some" in notes
     assert jaw.section.polygon.area == pytest.approx(polygon.area * MILLIMETRE**2, rel=1e-3)
@@ -646,7 +646,7 @@ def test_a_finger_with_its_holder_is_refused_with_a_picture_and_taken_as_a_solid
     held = trimesh.boolean.union([boxes_joined(surface, *plates, *sides), bridge], engine="manifold")
     held.export(tmp_path / "finger.stl")
     with pytest.raises(JawFileError, match=r"not prismatic.*--solid.*export the finger alone.*drawn in .*jaw\.png"):
-        make_jaw(tmp_path / "finger.stl", tmp_path / "jaw.yaml", name="held", overrides=Overrides())
+        make_jaw(tmp_path / "finger.stl", tmp_path / "jaw.yaml", Overrides(name="held"))
     assert (tmp_path / "jaw.png").exists()
     raw = read_section(tmp_path / "finger.stl", layered=True)
     finger = recognize(raw.polygon, raw.width, Overrides())
@@ -945,7 +945,7 @@ def test_candidates_end_where_a_flat_inner_face_does(tmp_path):
         room = room.difference(shapely.box(-50.0, z, 50.0, z + 1.0))
     loops = [ring.tolist() for ring in order_rings(outline.difference(room))]
     (tmp_path / "notch.json").write_text(json.dumps({"unit": "mm", "width": 12, "loops": loops}))
-    make_jaw(tmp_path / "notch.json", tmp_path / "jaw.yaml", name="notch", overrides=Overrides())
+    make_jaw(tmp_path / "notch.json", tmp_path / "jaw.yaml", Overrides(name="notch"))
     jaw = load_jaw(tmp_path / "jaw.yaml")
     assert shapely.distance(jaw.section.polygon.exterior, shapely.points(jaw.candidates[:, [0, 2]])).max() < 1e-4
     assert 38e-3 < jaw.candidates[:, 2].max() < 44e-3

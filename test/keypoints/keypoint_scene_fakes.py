@@ -437,3 +437,8 @@ def build(view="robot", bend=None, rng=None, **settings):
     pixel_detector = FakePixelDetector(scene.pixels(), rng)
     detector = KeypointDetector(pixel_detector, scene.jaws, scene.T_gripper_camera, DetectorSettings(**settings))
     return scene, depth, pixel_detector, detector
+
+
+def lost_sides(detector):
+    """The jaws that a detector has to look for everywhere."""
+    return tuple(side for side, jaw in detector._jaws.items() if jaw.is_lost)

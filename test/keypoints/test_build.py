@@ -4,7 +4,7 @@ from dataclasses import replace
 from hashlib import sha256
 
 import pytest
-from keypoint_scene_fakes import Fake, small_jaws, write_model
+from keypoint_scene_fakes import Fake, lost_sides, small_jaws, write_model
 
 from finforce_keypoints.build import build_detector, build_pixel_detector, choose_network
 from finforce_keypoints.detector import KeypointDetector
@@ -99,6 +99,6 @@ def test_the_detector_has_the_jaws_and_the_camera_of_the_parameters():
         detection_method="dots", jaws="right", T_gripper_camera=(0.0, 0.0, -0.1, 0.0, 0.0, 0.0, 1.0)
     )
     built = build_detector(load_jaws(parameters), parameters)
-    assert isinstance(built, KeypointDetector) and built.lost_sides == ("right",)
+    assert isinstance(built, KeypointDetector) and lost_sides(built) == ("right",)
     with pytest.raises(GeometryError):
         build_detector({"left": load_jaws(parameters)["right"]}, parameters)

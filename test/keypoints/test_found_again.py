@@ -4,7 +4,7 @@ import numpy as np
 import onnx
 import pytest
 import yaml
-from keypoint_scene_fakes import Fake, sidecar
+from keypoint_scene_fakes import Fake, lost_sides, sidecar
 from onnx import TensorProto, helper, numpy_helper
 
 from finforce.camera import project
@@ -119,7 +119,7 @@ def test_jaws_that_were_lost_for_a_second_and_a_half_are_found_again(scene, tmp_
         has_jaws = not 3 <= number < 50
         found = detector.detect(picture(scene, number, has_jaws))
         assert has_jaws or not any(keypoints.valid.any() for keypoints in found.values())
-        assert number != 49 or set(detector.lost_sides) == {"left", "right"}
+        assert number != 49 or set(lost_sides(detector)) == {"left", "right"}
     for side, true in pixels.items():
         error = np.linalg.norm(found[side].pixels - true[:-1], axis=1)
         assert found[side].valid.all() and error.max() < STRIDE  # px

@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from keypoint_scene_fakes import CAMERA, Bend, FakePixelDetector, bare_image, build, scene_of
+from keypoint_scene_fakes import CAMERA, Bend, FakePixelDetector, bare_image, build, lost_sides, scene_of
 
 from finforce.camera import ImageError, compute_rays
 from finforce.gripper_frames import jaw_in_camera
@@ -43,7 +43,7 @@ def test_points_are_found_to_a_fraction_of_a_millimetre_whatever_the_depth_scale
 def test_the_jaws_are_where_they_are_and_their_names_are_sides():
     scene, depth, _, detector = build()
     found = detector.detect(scene.image(0.0, np.random.default_rng(0), depth=depth))
-    assert set(found) == {"left", "right"} and detector.lost_sides == ()
+    assert set(found) == {"left", "right"} and lost_sides(detector) == ()
     for side, T in scene.poses().items():
         np.testing.assert_allclose(found[side].T_camera_jaw, T, atol=1e-6)
         assert found[side].stamp == 0.0 and found[side].likelihood[found[side].valid].min() == 0.95
@@ -240,7 +240,7 @@ def test_a_lost_jaw_is_absent_looked_for_everywhere_and_found_again():
     for n in range(1, 8):
         found = detector.detect(replace(image, stamp=n / RATE))
         assert set(found) == {"right"}
-    assert detector.lost_sides == ("left",) and pixel_detector.expected[-1]["left"] is None
+    assert lost_sides(detector) == ("left",) and pixel_detector.expected[-1]["left"] is None
     assert pixel_detector.expected[2]["left"] is not None
     pixel_detector.pixels = {"left": seen, **pixel_detector.pixels}
     pixel_detector.likelihood["left"] = np.full(16, 0.95)
@@ -270,12 +270,12 @@ def test_a_jaw_that_no_depth_confirms_is_lost_and_found_again_by_one_that_does()
         found = detector.detect(replace(flat, stamp=n / RATE))
         assert set(found) == ({"left", "right"} if n < 4 else set())
         assert not any(keypoints.valid.any() for keypoints in found.values())
-    assert set(detector.lost_sides) == {"left", "right"} and pixel_detector.expected[-1] == {
+    assert set(lost_sides(detector)) == {"left", "right"} and pixel_detector.expected[-1] == {
         "left": None,
         "right": None,
     }
     found = detector.detect(replace(whole, stamp=0.5))
-    assert set(found) == {"left", "right"} and found["left"].valid.all() and not detector.lost_sides
+    assert set(found) == {"left", "right"} and found["left"].valid.all() and not lost_sides(detector)
     assert set(detector.detect(replace(flat, stamp=0.53))) == {"left", "right"}  # counted anew
 
 
@@ -309,7 +309,7 @@ def test_reset_starts_anew():
     with pytest.raises(ImageOrderError, match="reset"):
         detector.detect(image)
     detector.reset()
-    assert detector.lost_sides == ("left", "right") and not detector.counts
+    assert lost_sides(detector) == ("left", "right") and not detector.counts
     again = detector.detect(image)
     assert pixel_detector.expected[-1]["left"] is None
     np.testing.assert_array_equal(again["left"].points, first["left"].points)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from keypoint_scene_fakes import bare_image, build
+from keypoint_scene_fakes import bare_image, build, lost_sides
 
 from finforce.gripper_frames import jaw_in_camera
 from finforce_keypoints.errors import DetectionError
@@ -18,7 +18,7 @@ def test_a_detector_that_was_warmed_up_has_done_everything_once_and_knows_nothin
     lost, known = pixel_detector.expected[-2:]
     assert lost == {"left": None, "right": None}
     assert np.allclose(known["left"], jaw_in_camera(scene.T_gripper_camera, "left", -0.045))  # of 10 to 80 mm
-    assert detector.lost_sides == ("left", "right") and not detector.counts and not detector.warnings
+    assert lost_sides(detector) == ("left", "right") and not detector.counts and not detector.warnings
     after = detector.detect(image)
     for side in before:
         np.testing.assert_array_equal(after[side].points, before[side].points)

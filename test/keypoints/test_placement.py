@@ -32,8 +32,8 @@ from finforce_keypoints.placement import (
     OUTLINE_STDDEV,
     CameraPlacement,
     OutlineContrast,
+    PlacementTask,
     _Refinement,
-    _Task,
     _widen_stddev,
     compare_poses,
     find_covered,
@@ -347,20 +347,21 @@ def test_a_stated_opening_is_kept_and_a_picture_without_jaws_refused(monkeypatch
             )
 
     poses = {side: jaw_in_camera(ROBOT_CAMERA, side, x) for side, x in (("left", -0.045), ("right", 0.045))}
-    found = find_placement([paint(poses, jaws)], CAMERA, jaws, Dreamer(), ROBOT_CAMERA)
+    seen = PlacementTask(images=[paint(poses, jaws)], camera=CAMERA, jaws=jaws, locator=Dreamer())
+    found = find_placement(seen, ROBOT_CAMERA)
     assert found.contrast > 0.8 and not any(mount.covered for mount in found.mounts.values())
-    told = find_placement([paint(poses, jaws)], CAMERA, jaws, Dreamer(), ROBOT_CAMERA, opening=0.0616)
+    told = find_placement(replace(seen, opening=0.0616), ROBOT_CAMERA)
     assert all(told.mounts[side].stddev[1] < found.mounts[side].stddev[1] for side in jaws)
     apart = told.origins["right"][0] - told.origins["left"][0]
     assert apart == pytest.approx(0.0616 + 2 * jaws["left"].inner_face_x, abs=1e-9)
     blank = np.random.default_rng(0).integers(0, 255, (480, 640, 3), dtype=np.uint8)
     with pytest.raises(GeometryError, match="do not show the finger .* finforce jaw PHOTO"):
-        find_placement([blank], CAMERA, jaws, Dreamer(), ROBOT_CAMERA)
+        find_placement(replace(seen, images=[blank]), ROBOT_CAMERA)
 
 
 def look_for(jaws, images):
     """Return the task of finding jaws in images without a network."""
-    return _Task(images=images, camera=CAMERA, jaws=jaws, locator=None, half_opening=None)
+    return PlacementTask(images=images, camera=CAMERA, jaws=jaws, locator=None)
 
 
 @pytest.mark.parametrize(("off", "told"), [((40.0,), ""), ((5.0,) * (len(NAMES) + 1), "do not show the finger")])
@@ -381,7 +382,7 @@ def test_without_a_guess_jaws_are_found_unless_their_points_are_off(off, told, m
 
     monkeypatch.setattr(placement, "find_points", find)
     with pytest.raises(GeometryError, match=told) if told else nullcontext():
-        found = find_placement([paint(poses, jaws)], CAMERA, jaws, None)
+        found = find_placement(look_for(jaws, [paint(poses, jaws)]))
         for side, jaw in jaws.items():
             off_place = np.abs(compare_poses(jaw, found.pose(side, 0), poses[side]))
             assert (off_place < (3e-3, 0.03)).all() and (off_place < 3.0 * np.array(found.mounts[side].stddev)).all()

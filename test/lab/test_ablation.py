@@ -8,12 +8,10 @@ from importlib import import_module
 import numpy as np
 import pytest
 
-from finforce_eval.errors import OptionError
 from finforce_ifea.observation import check_contact, check_observation
 from lab.ablation.rules import RULES
 from lab.ablation.run import find_compiled, list_runs, run_child, switch_off
 from lab.ablation.scenes import SCENES, Press, build_scene, film, tell_height
-from lab.cli.ablation import choose_rules
 from lab.stress.session import Bench
 from lab.stress.stress import Plan
 
@@ -62,11 +60,6 @@ def test_a_place_that_is_gone_is_an_error():
     gone = type(rule)(**{**vars(rule), "off": {"finforce_ifea.filter.tracker:_NO_SUCH_RULE": 0}})
     with pytest.raises(AttributeError, match="_NO_SUCH_RULE"), switch_off(gone):
         pass
-
-
-def test_an_unknown_rule_lists_the_known_ones():
-    with pytest.raises(OptionError, match="none such: expected some of Student's t; gross errors"):
-        choose_rules("gross errors; none such")
 
 
 @pytest.fixture(scope="module")

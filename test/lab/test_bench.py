@@ -23,7 +23,7 @@ from finforce_eval.replay.process_group import resident_bytes
 from finforce_ifea.jaw.jaw import load_jaw
 from lab import harness
 from lab.cli import bench
-from lab.harness import PARTS, Figures, percentiles, select_parts
+from lab.harness import PARTS, Figures, choose_names, percentiles
 
 ROOT = Path(__file__).parents[2]
 
@@ -91,12 +91,15 @@ def test_a_process_takes_memory_until_it_has_gone():
     assert resident_bytes(child.pid) == 0
 
 
-def test_all_parts_are_measured_unless_some_are_named(two_parts):
-    assert select_parts(None) == ("first", "second")
-    assert select_parts("second, first,second") == ("second", "first")
-    assert select_parts("second") == ("second",)
-    with pytest.raises(OptionError, match="no part 'third', expected some of first, second"):
-        select_parts("third")
+def test_all_are_chosen_unless_some_are_named():
+    known = {"first": 1, "second": 2}
+    assert choose_names("--parts", None, known) == ("first", "second")
+    assert choose_names("--parts", "second, first,second", known) == ("second", "first")
+    assert choose_names("--rules", "gross errors; first", ["first", "gross errors"], ";") == ("gross errors", "first")
+    with pytest.raises(OptionError, match="--parts third: expected some of first, second"):
+        choose_names("--parts", "third", known)
+    with pytest.raises(OptionError, match="--rules third: expected some of first; second"):
+        choose_names("--rules", "first; third", known, ";")
 
 
 def test_every_listed_part_can_be_measured():
@@ -206,7 +209,29 @@ def measure_pages(monkeypatch, tmp_path):
     return module
 
 
-def test_a_figure_from_before_the_last_release_is_stale(measure_pages, tmp_path):
+def list_stale(known, repository=ROOT):
+    """Return the sources of kept figures that are not of the last release or later; none before the first release."""
+    tag = _ask_git(repository, "describe", "--tags", "--abbrev=0")
+    named = {source: figures["machine"].partition("at commit ")[2] for source, figures in known.items()}
+    commits = {source: text.partition(" ")[0].partition("-dirty")[0] for source, text in named.items()}
+    return [
+        source
+        for source, name in commits.items()
+        if tag and (not name or _ask_git(repository, "merge-base", "--is-ancestor", tag, name) is None)
+    ]
+
+
+def _ask_git(repository, *words):
+    """Return what git says, None where it fails or is absent."""
+    try:
+        return subprocess.run(
+            ["git", *words], cwd=repository, capture_output=True, check=True, text=True
+        ).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
+def test_a_figure_from_before_the_last_release_is_stale(tmp_path):
     def git(*words):
         who = ("git", "-c", "user.name=A", "-c", "user.email=a@b.c")
         done = subprocess.run((*who, *words), cwd=tmp_path, check=True, capture_output=True, text=True)
@@ -216,16 +241,16 @@ def test_a_figure_from_before_the_last_release_is_stale(measure_pages, tmp_path)
     git("commit", "-q", "--allow-empty", "-m", "One")
     old = git("rev-parse", "HEAD")
     known = {"old": {"machine": f"Measured at commit {old} on P."}, "unnamed": {"machine": ""}}
-    assert measure_pages.list_stale(known, tmp_path) == []
+    assert list_stale(known, tmp_path) == []
     git("commit", "-q", "--allow-empty", "-m", "Two")
     git("tag", "-a", "v1", "-m", "v1")
     new = git("rev-parse", "HEAD")
     known["new"] = {"machine": f"Measured at commit {new}-dirty-1a2b on P."}
-    assert measure_pages.list_stale(known, tmp_path) == ["old", "unnamed"]
+    assert list_stale(known, tmp_path) == ["old", "unnamed"]
 
 
 def test_no_page_shows_figures_from_before_the_last_release(measure_pages):
-    assert measure_pages.list_stale(json.loads(measure_pages.FIGURES.read_text(encoding="utf-8"))) == []
+    assert list_stale(json.loads(measure_pages.FIGURES.read_text(encoding="utf-8"))) == []
 
 
 def test_no_part_changes_the_commit_of_the_next_one(measure_pages):

@@ -9,8 +9,7 @@ import pytest
 from eval_fakes import answers, divide, fail_with, family_of, refuse
 
 from finforce_eval.cli.main import main
-from finforce_eval.errors import OptionError
-from lab.cli.stress import FAMILIES, choose_families, list_broken, worst_trials
+from lab.cli.stress import FAMILIES, list_broken, worst_trials
 from lab.stress.stress import (
     Plan,
     Trial,
@@ -187,12 +186,6 @@ def test_a_seed_draws_the_same_and_other_keys_another():
 def test_families_have_names_of_their_own_and_say_what_they_do():
     assert {"subsets", "noise", "gross", "clusters", "jumps", "stamps", "long", "contacts", "forces"} <= set(FAMILIES)
     assert all(family.what and "\n" not in family.what for family in FAMILIES.values())
-
-
-def test_unknown_family_is_refused_with_their_names():
-    with pytest.raises(OptionError, match="expected one of.*noise"):
-        choose_families("nothing")
-    assert [family.name for family in choose_families("noise, gross")] == ["noise", "gross"]
 
 
 @pytest.fixture

@@ -49,15 +49,10 @@ _BELOW = -6e-3
 def make_jaw(
     file: Path,
     output: Path,
-    *,
-    name: str,
-    material: str = "tpu95a",
-    unit: str | None = None,
-    body: int | None = None,
-    width: float | None = None,
     overrides: Overrides,
+    *,
+    material: str = "tpu95a",
     picture: Path | None = None,
-    solid: bool = False,
     measure_warping: Callable[[Jaw], float] | None = None,
 ) -> tuple[list[Path], list[str]]:
     """Read a finger and write the jaw file that describes it; return what was written, and what was found and guessed.
@@ -65,14 +60,9 @@ def make_jaw(
     Args:
         file: the finger, see `read_section`.
         output: the YAML file; its section goes next to it.
-        name: of the finger.
-        material: a name in `MATERIALS`.
-        unit: of the file; None to guess it; of a photograph its scale.
-        body: number of the body among several, from 1.
-        width: along y [m]; needed for drawings and photographs.
         overrides: values stated in place of the guesses.
+        material: a name in `MATERIALS`.
         picture: the PNG file; None for one next to the jaw file.
-        solid: take a closed solid as it is, as layers along its width, whatever its shape.
         measure_warping: returns by what share the stiffness of a layered jaw is off where it is taken as plane;
             None: it is taken so unasked.
 
@@ -80,10 +70,10 @@ def make_jaw(
         JawFileError: The file shows no fin-ray finger; the message says what it shows and what to do.
         MissingDependencyError: An optional reader is not installed.
     """
-    picture = picture or output.with_suffix(".png")
+    picture, name = picture or output.with_suffix(".png"), overrides.name or file.stem
     output.parent.mkdir(parents=True, exist_ok=True)
-    raw = _read_section(file, unit, body, picture, solid)
-    finger, stiffness_error = _find_finger(file, raw, width, overrides, picture)
+    raw = _read_section(file, overrides, picture)
+    finger, stiffness_error = _find_finger(file, raw, overrides, picture)
     reference, place = _choose_reference(finger)
     section = output.with_suffix(".section.json")
     section.write_text(_describe_section(finger, file.name), encoding="utf-8")
@@ -113,10 +103,10 @@ def _write_jaw(output: Path, lines: Sequence[str]) -> Jaw:
     return load_jaw(output)
 
 
-def _read_section(file: Path, unit: str | None, body: int | None, picture: Path, solid: bool) -> RawSection:
+def _read_section(file: Path, overrides: Overrides, picture: Path) -> RawSection:
     """Read the section of a finger; draw the usual one of a solid that has others, too."""
     try:
-        return read_section(file, unit=unit, body=body, layered=solid)
+        return read_section(file, unit=overrides.unit, body=overrides.body, layered=overrides.solid)
     except JawFileError as error:
         if not isinstance(error.__cause__, UnlikeSectionsError):
             raise
@@ -124,15 +114,13 @@ def _read_section(file: Path, unit: str | None, body: int | None, picture: Path,
         raise JawFileError(f"{error} (its usual section is drawn in {picture})") from error
 
 
-def _find_finger(
-    file: Path, raw: RawSection, width: float | None, overrides: Overrides, picture: Path
-) -> tuple[RecognizedFinger, float]:
+def _find_finger(file: Path, raw: RawSection, overrides: Overrides, picture: Path) -> tuple[RecognizedFinger, float]:
     """Return the finger in a section and the relative deviation of its stiffness; draw one that shows none.
 
     Raises:
         JawFileError: The section shows no fin-ray finger, or the file names no width and none is given.
     """
-    width = width or raw.width
+    width = overrides.width or raw.width
     if width is None:
         raise JawFileError(f"{file.name}: a flat file has no width; give it in millimetres: --width 25")
     try:

@@ -148,12 +148,22 @@ class Overrides:
     """Values that a user states in place of the guesses.
 
     Attributes:
+        name: of the finger; empty for that of the file.
+        unit: of the file; None to guess it; of a photograph its scale.
+        body: number of the body among several, from 1.
+        width: along y [m]; needed for drawings and photographs.
+        solid: take a closed solid as it is, as layers along its width, whatever its shape.
         flip: True if the wider end is the tip, where both ends are about as wide; None: not stated.
         other_face: the other side is the inner face.
         clamp_z: height of the clamp [m].
         face_x: x of the inner face [m].
     """
 
+    name: str = ""
+    unit: str | None = None
+    body: int | None = None
+    width: float | None = None
+    solid: bool = False
     flip: bool | None = None
     other_face: bool = False
     clamp_z: float | None = None
