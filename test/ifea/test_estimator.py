@@ -105,17 +105,19 @@ def test_standard_deviation_is_honest():
     assert np.nanmax(np.abs(np.concatenate(ratios))) < 6.0
 
 
-@pytest.mark.parametrize("spread", [0.0, 0.3])
-def test_modulus_that_is_not_known_leaves_the_direction_as_it_is(spread):
+def test_modulus_that_is_not_known_leaves_the_direction_as_it_is():
     """A finger that is a third stiffer gives a third more of the same force."""
-    jaw = replace(BENCH, material=BENCH.material.model_copy(update={"spread": spread}))
-    recording = pressed()
-    estimator = ForceEstimator(jaw, settings=EstimatorSettings(solver="frame", friction=0.0))
-    for observation in recording.observations[: HELD_5 + 10]:
-        solution = estimator.update(observation, recording.contact)
-    along, _, across = solution.force_stddev / np.linalg.norm(solution.force)
-    assert along == pytest.approx(np.hypot(spread, 0.1), abs=0.03)
-    assert across < 0.15
+    recording, across = pressed(), []
+    for spread in (0.0, 0.3):
+        jaw = replace(BENCH, material=BENCH.material.model_copy(update={"spread": spread}))
+        estimator = ForceEstimator(jaw, settings=EstimatorSettings(solver="frame", friction=0.0))
+        for observation in recording.observations[: HELD_5 + 10]:
+            solution = estimator.update(observation, recording.contact)
+        along, _, z = solution.force_stddev / np.linalg.norm(solution.force)
+        assert along == pytest.approx(np.hypot(spread, 0.1), abs=0.03)
+        across.append(z)
+    assert across[1] == pytest.approx(across[0], abs=0.02)
+    assert across[0] < 0.25  # that of an unknown coefficient of friction
 
 
 def test_standard_deviation_grows_with_the_noise_and_with_hidden_points():
