@@ -192,9 +192,9 @@ class Bench:
         jaw = jaw or load_jaw(plan.jaw)
         self._reach = jaw.candidates[[0, -1], 2]
         self._size = float(np.diff(self._reach)[0] / np.diff(_BENCH_REACH)[0]) if plan.jaw != "bench" else 1.0
-        calibration = Calibration(
-            young_modulus=modulus * jaw.material.young_modulus, force_error=FORCE_ERROR, clamped_z=0.0
-        )
+        young_modulus = modulus * jaw.material.young_modulus
+        jaw = replace(jaw, material=jaw.material.model_copy(update={"young_modulus": young_modulus}))
+        calibration = Calibration(young_modulus=young_modulus, force_error=FORCE_ERROR, clamped_z=0.0)
         chosen = EstimatorSettings(solver=plan.solver, mesh=plan.mesh, **{**FRICTIONLESS, **settings})
         self.estimator = ForceEstimator(jaw, settings=chosen, calibration=calibration)
         self.estimator.warm_up()

@@ -18,7 +18,7 @@ from lab.stress.session import Bench, judge, open_session, update
 from lab.stress.stress import Plan, run_family, summarise_family
 
 # Families whose answers are right within what they state, with as many trials as there is time for; see evidence.md.
-SHORT = ("subsets", "noise", "gross", "jumps", "stamps", "model", "right")
+SHORT = ("subsets", "noise", "gross", "jumps", "stamps", "model", "right", "forces")
 
 
 @cache
