@@ -34,9 +34,9 @@ _STEP = 0.02e-3
 _SMALL = 1e-6
 # Gap between two parts of a contact [m].
 _GAP = 4e-3
-# Of `measure_rates`: which of the parts stick.
-_BOTH, _LOWER, _UPPER = 0, 1, 2
-_NO_RATES, _NOWHERE = np.zeros((3, 2, 3, 2)), (np.inf, np.inf)
+# Of `measure_rates`: a part sticks while the other does, too, or while it slides.
+_BOTH, _ALONE = 0, 1
+_NO_RATES, _NOWHERE = np.zeros((2, 2, 3, 2)), (np.inf, np.inf)
 
 
 class PathState(NamedTuple):
@@ -94,7 +94,7 @@ class SlipPath:
     @property
     def state(self) -> PathState:
         """What `resume` goes on from."""
-        return PathState(self.parts.copy(), self._heights)
+        return PathState(self.parts, self._heights)
 
     def resume(self, state: PathState) -> None:
         """Go on from another state; a part of the contact that is new begins where it gives way while all sticks."""
@@ -137,30 +137,33 @@ def turn_path(parts, coefficients, rates, motion):
             lower = out[i, 0] + _find_rate(rates[_BOTH, 0], out[i, 0], depth, height)
             upper = out[i, 1] + _find_rate(rates[_BOTH, 1], out[i, 1], depth, height)
             if abs(upper) > mu >= abs(lower):
-                lower = out[i, 0] + _find_rate(rates[_LOWER, 0], out[i, 0], depth, height)
+                lower = out[i, 0] + _find_rate(rates[_ALONE, 0], out[i, 0], depth, height)
             elif abs(lower) > mu >= abs(upper):
-                upper = out[i, 1] + _find_rate(rates[_UPPER, 1], out[i, 1], depth, height)
+                upper = out[i, 1] + _find_rate(rates[_ALONE, 1], out[i, 1], depth, height)
             out[i, 0], out[i, 1] = min(max(lower, -mu), mu), min(max(upper, -mu), mu)
     return out
 
 
 def measure_rates(contact: RigidContact, q: NDArray, x: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """Return rates of the parts' forces (3, 2, 3, 2) [1/m], the parts' shares (2,), and their heights (2,) [m].
+    """Return rates of the parts' forces (2, 2, 3, 2) [1/m], the parts' shares (2,), and their heights (2,) [m].
 
-    The rates are those if both parts stick, the lower one, or the upper one; of the lower and the upper part; along
-    the surface and ahead, relative to the part's normal force, and of the turn of the latter; by depth and height. A
-    part that is missing has none, and an infinite height.
+    The rates are those of a part that sticks, if both do, or it alone; of the lower and the upper part; along the
+    surface and ahead, relative to the part's normal force, and of the turn of the latter; by depth and height. A part
+    that is missing has none, and an infinite height.
     """
     points, rates, shares, heights = contact.place_points(q), _NO_RATES.copy(), np.zeros(2), np.full(2, np.inf)
     smooth = contact.press(points, x, FRICTIONLESS)
     size, rest = np.hypot(smooth.forces[:, 0], smooth.forces[:, 2]), contact.surface.points[:, 2]
     parts = _split(size, rest)
-    for i, sticking in enumerate((np.flatnonzero(size), *parts) if len(parts) > 1 else parts):
+    alone = [(_ALONE, [h]) for h in range(len(parts))] if len(parts) > 1 else []
+    for case, sticking in [(_BOTH, list(range(len(parts)))), *alone] if parts else []:
         traction = Traction(0.0, np.zeros(len(points)), np.zeros(len(points)), points, np.zeros(2))
-        traction.coefficient[sticking] = _STICKS
+        for h in sticking:
+            traction.coefficient[parts[h]] = _STICKS
         modes = contact.linearize(q, x, traction).modes[:, [0, 2]]
         moved = [contact.place_points(q + _SMALL * mode) for mode in modes.T]
-        for part, rate in zip(parts, rates[i], strict=False):
+        for h in sticking:
+            part = parts[h]
             motions = np.stack([each[part] - points[part] for each in moved], axis=2) / _SMALL
             own = Traction(0.0, traction.coefficient[part], traction.shear[part], points[part], traction.moved)
             pressed = contact.indenter.press(points[part], contact.surface.stiffness[part], contact.face_x, x, own)
@@ -168,7 +171,7 @@ def measure_rates(contact: RigidContact, q: NDArray, x: NDArray) -> tuple[NDArra
             turned = _find_change(smooth.changes[part], smooth.springs[part], motions)
             normal = smooth.forces[part].sum(0)
             across = np.array([normal[2], 0.0, -normal[0]])
-            rate[:] = np.stack([across @ change, normal @ change, across @ turned]) / (normal @ normal)
+            rates[case, h] = np.stack([across @ change, normal @ change, across @ turned]) / (normal @ normal)
     for i, part in enumerate(parts):
         shares[i], heights[i] = size[part].sum() / size.sum(), np.average(rest[part], weights=size[part])
     return rates, shares, heights

@@ -19,20 +19,18 @@ from finforce_ifea.contact_mechanics.indenter import Indenter, OutlineIndenter, 
 from finforce_ifea.contact_mechanics.pressed_jaw import RigidContact
 from finforce_ifea.filter.lateral_load import measure_torsion
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE
-from finforce_ifea.observation import Contact, ObjectOutline, Observation
+from finforce_ifea.observation import Contact, Observation
 from finforce_ifea.relaxation import RelaxationTerm
 from lab.presses import circle, keep_shear
 from lab.stress.objects import rectangle
 from lab.stress.session import FRICTIONLESS as SMOOTH
-from lab.stress.session import LIKELIHOOD, OFFSET, PERIOD, Bench, noise_of
+from lab.stress.session import LIKELIHOOD, OFFSET, PERIOD, POSE, Bench, noise_of, tell_pose
 from lab.stress.stress import Plan
 
 # Steps of a press, of depth and height [m]; the last Newton step, as a share of the model's reach, and their number.
 _STEP, _SETTLED, _ITERATIONS = 0.1e-3, 1e-5, 100
 # Images of the tare and of rest before a press; speed of the press [m/s].
 _TARE, _REST, _SPEED = 45, 15, 2e-3
-# Standard deviation of a tracked pose: x, z [m] and turn [rad].
-_POSE = np.array([0.5e-3, 0.5e-3, 5e-3])
 _RADIUS, _HEIGHT = 12.5e-3, 0.040
 _RELAXING = (RelaxationTerm(share=0.5, time_constant=5.0),)
 _HELD = {"held": "either"}
@@ -166,17 +164,14 @@ def tell_height(bench: Bench, pressed: Press, error: float = 0.0) -> list[Contac
 
 def tell_outline(bench: Bench, pressed: Press, random: np.random.Generator, polygon: NDArray) -> list[Contact]:
     """Return the outline at a pose that is off by chance, constant over the recording, in every third image anew."""
-    face, told, off = bench.jaw.inner_face_x, [], _POSE * random.normal(size=3)
-    profile = bench.mechanics.contact.profile
+    told, off = [], POSE * random.normal(size=3)
+    profile, front = bench.mechanics.contact.profile, pressed.indenter.pressed.front
     for i, (depth, tilt, height) in enumerate(pressed.states):
         if i % 3:
             told.append(told[-1])
             continue
         touch = pressed.indenter.find_touch(np.array([0.0, tilt, height]), profile)
-        origin = np.array([face + pressed.indenter.pressed.front - depth - touch + off[0], height + off[1]])
-        outline = ObjectOutline(polygons=(polygon,), origin=origin, tilt=tilt + off[2], stddev=_POSE)
-        where = np.array([[face, 0.0, min(max(height, 0.01), 0.07)]])
-        told.append(Contact(points=where, weights=np.ones(1), outline=outline))
+        told.append(tell_pose(bench, polygon, front, np.array([depth + touch, tilt, height]), off))
     return told
 
 

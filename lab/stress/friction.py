@@ -11,11 +11,11 @@ from scipy.interpolate import PchipInterpolator
 
 from finforce_ifea.contact_mechanics.indenter import OutlineIndenter, RoundIndenter
 from finforce_ifea.errors import ContactError
-from finforce_ifea.observation import Contact, ObjectOutline
+from finforce_ifea.observation import Contact
 from finforce_ifea.settings import EstimatorSettings
 from lab.presses import PressHistory, rub_jaw
 from lab.stress.objects import rectangle
-from lab.stress.session import Bench, open_session
+from lab.stress.session import POSE, Bench, open_session, tell_pose
 from lab.stress.stress import Family, Plan, Trial
 
 # Coefficients of friction that are drawn [-]: bounds of each level.
@@ -27,8 +27,6 @@ _SPEED = 4e-3
 _HOLD = 10
 # Distance of the places at which the path is kept [m].
 _SPACING = 0.05e-3
-# Standard deviation of a tracked pose: x, z [m] and turn [rad].
-_POSE = np.array([0.5e-3, 0.5e-3, 5e-3])
 # Height [m] above which the lower edge of a box stays: what leans on the clamp is another family's.
 _CLAMPED = 0.012
 
@@ -51,12 +49,10 @@ class RubbedObject:
     states: tuple[NDArray, NDArray]
     front: float
 
-    def tell(self, face: float, length: float, off: NDArray) -> Contact:
+    def tell(self, bench: Bench, length: float, off: NDArray) -> Contact:
         """Return the outline at a length of the path [m], its pose off by x, z [m] and turn [rad] (3,)."""
-        depth, tilt, height = (np.interp(length, self.states[1], column) for column in self.states[0].T)
-        origin = np.array([face + self.front - depth, height]) + off[:2]
-        outline = ObjectOutline(polygons=(self.polygon,), origin=origin, tilt=tilt + off[2], stddev=_POSE)
-        return Contact(points=np.array([[face, 0.0, height]]), weights=np.ones(1), outline=outline)
+        state = np.array([np.interp(length, self.states[1], column) for column in self.states[0].T])
+        return tell_pose(bench, self.polygon, self.front, state, off)
 
 
 def rub(bench: Bench, random: np.random.Generator, coefficient: float, *, flat: bool) -> RubbedObject:
@@ -111,11 +107,10 @@ def run_friction(plan: Plan) -> Iterator[Trial]:
         bench.estimator.forget()
         level = f"friction {low:g} to {high:g}, {'box' if flat else 'cylinder'}"
         session = open_session(bench, random, history=rubbed.history, level=level)
-        images, off = _plan_images(rubbed.turns), _POSE * random.normal(size=3)
+        images, off = _plan_images(rubbed.turns), POSE * random.normal(size=3)
         steps = session.steps(images)
         if flat:
-            face = bench.jaw.inner_face_x
-            steps = [replace(s, contact=rubbed.tell(face, w, off)) for s, w in zip(steps, images, strict=True)]
+            steps = [replace(s, contact=rubbed.tell(bench, w, off)) for s, w in zip(steps, images, strict=True)]
         yield from session.play(seed, steps)
 
 

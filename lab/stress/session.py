@@ -14,7 +14,7 @@ from finforce_ifea.estimator import ForceEstimator
 from finforce_ifea.jaw.calibration import Calibration
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_ifea.mechanics import build_mechanics
-from finforce_ifea.observation import Contact, Observation, Solution
+from finforce_ifea.observation import Contact, ObjectOutline, Observation, Solution
 from finforce_ifea.settings import EstimatorSettings
 from lab.presses import PressHistory, RigidCylinder, press_jaw
 from lab.stress.stress import Plan, Trial, attempt
@@ -25,6 +25,8 @@ LIKELIHOOD = 0.95
 ACROSS, ALONG = 0.2e-3, 0.45e-3
 SIGHT = np.array([0.25, -0.95, 0.18]) / np.linalg.norm([0.25, -0.95, 0.18])
 OFFSET = 0.2e-3
+# Standard deviation of a tracked pose: x, z [m] and turn [rad].
+POSE = np.array([0.5e-3, 0.5e-3, 5e-3])
 # What an estimator is told of objects that slide without friction.
 FRICTIONLESS = {"friction": 0.0, "friction_stddev": 0.03}
 
@@ -61,6 +63,24 @@ def noise_of(random: np.random.Generator, shape: tuple[int, ...], scale: float =
     """Return the noise (..., 3) [m] of a bench camera, `scale` times as large."""
     scatter = ACROSS * random.normal(size=(*shape, 3))
     return scale * (scatter + ALONG * random.normal(size=(*shape, 1)) * SIGHT)
+
+
+def tell_pose(bench: Bench, polygon: NDArray, front: float, state: NDArray, off: NDArray) -> Contact:
+    """Return the contact that a tracked object tells: its outline at a pose.
+
+    Args:
+        bench: whose jaw it presses.
+        polygon: outline (n, 2) [m].
+        front: distance from its origin to its leading point [m].
+        state: of the contact (3,): depth [m], tilt [rad], height [m].
+        off: error of the pose along x, z [m], and turn [rad] (3,).
+    """
+    depth, tilt, height = state
+    face = bench.jaw.inner_face_x
+    origin = np.array([face + front - depth, height]) + off[:2]
+    outline = ObjectOutline(polygons=(polygon,), origin=origin, tilt=tilt + off[2], stddev=POSE)
+    where = np.array([[face, 0.0, min(max(height, 0.01), 0.07)]])
+    return Contact(points=where, weights=np.ones(1), outline=outline)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
