@@ -40,7 +40,7 @@ PARTS = {
     "stress": "stress --count 12 --json {json}",
     **{
         name: f"experiment {name} --report {{report}}"
-        for name in ("grasp", "friction", "pose", "manipulation", "chip", "places")
+        for name in ("grasp", "friction", "manipulation", "chip", "places")
     },
     "network": "experiment network --network {network} --report {report}",
     "bound": "bound {recordings} --calibration bench --json {json}",

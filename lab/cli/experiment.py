@@ -18,10 +18,9 @@ QUICK_SIZE = "320x240"
 # what each does, and the module in which it stands under its name in capitals
 EXPERIMENTS = {
     "places": ("Table II: value of knowing the contact location", "paper_tables"),
-    "grasp": ("27 grasps: three objects, places and forces, both jaws", "grasp"),
+    "grasp": ("27 grasps: three objects, places and forces, both jaws; nine also with slow and late poses", "grasp"),
     "manipulation": ("a held weight of 100 g that is turned, in two lights", "manipulation"),
-    "friction": ("27 first grasps without friction, and with 0.5, with and without a probe", "conditions"),
-    "pose": ("nine grasps whose object's poses come slowly or late", "conditions"),
+    "friction": ("the 27 grasps with a friction of 0.5, and nine of them with a probe", "friction"),
     "network": ("nine grasps in two lights against the paper's baseline network", "network"),
     "chip": ("an object that breaks at 5.43 N, grasped to 5 N by force, position and current", "chip"),
 }

@@ -13,8 +13,10 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from finforce_eval.evaluation.batch import evaluate_all
+from finforce_eval.evaluation.contact_source import ContactChoice
 from finforce_eval.evaluation.scoring import ONSET_FORCE, Evaluation, force_delays, rms
 from finforce_eval.figures.figures import BLACK, BLUE, GREEN, ORANGE
+from finforce_eval.recordings.tracks import Recording
 from lab.experiments.experiment import (
     SHARP,
     Case,
@@ -36,6 +38,8 @@ PLACES = {"lower": 0.024, "middle": 0.040, "upper": 0.058}  # [m] of the object'
 LEVELS = {"low": (1.5, 0.001), "medium": (2.5, 0.002), "high": (4.0, 0.004)}
 HOLD = {"settle": 0.5, "record": 2.5, "clearance": 0.003}  # [s, s, m]
 QUICK = {"settle": 0.2, "record": 0.6, "clearance": 0.001}
+RATES, DELAYS = (30.0, 10.0, 3.0), (0.0, 0.100, 0.250)  # [Hz], [s] of poses; the twin measures them at the first rate
+PAPER_RATE = 10.0  # [Hz] of the paper's object tracker
 QUICK_CASES = (("cylinder", "middle", "high"), ("cube", "upper", "medium"), ("asymmetric", "lower", "high"))
 RISEN = 0.97  # [-], of the largest true force: where loading ends
 FALLEN = 0.75  # [-], of the largest true force: where letting go begins
@@ -99,7 +103,7 @@ def list_cases(options: RunOptions) -> Sequence[Case]:
     """Return the grasps."""
     if options.bags:
         return options.bag_cases()
-    return list_grasps(options)
+    return list_grasps(options, tracking=RATES[0])
 
 
 def list_grasps(options: RunOptions, levels: Sequence[str] = tuple(LEVELS), **more: Any) -> list[Case]:
@@ -115,45 +119,73 @@ def list_grasps(options: RunOptions, levels: Sequence[str] = tuple(LEVELS), **mo
 
 
 def run(options: RunOptions, case: Case, folder: Path) -> dict[str, Any]:
-    """Return the figures of a grasp."""
+    """Return the figures of a grasp; poses of the twin come at the paper's rate, and at medium force at others, too."""
     with options.open_case(with_displacement(case), folder) as recording:
-        setup = build_setup(case.settings)
-        evaluation = evaluate_all([recording], setup)
-        grasp = join_jaws(evaluation, recording.name)
+        seen = recording if "bag" in case.settings else thin_poses(recording, PAPER_RATE)
+        evaluation = evaluate_all([seen], build_setup(case.settings))
+        grasp = join_jaws(evaluation, seen.name)
         loading = np.flatnonzero(find_phases(grasp)["load"])
         full = int(grasp.stamp.iloc[loading[-1] if loading.size else -1])
-        hidden = keep_poses(recording, recording.object_pose.stamps_ns < full)
-        unseen = join_jaws(evaluate_all([hidden], setup), recording.name)
+        hidden = score_recording(keep_poses(seen, seen.object_pose.stamps_ns < full), case)
+        poses = {
+            f"{rate:g} Hz, {1e3 * delay:g} ms late": score_recording(thin_poses(recording, rate), case, delay)
+            for rate, delay in product(RATES, DELAYS)
+            if case.settings.get("words", {}).get("level") == "medium"
+        }
     drawn = grasp[["seconds", "truth", "found"]].iloc[::DRAWN_EVERY].round(4).to_dict("list")
-    told = {"sharpness": axis_sharpness(evaluation), "hidden": score_grasp(unseen), "drawn": drawn}
+    told = {"sharpness": axis_sharpness(evaluation), "hidden": hidden, "poses": poses, "drawn": drawn}
     return score_grasp(grasp) | told
 
 
+def score_recording(recording: Recording, case: Case, delay: float = 0.0) -> dict[str, Any]:
+    """Return the figures of a recorded grasp whose poses arrive with a delay [s]."""
+    setup = build_setup(case.settings, ContactChoice(mode="estimate", pose_delay=round(1e9 * delay)))
+    return score_grasp(join_jaws(evaluate_all([recording], setup), recording.name))
+
+
+def thin_poses(recording: Recording, rate: float) -> Recording:
+    """Return a recording with poses of the object at a rate [Hz]."""
+    stamps = recording.object_pose.stamps_ns
+    period = np.floor(1e-9 * (stamps - stamps[0]) * rate + 1e-3).astype(int)
+    return keep_poses(recording, np.diff(period, prepend=-1) > 0)
+
+
 def find(options: RunOptions, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Figures:
-    """Return errors by force and by object and place."""
+    """Return errors by force, by object and place, and by rate and delay of the poses."""
     grasps, drawn = tabulate(figures), {}
     grasps["delay_ms"] = grasps.delay_ms.map(lambda delays: np.median([one for one in delays if one] or [np.nan]))
     grasps["level"] = grasps.get("level", "all")
     if not options.bags:
         draw_grasps(figures).savefig(folder / "grasps.png")
         drawn["Measured (dashed) and estimated grasp force"] = "grasps.png"
-    every = [average(part, ("level",), COLUMNS) for part in (grasps, grasps.assign(level="all"))]
-    levels = pd.concat(every).drop_duplicates("level", keep="last").rename(columns={"level": "force"})
     each = grasps[["case", *COLUMNS]].rename(columns={"case": "grasp", **COLUMNS})
-    return Figures(tables={"By force": levels, "Each grasp": each}, notes=[NOTE], drawn=drawn)
+    tables = {"By force": average_by_force(grasps, (), COLUMNS), "Each grasp": each}
+    slow = [{"poses": name, **score} for row in figures.values() for name, score in row.get("poses", {}).items()]
+    if slow:
+        tables["Poses"] = average(pd.json_normalize(slow, sep=" "), ("poses",), ERRORS)
+    return Figures(tables=tables, notes=[NOTE], drawn=drawn)
+
+
+def average_by_force(grasps: pd.DataFrame, by: Sequence[str], columns: Mapping[str, str]) -> pd.DataFrame:
+    """Return averages by groups and, within each, by level of force, and of all levels; see `average`."""
+    every = pd.concat([grasps, grasps.assign(level="all")]).drop_duplicates(["case", "level"])
+    return average(every, (*by, "level"), columns).rename(columns={"level": "force"})
 
 
 # headings of the averages by figure of a grasp
-COLUMNS = {
-    "peak_N": "peak/N",
+ERRORS = {
     **{f"rmse_N {phase}": f"{phase}: RMSE/N" for phase in PHASES},
-    "nrmsd_pct all": "NRMSD/%",
-    "nrmsd_pct load": "load: NRMSD/%",
-    "hidden rmse_N all": "hidden: RMSE/N",
     "max_error_N": "largest/N",
     "bias_N": "bias/N",
     "answered_pct": "answered/%",
     "within_3_sigma_pct": "within 3σ/%",
+}
+COLUMNS = {
+    "peak_N": "peak/N",
+    **ERRORS,
+    "nrmsd_pct all": "NRMSD/%",
+    "nrmsd_pct load": "load: NRMSD/%",
+    "hidden rmse_N all": "hidden: RMSE/N",
     **SHARP,
     "delay_ms": "shows after/ms",
 }
@@ -206,7 +238,8 @@ GRASP = Experiment(
         "with three motor currents, five times each. Here the objects, places and the ratio of the forces are the "
         "same; finger, camera and objects are rendered, the material relaxes, seeds differ from grasp to grasp, and "
         "force stands for current: the motor's nominal force would shut the jaws on each of them. The contact is not "
-        "known before. *Hidden*: from full force on no pose of the object comes any more."
+        "known before. *Hidden*: from full force on no pose of the object comes any more. The twin's poses come at the "
+        "paper's 10 Hz; *Poses*: at medium force also at 30 and 3 Hz, 0, 100 and 250 ms after their images."
     ),
     list_cases=list_cases,
     run=run,

@@ -2,6 +2,7 @@
 
 import json
 import subprocess
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,7 +22,6 @@ from finforce_eval.tasks import Manifest
 from finforce_ifea.grasp_force import R_GRIPPER_JAW
 from lab.experiments import grasp_world
 from lab.experiments.chip import CHIP
-from lab.experiments.conditions import CONTACTS, FRICTION, POSE, thin_poses
 from lab.experiments.experiment import (
     Case,
     Experiment,
@@ -32,7 +32,8 @@ from lab.experiments.experiment import (
     run_experiment,
     tabulate,
 )
-from lab.experiments.grasp import GRASP, find_phases, score_grasp
+from lab.experiments.friction import FRICTION
+from lab.experiments.grasp import GRASP, find_phases, score_grasp, thin_poses
 from lab.experiments.manipulation import MANIPULATION, score_weight, tell_gravity, true_gravity
 from lab.experiments.network import NETWORK, name_condition
 from lab.experiments.paper_tables import PLACES
@@ -295,25 +296,61 @@ def test_an_object_that_is_hidden_has_no_poses_any_more():
     assert len(one.object_pose.stamps_ns) > 5
 
 
-def test_poses_at_a_lower_rate_are_some_of_those_that_there_are():
+def tracked_recording():
+    """A recording with poses of the object at 30 Hz for 3 s."""
     one = make_recording("one")
     track, count = one.object_pose, 90
     stamps = track.stamps_ns[0] + np.round(np.arange(count) * 1e9 / 30.0).astype(int)
     many = replace(
         track, stamps_ns=stamps, position=np.zeros((count, 3)), quaternion=np.tile([0.0, 0, 0, 1], (count, 1))
     )
-    recording = replace(one, object_pose=many)
+    return replace(one, object_pose=many)
+
+
+def test_poses_at_a_lower_rate_are_some_of_those_that_there_are():
+    recording = tracked_recording()
     assert [len(thin_poses(recording, rate).object_pose.stamps_ns) for rate in (30.0, 10.0, 3.0)] == [90, 30, 9]
     gaps = np.diff(thin_poses(recording, 10.0).object_pose.stamps_ns)
     np.testing.assert_allclose(gaps, 1e8, atol=2)
 
 
-def test_every_grasp_of_the_paper_is_repeated_under_each_contact_and_light():
-    contacts = pd.Series([case.settings["contact"] for case in FRICTION.list_cases(RunOptions())])
-    assert contacts.value_counts().to_dict() == dict.fromkeys(CONTACTS, 27)
-    changes = FRICTION.list_cases(RunOptions())[-1].settings["changes"]
-    assert changes["roughness"] == 0.5
-    assert len(POSE.list_cases(RunOptions())) == 9
+@pytest.mark.parametrize(("settings", "counts", "delays"), [
+    ({"words": {"level": "medium"}}, [30, 15, *[90] * 3, *[30] * 3, *[9] * 3], [0, 0, *[0, 100, 250] * 3]),
+    ({"words": {"level": "high"}}, [30, 15], [0, 0]),
+    ({"bag": "mine"}, [90, 45], [0, 0]),
+])  # fmt: skip
+def test_poses_of_the_twin_come_at_10_hz_and_at_medium_force_at_other_rates_and_delays_too(
+    settings, counts, delays, monkeypatch, tmp_path
+):
+    recording, given = tracked_recording(), []
+    joined = grasp_of().assign(stamp=lambda grasp: recording.object_pose.stamps_ns[0] + 1e9 * grasp.seconds)
+    fakes = {
+        "evaluate_all": lambda recordings, setup: given.append((recordings[0], setup)),
+        "with_displacement": lambda case: case,
+        "join_jaws": lambda *_: joined,
+        "axis_sharpness": lambda _: {},
+    }
+    for name, fake in fakes.items():
+        monkeypatch.setattr(f"lab.experiments.grasp.{name}", fake)
+    monkeypatch.setattr(RunOptions, "open_case", lambda *_: nullcontext(recording))
+    found = GRASP.run(RunOptions(), Case(name="one", settings=RunOptions().shared | settings), tmp_path)
+    assert [len(one.object_pose.stamps_ns) for one, _ in given] == counts
+    assert [1e-6 * setup.contacts.pose_delay for _, setup in given] == delays
+    assert len(found["poses"]) == len(given) - 2
+
+
+def test_grasps_of_the_paper_are_repeated_with_friction_a_probe_and_in_each_light():
+    cases = FRICTION.list_cases(RunOptions())
+    assert len({case.name for case in cases}) == len(cases) == 27 + 9
+    assert all(case.settings["changes"]["roughness"] == 0.5 for case in cases)
+    probed = [case.settings for case in cases if case.settings["changes"]["probe"]]
+    assert [one["words"]["level"] for one in probed] == ["medium"] * 9
+    assert {case.settings["changes"]["tracking"] for case in GRASP.list_cases(RunOptions())} == {30.0}
+    smooth = {case.settings["seed"]: case.settings["words"] for case in GRASP.list_cases(RunOptions())}
+    assert all(case.settings["words"].items() >= smooth[case.settings["seed"]].items() for case in cases)
+    assert [bool(case.settings["changes"]["probe"]) for case in FRICTION.list_cases(RunOptions(quick=True))] == [
+        *[False] * 3, *[True] * 3
+    ]  # fmt: skip
     words = [case.settings["words"] for case in NETWORK.list_cases(RunOptions(network="checkpoint.pt"))]
     assert pd.Series([name_condition(one) for one in words]).value_counts().to_dict() == {
         "trained object, trained light": 6,
@@ -341,7 +378,6 @@ def test_errors_of_both_methods_are_over_the_images_for_which_both_have_a_force(
     ("words", "expected"),
     [
         (["network"], "--network RUN/checkpoint.pt"),
-        (["pose", "--on", "some_bag"], "expected twin"),
         (["friction", "--on", "some_bag"], "expected twin"),
         (["nothing"], "got 'nothing', expected one of"),
         (["chip", "--on", "some_bag"], "expected twin"),
@@ -409,6 +445,14 @@ def test_grasps_and_turns_are_put_in_tables(tmp_path):
     score |= {"sharpness": {"x": 1.5, "y": None, "z": 2.0}}
     row = {**score, "hidden": score, "drawn": series, "object": "cube", "place": "upper", "level": "low"}
     found = GRASP.find(RunOptions(), {"one": row}, tmp_path)
+    assert list(found.tables) == ["By force", "Each grasp"]
+    slow = row | {"level": "medium", "poses": {"3 Hz, 0 ms late": score}}
+    assert GRASP.find(RunOptions(), {"one": row, "two": slow}, tmp_path).tables["Poses"].n.tolist() == [1]
+    conditions = {name: row | {"condition": name} for name in ("unprobed", "probed")}
+    rough = first_table(FRICTION.find(RunOptions(), conditions, tmp_path))
+    assert rough[["condition", "force"]].to_numpy().tolist() == [
+        [name, force] for force in ("low", "all") for name in conditions
+    ]
     assert first_table(found).force.tolist() == ["low", "all"]
     assert first_table(found)["shows after/ms"].tolist() == [100.0, 100.0]
     assert first_table(found)["sharp z"].tolist() == [2.0, 2.0]
