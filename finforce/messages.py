@@ -351,8 +351,17 @@ def direction_from_message(message: Any, frame: str, what: str) -> NDArray:
         ObservationError: the frame is another one, a number is not finite, or the length is next to nothing.
     """
     check_frame(message, frame, what)
-    vector = np.array([message.vector.x, message.vector.y, message.vector.z])
-    length = float(np.linalg.norm(vector))
+    return check_direction([message.vector.x, message.vector.y, message.vector.z], what)
+
+
+def check_direction(vector: ArrayLike, what: str) -> NDArray:
+    """Return the unit vector (3,) of a direction of any length.
+
+    Raises:
+        ObservationError: it is no vector, a number is not finite, or the length is next to nothing.
+    """
+    vector = np.asarray(vector, dtype=float)
+    length = float(np.linalg.norm(vector)) if vector.shape == (3,) else np.nan
     if not _LEAST_LENGTH < length < np.inf:
         raise ObservationError(f"{what} is {vector.tolist()}, expected a direction: three finite numbers, not all zero")
     return vector / length

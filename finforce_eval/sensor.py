@@ -15,6 +15,7 @@ from finforce.camera import CameraIntrinsics, decode_depth
 from finforce.camera_file import build_camera, camera_numbers, read_camera
 from finforce.errors import ObservationError
 from finforce.gripper_frames import SIDES, read_extrinsics
+from finforce.messages import check_direction
 from finforce.rig import read_rig
 from finforce.transforms import check_pose, invert_pose, pose_numbers
 from finforce_contact.estimator import ContactEstimator
@@ -27,6 +28,7 @@ from finforce_ifea.grasp_force import Wrench, combine_wrenches, single_jaw_grasp
 from finforce_ifea.jaw.calibration import Calibration
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_ifea.observation import Contact, Observation, Solution, check_stamp
+from finforce_ifea.payload import Payload
 from finforce_ifea.settings import EstimatorSettings
 from finforce_keypoints.build import build_detector
 from finforce_keypoints.geometry.jaw_localizer import JawKeypoints
@@ -117,13 +119,19 @@ class ForceSensor:
         settings = whole.resolve_held(both=len(sides) == len(SIDES))
         mesh = None if object_mesh is None else load_object_mesh(object_mesh)
         self._loops: dict[str, ForceLoop] = {}
+        self._payload = Payload()
         for side, own in jaws.items():
             force = ForceEstimator(own, settings=settings, calibration=calibration)
             fixed = mesh is None and GivenContact(Contact.fixed(force.jaw, contact_height))
             self._loops[side] = ForceLoop(fixed or ContactEstimator(force.jaw, mesh=mesh), force)
 
     def update(
-        self, rgb: NDArray, depth: NDArray | None, stamp: float, T_camera_object: ArrayLike | None = None
+        self,
+        rgb: NDArray,
+        depth: NDArray | None,
+        stamp: float,
+        T_camera_object: ArrayLike | None = None,
+        gravity: ArrayLike | None = None,
     ) -> GripperForces:
         """Return the forces in an image.
 
@@ -136,13 +144,16 @@ class ForceSensor:
             stamp: image capture time [s], a float that rises from image to image. Divide frame numbers by the frame
                 rate.
             T_camera_object: (4, 4) pose of the object's mesh in this image, if it is known.
+            gravity: (3,) direction in which things fall, of any length, in `gripper_base`, if it is known. With it, the
+                net force is that of what hangs from the jaws; see `Payload`.
 
         Raises:
             ImageError: the image has another shape, shows nothing, or its stamp does not rise.
-            ObservationError: the stamps are not in seconds.
+            ObservationError: the stamps are not in seconds, or gravity is no direction.
             PoseError: the matrix is no pose.
         """
         check_stamp(stamp)
+        gravity = None if gravity is None else check_direction(gravity, "gravity")
         if not isinstance(self.camera, CameraIntrinsics):
             self.camera = read_intrinsics(self.camera, rgb.shape[:2])
         if depth is not None:
@@ -151,7 +162,8 @@ class ForceSensor:
         seen = self._detector.detect(image)
         T = None if T_camera_object is None else check_pose(T_camera_object, "T_camera_object")
         found = {side: self._solve(loop, seen.get(side), stamp, T) for side, loop in self._loops.items()}
-        return combine_solutions(stamp, {side: found[side] if side in seen else None for side in found})
+        known = {side: found[side] if side in seen else None for side in found}
+        return combine_solutions(stamp, known, self._payload, gravity)
 
     def skip(self, stamp: float, reason: str) -> GripperForces:
         """Let time pass for an image at `stamp` [s] that `update` has rejected, and return a result without forces."""
@@ -163,6 +175,7 @@ class ForceSensor:
     def reset(self) -> None:
         """Forget all images, including the tare, before a new recording or episode."""
         self._detector.reset()
+        self._payload.reset()
         for loop in self._loops.values():
             loop.force.forget()
             loop.contact.reset()
@@ -197,7 +210,9 @@ def observe_jaw(seen: JawKeypoints | None, stamp: float, count: int) -> Observat
     return Observation(stamp=stamp, points=points, likelihood=seen.likelihood, stddev=stddev, shared=seen.shared)
 
 
-def combine_solutions(stamp: float, found: Mapping[str, Solution | None]) -> GripperForces:
+def combine_solutions(
+    stamp: float, found: Mapping[str, Solution | None], payload: Payload | None = None, gravity: NDArray | None = None
+) -> GripperForces:
     """Return what the solutions of one jaw or two in one image, None where a jaw was not seen, say of the gripper."""
     jaws = {side: solution for side, solution in found.items() if solution is not None}
     wrong = [
@@ -210,7 +225,12 @@ def combine_solutions(stamp: float, found: Mapping[str, Solution | None]) -> Gri
     wrenches = {side: Wrench(each.force, each.torque) for side, each in jaws.items()}
     side, weakest = min(jaws.items(), key=lambda jaw: float(np.linalg.norm(jaw[1].force)))
     both = len(jaws) == len(SIDES)
-    grasp = combine_wrenches(**wrenches, distance=None) if both else single_jaw_grasp(wrenches[side], side)
+    stddevs = [each.force_stddev for each in jaws.values()]
+    if both:
+        grasp = combine_wrenches(**wrenches, distance=None, stddevs=stddevs)
+        grasp = grasp if payload is None else payload.update(grasp, stamp, gravity)
+    else:
+        grasp = single_jaw_grasp(wrenches[side], side)
     return GripperForces(
         stamp=stamp,
         jaws=jaws,
@@ -218,7 +238,7 @@ def combine_solutions(stamp: float, found: Mapping[str, Solution | None]) -> Gri
         grasp=float(grasp.grasp[0]),
         grasp_stddev=weakest.magnitude_stddev,
         manipulation=grasp.manipulation,
-        manipulation_stddev=np.sqrt(sum(each.force_stddev**2 for each in jaws.values())),
+        manipulation_stddev=grasp.stddev if both else stddevs[0],
     )
 
 

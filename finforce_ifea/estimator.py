@@ -223,8 +223,7 @@ class ForceEstimator:
         """Take one image's key points and return what they say.
 
         Args:
-            observation: stamp [s], points (K, 3) [m] in the jaw frame, likelihood (K,), stddev (K, 3) [m] and
-                gravity (3,) if known.
+            observation: stamp [s], points (K, 3) [m] in the jaw frame, likelihood (K,), stddev (K, 3) [m].
             contact: where the object touches; None or no rows when there is no object.
 
         Raises:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from time import monotonic
 from typing import Literal, NamedTuple
@@ -33,14 +34,16 @@ class Grasp:
         manipulation: (3,) [N], the net force on the gripper.
         torque: (3,) [N m] of the net force about the origin, of one jaw alone about that jaw's; None where the jaws are
             is not known.
+        stddev: (3,) standard deviation of the net force [N]; None if unknown.
     """
 
     grasp: NDArray[np.float64]
     manipulation: NDArray[np.float64]
     torque: NDArray[np.float64] | None
+    stddev: NDArray[np.float64] | None = None
 
 
-def combine_wrenches(left: Wrench, right: Wrench, distance: float | None) -> Grasp:
+def combine_wrenches(left: Wrench, right: Wrench, distance: float | None, stddevs: Sequence[NDArray] = ()) -> Grasp:
     """Return grasp force min(|F_left|, |F_right|) and manipulation force R_left F_left + R_right F_right.
 
     Seen in the gripper's frame the jaws' forces oppose each other, so that the sum is the difference
@@ -50,6 +53,7 @@ def combine_wrenches(left: Wrench, right: Wrench, distance: float | None) -> Gra
         left: of the left jaw.
         right: of the right jaw.
         distance: between the jaws' origins, half way between which the gripper's is [m]; None unknown.
+        stddevs: standard deviations (3,) of the forces [N] of both jaws, of one where the other's is alike, or none.
     """
     held = min(float(np.linalg.norm(left.force)), float(np.linalg.norm(right.force)))
     forces = [R_GRIPPER_JAW["left"] @ left.force, R_GRIPPER_JAW["right"] @ right.force]
@@ -58,7 +62,10 @@ def combine_wrenches(left: Wrench, right: Wrench, distance: float | None) -> Gra
         # x cross F = (0, -F_z, F_y)
         couple = (0.5 * distance * (forces[1] - forces[0]))[[0, 2, 1]] * [0.0, -1.0, 1.0]
         torque = R_GRIPPER_JAW["left"] @ left.torque + R_GRIPPER_JAW["right"] @ right.torque + couple
-    return Grasp(grasp=np.array([held, 0.0, 0.0]), manipulation=forces[0] + forces[1], torque=torque)
+    # the jaws' frames are turned about z by half a turn: their axes are those of the gripper
+    stddev = np.sqrt(2.0 * np.mean(np.square(stddevs), axis=0)) if len(stddevs) else None
+    grasp = np.array([held, 0.0, 0.0])
+    return Grasp(grasp=grasp, manipulation=forces[0] + forces[1], torque=torque, stddev=stddev)
 
 
 def single_jaw_grasp(wrench: Wrench, side: Side) -> Grasp:
@@ -114,14 +121,22 @@ class ForcePairing:
         """Note that nothing was to be heard of the other jaw so far."""
         self._heard = monotonic()
 
-    def add(self, stamp: int, wrench: Wrench, *, own: bool) -> Grasp | None:
-        """Take the wrench on a jaw; return the grasp once the stamp [ns] has both."""
+    def add(self, stamp: int, wrench: Wrench, stddev: NDArray | None = None, *, own: bool) -> Grasp | None:
+        """Take the wrench on a jaw; return the grasp once the stamp [ns] has both.
+
+        Args:
+            stamp: of the image [ns].
+            wrench: of a jaw.
+            stddev: standard deviation of its force (3,) [N]; None if unknown.
+            own: True for the jaw whose wrenches come first-hand.
+        """
         if not own:
             self._heard = monotonic()
         mine, peer = (self._own, self._other) if own else (self._other, self._own)
         found = self._wrenches.take(peer, stamp)
         if found is None:
-            self._wrenches.add(mine, stamp, wrench)
+            self._wrenches.add(mine, stamp, (wrench, stddev))
             return None
-        wrenches = {mine: wrench, peer: found.value}
-        return combine_wrenches(wrenches["left"], wrenches["right"], self.distance.at(stamp))
+        pair = {mine: (wrench, stddev), peer: found.value}
+        stddevs = [each for _, each in pair.values() if each is not None]
+        return combine_wrenches(pair["left"][0], pair["right"][0], self.distance.at(stamp), stddevs)

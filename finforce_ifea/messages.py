@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from finforce.errors import ObservationError
 from finforce.messages import check_cloud, decode_columns, decode_keypoints, direction_from_message, stamp_of
 from finforce_ifea.errors import ContactError
-from finforce_ifea.grasp_force import R_GRIPPER_JAW
 from finforce_ifea.observation import Contact, ObjectOutline, Observation, are_same_polygons
 
 if TYPE_CHECKING:
@@ -28,13 +27,12 @@ CONTACT_DIAMETER = 0.005
 ARROW = (0.002, 0.004, 0.005)  # shaft, head, head length
 
 
-def observation_from_cloud(cloud: Any, frame: str, gravity: NDArray | None = None) -> Observation:
+def observation_from_cloud(cloud: Any, frame: str) -> Observation:
     """Return the key points of a sensor_msgs/PointCloud2 in the jaw frame `frame`.
 
     Args:
         cloud: one row per key point.
         frame: the jaw frame.
-        gravity: its direction (3,) there, None where unknown.
 
     Raises:
         ObservationError: the frame, the height, the fields, a standard deviation or the buffer are wrong.
@@ -42,7 +40,7 @@ def observation_from_cloud(cloud: Any, frame: str, gravity: NDArray | None = Non
     check_cloud(cloud, frame, "the key points")
     seen = decode_keypoints(cloud)
     stamp = cloud.header.stamp.sec + 1e-9 * cloud.header.stamp.nanosec
-    return Observation(stamp=stamp, gravity=gravity, **seen._asdict())
+    return Observation(stamp=stamp, **seen._asdict())
 
 
 def contact_from_cloud(cloud: Any, frame: str, *, free: bool) -> Contact:
@@ -269,7 +267,7 @@ class GravityFeed:
     """
 
     def __init__(self, parameters: NodeParameters) -> None:
-        self._frame, self._R = parameters.base_frame, R_GRIPPER_JAW[parameters.jaw_name]
+        self._frame = parameters.base_frame
         self._max_age = round(1e9 * parameters.max_age)
         self._direction: NDArray | None = None
         self._stamp = 0
@@ -284,10 +282,10 @@ class GravityFeed:
 
     def keep(self, stamp: int, direction: NDArray) -> None:
         """Keep a direction (3,) in the gripper's frame, of a time [ns]."""
-        self._direction, self._stamp = direction @ self._R, stamp
+        self._direction, self._stamp = direction, stamp
 
     def at(self, stamp: int) -> NDArray | None:
-        """Return the direction (3,) in the jaw's frame, None where it is farther from an image [ns] than `max_age`."""
+        """Return the direction (3,) in the gripper's frame; None farther from an image [ns] than `max_age`."""
         return self._direction if abs(stamp - self._stamp) <= self._max_age else None
 
 

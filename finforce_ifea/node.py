@@ -17,7 +17,7 @@ from sensor_msgs.msg import PointCloud2
 from finforce.errors import MissingDependencyError
 from finforce.gripper_frames import SIDES
 from finforce.health import IDLE, Health, Idling, Level, Outcome, Report, Skips, StampGate
-from finforce.messages import pose_from_message, stamp_of, wrench_from_message
+from finforce.messages import SECOND, pose_from_message, stamp_of, wrench_from_message
 from finforce.ros import node as ros
 from finforce.ros.messages import MarkerStyle, points_marker
 from finforce_ifea.grasp_force import ForcePairing, Grasp, Wrench, single_jaw_grasp
@@ -34,6 +34,7 @@ from finforce_ifea.messages import (
 )
 from finforce_ifea.observation import Observation, Solution
 from finforce_ifea.parameters import NodeParameters, build_estimator
+from finforce_ifea.payload import Payload
 from finforce_ifea.resting import RestingContact
 from finforce_ifea.settings import EstimatorSettings
 
@@ -74,10 +75,8 @@ class _SolverOutputs:
         if ros.is_wanted(self.stddev, self._skips):
             self.stddev.publish(ros.wrench_message(header, solution.force_stddev, solution.torque_stddev))
 
-    def send_grasp(self, header: Any, grasp: Grasp | None) -> None:
-        """Send what the object does to the gripper, once it is known; a torque that is not known is left at zero."""
-        if grasp is None:
-            return
+    def send_grasp(self, header: Any, grasp: Grasp) -> None:
+        """Send what the object does to the gripper; a torque that is not known is left at zero."""
         header = ros.Header(stamp=header.stamp, frame_id=self._parameters.base_frame)
         if ros.is_wanted(self.grasp, self._skips):
             self.grasp.publish(ros.wrench_message(header, grasp.grasp))
@@ -193,7 +192,7 @@ class IfeaSolverNode(ros.ImageNode):
         ros.follow_settings(self, parameters, lambda changed: self.gate.limit(changed.max_age))
         health = Health(source=f"{parameters.jaw_name}/keypoints", stale_after=parameters.max_age)
         self.health[parameters.jaw_name] = health
-        self.pairing = ForcePairing(parameters.jaw_name)
+        self.pairing, self.payload = ForcePairing(parameters.jaw_name), Payload()
         self.idling, self.resting = Idling(), RestingContact()
         self.waiting: tuple[PointCloud2, float] | None = None  # key points without their contact, and when they came
         self.last: Solution | None = None
@@ -265,8 +264,7 @@ class IfeaSolverNode(ros.ImageNode):
         """Solve an image and publish its wrench, if it can be trusted."""
         header, stamp = cloud.header, stamp_of(cloud)
         with self.rejections():
-            gravity = self._find_gravity(stamp)
-            observation = observation_from_cloud(cloud, self.frame, gravity)
+            observation = observation_from_cloud(cloud, self.frame)
             if self.gate.enter(stamp, self.now()):
                 self._restart("the stamps went back: a new recording")
             contact = self.resting.complete(self.contacts.at(stamp), observation.stamp)
@@ -280,15 +278,21 @@ class IfeaSolverNode(ros.ImageNode):
             self.out.wrench.publish(ros.wrench_message(header, solution.force, solution.torque))
             wrench = Wrench(solution.force, solution.torque)
             if self.parameters.peer:
-                self.out.send_grasp(header, self.pairing.add(stamp, wrench, own=True))
+                self._send_grasp(header, stamp, self.pairing.add(stamp, wrench, solution.force_stddev, own=True))
             elif self.parameters.completes_grasp:
                 self.out.send_grasp(header, single_jaw_grasp(wrench, self.parameters.jaw_name))
             self.out.send_stddev(header, solution)
             self.confirm(self.parameters.jaw_name, stamp, outcome_of_solution(solution), began)
             self.stage.afterwards(partial(self._finish, header, observation, solution))
 
+    def _send_grasp(self, header: Any, stamp: int, grasp: Grasp | None) -> None:
+        """Send the grasp of both jaws in an image [ns], with the weight that they carry where gravity is known."""
+        if grasp is not None:
+            grasp = self.payload.update(grasp, SECOND * stamp, self._find_gravity(stamp))
+            self.out.send_grasp(header, grasp)
+
     def _find_gravity(self, stamp: int) -> NDArray | None:
-        """Return which way things fall at an image [ns] (3,), in the jaw's frame; None where nobody says."""
+        """Return which way things fall at an image [ns] (3,), in the gripper's frame; None where nobody says."""
         if self.gravity is None:
             return None
         upright = self.parameters.gravity_frame
@@ -320,7 +324,7 @@ class IfeaSolverNode(ros.ImageNode):
         with self.rejections():
             found = Wrench(*wrench_from_message(wrench, self.parameters.jaw_frame(peer)))
             self.gate.check_age(stamp, self.now())
-            self.out.send_grasp(wrench.header, self.pairing.add(stamp, found, own=False))
+            self._send_grasp(wrench.header, stamp, self.pairing.add(stamp, found, own=False))
 
     def _on_gravity(self, direction: Vector3Stamped) -> None:
         """Keep which way things fall."""
@@ -342,6 +346,7 @@ class IfeaSolverNode(ros.ImageNode):
     def _restart(self, reason: str) -> str:
         self.estimator.reset()
         self.resting.reset()
+        self.payload.reset()
         self.get_logger().warning(f"{reason}; the estimator restarts")
         return reason
 
@@ -354,5 +359,7 @@ class IfeaSolverNode(ros.ImageNode):
         tared = {"tared": str(self.estimator.tared), "friction": f"{mean:.2f} ± {stddev:.2f}, {source}"}
         tared["touch probability"] = f"{self.estimator.touch_probability:.2f}"
         health = self.health[self.parameters.jaw_name]
+        if np.isfinite(self.payload.stddev):
+            tared["payload"] = f"{self.payload.weight:.2f} ± {self.payload.stddev:.2f} N"
         values = describe_solution(self.last) | tared | self.skips.describe()
         return health.report(alarms, values, self.unheard)

@@ -14,7 +14,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from finforce.errors import FinforceError
-from finforce_eval.evaluation.gripper import combine_jaws
+from finforce_eval.evaluation.gripper import carry_payload, combine_jaws
 from finforce_eval.recordings.tracks import DetectionTrack, DetectionTruth, Recording, WrenchTrack
 from finforce_eval.table import ForceSeries
 
@@ -545,9 +545,15 @@ def score_manipulation(results: Iterable[ForceSeries]) -> dict[str, Stats]:
     return {name: score_net(join_net(pair)) for name, pair in pairs.items() if len(pair) == 2}
 
 
-def join_net(jaws: Mapping[str, ForceSeries]) -> ForceSeries:
-    """Return what `combine_jaws` does, in the images of the record phases in which both jaws were measured."""
+def join_net(jaws: Mapping[str, ForceSeries], gravity: Mapping[int, NDArray] | None = None) -> ForceSeries:
+    """Return what `combine_jaws` does, in the images of the record phases in which both jaws were measured.
+
+    Args:
+        jaws: by side.
+        gravity: see `carry_payload`; None if unknown.
+    """
     net = combine_jaws(jaws)
+    net = carry_payload(net, gravity) if gravity else net
     return net.at(net.scored & np.isfinite(net.true_force).all(axis=1))
 
 

@@ -166,8 +166,6 @@ _TRACTION_TIME = 60.0
 # The same of a weight that the jaws have lifted and turn.
 _WEIGHT = 0.3
 _WEIGHT_TIME = 1.0
-# The smallest part of such a weight that is expected where gravity has none [-].
-_ASIDE = 0.1
 # Log prior odds of a lift in an image, and the log odds against one, prior left out, after which the test begins anew.
 _LIFTED = np.log(1e-4)
 _UNLIKELY = -3.0
@@ -186,11 +184,6 @@ _TURN_ERROR = 0.5
 # A key point nearer to the middle plane does not show how its section turns, and one so little above another is of the
 # same section [m].
 _LEAST_ARM, _LEAST_RISE = 1e-3, 2e-3
-
-
-def expect_weight(gravity: NDArray | None) -> float:
-    """Return 1 sigma of the traction ratio across a finger by a weight [-], whose direction (3,) may be known."""
-    return _WEIGHT if gravity is None else _WEIGHT * max(abs(gravity[1]) / float(np.linalg.norm(gravity)), _ASIDE)
 
 
 class _Estimate(NamedTuple):
@@ -237,7 +230,7 @@ class LateralLoad:
         self._expected = min(max(float(location), -half), half), uneven * narrow * float(stddev)
 
     def update(
-        self, motions: NDArray, bend: NDArray, points: NDArray, state: ContactState, dt: float, weight: float | None
+        self, motions: NDArray, bend: NDArray, points: NDArray, state: ContactState, dt: float, may_be_held: bool
     ) -> None:
         """Take the motions of the key points along y in an image.
 
@@ -247,7 +240,7 @@ class LateralLoad:
             points: see `KEYPOINT`.
             state: see `CONTACT_STATE`.
             dt: time since the last image [s].
-            weight: 1 sigma of the lateral traction ratio by a weight that may have been lifted; None where none may.
+            may_be_held: True if the jaws may have lifted a weight.
         """
         torsion, force, height = self._torsion, state["force"], float(state["pressure_location"][2])
         normal = hypot(force[0], force[2])
@@ -257,7 +250,7 @@ class LateralLoad:
         place = height, normal, force[0], self.load[0]
         measured, (by_moment, by_force, rolled) = _observe(points, motions, bend, torsion.packed, place)
         moved, self._depth = abs(float(state["depth"]) - self._depth), float(state["depth"])
-        self._follow(measured, points["offset_variance"], (moved, dt), weight)
+        self._follow(measured, points["offset_variance"], (moved, dt), may_be_held)
         x, P, half = *self._known, torsion.half_width
         location, stddev = min(max(float(x[0]), -half), half), hypot(sqrt(P[1, 1]), _NONLINEAR)
         # unless a weight was lifted, chance and what the linear jaw errs by are no force
@@ -267,7 +260,7 @@ class LateralLoad:
         self.motions = by_moment * (-location * force[0]) + by_force * total
 
     def _follow(
-        self, measured: tuple[NDArray, ...], offsets: NDArray, passed: tuple[float, float], weight: float | None
+        self, measured: tuple[NDArray, ...], offsets: NDArray, passed: tuple[float, float], may_be_held: bool
     ) -> None:
         """Take an image into both hypotheses, and decide between them.
 
@@ -275,20 +268,19 @@ class LateralLoad:
             measured: see `_observe`.
             offsets: stationary variance of each key point's offset (K,) [m^2].
             passed: motion of the object in depth [m] and time [s] since the last image.
-            weight: see `update`.
+            may_be_held: see `update`.
         """
         if self._known is None:
             self._known = self._candidate = _begin(self._expected, offsets)
             self._odds = 0.0
-        expected = (*self._expected, 0.0 if weight is None else weight)
+        light, lifted = (*self._expected, 0.0), (*self._expected, _WEIGHT)
         if self._is_lifted:
-            self._known = _step(tuple(self._known), expected, offsets, passed, measured)[0]
+            self._known = _step(tuple(self._known), lifted, offsets, passed, measured)[0]
             return
-        before, light = self._known, (*self._expected, 0.0)
-        self._known, likely = _step(tuple(before), light, offsets, passed, measured)
-        if weight is None:
+        self._known, likely = _step(tuple(self._known), light, offsets, passed, measured)
+        if not may_be_held:
             return
-        self._candidate, other = _step(tuple(self._candidate), expected, offsets, passed, measured)
+        self._candidate, other = _step(tuple(self._candidate), lifted, offsets, passed, measured)
         self._odds += other - likely
         if self._odds < _UNLIKELY:
             self._candidate, self._odds = self._known, 0.0

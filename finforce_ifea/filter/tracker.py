@@ -15,7 +15,7 @@ from finforce_ifea.contact_mechanics.friction import Coefficient, constant_tract
 from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, OutlineIndenter, RoundIndenter, expect_object
 from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics, RigidContact, limit_step
 from finforce_ifea.filter.hidden import APART_SIGMAS, HiddenForce, list_clamped_heights
-from finforce_ifea.filter.lateral_load import LateralLoad, Torsion, expect_weight
+from finforce_ifea.filter.lateral_load import LateralLoad, Torsion
 from finforce_ifea.filter.search import ContactSearch, find_x_model
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE
 from finforce_ifea.observation import Contact, Observation
@@ -231,8 +231,8 @@ class ContactTracker:
         self._complete(state)
         if self._is_known:
             bend = search.positions[:, 0] - self._rest[:, 0]
-            weight = expect_weight(observation.gravity) if self.settings.may_be_held else None
-            self._lateral.update((measured - search.positions)[:, 1], bend, search.points, state, dt, weight)
+            across, may_be_held = (measured - search.positions)[:, 1], self.settings.may_be_held
+            self._lateral.update(across, bend, search.points, state, dt, may_be_held)
         if self._fidelity and not state["converged"]:
             self._restore_shape()
         self._change_fidelity(state)

@@ -159,7 +159,7 @@ RULES = (
     _rule("lateral load", "`LateralLoad`", "force across the finger, and its torsion",
           {"finforce_ifea.filter.lateral_load:LateralLoad.update": _nothing}, "across", "carried"),
     _rule("weight across the finger", "`_WEIGHT`", "a weight that pulls across the fingers",
-          {_TRACKER + "expect_weight": lambda gravity: None}, "carried"),
+          {"finforce_ifea.filter.lateral_load:_LIFTED": -np.inf}, "carried"),
     _rule("lateral threshold", "`_CLEAR`", "keeps noise from counting as a lateral force",
           {"finforce_ifea.filter.lateral_load:_CLEAR": 1e-3}, "across", "box"),
     _rule("following a slide", "`_lead`", "objects that slide, as their pose shows",

@@ -83,3 +83,21 @@ def track(stamps, x):
     rows = len(stamps)
     position, quaternion = (np.tile(part, (rows, 1)) for part in (pose[:3, 3], quaternion_from_pose(pose)))
     return PoseTrack(stamps_ns=stamps, position=position, quaternion=quaternion, frame_id="camera")
+
+
+def test_gravity_tells_the_weight_along_the_fingers_of_what_is_turned():
+    count = 240
+    angles = np.clip(np.linspace(-0.5, 2.0 * np.pi, count), 0.0, None)
+    down = np.stack([np.zeros(count), np.sin(angles), np.cos(angles)], axis=1)
+    left, right = jaws(count)
+    true = 0.5 * down
+    shown = true * [1.0, 1.0, 0.0]  # key points show nothing along the fingers
+    mirrored = [-1.0, -1.0, 1.0]
+    closed = np.array([3.0, 0.0, 0.0])
+    left = left.with_columns(force=shown - closed, true_force=true - closed)
+    right = right.with_columns(force=shown * mirrored - closed, true_force=true * mirrored - closed)
+    both = {"left": left, "right": right}
+    gravity = dict(zip(left.stamps_ns.tolist(), down, strict=True))
+    blind, told = score_net(join_net(both)), score_net(join_net(both, gravity))
+    assert told.axis_rmse_N[2] < 0.5 * blind.axis_rmse_N[2]
+    assert min(told.within_3_sigma_pct) > 98.0

@@ -19,8 +19,8 @@ from finforce.health import Level
 from finforce.messages import stamp_of
 from finforce.ros import node as ros
 from finforce.transforms import pose_numbers
-from finforce_ifea.grasp_force import R_GRIPPER_JAW
 from finforce_ifea.node import IfeaSolverNode
+from finforce_ifea.payload import Payload
 
 SECOND = 1_000_000_000
 
@@ -95,33 +95,69 @@ def gravity_message(vector, frame="gripper_base"):
     return message
 
 
-@pytest.mark.parametrize("side", ["left", "right"])
-def test_which_way_things_fall_reaches_the_estimator_in_the_jaws_frame(probe, side):
-    estimator = FakeEstimator()
-    node = start_solver(probe, estimator, jaw_name=side, peer="left" if side == "right" else "right")
-    out, down = probe.speak(f"{side}/keypoints"), probe.speak("gravity", Vector3Stamped)
+class RecordedPayload(Payload):
+    """Keeps which gravity it was told."""
+
+    def __init__(self):
+        super().__init__()
+        self.told = []
+
+    def update(self, grasp, stamp, gravity):
+        self.told.append(gravity)
+        return super().update(grasp, stamp, gravity)
+
+
+def reported(probe):
+    """Values of every diagnosis so far."""
+    return [
+        {entry.key: entry.value for entry in state.values}
+        for message in probe.got["/diagnostics"]
+        for state in message.status
+    ]
+
+
+def hold(probe, side="left", **parameters):
+    """A solver of one of two jaws, and what gives it an image of both."""
+    peer = "left" if side == "right" else "right"
+    node = start_solver(probe, jaw_name=side, peer=peer, **parameters)
+    node.payload = RecordedPayload()
+    prefix = parameters.get("frame_prefix", "")
+    out, other = probe.speak(f"{side}/keypoints"), probe.speak(f"{peer}/wrench", WrenchStamped)
+    probe.hear("manipulation_wrench")
     probe.connected(out)
+    probe.connected(other)
+
+    def show():
+        stamp = time_ns()
+        out.publish(keypoint_cloud(stamp, frame=f"{prefix}{side}_jaw"))
+        other.publish(
+            ros.wrench_message(Header(stamp=ros.stamp_message(stamp), frame_id=f"{prefix}{peer}_jaw"), (-2.0, 0.0, 0.5))
+        )
+        probe.wait_for(lambda: node.payload.told)
+        return node.payload.told[-1]
+
+    return node, show
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_which_way_things_fall_reaches_the_payload(probe, side):
+    node, show = hold(probe, side)
+    down = probe.speak("gravity", Vector3Stamped)
     probe.connected(down)
     down.publish(gravity_message((0.0, 3.0, -4.0)))
     probe.wait_for(lambda: node.gravity.at(time_ns()) is not None)
-    out.publish(keypoint_cloud(frame=f"{side}_jaw"))
-    probe.wait_for(lambda: estimator.observations)
-    expected = R_GRIPPER_JAW[side].T @ [0.0, 0.6, -0.8]
-    np.testing.assert_allclose(estimator.observations[0].gravity, expected, atol=1e-12)
+    np.testing.assert_allclose(show(), [0.0, 0.6, -0.8], atol=1e-12)
+    assert np.isfinite(node.payload.stddev)
+    probe.wait_for(lambda: probe.got["manipulation_wrench"])
+    probe.wait_for(lambda: any("payload" in told for told in reported(probe)))
 
 
 def test_which_way_things_fall_is_told_by_a_frame_that_stands_upright(probe, tf):
     tilt = np.eye(4)
     tilt[1:3, 1:3] = [[0.8, -0.6], [0.6, 0.8]]  # the base's z points along (0, -0.6, 0.8) of the gripper
     tf["r1/gripper_base", "base_link"] = tilt
-    estimator = FakeEstimator()
-    start_solver(probe, estimator, peer="right", gravity_frame="base_link", frame_prefix="r1/")
-    out = probe.speak("left/keypoints")
-    probe.connected(out)
-    out.publish(keypoint_cloud(frame="r1/left_jaw"))
-    probe.wait_for(lambda: estimator.observations)
-    expected = R_GRIPPER_JAW["left"].T @ [0.0, 0.6, -0.8]
-    np.testing.assert_allclose(estimator.observations[0].gravity, expected, atol=1e-12)
+    _, show = hold(probe, gravity_frame="base_link", frame_prefix="r1/")
+    np.testing.assert_allclose(show(), [0.0, 0.6, -0.8], atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -129,29 +165,21 @@ def test_which_way_things_fall_is_told_by_a_frame_that_stands_upright(probe, tf)
     [(((0.0, 0.0, 0.0),), "not all zero"), (((0.0, np.nan, 1.0),), "finite"), (((0, 0, 1.0), "camera"), "camera")],
 )
 def test_a_direction_that_is_none_is_refused_and_forces_go_on_without(probe, message, word):
-    estimator = FakeEstimator()
-    start_solver(probe, estimator, peer="right")
-    out, down = probe.speak("left/keypoints"), probe.speak("gravity", Vector3Stamped)
-    probe.connected(out)
+    _, show = hold(probe)
+    down = probe.speak("gravity", Vector3Stamped)
     probe.connected(down)
     down.publish(gravity_message(*message))
     probe.diagnosis(level=Level.ERROR, word=word)
-    out.publish(keypoint_cloud())
-    probe.wait_for(lambda: estimator.observations)
-    assert estimator.observations[0].gravity is None
+    assert show() is None
 
 
 def test_a_direction_of_long_ago_is_no_longer_used(probe):
-    estimator = FakeEstimator()
-    start_solver(probe, estimator, peer="right", max_age=0.3)
-    out, down = probe.speak("left/keypoints"), probe.speak("gravity", Vector3Stamped)
-    probe.connected(out)
+    _, show = hold(probe, max_age=0.3)
+    down = probe.speak("gravity", Vector3Stamped)
     probe.connected(down)
     down.publish(gravity_message((0.0, 0.0, 1.0)))
     probe.spin(0.6)
-    out.publish(keypoint_cloud())
-    probe.wait_for(lambda: estimator.observations)
-    assert estimator.observations[0].gravity is None
+    assert show() is None
 
 
 MALFORMED = {

@@ -19,7 +19,6 @@ from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.writer import write_recording
 from finforce_eval.table import ForceSeries
 from finforce_eval.tasks import Manifest
-from finforce_ifea.grasp_force import R_GRIPPER_JAW
 from lab.experiments import grasp_world
 from lab.experiments.chip import CHIP
 from lab.experiments.experiment import (
@@ -34,7 +33,7 @@ from lab.experiments.experiment import (
 )
 from lab.experiments.friction import FRICTION
 from lab.experiments.grasp import GRASP, find_phases, score_grasp, thin_poses
-from lab.experiments.manipulation import MANIPULATION, score_weight, tell_gravity, true_gravity
+from lab.experiments.manipulation import MANIPULATION, score_weight, true_gravity
 from lab.experiments.network import NETWORK, name_condition
 from lab.experiments.paper_tables import PLACES
 from lab.harness import Figures, format_figures
@@ -201,19 +200,12 @@ def test_a_weight_is_scored_along_gravity():
     assert score["within_3_sigma_pct"] == 100.0
 
 
-def test_gravity_is_told_in_each_jaws_frame():
+def test_a_level_gripper_that_rolls_is_told_which_way_things_fall():
     case = MANIPULATION.list_cases(RunOptions())[0]
     gravity = true_gravity(case.settings)
     directions = np.array(list(gravity.values()))
     assert directions[0] == pytest.approx([0.0, -1.0, 0.0])  # a level gripper that rolls
     assert directions[:, 0].min() == pytest.approx(-1.0, abs=1e-3) and np.abs(directions[:, 2]).max() < 1e-9
-    one = make_recording("one")
-    told = tell_gravity(
-        one, {stamp: np.array([0.6, 0.0, 0.8]) for stamp in one.jaw("left").keypoints.stamps_ns.tolist()}
-    )
-    seen = told.jaw("left").keypoints.observation(0).gravity
-    assert R_GRIPPER_JAW["left"] @ seen == pytest.approx([0.6, 0.0, 0.8])
-    assert one.jaw("left").keypoints.observation(0).gravity is None
 
 
 def test_the_twin_has_27_grasps_with_seeds_of_their_own():
