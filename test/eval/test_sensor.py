@@ -43,7 +43,7 @@ def test_arrays_go_through_the_detector_to_both_jaws():
     for gravity in ([0.0, 0.0, 0.0], [0.0, np.nan, 1.0], [0.0, 1.0]):
         with pytest.raises(ValueError, match="expected a direction"):
             sensor.update(rgb, None, stamp=2.0, gravity=gravity)
-    assert sensor.update(rgb, None, stamp=2.0, gravity=[0.0, 0.0, -9.81]).stamp == 2.0
+    assert sensor.update(rgb[::-1], None, stamp=2.0, gravity=[0.0, 0.0, -9.81]).stamp == 2.0
 
 
 @pytest.fixture(scope="module")
