@@ -41,8 +41,10 @@ TRACTION_FLOOR = 0.04
 TRACTION_SHARE = 0.15
 # Motion over which it stays the same [m].
 TRACTION_LENGTH = 2e-3
-# 1 sigma of the traction ratio that errors of the mechanics look like [-], and the time over which it stays [s].
+# 1 sigma of the traction ratio that errors of the mechanics look like [-], and that errors of a detector which last
+# while it sees the same look like, by their size [1/m], and the time over which it stays [s].
 APPARENT_TRACTION = 0.2
+APPARENT_SIGHT = 2e3
 APPARENT_TIME = 10.0
 # 1 sigma of the shift [m] and turn [rad] of a camera that nobody touches, and the time over which they stay [s].
 CAMERA_SHIFT = 0.02e-3
@@ -66,6 +68,7 @@ class Expectation(NamedTuple):
         mean: of shape and height (2,).
         variance: of both (2,).
         traction_variance: of the traction ratio beyond friction.
+        apparent_variance: of the traction ratio that errors look like.
         camera_variance: of the camera's motion (4,).
         camera_time: over which that stays the same [s].
     """
@@ -73,6 +76,7 @@ class Expectation(NamedTuple):
     mean: NDArray
     variance: NDArray
     traction_variance: float
+    apparent_variance: float
     camera_variance: NDArray
     camera_time: float
 
@@ -90,7 +94,7 @@ def expect_state(expected, offset_variance, displacement):
     n = SHARED + 4 * count
     m, V = np.zeros(n), np.zeros(n)
     m[SHAPE : HEIGHT + 1], V[SHAPE : HEIGHT + 1] = expected.mean, expected.variance
-    V[TRACTION], V[APPARENT] = expected.traction_variance, APPARENT_TRACTION**2
+    V[TRACTION], V[APPARENT] = expected.traction_variance, expected.apparent_variance
     V[CAMERA_X : CAMERA_STRETCH + 1] = expected.camera_variance
     for k in range(count):
         own = offset_variance[k] + MODEL_FLOOR**2 + (MODEL_SHAPE * displacement[k]) ** 2

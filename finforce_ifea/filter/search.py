@@ -33,6 +33,8 @@ from finforce_ifea.filter.jump import (
 )
 from finforce_ifea.filter.measurement import Measurement, find_seen, observe
 from finforce_ifea.filter.process import (
+    APPARENT_SIGHT,
+    APPARENT_TRACTION,
     BUMPED_SHIFT,
     BUMPED_TIME,
     BUMPED_TURN,
@@ -269,7 +271,8 @@ class ContactSearch:
         if shared > 0.0:
             camera, time = camera + np.array([shared, shared, PLACE_TURN, PLACE_STRETCH]) ** 2, PLACE_TIME
         mean, traction = self.expectation["mean"].copy(), traction + self.hypotheses.unweighed**2
-        return Expectation(mean, variance, traction, camera, time)
+        apparent = APPARENT_TRACTION**2 + APPARENT_SIGHT**2 * float(np.median(self.points["sight"]))
+        return Expectation(mean, variance, traction, apparent, camera, time)
 
     def _predict(self, dt: float) -> None:
         """Predict the state of an image dt [s] after the last one."""

@@ -140,15 +140,22 @@ def list_missing(recording: Recording, needed: Sequence[str]) -> list[str]:
     return missing if recording.object_pose is not None else [*missing, "/object_pose"]
 
 
-def build_setup(settings: Mapping[str, Any], contact: ContactChoice | None = None) -> EvaluationSetup:
+def build_setup(
+    settings: Mapping[str, Any], contact: ContactChoice | None = None, estimator: EstimatorSettings | None = None
+) -> EvaluationSetup:
     """Return the setup that a case's settings name.
+
+    Args:
+        settings: of the case.
+        contact: estimated by default.
+        estimator: its settings; defaults without.
 
     Raises:
         FinforceError: jaw or calibration cannot be used.
     """
     return EvaluationSetup(
         jaw=load_jaw(settings["jaw"]),
-        settings=EstimatorSettings(),
+        settings=estimator or EstimatorSettings(),
         calibration=load_calibration(settings["calibration"]) if settings["calibration"] else None,
         contacts=contact or ContactChoice(mode="estimate"),
         about={},

@@ -17,6 +17,7 @@ from finforce_eval.evaluation.contact_source import ContactChoice
 from finforce_eval.evaluation.scoring import ONSET_FORCE, Evaluation, force_delays, rms
 from finforce_eval.figures.figures import BLACK, BLUE, GREEN, ORANGE
 from finforce_eval.recordings.tracks import Recording
+from finforce_ifea.settings import EstimatorSettings
 from lab.experiments.experiment import (
     SHARP,
     Case,
@@ -137,9 +138,11 @@ def run(options: RunOptions, case: Case, folder: Path) -> dict[str, Any]:
     return score_grasp(grasp) | told
 
 
-def score_recording(recording: Recording, case: Case, delay: float = 0.0) -> dict[str, Any]:
-    """Return the figures of a recorded grasp whose poses arrive with a delay [s]."""
-    setup = build_setup(case.settings, ContactChoice(mode="estimate", pose_delay=round(1e9 * delay)))
+def score_recording(
+    recording: Recording, case: Case, delay: float = 0.0, estimator: EstimatorSettings | None = None
+) -> dict[str, Any]:
+    """Return the figures of a recorded grasp whose poses arrive with a delay [s]; see `build_setup`."""
+    setup = build_setup(case.settings, ContactChoice(mode="estimate", pose_delay=round(1e9 * delay)), estimator)
     return score_grasp(join_jaws(evaluate_all([recording], setup), recording.name))
 
 
