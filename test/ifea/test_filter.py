@@ -96,7 +96,7 @@ EXPECTED = Expectation(np.ones(2), np.full(2, 4.0), 0.01, 0.04, np.ones(4), CAME
 class TestProcess:
     def test_errors_of_a_detector_that_last_may_look_like_traction(self):
         search = ContactSearch(COUNT, EstimatorSettings())
-        search.expect_friction(FRICTIONLESS)
+        search.expect_friction(Coefficient(0.3, 0.1))
         usual = search._expect().apparent_variance
         search.points["sight"] = (0.2e-3) ** 2
         assert search._expect().apparent_variance == pytest.approx(usual + 0.4**2)
