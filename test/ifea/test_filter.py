@@ -23,7 +23,7 @@ from finforce_ifea.filter.friction_path import NODES, TractionHypotheses
 from finforce_ifea.filter.jump import BUMPED, MISPLACED, NUDGED, JumpWatch, weigh_jump
 from finforce_ifea.filter.measurement import FREEDOM, NO_WEIGHT, Measurement, measure_distances, weigh
 from finforce_ifea.filter.process import CAMERA_TIME, FREE_DEPTH, Expectation, expect_state, find_decay, predict
-from finforce_ifea.filter.search import ContactSearch, _follow_scatter
+from finforce_ifea.filter.search import _follow_scatter
 from finforce_ifea.filter.slip_path import PathState, SlipPath, turn_path
 from finforce_ifea.filter.state import DEPTH, SHARED, TRACTION, state_size
 from finforce_ifea.jaw.calibration import Calibration, load_calibration
@@ -95,8 +95,7 @@ EXPECTED = Expectation(np.ones(2), np.full(2, 4.0), 0.01, 0.04, np.ones(4), CAME
 
 class TestProcess:
     def test_errors_of_a_detector_that_last_may_look_like_traction(self):
-        search = ContactSearch(COUNT, EstimatorSettings())
-        search.expect_friction(Coefficient(0.3, 0.1))
+        search = ForceEstimator(BENCH)._tracker._search
         usual = search._expect().apparent_variance
         search.points["sight"] = (0.2e-3) ** 2
         assert search._expect().apparent_variance == pytest.approx(usual + 0.4**2)
