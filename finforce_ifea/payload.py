@@ -83,7 +83,7 @@ class Payload:
         variance = weights @ (np.diagonal(P, axis1=1, axis2=2) + (means - mean) ** 2) + (_SCALE * weight * gravity) ** 2
         spread = weights @ (self._P[:, 0, 0] + (self._x[:, 0] - weight) ** 2)
         self.weight, self.stddev = float(weight), sqrt(spread + (_SCALE * weight) ** 2)
-        return replace(grasp, manipulation=mean, stddev=np.sqrt(variance))
+        return replace(grasp, manipulation=mean, stddev=np.sqrt(np.maximum(variance, _LEAST_STDDEV**2)))
 
     def _predict(self, stamp: float, gravity: NDArray, expected: float, variance: NDArray) -> None:
         """Predict an image in which weight and support are expected with a variance, and forces with theirs (2,)."""
@@ -118,7 +118,7 @@ class Payload:
 
     def _weigh(self) -> NDArray:
         """Return the probabilities of the hypotheses (2,): a weight that is free is not negative."""
-        stddev = np.sqrt(self._P[:, 0, 0])
+        stddev = np.sqrt(np.maximum(self._P[:, 0, 0], 0.0))
         positive = [
             max(erfc(-x / max(2.0**0.5 * s, 1e-12)), 1e-300) for x, s in zip(self._x[:, 0], stddev, strict=True)
         ]

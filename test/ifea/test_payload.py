@@ -114,3 +114,13 @@ def test_an_image_of_before_stays_as_it_is_and_a_release_forgets():
     assert np.isfinite(payload.stddev)
     payload.update(grasp_of([0.0, 0.0, 0.0], held=0.0), 2.0, down)
     assert payload.stddev == np.inf
+
+
+def test_hours_of_images_with_deviations_from_next_to_nothing_to_large_stay_finite():
+    payload, random = Payload(), np.random.default_rng(0)
+    for k in range(3000):
+        gravity = random.normal(size=3)
+        stddev = 10.0 ** random.uniform(-9.0, 2.0, size=3)
+        grasp = grasp_of(random.normal(size=3), held=random.uniform(0.3, 50.0), stddev=stddev)
+        told = payload.update(grasp, k * 10.0 ** random.uniform(0.0, 0.5), gravity / np.linalg.norm(gravity))
+        assert np.isfinite(told.manipulation).all() and np.isfinite(told.stddev).all() and (told.stddev > 0.0).all()
