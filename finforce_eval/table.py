@@ -256,7 +256,9 @@ def read_table(path: Path) -> tuple[list[ForceSeries], dict[str, Any]]:
         table = pq.read_table(path)
         about = json.loads(table.schema.metadata[_ABOUT])
         rows = table.to_pandas()
-        series = [ForceSeries(_drop_unknown(own)) for _, own in rows.groupby("case", sort=False)]
+        series = [
+            ForceSeries(_drop_unknown(own)) for _, own in rows.groupby(["case", "side"], sort=False, dropna=False)
+        ]
     except Exception as error:  # pyarrow and its decompressors each have their own classes
         raise RecordingError(f"{path}: {one_line(error)}; expected what finforce evaluate --out writes") from error
     return series, about
