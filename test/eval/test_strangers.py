@@ -132,7 +132,8 @@ def test_of_several_cameras_one_is_named(tmp_path, capsys):
         read_recording(bag, ImageChoice(color="/camera"))
     forces = ["--contact", "fixed:40"]
     commands = {"annotate": [*forces, "--out", str(tmp_path / "out")], "check": [], "extrinsics": []}
-    for command, words in (commands | dict.fromkeys(("evaluate", "view", "replay", "trace"), forces)).items():
+    commands["view"] = [*forces, "--save", str(tmp_path / "x.rrd")]
+    for command, words in (commands | dict.fromkeys(("evaluate", "replay", "trace"), forces)).items():
         assert main([command, str(bag), *words, "--color", "/nowhere"]) == 2
         assert "nothing on /nowhere" in capsys.readouterr().err
 
