@@ -8,6 +8,7 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 from shutil import which
+from socket import create_connection
 from typing import Any
 
 import numpy as np
@@ -56,6 +57,7 @@ def run(options: argparse.Namespace) -> CommandResult:
 
 
 DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")  # variables, of which a desktop sets one
+PORT = 9876  # of a local viewer, by default
 TIMELINE = "recording"
 _QUALITY = 80  # of the pictures, JPEG
 _COLOURS = {"left": (0, 114, 178), "right": (213, 94, 0), "grasp": (0, 158, 115), "truth": (204, 204, 204)}
@@ -80,9 +82,11 @@ class _RerunView:
         if file is None:
             beside = os.pathsep.join((str(Path(sys.executable).parent), os.environ.get("PATH", "")))
             try:  # the viewer of this environment, active or not
-                rr.spawn(executable_path=which("rerun", path=beside), recording=self._stream, default_blueprint=layout)
-            except RuntimeError as error:
+                rr.spawn(executable_path=which("rerun", path=beside), recording=self._stream, connect=False)
+                create_connection(("127.0.0.1", PORT), timeout=5.0).close()  # one without a screen is gone by now
+            except (RuntimeError, OSError) as error:
                 raise OptionError(f"Rerun's viewer does not start; --save FILE.rrd needs none: {error}") from error
+            self._stream.connect_grpc(f"rerun+http://127.0.0.1:{PORT}/proxy", default_blueprint=layout)
             return
         file.parent.mkdir(parents=True, exist_ok=True)
         with file.open("wb"):
