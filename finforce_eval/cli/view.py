@@ -82,7 +82,8 @@ class _RerunView:
         if file is None:
             beside = os.pathsep.join((str(Path(sys.executable).parent), os.environ.get("PATH", "")))
             try:  # the viewer of this environment, active or not
-                rr.spawn(executable_path=which("rerun", path=beside), recording=self._stream, connect=False)
+                viewer = which("rerun", path=beside)
+                rr.spawn(port=PORT, executable_path=viewer, recording=self._stream, connect=False)
                 create_connection(("127.0.0.1", PORT), timeout=5.0).close()  # one without a screen is gone by now
             except (RuntimeError, OSError) as error:
                 raise OptionError(f"Rerun's viewer does not start; --save FILE.rrd needs none: {error}") from error

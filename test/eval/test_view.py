@@ -1,6 +1,7 @@
 """Claims about `finforce view`: the file holds pictures, jaws and forces as they were found, at their times."""
 
 import re
+import socket
 from dataclasses import replace
 from importlib.util import find_spec
 from types import SimpleNamespace
@@ -97,6 +98,8 @@ def test_without_a_screen_or_its_viewer_a_file_is_to_be_written(display, words, 
         monkeypatch.delenv(name, raising=False)
     if display:
         monkeypatch.setenv("DISPLAY", display)
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        monkeypatch.setattr(view, "PORT", free.getsockname()[1])
     monkeypatch.setattr(view, "which", lambda program, path: "/nowhere/rerun")
     assert main(["view", str(DEMO), "--contact", "fixed:40", "--calibration", "bench"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
