@@ -13,6 +13,8 @@ from finforce.transforms import check_pose, invert_pose, move_pose, pose_from_qu
 
 SIDES = ("left", "right")
 FARTHEST_CAMERA = 3.0  # [m] from the gripper, where f = 430 px shows a finger of 80 mm in 11 px
+_JAWS = (0.0, 0.010, 0.042)  # middle of both jaws' sides [m]
+_LOOKS_AT, LOOKS_AWAY = np.radians((35.0, 70.0))  # off them: surely in view, surely not
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # about z: left and right change places
 
 
@@ -77,9 +79,9 @@ def look_at(position: ArrayLike, target: ArrayLike, right: ArrayLike) -> NDArray
 
 
 # On the wrist, above the fingers' side faces, both jaws in view from base to tip.
-ROBOT_CAMERA = look_at((0.0, 0.095, -0.045), (0.0, 0.010, 0.042), (1.0, 0.0, 0.0))
+ROBOT_CAMERA = look_at((0.0, 0.095, -0.045), _JAWS, (1.0, 0.0, 0.0))
 # Beyond the tips, looking back at the same sides, 30 degrees from square to them.
-FRONT_CAMERA = look_at((0.0, 0.114, 0.102), (0.0, 0.010, 0.042), (1.0, 0.0, 0.0))
+FRONT_CAMERA = look_at((0.0, 0.114, 0.102), _JAWS, (1.0, 0.0, 0.0))
 
 # The bench has one jaw, held here on the closing axis [m]; its pose before the camera is that of the bench recordings.
 BENCH_ORIGIN_X = -0.055
@@ -88,6 +90,29 @@ _BENCH_JAW = pose_from_quaternion(
 )
 BENCH_CAMERA = jaw_in_gripper("left", BENCH_ORIGIN_X) @ invert_pose(_BENCH_JAW)
 CAMERAS = {"robot": ROBOT_CAMERA, "bench": BENCH_CAMERA, "turned": ROBOT_CAMERA @ HALF_TURN, "front": FRONT_CAMERA}
+
+
+# Of a camera's optical frame (z forward, y down) in that of its body (x forward, z up), as in REP 103.
+_BODY_OPTICAL = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+
+
+def angle_off_jaws(T_gripper_camera: NDArray) -> float:
+    """Return the angle [rad] between a camera's axis and its line of sight to the middle of the jaws."""
+    x, y, z = (invert_pose(T_gripper_camera) @ (*_JAWS, 1.0))[:3]
+    return float(np.arctan2(np.hypot(x, y), z))
+
+
+def suggest_camera(T_gripper_camera: NDArray) -> dict[str, NDArray]:
+    """Return what the pose (4, 4) of a camera that does not look at the jaws may be instead, T_gripper_camera by it."""
+    inverse = invert_pose(T_gripper_camera)
+    readings = {
+        "the pose of the gripper in the camera frame": inverse,
+        "the pose of the camera's body, x forward (camera_link), not of its optical frame": T_gripper_camera
+        @ _BODY_OPTICAL,
+        "that of a camera on the other side of the gripper, with left and right exchanged": HALF_TURN
+        @ T_gripper_camera,
+    }
+    return {what: T for what, T in readings.items() if T[1, 3] > _JAWS[1] and angle_off_jaws(T) < _LOOKS_AT}
 
 
 def check_camera(T_gripper_camera: NDArray) -> NDArray:

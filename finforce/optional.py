@@ -1,7 +1,9 @@
 """Libraries that not everybody installs, imported where they are used; their absence says what to install."""
 
 import os
+import sys
 from importlib import import_module
+from pathlib import Path
 from types import ModuleType
 
 from finforce.errors import MissingDependencyError
@@ -28,7 +30,24 @@ def import_library(name: str, purpose: str, package: str = "", title: str = "") 
 
 def import_ros(name: str, purpose: str) -> ModuleType:
     """Return a module of finforce that needs ROS 2; raises MissingDependencyError where that is not installed."""
+    check_middleware()
     return import_library(name, purpose, "'finforce[ros]'", "ROS 2")
+
+
+def check_middleware() -> None:
+    """Refuse a middleware that RMW_IMPLEMENTATION names and ROS 2 has not, with which every node would exit.
+
+    Raises:
+        MissingDependencyError: it is not installed.
+    """
+    wanted, prefixes = os.environ.get("RMW_IMPLEMENTATION"), os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
+    index = [Path(prefix, "share/ament_index/resource_index/rmw_typesupport") for prefix in (*prefixes, sys.prefix)]
+    known = {each.name for folder in index if folder.is_dir() for each in folder.iterdir()} - {"rmw_implementation"}
+    if wanted and known and wanted not in known:
+        raise MissingDependencyError(
+            f"RMW_IMPLEMENTATION={wanted} is not installed, {', '.join(sorted(known))} is: unset RMW_IMPLEMENTATION, "
+            f"or use ROS 2 from apt with ros-{os.environ.get('ROS_DISTRO', 'jazzy')}-{wanted.replace('_', '-')}"
+        )
 
 
 def import_manifold3d() -> ModuleType:

@@ -255,8 +255,8 @@ def read_table(path: Path) -> tuple[list[ForceSeries], dict[str, Any]]:
     try:
         table = pq.read_table(path)
         about = json.loads(table.schema.metadata[_ABOUT])
-        rows = table.to_pandas()
-        series = [ForceSeries(_drop_unknown(own)) for _, own in rows.groupby("case", sort=False)]
+        jaws = table.to_pandas().groupby(["case", "side"], sort=False, dropna=False)
+        series = [ForceSeries(_drop_unknown(rows)) for _, rows in jaws]
     except Exception as error:  # pyarrow and its decompressors each have their own classes
         raise RecordingError(f"{path}: {one_line(error)}; expected what finforce evaluate --out writes") from error
     return series, about

@@ -101,6 +101,8 @@ def _value(entry: Field, text: str) -> Any:
         return text.lower() == "true"
     if text == NONE and NONE not in entry.metadata.get("choices", ()) and isinstance(default, str | float):
         return type(default)("" if isinstance(default, str) else "nan")
+    if text.startswith("~/") and not name.endswith("_topic"):  # of a topic it is the node's own name
+        text = os.path.expanduser(text)  # shells leave it as it is after :=
     try:
         return type(default)(text)
     except ValueError:

@@ -148,20 +148,21 @@ def scale_calibration(
         try:
             scaled.check_plausible(jaw)
         except CalibrationError as error:
-            raise CalibrationError(f"{error}{_suspect_newtons(scaled, weighing, jaw)}") from None
+            raise CalibrationError(f"{error}{_suspect_unit(scaled, weighing, jaw)}") from None
     stddev = scaled.young_modulus * weighing.stddev / weighing.factor
     return scaled.changed(uncertainty={"young_modulus": stddev})
 
 
-def _suspect_newtons(scaled: Calibration, weighing: Weighing, jaw: Jaw) -> str:
-    """Return a hint where the readings make sense as newtons."""
-    newton = 1e3 / GRAVITY  # in grams
-    try:
-        scaled.changed(young_modulus=scaled.young_modulus * newton).check_plausible(jaw)
-    except CalibrationError:
-        return ""
-    grams = " ".join(f"{newton * newton * weight:.0f}" for weight in weighing.weights)
-    return f"; the readings look like newtons, in grams they are {grams}"
+def _suspect_unit(scaled: Calibration, weighing: Weighing, jaw: Jaw) -> str:
+    """Return a hint where the readings make sense in another unit."""
+    for unit, grams in {"newtons": 1e3 / GRAVITY, "kilograms": 1e3, "ounces": 28.35}.items():
+        try:
+            scaled.changed(young_modulus=scaled.young_modulus * grams).check_plausible(jaw)
+        except CalibrationError:
+            continue
+        readings = " ".join(f"{grams * weight * 1e3 / GRAVITY:.0f}" for weight in weighing.weights)
+        return f"; the readings look like {unit}, in grams they are {readings}"
+    return ""
 
 
 def weigh(holds: Sequence[Hold], grams: Sequence[float], name: str = "the recording") -> Weighing:

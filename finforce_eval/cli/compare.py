@@ -84,4 +84,6 @@ def format_changes(changes: Sequence[Change]) -> str:
         "chance: one standard deviation of the difference, by how it varies within the recording; better and worse are "
         "beyond three of them, worse also where 5 % fewer frames are answered."
     )
+    if not any(np.isfinite(change.difference) for change in changes):
+        lines.append("No recording is in both: recordings are paired by name, that of their file or folder.")
     return "\n".join(lines)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from finforce.camera import CameraIntrinsics, ImageError
 from finforce.messages import NANOSECONDS
 from finforce.optional import import_cv2
-from finforce_eval.cli.parser import CommandResult, length_mm
+from finforce_eval.cli.parser import CommandResult, file_type, length_mm
 from finforce_eval.errors import RecordingError
 from finforce_eval.sensor import ForceSensor, GripperForces
 from finforce_eval.table import ForceSeries, write_table
@@ -27,7 +27,7 @@ _COLUMNS["magnitude_stddev"] = np.nan
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
-    text = "number of a camera (/dev/videoN), or a file or address that OpenCV can open (0)"
+    text = "number of a camera or its name (/dev/videoN), or a file or address that OpenCV can open (0)"
     parser.add_argument("--camera", default="0", metavar="N", help=text)
     parser.add_argument("--rig", required=True, metavar="FILE", help="rig file of finforce camera")
     text = "height of first touch above the clamped base [mm]"
@@ -35,7 +35,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     text = "calibration file, or name of an included one (material of the jaw file)"
     parser.add_argument("--calibration", metavar="FILE", help=text)
     text = "write a Parquet table, a row per image and jaw, at the end"
-    parser.add_argument("-o", "--output", metavar="FILE", help=text)
+    parser.add_argument("-o", "--output", type=file_type(".parquet"), metavar="FILE.parquet", help=text)
 
 
 def run(options: argparse.Namespace) -> CommandResult:
@@ -66,7 +66,7 @@ class Webcam:
     """The images of a UVC camera, a file or a stream, by OpenCV.
 
     Args:
-        source: number of the camera, or path or address.
+        source: number of the camera, its name in /dev, or path or address.
         camera: intrinsics, which the images have to agree with in size; a camera is asked for that.
 
     Raises:
@@ -75,15 +75,18 @@ class Webcam:
 
     def __init__(self, source: str, camera: CameraIntrinsics) -> None:
         cv2 = import_cv2()
-        self._name, self._camera, self._is_device = f"camera {source}", camera, source.isdigit()
-        self._capture = cv2.VideoCapture(int(source) if self._is_device else source)
+        self._name, self._camera = f"camera {source}", camera
+        self._capture = cv2.VideoCapture(int(source) if source.isdigit() else source)
         if not self._capture.isOpened():
             there = ", ".join(sorted(each.name for each in Path("/dev").glob("video*"))) or "none"
             raise RecordingError(
                 f"{self._name}: cannot be opened; expected a number of /dev/video* ({there}), a file, "
                 "or the address of a stream that can be reached from here"
             )
-        if self._is_device:
+        is_device = source.isdigit() or source.startswith("/dev/")
+        is_stream = "://" in source and self._capture.get(cv2.CAP_PROP_FRAME_COUNT) <= 0  # its rate is but a guess
+        self._is_live = is_device or is_stream
+        if is_device:
             self._capture.set(cv2.CAP_PROP_FRAME_WIDTH, camera.width)
             self._capture.set(cv2.CAP_PROP_FRAME_HEIGHT, camera.height)
             self._capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # the newest image, not the oldest that waits
@@ -100,7 +103,7 @@ class Webcam:
             while True:
                 is_read, bgr = self._capture.read()
                 now = time.monotonic()
-                if not is_read and (self._is_device or not number):
+                if not is_read and (self._is_live or not number):
                     raise RecordingError(
                         f"{self._name}: no image for {now - begin:.1f} s, after {number}: unplugged, stalled, or used "
                         "by another program?"
@@ -112,7 +115,7 @@ class Webcam:
                         f"{self._name}: image {number} is {bgr.shape[1]} x {bgr.shape[0]}; expected {size[1]} x "
                         f"{size[0]} as the rig has: make a rig of these by finforce camera"
                     )
-                yield now if self._is_device else number * self._period, np.ascontiguousarray(bgr[..., ::-1])
+                yield now if self._is_live else number * self._period, np.ascontiguousarray(bgr[..., ::-1])
                 number, begin = number + 1, time.monotonic()
         finally:
             self._capture.release()

@@ -39,11 +39,18 @@ class CommandResult:
     status: int = 0
 
 
-def picture_file(text: str) -> str:
-    """Return the name of a picture to be drawn, for `type=` of an option; another ending is refused."""
-    if not text.lower().endswith(PICTURES):
-        raise argparse.ArgumentTypeError(f"{text}: expected a name that ends in {', '.join(PICTURES)}")
-    return text
+def file_type(*endings: str) -> Callable[[str], str]:
+    """Return what reads the name of a file to be written, for `type=` of an option; another ending is refused."""
+
+    def read(text: str) -> str:
+        if not text.lower().endswith(endings):
+            raise argparse.ArgumentTypeError(f"{text}: expected a name that ends in {', '.join(endings)}")
+        return text
+
+    return read
+
+
+picture_file = file_type(*PICTURES)
 
 
 class Parser(argparse.ArgumentParser):

@@ -31,7 +31,7 @@ from finforce_eval.recordings.image_files import read_depth, read_image, read_in
 OUTPUTS = (".stl", ".ply", ".glb")
 POSE_FORMS = (
     '{"rotation": [w, x, y, z], "translation": [x, y, z], "scale": s, "axes": "glb" or "canonical"}, '
-    '{"matrix": 4x4}, {"T_camera_object": 4x4} as reconstruct writes it, or a bare 4x4 list'
+    '{"matrix": 4x4}, {"T_camera_object": 4x4} as reconstruct writes it, a bare 4x4 list, or such lines as .txt'
 )
 
 
@@ -47,7 +47,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--mesh", metavar="FILE", help="generated mesh (STL, OBJ, PLY, GLB) or splats (PLY), in any unit"
     )
-    pose = "JSON with its pose: rotation (w x y z), translation and scale as from SAM-3D, or a 4x4 matrix"
+    pose = "JSON with its pose: rotation (w x y z), translation and scale as from SAM-3D, or a 4x4 matrix, also as .txt"
     parser.add_argument("--pose", metavar="FILE", help=pose)
     method = "method (robust with a generated mesh; otherwise primitive if one fits, else completion)"
     parser.add_argument("--method", choices=("robust", "paper", "primitive", "completion"), help=method)
@@ -130,12 +130,12 @@ def read_generated_pose(path: Path | str) -> NDArray:
     """Return the map (4, 4) of a generated mesh into the camera frame.
 
     Raises:
-        OptionError: the file is no JSON of one of `POSE_FORMS`.
+        OptionError: the file is none of `POSE_FORMS`.
         PoseError: its numbers are no pose.
     """
     path = Path(path)
     try:
-        content = read_json(path)
+        content = np.loadtxt(path).tolist() if path.suffix == ".txt" else read_json(path)
         if isinstance(content, list):
             content = {"matrix": content}
         for key in ("matrix", "T_camera_object"):

@@ -13,7 +13,7 @@ from finforce.gripper_frames import SIDES
 from finforce.messages import NANOSECONDS, stamp_of
 from finforce_eval.cli.parser import CommandResult
 from finforce_eval.errors import OptionError, RecordingError
-from finforce_eval.evaluation.batch import read_evaluations
+from finforce_eval.evaluation.batch import SCORED, read_evaluations
 from finforce_eval.evaluation.scoring import match_truth
 from finforce_eval.figures.report import PageHead, write_html, write_page
 from finforce_eval.machine import version
@@ -22,13 +22,13 @@ from finforce_eval.recordings.dataset import Dataset, is_dataset, open_dataset, 
 from finforce_eval.recordings.recording import WRENCH
 from finforce_eval.recordings.tracks import WrenchTrack, stack_vectors
 from finforce_eval.recordings.writer import STATUS
-from finforce_eval.table import ForceSeries, stddev_along
+from finforce_eval.table import ForceSeries, read_table, stddev_along
 from finforce_eval.tasks import is_manifest
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
-    text = "recordings or LeRobot datasets with forces, or output folders of finforce "
+    text = "recordings, LeRobot datasets or tables (.parquet) with forces, or output folders of finforce "
     text += "evaluate --out"
     parser.add_argument("sources", nargs="+", metavar="SOURCE", help=text)
     parser.add_argument("-o", "--output", default="report.html", metavar="FILE", help="page to write (report.html)")
@@ -47,8 +47,14 @@ def run(options: argparse.Namespace) -> CommandResult:
     tables, recorded = [], []
     sources = [Path(source) for source in options.sources if not is_manifest(Path(source))]
     for source in sources:
-        files = sorted(source.glob("*.parquet")) if source.is_dir() else []
-        tables += files
+        files = sorted(source.glob("*.parquet")) if source.is_dir() else [source] * (source.suffix == ".parquet")
+        for file in files:
+            series, about = read_table(file)
+            if SCORED in about:
+                tables.append(file)
+                continue
+            alike = len({each.name for each in series}) < len(series)
+            recorded += [each.renamed(f"{each.name}/{each.side}") for each in series] if alike else series
         recorded += [] if files else read_forces(source)
     if not tables and not recorded:
         raise OptionError(f"{' '.join(options.sources)}: only a manifest; expected the recordings next to it")

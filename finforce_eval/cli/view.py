@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import os
+import sys
 from collections.abc import Mapping
 from pathlib import Path
+from shutil import which
+from socket import create_connection
 from typing import Any
 
 import numpy as np
@@ -36,6 +40,8 @@ def run(options: argparse.Namespace) -> CommandResult:
     """Find the forces of a recording and show them with its pictures."""
     if options.save and not options.save.endswith(".rrd"):
         raise OptionError(f"--save {options.save}: expected a name that ends in .rrd")
+    if not (options.save or sys.platform != "linux" or any(map(os.environ.get, DISPLAYS))):
+        raise OptionError(f"no screen to show it on, as over SSH ({', '.join(DISPLAYS)}): expected --save FILE.rrd")
     setup = make_setup(options)
     (recording,) = read_keypoints(options)
     view = _RerunView(recording.name, Path(options.save) if options.save else None)
@@ -50,6 +56,8 @@ def run(options: argparse.Namespace) -> CommandResult:
     return CommandResult({"file": options.save, "images": frames, "jaws": list(jaws)})
 
 
+DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")  # variables, of which a desktop sets one
+PORT = 9876  # of a local viewer, by default
 TIMELINE = "recording"
 _QUALITY = 80  # of the pictures, JPEG
 _COLOURS = {"left": (0, 114, 178), "right": (213, 94, 0), "grasp": (0, 158, 115), "truth": (204, 204, 204)}
@@ -72,7 +80,14 @@ class _RerunView:
         self._stream = rr.RecordingStream("finforce", recording_id=name)
         layout = _lay_out(import_library("rerun.blueprint", "finforce view", "'finforce[view]'"))
         if file is None:
-            self._stream.spawn(default_blueprint=layout)
+            beside = os.pathsep.join((str(Path(sys.executable).parent), os.environ.get("PATH", "")))
+            try:  # the viewer of this environment, active or not
+                viewer = which("rerun", path=beside)
+                rr.spawn(port=PORT, executable_path=viewer, recording=self._stream, connect=False)
+                create_connection(("127.0.0.1", PORT), timeout=5.0).close()  # one without a screen is gone by now
+            except (RuntimeError, OSError) as error:
+                raise OptionError(f"Rerun's viewer does not start; --save FILE.rrd needs none: {error}") from error
+            self._stream.connect_grpc(f"rerun+http://127.0.0.1:{PORT}/proxy", default_blueprint=layout)
             return
         file.parent.mkdir(parents=True, exist_ok=True)
         with file.open("wb"):

@@ -183,6 +183,9 @@ def evaluate_many(
     return evaluation, failed
 
 
+SCORED = "true_range_N"  # of what a table says of its run: it is that of an evaluation
+
+
 def read_evaluations(paths: Iterable[Path]) -> tuple[Evaluation, dict[str, Any]]:
     """Return the scores of the tables of some recordings together, and what the first of them says was run.
 
@@ -191,7 +194,7 @@ def read_evaluations(paths: Iterable[Path]) -> tuple[Evaluation, dict[str, Any]]
     """
     tables = [read_table(path) for path in paths]
     try:
-        found = [about["true_range_N"] for _, about in tables]
+        found = [about[SCORED] for _, about in tables]
         ranges = [(float(low), float(high)) for low, high in filter(None, found)]
         first = dict(tables[0][1]["about"])
     except (KeyError, TypeError, ValueError) as error:
@@ -226,7 +229,7 @@ def evaluate_task(name: str, path: str, target: str, options: argparse.Namespace
         raise RecordingError(text if name in text or path in text else f"{name}: {text}") from error
     names = list(setup.jaw.keypoint_names)
     cases = {case: asdict(score) for case, score in score_results(results, [recording]).scores.items()}
-    about = {"about": dict(setup.about), "path": path, "true_range_N": true_range(recording), "keypoint_names": names}
+    about = {"about": dict(setup.about), "path": path, SCORED: true_range(recording), "keypoint_names": names}
     write_table(Path(target), results, about | {"cases": cases})
     notes = [*recording.notes, *setup.contacts.describe_comparison(recording), *describe_contradictions(results)]
     notes += [note_left_out(recording, result) for result in results if setup.as_live]

@@ -284,10 +284,11 @@ _OTHERS = {
     ".hdf5": "HDF5, as ALOHA and robomimic write it: make a LeRobot dataset of it, with LeRobotDataset.create",
     ".zstd": "compressed as a whole: unpack it with zstd -d FILE",
     ".zip": "a zip file; a replay buffer of UMI is called NAME.zarr.zip",
+    ".heic": "a picture as phones write it: make .jpg of all of them, with heif-convert or on the phone",
 }
 # of what is said of MCAP files that are not written by ROS 2
 _FOREIGN = ("Profile is not ros2", "'protobuf'", "'jsonschema'", "'flatbuffer'", "'ros1msg'")
-_OTHERS |= {".h5": _OTHERS[".hdf5"], ".zst": _OTHERS[".zstd"]}
+_OTHERS |= {".h5": _OTHERS[".hdf5"], ".zst": _OTHERS[".zstd"], ".heif": _OTHERS[".heic"]}
 
 
 def bag_source(path: Path) -> Path:
@@ -299,8 +300,8 @@ def bag_source(path: Path) -> Path:
     if not path.exists():
         raise RecordingError(f"{path}: no such recording")
     path = path.resolve()
-    if path.suffix in _OTHERS:
-        raise RecordingError(f"{path.name}: {_OTHERS[path.suffix]}")
+    if path.suffix.lower() in _OTHERS:
+        raise RecordingError(f"{path.name}: {_OTHERS[path.suffix.lower()]}")
     if path.is_file() and path.suffix not in (".mcap", ".db3"):
         raise RecordingError(f"{path.name}: not a recording; expected a rosbag2 folder, .mcap or .db3")
     if path.is_file():
@@ -312,10 +313,12 @@ def bag_source(path: Path) -> Path:
     if len(files) != 1:
         found = f"no metadata.yaml and {len(files)} bag files: run `ros2 bag reindex` on it; expected one or metadata"
         found = found if files else "no metadata.yaml, .mcap, .db3 or pictures"
-        packed = [] if files else [each for each in sorted(path.iterdir()) if each.suffix in _OTHERS]
+        packed = [] if files else [each for each in sorted(path.iterdir()) if each.suffix.lower() in _OTHERS]
         if packed:
-            raise RecordingError(f"{packed[0].name}: {_OTHERS[packed[0].suffix]}")
-        raise RecordingError(f"{path.name}: the folder is not a recording: {found} in it")
+            raise RecordingError(f"{packed[0].name}: {_OTHERS[packed[0].suffix.lower()]}")
+        kinds = ", ".join(sorted({each.suffix for each in path.iterdir() if each.suffix}))
+        other = f", but {kinds}; expected pictures as {', '.join(PICTURES)}" if kinds and not files else ""
+        raise RecordingError(f"{path.name}: the folder is not a recording: {found} in it{other}")
     return _check_bag(files[0])
 
 

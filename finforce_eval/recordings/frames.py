@@ -245,6 +245,21 @@ def read_picture(path: Path) -> NDArray[np.uint8]:
         raise RecordingError(f"{path.name}: {error}; expected a picture, jpeg or png") from error
 
 
+def _read_pictures(paths: Sequence[Path]) -> Iterator[NDArray[np.uint8]]:
+    """Yield pictures (h, w, 3); raises RecordingError where one has another size than the first."""
+    size = None
+    for path in paths:
+        picture = read_picture(path)
+        height, width = picture.shape[:2]
+        size = size or (width, height)
+        if (width, height) != size:
+            raise RecordingError(
+                f"{path.name}: {width} x {height}; expected {size[0]} x {size[1]} as {paths[0].name} has: turned, "
+                "or of another camera? leave it out"
+            )
+        yield picture
+
+
 def read_frames(path: Path, choice: ImageChoice, sides: Sequence[str] = ()) -> Recording:
     """Return a video or a folder of pictures as a recording whose jaws are still to be found.
 
@@ -257,7 +272,7 @@ def read_frames(path: Path, choice: ImageChoice, sides: Sequence[str] = ()) -> R
     if path.is_dir():
         paths = list_pictures(path)
         fps, count, shape = STILL_RATE, len(paths), read_picture(paths[0]).shape[:2]
-        read = partial(map, read_picture, paths)
+        read = partial(_read_pictures, paths)
     else:
         with _open_video(path, name) as (container, stream):
             fps, shown = float(stream.average_rate or 0.0), _list_shown(container, stream)

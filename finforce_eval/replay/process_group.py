@@ -15,6 +15,7 @@ from typing import IO, Any
 import psutil
 
 from finforce.errors import FinforceError
+from finforce.optional import check_middleware
 from finforce.ros.transport import describe_domain
 from finforce.systems.processes import RESPAWN_DELAY, SINGLE_THREAD, UNUSABLE, Process
 
@@ -36,6 +37,7 @@ class ProcessGroup:
     """
 
     def __init__(self, processes: Sequence[Process], environment: Mapping[str, str], *, quiet: bool = True) -> None:
+        check_middleware()
         self._processes, self._quiet = processes, quiet
         self._environment = {**os.environ, **SINGLE_THREAD, **environment}
         self._children: list[subprocess.Popen] = []

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.camera import CameraIntrinsics
-from finforce.gripper_frames import HALF_TURN, OpeningRange, jaw_in_camera
+from finforce.gripper_frames import LOOKS_AWAY, OpeningRange, angle_off_jaws, jaw_in_camera, suggest_camera
 from finforce.transforms import pose_numbers
 from finforce_keypoints.errors import GeometryError, ModelError
 from finforce_keypoints.geometry.jaw_pose import COVERED_STDDEV, SLIP
@@ -248,18 +248,23 @@ class SidePlaneDetector:
 def check_camera_side(jaw: Jaw, T_gripper_camera: NDArray) -> None:
     """Refuse a camera, T_gripper_camera (4, 4), that is not beyond the side of a jaw on which its key points lie.
 
+    One that looks away from the jaws is refused, too, where its pose is that of another frame.
+
     Raises:
-        GeometryError: it is not; the message says what to give where the camera is mounted on the other side.
+        GeometryError: it is not; the message says what its pose is likely of, and what to give then.
     """
     y, side_y = float(T_gripper_camera[1, 3]), float(np.abs(jaw.keypoints[:, 1]).mean())
-    if y > side_y:
+    angle, likely = angle_off_jaws(T_gripper_camera), suggest_camera(T_gripper_camera)
+    if y > side_y and (angle < LOOKS_AWAY or not likely):
         return
-    turned = ", ".join(f"{number:.4f}" for number in pose_numbers(HALF_TURN @ T_gripper_camera))
-    raise GeometryError(
-        f"T_gripper_camera: the camera is at y = {y:g} m and does not see the sides of the jaws, y = {side_y:g} m; "
-        f"expected it beyond them. A camera on the other side of the gripper sees it turned about z by half a turn: "
-        f"the left jaw is called right, and T_gripper_camera is [{turned}]"
-    )
+    found = f", at y = {y:g} m, does not see the sides of the jaws, y = {side_y:g} m; expected it beyond them"
+    if y > side_y:
+        found = f" looks {np.degrees(angle):.0f} degrees past the jaws"
+    hints = [
+        f"is it {what}? then T_gripper_camera is [{', '.join(f'{number:.4f}' for number in pose_numbers(T))}]"
+        for what, T in likely.items()
+    ]
+    raise GeometryError("; ".join((f"T_gripper_camera: the camera{found}", *hints)))
 
 
 def find_rest(jaw: Jaw) -> NDArray:

@@ -98,6 +98,14 @@ def files(tmp_path):
     return [str(path) for path in paths]
 
 
+def test_recordings_that_were_renamed_are_said_to_be_paired_by_name(files, tmp_path, capsys):
+    renamed = tmp_path / "renamed.json"
+    renamed.write_text(json.dumps(evaluation(ERRORS, name="b")))
+    for other, is_said in ((renamed, True), (files[1], False)):
+        assert main(["compare", files[0], str(other)]) == 0
+        assert ("No recording is in both: recordings are paired by name" in capsys.readouterr().out) == is_said
+
+
 def test_table_and_json_tell_the_same(files, tmp_path, capsys):
     out = tmp_path / "out.json"
     assert main(["compare", *files, "--json", str(out)]) == 0

@@ -218,6 +218,13 @@ def test_report_takes_annotated_recordings_and_kept_evaluations(tmp_path, capsys
     page, *_ = look_at(browser, page_file)
     assert page.title() == "Mine" and page.locator("canvas").count() == 1
     page.close()
+    bare = tmp_path / "video" / "forces.parquet"  # as `live` and `annotate` write it
+    bare.parent.mkdir()
+    right = ForceSeries(result.table.assign(side="right"))
+    write_table(bare, [result, right], {"rig": "rig.yaml"})
+    for source, plots in ((bare, 2), (bare.parent, 2), (kept / "pressed.parquet", 1)):
+        assert main(["report", str(source), "-o", str(tmp_path / "table.html")]) == 0
+        assert f"{plots} plots" in capsys.readouterr().out
     bag = write_recording(recording, tmp_path / "bag")
     assert main(["report", str(bag), "-o", str(tmp_path / "x.html")]) == 2
     assert "no forces" in capsys.readouterr().err

@@ -1,11 +1,14 @@
 """Claims about `finforce launch`: the systems of the launch files, without `ros2`."""
 
+import re
 import sys
 from dataclasses import dataclass
 
 import pytest
 
+from finforce import optional
 from finforce.errors import MissingDependencyError
+from finforce.optional import check_middleware
 from finforce.systems.processes import executables_of
 from finforce_eval.cli import demo, launch
 from finforce_eval.cli.main import main
@@ -54,6 +57,30 @@ def test_a_word_that_cannot_be_used_is_one_line(word, reason, capsys):
     assert main(["launch", "robot", word]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert reason in line
+
+
+def test_the_home_folder_is_found_where_the_shell_leaves_it_and_names_of_topics_stay(monkeypatch):
+    monkeypatch.setenv("HOME", "/home/me")
+    words = ["sim:=true", "object_mesh:=~/can.stl", "pose_topic:=~/pose"]
+    commands = str([process.command() for process in launch.startable(launch.list_parts("robot", words))])
+    assert "/home/me/can.stl" in commands and "~/pose" in commands and "~/can.stl" not in commands
+
+
+@pytest.mark.parametrize("words", [("launch", "robot", "sim:=true"), ("echo", "grasp_wrench")])
+def test_a_middleware_that_is_not_installed_is_named_before_any_node_exits(words, monkeypatch, tmp_path, capsys):
+    index = tmp_path / "share/ament_index/resource_index/rmw_typesupport"
+    index.mkdir(parents=True)
+    (index / "rmw_mine_cpp").touch()
+    monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
+    monkeypatch.setenv("RMW_IMPLEMENTATION", "rmw_mine_cpp")
+    check_middleware()
+    monkeypatch.setenv("RMW_IMPLEMENTATION", "rmw_other_cpp")
+    monkeypatch.setattr(process_group.ProcessGroup, "_start", lambda *_: pytest.fail("a node was started"))
+    monkeypatch.setattr(optional, "import_library", lambda *_: pytest.fail("ROS 2 was loaded"))
+    assert main(list(words)) == 2
+    assert re.search(
+        "RMW_IMPLEMENTATION=rmw_other_cpp is not installed, .*rmw_mine_cpp.*unset", capsys.readouterr().err
+    )
 
 
 def test_every_argument_is_listed_with_its_default(capsys):

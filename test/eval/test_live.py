@@ -30,7 +30,7 @@ STALLED = None
 class FakeCapture:
     """A camera that gives some images, then stalls; an exception among them is raised."""
 
-    images = ()
+    images, asked = (), {}
 
     def __init__(self, source):
         self.source, self.left = source, list(self.images)
@@ -39,6 +39,7 @@ class FakeCapture:
         return self.source not in (7, "rtsp://10.0.0.1/a")
 
     def set(self, name, value):
+        self.asked[name] = value
         return True
 
     def get(self, name):
@@ -83,14 +84,20 @@ def make_image(blue, size=(48, 64)):
 def watch(monkeypatch, tmp_path, capsys):
     """Run the command with a camera that gives some images; its status, what it printed, and the table."""
 
-    def run(*images, camera="0"):
+    def run(*images, camera="0", table="live.parquet"):
         cv2 = import_cv2()
-        names = ("CAP_PROP_FRAME_WIDTH", "CAP_PROP_FRAME_HEIGHT", "CAP_PROP_BUFFERSIZE", "CAP_PROP_FPS")
+        names = (
+            "CAP_PROP_FRAME_WIDTH",
+            "CAP_PROP_FRAME_HEIGHT",
+            "CAP_PROP_BUFFERSIZE",
+            "CAP_PROP_FPS",
+            "CAP_PROP_FRAME_COUNT",
+        )
         fake = SimpleNamespace(VideoCapture=FakeCapture, **{name: getattr(cv2, name) for name in names})
         monkeypatch.setattr(FakeCapture, "images", images)
         monkeypatch.setattr(live, "import_cv2", lambda: fake)
         monkeypatch.setattr(live, "ForceSensor", FakeSensor)
-        table = tmp_path / "live.parquet"
+        table = tmp_path / table
         words = ["--camera", camera, "--rig", "rig.yaml", "--contact-height", "40", "-o", str(table)]
         status = main(["live", *words])
         said = capsys.readouterr()
@@ -114,6 +121,8 @@ def test_ctrl_c_ends_it_and_the_forces_are_written(watch):
         ((), "rtsp://10.0.0.1/a", " a file, or the address of a stream that can be reached"),
         ((), "0", "camera 0: no image for 0.0 s, after 0: unplugged, stalled"),
         ((make_image(9), STALLED), "0", "camera 0: no image for 0.0 s, after 1"),
+        ((make_image(9), STALLED), "/dev/video2", "camera /dev/video2: no image for 0.0 s, after 1"),
+        ((make_image(9), STALLED), "http://10.0.0.2/mjpg", "camera http://10.0.0.2/mjpg: no image for 0.0 s, after 1"),
         ((make_image(9), make_image(9, (72, 96))), "0", "camera 0: image 1 is 96 x 72; expected 64 x 48"),
     ],
 )
@@ -121,6 +130,22 @@ def test_a_camera_that_is_missing_stalls_or_changes_is_named(images, camera, wor
     status, said, table = watch(*images, camera=camera)
     assert status == 2 and words in said.err
     assert (table is not None) == bool(images)  # what was seen before is kept
+
+
+@pytest.mark.parametrize(("camera", "is_asked"), [("/dev/video2", True), ("http://10.0.0.2/mjpg", False)])
+def test_a_device_by_name_and_a_stream_are_cameras_not_files(camera, is_asked, watch, monkeypatch):
+    monkeypatch.setattr(FakeCapture, "asked", {})
+    received = iter(range(100, 200))
+    monkeypatch.setattr(live.time, "monotonic", lambda: float(next(received)))
+    _, _, table = watch(make_image(9), make_image(9), camera=camera)
+    assert (table.stamp[table.side == "left"] > 100.0).all()  # when they came, not their places in a file
+    assert (FakeCapture.asked.get(import_cv2().CAP_PROP_FRAME_WIDTH) == 64) == is_asked
+
+
+def test_a_table_of_another_kind_than_asked_for_is_refused_before_the_first_image(watch, capsys):
+    with pytest.raises(SystemExit):
+        watch(make_image(9), table="forces.csv")
+    assert "forces.csv: expected a name that ends in .parquet" in capsys.readouterr().err
 
 
 def test_the_images_of_a_file_come_with_their_colours_and_times(tmp_path):

@@ -179,6 +179,12 @@ def test_pose_of_the_generator_is_read_in_each_form(tmp_path):
     for content in (expected, {"matrix": expected}, {"T_camera_object": expected, "method": "robust"}):
         path.write_text(json.dumps(content))
         np.testing.assert_allclose(read_generated_pose(path), expected)
+    lines = tmp_path / "0000.txt"  # of FoundationPose
+    np.savetxt(lines, expected)
+    np.testing.assert_allclose(read_generated_pose(lines), expected)
+    lines.write_text("0.1 0.2 0.3\n")
+    with pytest.raises(OptionError, match=r"0000\.txt: a matrix of shape \(3,\)"):
+        read_generated_pose(lines)
     for content in ("{", "3", "[[1, 2], [3]]", '{"rotation": [1, 0, 0, 0]}'):
         path.write_text(content)
         with pytest.raises(OptionError, match="pose.json"):

@@ -146,6 +146,9 @@ def test_absent_and_empty_places_are_refused(tmp_path):
         read_recording(tmp_path / "nowhere")
     with pytest.raises(RecordingError, match="no metadata.yaml, .mcap, .db3 or pictures in it"):
         read_recording(tmp_path)
+    (tmp_path / "a.TIFF").write_bytes(b"II")
+    with pytest.raises(RecordingError, match=r"pictures in it, but \.TIFF; expected pictures as \.png, \.jpg, \.jpeg"):
+        read_recording(tmp_path)
     (tmp_path / "bag_0.mcap.zstd").write_bytes(b"\x28\xb5\x2f\xfd")
     with pytest.raises(RecordingError, match=r"bag_0\.mcap\.zstd: compressed as a whole: unpack it with zstd -d FILE"):
         read_recording(tmp_path)

@@ -132,7 +132,8 @@ def test_of_several_cameras_one_is_named(tmp_path, capsys):
         read_recording(bag, ImageChoice(color="/camera"))
     forces = ["--contact", "fixed:40"]
     commands = {"annotate": [*forces, "--out", str(tmp_path / "out")], "check": [], "extrinsics": []}
-    for command, words in (commands | dict.fromkeys(("evaluate", "view", "replay", "trace"), forces)).items():
+    commands["view"] = [*forces, "--save", str(tmp_path / "x.rrd")]
+    for command, words in (commands | dict.fromkeys(("evaluate", "replay", "trace"), forces)).items():
         assert main([command, str(bag), *words, "--color", "/nowhere"]) == 2
         assert "nothing on /nowhere" in capsys.readouterr().err
 
@@ -213,15 +214,17 @@ def test_a_file_beside_the_bag_that_leads_elsewhere_is_not_copied(tmp_path, caps
     [
         ("take.bag", "ROS 1 bag: rosbags-convert"),
         ("episode_0.hdf5", "HDF5.*LeRobotDataset.create"),
+        ("photos/IMG_0001.HEIC", "a picture as phones write it: make .jpg"),
         ("replay_buffer.zip", r"called NAME\.zarr\.zip"),
         ("replay_buffer.zarr.zip", "git lfs pull"),
         ("pointer.mcap", "git lfs pull"),
     ],
 )
 def test_recordings_of_other_kinds_are_refused_with_what_makes_one_of_ours(name, words, tmp_path):
+    (tmp_path / name).parent.mkdir(exist_ok=True)
     (tmp_path / name).write_text("version https://git-lfs.github.com/spec/v1\n")
     with pytest.raises(RecordingError, match=words):
-        read_recording(tmp_path / name)
+        read_recording(tmp_path / name.split("/")[0])
 
 
 def test_a_name_that_cannot_be_printed_is_refused(tmp_path, capsys):

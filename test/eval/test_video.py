@@ -1,5 +1,6 @@
 """Claims about pictures without messages: a video and a folder of them are recordings like others."""
 
+import shutil
 from dataclasses import replace
 from fractions import Fraction
 from types import SimpleNamespace
@@ -142,6 +143,13 @@ def test_pictures_of_another_size_than_the_rigs_are_refused(tmp_path):
         read_recording(write_pictures(tmp_path / "stills", size=(72, 96)), CHOICE)
     with pytest.raises(OptionError, match="--rig"):
         read_recording(write_pictures(tmp_path / "others"), ImageChoice())
+
+
+def test_a_picture_of_another_size_than_the_first_is_named(tmp_path):
+    folder = write_pictures(tmp_path / "stills")
+    shutil.copy(write_pictures(tmp_path / "turned", names=("c_11.png",), size=(64, 48)) / "c_11.png", folder)
+    with pytest.raises(RecordingError, match=r"^c_11\.png: 48 x 64; expected 64 x 48 as a_1\.png has"):
+        list(read_recording(folder, CHOICE).images)
 
 
 def test_a_damaged_picture_or_video_is_named(tmp_path):

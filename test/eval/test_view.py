@@ -1,5 +1,7 @@
 """Claims about `finforce view`: the file holds pictures, jaws and forces as they were found, at their times."""
 
+import re
+import socket
 from dataclasses import replace
 from importlib.util import find_spec
 from types import SimpleNamespace
@@ -86,6 +88,22 @@ def test_an_arrow_stands_where_something_presses_and_only_there(scene):
     pressed = np.nan_to_num([value[0] for value in values]) > 0.0
     times, _ = column(rows["/jaws/left/force/arrow"], "vectors")
     assert len(times) == pressed.sum() > 10
+
+
+@pytest.mark.parametrize(
+    ("display", "words"), [(None, "no screen.* --save FILE.rrd"), (":0", "does not start; --save")]
+)
+def test_without_a_screen_or_its_viewer_a_file_is_to_be_written(display, words, monkeypatch, capsys):
+    for name in view.DISPLAYS:
+        monkeypatch.delenv(name, raising=False)
+    if display:
+        monkeypatch.setenv("DISPLAY", display)
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        monkeypatch.setattr(view, "PORT", free.getsockname()[1])
+    monkeypatch.setattr(view, "which", lambda program, path: "/nowhere/rerun")
+    assert main(["view", str(DEMO), "--contact", "fixed:40", "--calibration", "bench"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert re.search(words, line)
 
 
 def test_another_ending_or_a_folder_that_is_none_is_refused(tmp_path, capsys):

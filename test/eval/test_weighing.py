@@ -146,6 +146,13 @@ def test_the_calibration_is_that_of_the_finger_with_its_modulus_scaled():
     assert calibrate_with_scale(times, vectors, [145.3, 436.0, 290.6], jaw="bench") == calibration
 
 
+@pytest.mark.parametrize(("unit", "grams"), [("kilograms", 1e3), ("ounces", 28.35)])
+def test_readings_in_another_unit_are_named(unit, grams):
+    times, forces = staircase([1.0, 3.0, 0.0, 2.0])
+    with pytest.raises(CalibrationError, match=f"look like {unit}, in grams they are 145 436 291$"):
+        calibrate_with_scale(times, forces, np.array([145.3, 436.0, 290.6]) / grams, jaw="bench")
+
+
 def test_newtons_given_as_grams_are_refused_and_named():
     times, forces = staircase([1.0, 3.0, 0.0, 2.0])
     newtons = [1.425, 4.275, 2.85]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from finforce.camera import project
-from finforce.gripper_frames import HALF_TURN, ROBOT_CAMERA, jaw_in_camera
+from finforce.gripper_frames import FRONT_CAMERA, HALF_TURN, ROBOT_CAMERA, jaw_in_camera
 from finforce.transforms import pose_from_quaternion
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints.detectors.side_plane import SHIFTS, AnyFinger, OneFinger, SidePlaneDetector, grid_from_metadata
@@ -196,3 +196,23 @@ def test_a_camera_that_does_not_see_the_sides_is_refused_with_what_to_give():
     numbers = str(found.value).split("T_gripper_camera is [")[1].rstrip("]").split(",")
     turned = pose_from_quaternion([float(n) for n in numbers[:3]], [float(n) for n in numbers[3:]])
     np.testing.assert_allclose(turned, ROBOT_CAMERA, atol=1e-3)
+
+
+BODY = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])  # REP 103: in the optical frame
+
+
+@pytest.mark.parametrize("camera", [ROBOT_CAMERA, FRONT_CAMERA])
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (np.linalg.inv, "pose of the gripper in the camera frame"),
+        (lambda T: T @ BODY, r"body, x forward \(camera_link\)"),
+    ],
+)
+def test_the_pose_of_another_frame_is_refused_with_the_one_to_give(change, words, camera):
+    jaws = load_jaws("bench")
+    with pytest.raises(GeometryError, match=words) as found:
+        SidePlaneDetector(AnyFinger(ShadeNetwork(), jaws), jaws, change(camera))
+    numbers = str(found.value).split("T_gripper_camera is [")[1].rstrip("]").split(",")
+    meant = pose_from_quaternion([float(n) for n in numbers[:3]], [float(n) for n in numbers[3:]])
+    np.testing.assert_allclose(meant, camera, atol=1e-3)
