@@ -44,7 +44,7 @@ TRACTION_LENGTH = 2e-3
 # 1 sigma of the traction ratio that errors of the mechanics look like [-], and that errors of a detector which last
 # while it sees the same look like, by their size [1/m], and the time over which it stays [s].
 APPARENT_TRACTION = 0.2
-APPARENT_SIGHT = 2e3
+APPARENT_SIGHT = 1e3
 APPARENT_TIME = 10.0
 # 1 sigma of the shift [m] and turn [rad] of a camera that nobody touches, and the time over which they stay [s].
 CAMERA_SHIFT = 0.02e-3

@@ -98,7 +98,7 @@ class TestProcess:
         search = ForceEstimator(BENCH)._tracker._search
         usual = search._expect().apparent_variance
         search.points["sight"] = (0.2e-3) ** 2
-        assert search._expect().apparent_variance == pytest.approx(usual + 0.4**2)
+        assert search._expect().apparent_variance == pytest.approx(usual + 0.2**2)
 
     def test_a_prior_counts_once_and_for_ever(self):
         m, V = expect_state(EXPECTED, np.full(COUNT, 1e-8), np.zeros(COUNT))

@@ -440,7 +440,7 @@ def test_grasps_and_turns_are_put_in_tables(tmp_path):
     assert list(found.tables) == ["By force", "Each grasp"]
     slow = row | {"level": "medium", "poses": {"3 Hz, 0 ms late": score}}
     assert GRASP.find(RunOptions(), {"one": row, "two": slow}, tmp_path).tables["Poses"].n.tolist() == [1]
-    conditions = {name: row | {"condition": name} for name in ("unprobed", "probed")}
+    conditions = {name: row | {"condition": name, "supported": score} for name in ("unprobed", "probed")}
     rough = first_table(FRICTION.find(RunOptions(), conditions, tmp_path))
     assert rough[["condition", "force"]].to_numpy().tolist() == [
         [name, force] for force in ("low", "all") for name in conditions
