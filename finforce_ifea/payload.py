@@ -14,7 +14,7 @@ against an obstacle, where e stays: that is the other hypothesis, and the likeli
 from __future__ import annotations
 
 from dataclasses import replace
-from math import erfc, sqrt
+from math import erfc, log, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,9 +33,9 @@ _WHITE = 0.5
 _SCALE = 0.1
 # Grasp force below which nothing is held, and the least standard deviation of a force [N].
 _LEAST_FORCE, _LEAST_STDDEV = 0.3, 1e-3
-# Prior probability that what is turned has left its support behind, time over which what was seen counts [s], and the
+# Log prior odds that what is turned has left its support behind, time over which what was seen counts [s], and the
 # probability below which that is assumed anew.
-_FREE, _COUNTED, _DISCARDED = 0.9, 2.0, 1e-3
+_FREE, _COUNTED, _DISCARDED = log(0.9 / 0.1), 2.0, 1e-3
 # Of the net force: along the closing axis and across the fingers.
 _SEEN = slice(0, 2)
 
@@ -55,7 +55,7 @@ class Payload:
         """Forget what was held."""
         self._stamp = -np.inf
         # of the hypotheses that a turn leaves the support behind, and that it does not: W, e (3,), b (2,)
-        self._x, self._P, self._log_odds = np.zeros((2, 6)), np.zeros((2, 6, 6)), np.log(_FREE / (1.0 - _FREE))
+        self._x, self._P, self._log_odds = np.zeros((2, 6)), np.zeros((2, 6, 6)), _FREE
         self._expected, self._variance = 0.0, np.zeros(2)
         self.weight, self.stddev = 0.0, np.inf
 
@@ -94,8 +94,7 @@ class Payload:
             a = np.ones((2, 6))
             a[0, 1:4], a[:, 4:] = np.exp(-turn / _LEFT_BEHIND), kept * np.sqrt(variance / self._variance)
             self._x, self._P = a * self._x, a[:, :, None] * self._P * a[:, None, :]
-            prior = np.log(_FREE / (1.0 - _FREE))
-            self._log_odds = prior + np.exp(-dt / _COUNTED) * (self._log_odds - prior)
+            self._log_odds = _FREE + np.exp(-dt / _COUNTED) * (self._log_odds - _FREE)
         more = max(expected - self._expected, 0.0)
         self._expected, self._variance = self._expected + more, variance
         weight, support = (more + expected * dt / time for time in (_WEIGHT_TIME, _SUPPORT_TIME))
@@ -114,13 +113,13 @@ class Payload:
         self._x = self._x + np.einsum("hij,hj->hi", K, nu)
         self._P = self._P - K @ S @ K.transpose(0, 2, 1)
         if self._weigh()[0] < _DISCARDED:
-            self._x[0], self._P[0], self._log_odds = self._x[1], self._P[1], np.log(_FREE / (1.0 - _FREE))
+            self._x[0], self._P[0], self._log_odds = self._x[1], self._P[1], _FREE
 
     def _weigh(self) -> NDArray:
         """Return the probabilities of the hypotheses (2,): a weight that is free is not negative."""
         stddev = np.sqrt(np.maximum(self._P[:, 0, 0], 0.0))
         positive = [
-            max(erfc(-x / max(2.0**0.5 * s, 1e-12)), 1e-300) for x, s in zip(self._x[:, 0], stddev, strict=True)
+            max(erfc(-x / max(sqrt(2.0) * s, 1e-12)), 1e-300) for x, s in zip(self._x[:, 0], stddev, strict=True)
         ]
         odds = self._log_odds + np.log(positive[0] / positive[1])
         free = 1.0 / (1.0 + np.exp(-np.clip(odds, -500.0, 500.0)))
