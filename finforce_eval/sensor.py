@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from finforce_contact.mesh.object_mesh import ObjectMesh, load_object_mesh
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.keypoint_source import build_records
 from finforce_ifea.estimator import ForceEstimator
-from finforce_ifea.grasp_force import Wrench, combine_wrenches, single_jaw_grasp
+from finforce_ifea.grasp_force import Wrench, combine_wrenches, single_jaw_grasp, to_jaw
 from finforce_ifea.jaw.calibration import Calibration
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_ifea.observation import Contact, Observation, Solution, check_stamp
@@ -119,7 +119,7 @@ class ForceSensor:
         settings = whole.resolve_held(both=len(sides) == len(SIDES))
         mesh = None if object_mesh is None else load_object_mesh(object_mesh)
         self._loops: dict[str, ForceLoop] = {}
-        self._payload = Payload()
+        self._payload, self._may_be_held = Payload(), settings.may_be_held
         for side, own in jaws.items():
             force = ForceEstimator(own, settings=settings, calibration=calibration)
             fixed = mesh is None and GivenContact(Contact.fixed(force.jaw, contact_height))
@@ -144,8 +144,8 @@ class ForceSensor:
             stamp: image capture time [s], a float that rises from image to image. Divide frame numbers by the frame
                 rate.
             T_camera_object: (4, 4) pose of the object's mesh in this image, if it is known.
-            gravity: (3,) direction in which things fall, of any length, in `gripper_base`, if it is known. With it, the
-                net force is that of what hangs from the jaws; see `Payload`.
+            gravity: (3,) direction in which things fall, of any length, in `gripper_base`, if it is known. With it, a
+                turn of the gripper tells what hangs from the jaws alone, and its weight; see `Payload`.
 
         Raises:
             ImageError: the image has another shape, shows nothing, or its stamp does not rise.
@@ -154,6 +154,7 @@ class ForceSensor:
         """
         check_stamp(stamp)
         gravity = None if gravity is None else check_direction(gravity, "gravity")
+        down = gravity if self._may_be_held else None
         if not isinstance(self.camera, CameraIntrinsics):
             self.camera = read_intrinsics(self.camera, rgb.shape[:2])
         if depth is not None:
@@ -161,9 +162,11 @@ class ForceSensor:
         image = RgbdImage(stamp=stamp, color=rgb, depth=depth, camera=self.camera, is_video=self._is_video)
         seen = self._detector.detect(image)
         T = None if T_camera_object is None else check_pose(T_camera_object, "T_camera_object")
-        found = {side: self._solve(loop, seen.get(side), stamp, T) for side, loop in self._loops.items()}
+        found = {
+            side: self._solve(loop, seen.get(side), stamp, T, to_jaw(down, side)) for side, loop in self._loops.items()
+        }
         known = {side: found[side] if side in seen else None for side in found}
-        return combine_solutions(stamp, known, self._payload, gravity)
+        return combine_solutions(stamp, known, self._payload, down)
 
     def skip(self, stamp: float, reason: str) -> GripperForces:
         """Let time pass for an image at `stamp` [s] that `update` has rejected, and return a result without forces."""
@@ -188,10 +191,15 @@ class ForceSensor:
         self.reset()
 
     def _solve(
-        self, loop: ForceLoop, seen: JawKeypoints | None, stamp: float, T_camera_object: NDArray | None
+        self,
+        loop: ForceLoop,
+        seen: JawKeypoints | None,
+        stamp: float,
+        T_camera_object: NDArray | None,
+        gravity: NDArray | None = None,
     ) -> Solution:
-        """Return the force on one jaw, which may not have been found."""
-        observation = observe_jaw(seen, stamp, len(loop.force.jaw.keypoints))
+        """Return the force on one jaw, which may not have been found; gravity (3,) in its frame."""
+        observation = replace(observe_jaw(seen, stamp, len(loop.force.jaw.keypoints)), gravity=gravity)
         if seen is None or T_camera_object is None:
             return loop.update(observation)
         return loop.update(observation, [(stamp, invert_pose(seen.T_camera_jaw) @ T_camera_object)])

@@ -18,6 +18,11 @@ Side = Literal["left", "right"]
 R_GRIPPER_JAW = {side: jaw_in_gripper(side, 0.0)[:3, :3] for side in SIDES}
 
 
+def to_jaw(direction: NDArray | None, side: str) -> NDArray | None:
+    """Return a direction (3,) of `gripper_base` in the frame of a jaw; None for None."""
+    return None if direction is None else direction @ R_GRIPPER_JAW[side]
+
+
 class Wrench(NamedTuple):
     """The object's load on a jaw: force (3,) [N] and torque (3,) [N m] about the jaw's origin, in the jaw frame."""
 

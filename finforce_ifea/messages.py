@@ -27,12 +27,13 @@ CONTACT_DIAMETER = 0.005
 ARROW = (0.002, 0.004, 0.005)  # shaft, head, head length
 
 
-def observation_from_cloud(cloud: Any, frame: str) -> Observation:
+def observation_from_cloud(cloud: Any, frame: str, gravity: NDArray | None = None) -> Observation:
     """Return the key points of a sensor_msgs/PointCloud2 in the jaw frame `frame`.
 
     Args:
         cloud: one row per key point.
         frame: the jaw frame.
+        gravity: its direction (3,) there, None where unknown.
 
     Raises:
         ObservationError: the frame, the height, the fields, a standard deviation or the buffer are wrong.
@@ -40,7 +41,7 @@ def observation_from_cloud(cloud: Any, frame: str) -> Observation:
     check_cloud(cloud, frame, "the key points")
     seen = decode_keypoints(cloud)
     stamp = cloud.header.stamp.sec + 1e-9 * cloud.header.stamp.nanosec
-    return Observation(stamp=stamp, **seen._asdict())
+    return Observation(stamp=stamp, gravity=gravity, **seen._asdict())
 
 
 def contact_from_cloud(cloud: Any, frame: str, *, free: bool) -> Contact:

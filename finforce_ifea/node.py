@@ -20,7 +20,7 @@ from finforce.health import IDLE, Health, Idling, Level, Outcome, Report, Skips,
 from finforce.messages import SECOND, pose_from_message, stamp_of, wrench_from_message
 from finforce.ros import node as ros
 from finforce.ros.messages import MarkerStyle, points_marker
-from finforce_ifea.grasp_force import ForcePairing, Grasp, Wrench, single_jaw_grasp
+from finforce_ifea.grasp_force import ForcePairing, Grasp, Wrench, single_jaw_grasp, to_jaw
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.messages import (
     ARROW,
@@ -264,7 +264,8 @@ class IfeaSolverNode(ros.ImageNode):
         """Solve an image and publish its wrench, if it can be trusted."""
         header, stamp = cloud.header, stamp_of(cloud)
         with self.rejections():
-            observation = observation_from_cloud(cloud, self.frame)
+            gravity = to_jaw(self._find_gravity(stamp), self.parameters.jaw_name)
+            observation = observation_from_cloud(cloud, self.frame, gravity)
             if self.gate.enter(stamp, self.now()):
                 self._restart("the stamps went back: a new recording")
             contact = self.resting.complete(self.contacts.at(stamp), observation.stamp)

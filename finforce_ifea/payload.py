@@ -20,11 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce_ifea.grasp_force import Grasp
+from finforce_ifea.turn import LEFT_BEHIND, TurnTrack
 
 # 1 sigma of the weight, and of a support's force, as a share of the grasp force [-].
 _WEIGHT = 0.3
-# Turn after which a support is left behind [rad], and time after which there may be one again, and another weight [s].
-_LEFT_BEHIND = 0.15
+# Time after which there may be a support again, and another weight [s].
 _SUPPORT_TIME, _WEIGHT_TIME = 10.0, 30.0
 # Time over which an error of the estimated forces stays the same [s], and the share of their variance that is white.
 _ERROR_TIME = 10.0
@@ -49,11 +49,13 @@ class Payload:
     """
 
     def __init__(self) -> None:
+        self._turns = TurnTrack()
         self.reset()
 
     def reset(self) -> None:
         """Forget what was held."""
         self._stamp = -np.inf
+        self._turns.reset()
         # of the hypotheses that a turn leaves the support behind, and that it does not: W, e (3,), b (2,)
         self._x, self._P, self._log_odds = np.zeros((2, 6)), np.zeros((2, 6, 6)), _FREE
         self._expected, self._variance = 0.0, np.zeros(2)
@@ -75,7 +77,7 @@ class Payload:
             return grasp
         self._predict(stamp, gravity, (_WEIGHT * held) ** 2, np.maximum(grasp.stddev[_SEEN], _LEAST_STDDEV) ** 2)
         self._correct(grasp.manipulation[_SEEN], gravity)
-        self._stamp, self._gravity = stamp, gravity
+        self._stamp = stamp
         weights = self._weigh()
         told = np.hstack([gravity[:, None], np.eye(3)])
         means, P = self._x[:, :4] @ told.T, told @ self._P[:, :4, :4] @ told.T
@@ -87,12 +89,12 @@ class Payload:
 
     def _predict(self, stamp: float, gravity: NDArray, expected: float, variance: NDArray) -> None:
         """Predict an image in which weight and support are expected with a variance, and forces with theirs (2,)."""
-        dt, kept = 0.0, 0.0
+        dt, kept, turn = 0.0, 0.0, self._turns.update(gravity).angle
         if np.isfinite(self._stamp):
-            dt, turn = stamp - self._stamp, float(np.arccos(np.clip(gravity @ self._gravity, -1.0, 1.0)))
+            dt = stamp - self._stamp
             kept = np.exp(-dt / _ERROR_TIME)
             a = np.ones((2, 6))
-            a[0, 1:4], a[:, 4:] = np.exp(-turn / _LEFT_BEHIND), kept * np.sqrt(variance / self._variance)
+            a[0, 1:4], a[:, 4:] = np.exp(-turn / LEFT_BEHIND), kept * np.sqrt(variance / self._variance)
             self._x, self._P = a * self._x, a[:, :, None] * self._P * a[:, None, :]
             self._log_odds = _FREE + np.exp(-dt / _COUNTED) * (self._log_odds - _FREE)
         more = max(expected - self._expected, 0.0)

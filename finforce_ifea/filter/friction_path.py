@@ -14,6 +14,7 @@ from finforce_ifea.contact_mechanics.friction import Coefficient
 from finforce_ifea.contact_mechanics.pressed_jaw import RigidContact
 from finforce_ifea.filter.readout import LARGEST_RATIO
 from finforce_ifea.filter.slip_path import PathState, SlipPath, find_turn, turn_path
+from finforce_ifea.turn import LEFT_BEHIND
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
 # Coefficients of friction that are weighed against each other, and the deviation of a coefficient up to which one is
@@ -25,6 +26,8 @@ _SPAN = 2.5
 _LARGEST = 1.2
 # Prior probability that only the jaws hold an object between two of them [-].
 _HELD = 0.5
+# The largest log odds that turns of the gripper give to that: it may hold a handle.
+_TURNED = 4.0
 # A motion back by less than this is noise [sigma] while the object moves, and where it has stopped; and one along the
 # finger by less than this [m].
 _REVERSAL = 2.5
@@ -64,6 +67,7 @@ class TractionHypotheses:
     Attributes:
         mu: coefficients of friction (M,) [-].
         upright: traction ratio of an object that only the jaws hold [-].
+        pull_stddev: standard deviation of that by the object's weight [-].
         motion: of the object along the path since it was last asked for [m].
         stddev: of the traction ratio by errors of the path [-].
         doubt: change of the traction ratio if a motion back that may be chance is none [-].
@@ -89,6 +93,7 @@ class TractionHypotheses:
     def reset(self) -> None:
         """Expect an object that does not touch yet."""
         self.upright, self._bears, self.motion = 0.0, 0.0, 0.0
+        self.pull_stddev, self._turned, self._left_behind = 0.0, 0.0, 0.0
         self.leave()
 
     def leave(self) -> None:
@@ -150,16 +155,28 @@ class TractionHypotheses:
         """Return the probabilities of the coefficients (M,) where one of them holds, for all weights (N,)."""
         return _share(weights, len(self.mu))
 
+    def find_held(self, weights: NDArray) -> float:
+        """Return the probability that only the jaws hold the object, for the weights of the hypotheses (N,)."""
+        return float(weights[-1]) if self._held > 0.0 else 0.0
+
+    def turn(self, angle: float) -> None:
+        """Count a turn of the gripper [rad], which leaves behind whatever else held the object."""
+        self._turned += angle
+
     def bound_held(self, log_weights: NDArray) -> NDArray:
-        """Return the weights (N,), that of "held" less what friction does not bear: P(mu > |kappa|)."""
+        """Return the log weights (N,) with that of "held" by turns, and less what friction does not bear.
+
+        It bears a ratio with P(mu > |kappa|).
+        """
         if not 0.0 < self._held < 1.0:
             return log_weights
         step = max(self._cell, 2.0 * self.unweighed)
         bears = self._prior @ np.clip((self.mu + 0.5 * step - abs(self.upright)) / step, 0.0, 1.0)
         bears = float(np.log(max(bears, _LEAST_PROBABILITY)))
         weighed = log_weights.copy()
-        weighed[-1] += bears - self._bears
-        self._bears = bears
+        left_behind = min(self._turned / LEFT_BEHIND, _TURNED)
+        weighed[-1] += bears - self._bears + (left_behind - self._left_behind)
+        self._bears, self._left_behind = bears, left_behind
         return weighed - np.log(np.exp(weighed).sum())
 
     def take_motion(self) -> float:

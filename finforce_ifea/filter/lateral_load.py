@@ -11,7 +11,8 @@ about its own inclined axis, though: with the turn f(z) of its sections about z 
 
     y(z) += int f'(s) (u(z) - u(s) - u'(s) (z - s)) ds.
 
-y_c is expected where the object's mesh is nearest.
+y_c is expected where the object's mesh is nearest. Where the direction of gravity g is known, the lateral force t N is
+w g_y + e, with this jaw's share w of the weight, and the force e of a support, which a turn leaves behind.
 """
 
 from dataclasses import dataclass
@@ -28,6 +29,7 @@ from finforce_ifea.filter.filter import solve_lower
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE, Jaw
 from finforce_ifea.jaw.mesh import VolumeMesh
 from finforce_ifea.tracking.contact_state import MIDDLE_STDDEV, ContactState
+from finforce_ifea.turn import LEFT_BEHIND, Turn
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
 _HEIGHTS = 13
@@ -166,8 +168,14 @@ _TRACTION_TIME = 60.0
 # The same of a weight that the jaws have lifted and turn.
 _WEIGHT = 0.3
 _WEIGHT_TIME = 1.0
-# Log prior odds of a lift in an image, and the log odds against one, prior left out, after which the test begins anew.
-_LIFTED = np.log(1e-4)
+_LIFTED_RATIO = _WEIGHT**2 + _TRACTION**2, _WEIGHT_TIME
+# 1 sigma of the share of the weight, over the normal force [-], and the time over which it stays the same [s].
+_SHARE, _SHARE_TIME = 0.3, 30.0
+# 1 sigma of what else than the known pull of the weight there is, as a ratio [-].
+_REST = 0.05
+# Log prior odds of a lift in an image, the same where gravity tells its direction, and the log odds against one, prior
+# left out, after which the test begins anew.
+_LIFTED, _LIFTED_ALONG = np.log(1e-4), np.log(1e-2)
 _UNLIKELY = -3.0
 # 1 sigma of what the linear jaw makes of the ratio [-].
 _NONLINEAR = 0.04
@@ -187,7 +195,7 @@ _LEAST_ARM, _LEAST_RISE = 1e-3, 2e-3
 
 
 class _Estimate(NamedTuple):
-    """Mean (2 + K,) and covariance (2 + K, 2 + K) of location [m], ratio [-] and the offset of each key point [m]."""
+    """Mean (3 + K,) and covariance (3 + K, 3 + K) of the state of `LateralLoad`."""
 
     x: NDArray
     P: NDArray
@@ -196,8 +204,9 @@ class _Estimate(NamedTuple):
 class LateralLoad:
     """Follows what the key points show across one finger, by a Kalman filter.
 
-    Its state is the location of the pressure, the lateral traction ratio, and an offset along y for each key point. Two
-    hypotheses differ in the ratio: it stays as it was, or the jaws have lifted a weight. Their likelihoods decide.
+    Its state is the location of the pressure [m], the lateral traction ratio [-], an offset along y for each key point
+    [m], and the jaw's share of the weight [N]. Two hypotheses differ in the ratio: it stays as it was, or the jaws have
+    lifted a weight. Their likelihoods decide, or a turn that leaves a support behind.
 
     Attributes:
         motions: of the key points by what acts laterally (K, 3) [m]; zero where nothing does.
@@ -205,19 +214,20 @@ class LateralLoad:
             as a share of all force (4,).
     """
 
-    def __init__(self, torsion: Torsion | None, count: int, traction: float) -> None:
+    def __init__(self, torsion: Torsion | None, count: int, traction: float, *, may_be_held: bool) -> None:
         """Keep the response of the jaw with `count` key points, None where nothing is known of it.
 
-        `traction` is the standard deviation of the lateral traction ratio until something is seen.
+        `traction` is the standard deviation of the lateral traction ratio until something is seen; `may_be_held` says
+        that the jaws may lift a weight.
         """
-        self._torsion, self._count, self._traction = torsion, count, traction
+        self._torsion, self._count, self._traction, self._may_be_held = torsion, count, traction, may_be_held
         self._expected = (0.0, MIDDLE_STDDEV)
         self.reset()
 
     def reset(self) -> None:
         """Forget what was seen; where the object is expected stays."""
         self._known: _Estimate | None = None
-        self._depth, self._is_lifted = 0.0, False
+        self._depth, self._is_lifted, self._turned, self._largest = 0.0, False, 0.0, 0.0
         self.motions = np.zeros((self._count, 3))
         self.load = np.array([*self._expected, 0.0, self._traction])
 
@@ -229,8 +239,14 @@ class LateralLoad:
         uneven = _EVEN + (1.0 - _EVEN) * min(_CORE * abs(location) / half, 1.0) if half > 0.0 else 1.0
         self._expected = min(max(float(location), -half), half), uneven * narrow * float(stddev)
 
+    def weigh(self, force: float) -> tuple[float, float]:
+        """Return this jaw's share of the weight, and its standard deviation [N], for the force on the jaw [N]."""
+        if self._known is None or self._largest == 0.0:
+            return 0.0, _SHARE * force
+        return float(self._known.x[-1]), sqrt(max(self._known.P[-1, -1], 0.0))
+
     def update(
-        self, motions: NDArray, bend: NDArray, points: NDArray, state: ContactState, dt: float, may_be_held: bool
+        self, motions: NDArray, bend: NDArray, points: NDArray, state: ContactState, dt: float, turn: Turn | None
     ) -> None:
         """Take the motions of the key points along y in an image.
 
@@ -240,7 +256,7 @@ class LateralLoad:
             points: see `KEYPOINT`.
             state: see `CONTACT_STATE`.
             dt: time since the last image [s].
-            may_be_held: True if the jaws may have lifted a weight.
+            turn: in the jaw's frame, for one that may lift a weight; None where gravity is not known.
         """
         torsion, force, height = self._torsion, state["force"], float(state["pressure_location"][2])
         normal = hypot(force[0], force[2])
@@ -250,7 +266,7 @@ class LateralLoad:
         place = height, normal, force[0], self.load[0]
         measured, (by_moment, by_force, rolled) = _observe(points, motions, bend, torsion.packed, place)
         moved, self._depth = abs(float(state["depth"]) - self._depth), float(state["depth"])
-        self._follow(measured, points["offset_variance"], (moved, dt), may_be_held)
+        self._follow(measured, points["offset_variance"], (moved, dt), turn, normal)
         x, P, half = *self._known, torsion.half_width
         location, stddev = min(max(float(x[0]), -half), half), hypot(sqrt(P[1, 1]), _NONLINEAR)
         # unless a weight was lifted, chance and what the linear jaw errs by are no force
@@ -260,7 +276,12 @@ class LateralLoad:
         self.motions = by_moment * (-location * force[0]) + by_force * total
 
     def _follow(
-        self, measured: tuple[NDArray, ...], offsets: NDArray, passed: tuple[float, float], may_be_held: bool
+        self,
+        measured: tuple[NDArray, ...],
+        offsets: NDArray,
+        passed: tuple[float, float],
+        turn: Turn | None,
+        normal: float,
     ) -> None:
         """Take an image into both hypotheses, and decide between them.
 
@@ -268,23 +289,32 @@ class LateralLoad:
             measured: see `_observe`.
             offsets: stationary variance of each key point's offset (K,) [m^2].
             passed: motion of the object in depth [m] and time [s] since the last image.
-            may_be_held: see `update`.
+            turn: see `update`.
+            normal: force [N].
         """
         if self._known is None:
             self._known = self._candidate = _begin(self._expected, offsets)
             self._odds = 0.0
-        light, lifted = (*self._expected, 0.0), (*self._expected, _WEIGHT)
+        light, lifted = (*self._expected, _TRACTION**2, _TRACTION_TIME), (*self._expected, *_LIFTED_RATIO)
+        prior, weight = _LIFTED, (0.0, 0.0, 0.0, normal, 0.0, 0.0)
+        if turn is not None:
+            self._turned += turn.angle
+            self._is_lifted |= self._turned > LEFT_BEHIND
+            lifted, prior, before = (*self._expected, _REST**2, _WEIGHT_TIME), _LIFTED_ALONG, self._largest
+            self._largest = max((_SHARE * normal) ** 2, before)
+            told = float(turn.before[1]), float(turn.now[1]), turn.angle
+            weight = (*told, normal, self._largest, self._largest - before)
         if self._is_lifted:
-            self._known = _step(tuple(self._known), lifted, offsets, passed, measured)[0]
+            self._known = _step(tuple(self._known), lifted, offsets, passed, measured, weight)[0]
             return
-        self._known, likely = _step(tuple(self._known), light, offsets, passed, measured)
-        if not may_be_held:
+        self._known, likely = _step(tuple(self._known), light, offsets, passed, measured, weight)
+        if not self._may_be_held:
             return
-        self._candidate, other = _step(tuple(self._candidate), lifted, offsets, passed, measured)
+        self._candidate, other = _step(tuple(self._candidate), lifted, offsets, passed, measured, weight)
         self._odds += other - likely
         if self._odds < _UNLIKELY:
             self._candidate, self._odds = self._known, 0.0
-        elif self._odds + _LIFTED > 0.0:
+        elif self._odds + prior > 0.0:
             self._known, self._is_lifted = self._candidate, True
 
 
@@ -325,37 +355,49 @@ def _observe(points, motions, bend, torsion, place):
 @njit(**_OPTIONS)
 def _begin(expected, offsets):
     """Return the estimate before the first image; see `_step` for the arguments."""
-    x, V = np.zeros(2 + len(offsets)), np.empty(2 + len(offsets))
+    x, V = np.zeros(3 + len(offsets)), np.empty(3 + len(offsets))
     x[0] = expected[0]
-    V[0], V[1], V[2:] = expected[1] ** 2, _TRACTION**2, offsets + _FLOOR**2
+    V[0], V[1], V[2:-1], V[-1] = expected[1] ** 2, _TRACTION**2, offsets + _FLOOR**2, 0.0
     return _Estimate(x, np.diag(V))
 
 
 @njit(**_OPTIONS)
-def _step(estimate, expected, offsets, passed, measured):
+def _step(estimate, expected, offsets, passed, measured, weight):
     """Return the estimate after an image, and the logarithm of its likelihood; see `LateralLoad`.
 
     Args:
         estimate: before it, a plain tuple.
-        expected: location [m], its standard deviation [m], and 1 sigma of the ratio by a weight, 0 for none.
+        expected: location [m], its standard deviation [m], variance of the ratio, and time over which it lasts [s].
         offsets: stationary variance of each key point's offset (K,) [m^2].
         passed: motion [m] and time [s] since the last image.
         measured: see `_observe`.
+        weight: gravity along y in the last image and in this one [-], turn between them [rad], normal force [N],
+            variance of the share of the weight, and by how much that has grown [N^2].
     """
     (moved, dt), (seen, H, z, R), estimate = passed, measured, _Estimate(*estimate)
-    location, stddev, weight = expected
+    (location, stddev, variance, time), (before, now, angle, normal, carried, more) = expected, weight
     n, m, kept = len(estimate.x), len(seen), np.exp(-moved / _OFFSET_LENGTH - dt / _OFFSET_TIME)
-    rates = np.exp(-dt / _LOCATION_TIME), np.exp(-dt / (_WEIGHT_TIME if weight > 0.0 else _TRACTION_TIME))
+    rates, left = (np.exp(-dt / _LOCATION_TIME), np.exp(-dt / time)), np.exp(-angle / LEFT_BEHIND)
     x, P, a = estimate.x.copy(), estimate.P.copy(), np.empty(n)
-    for i in range(n):
+    w = n - 1
+    for i in range(w):
         a[i] = rates[i] if i < 2 else kept
+    a[1] *= left
+    a[w] = np.exp(-dt / _SHARE_TIME)
+    for i in range(n):
         mean = location if i == 0 else 0.0
         x[i] = mean + a[i] * (x[i] - mean)
-    for i in range(n):
         for j in range(n):
             P[i, j] *= a[i] * a[j]
-        V = offsets[i - 2] + _FLOOR**2 if i > 1 else (stddev**2 if i == 0 else weight**2 + _TRACTION**2)
-        P[i, i] += (1.0 - a[i] ** 2) * V
+    pull = (now - a[1] * before) / (a[w] * normal)
+    x[1] += pull * x[w]
+    P[1] += pull * P[w]
+    P[:, 1] += pull * P[:, w]
+    P[0, 0] += (1.0 - a[0] ** 2) * stddev**2
+    P[1, 1] += (1.0 - rates[1] ** 2) * variance + (1.0 - left**2) * _REST**2
+    for i in range(2, w):
+        P[i, i] += (1.0 - a[i] ** 2) * (offsets[i - 2] + _FLOOR**2)
+    P[w, w] += (1.0 - a[w] ** 2) * carried + more
     HP, nu, S = np.empty((m, n)), np.empty((m, 1)), np.empty((m, m))
     for i in range(m):
         k = 2 + seen[i]

@@ -75,10 +75,16 @@ def read_out(state, force, modes, x, log_weights, P, shift, smoothing, at, ratio
     state.quiet, state.loaded = state.depth < TOUCH_DEPTH, state.depth > LOADED_DEPTH
 
 
-def find_upright_ratio(force: NDArray, ratio: float) -> float:
-    """Return the traction ratio at which a force (3,) [N] that has a ratio now has nothing along the finger."""
+def find_held_ratio(force: NDArray, ratio: float, pull: float) -> tuple[float, float]:
+    """Return the traction ratio at which a force (3,) [N] that has a ratio now is a pull [N] along the finger.
+
+    The other number is the size of its derivative by the pull [1/N].
+    """
     ahead, along = force[0] - ratio * force[2], force[2] + ratio * force[0]
-    return min(max(along / ahead, -LARGEST_RATIO), LARGEST_RATIO) if ahead != 0.0 else 0.0
+    if ahead == 0.0:
+        return 0.0, 0.0
+    slope = (1.0 + ratio**2) / ahead
+    return min(max(along / ahead - slope * pull, -LARGEST_RATIO), LARGEST_RATIO), abs(slope)
 
 
 @njit(**_OPTIONS)

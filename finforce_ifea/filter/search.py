@@ -50,7 +50,7 @@ from finforce_ifea.filter.process import (
     advance,
     start,
 )
-from finforce_ifea.filter.readout import find_upright_ratio, judge_points, read_out
+from finforce_ifea.filter.readout import find_held_ratio, judge_points, read_out
 from finforce_ifea.filter.state import DEPTH, HEIGHT, SHAPE, TRACTION, state_size
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tracking.contact_state import KEYPOINT, LEAST_DEPTH, LOADED_DEPTH, blank_contact_state
@@ -145,11 +145,12 @@ class ContactSearch:
         P: covariance (n, n).
         log_weights: of the hypotheses (N,).
         track: of the depth.
+        pull: of the weight along the finger, if only the jaws hold the object, and its standard deviation [N].
     """
 
     def __init__(self, count: int, settings: EstimatorSettings) -> None:
         """Prepare the filter for `count` key points."""
-        self.settings = settings
+        self.settings, self.pull = settings, (0.0, 0.0)
         self.points, self.positions = np.zeros(count, KEYPOINT), np.zeros((count, 3))
         self.state, self.expectation = blank_contact_state(), np.zeros((), EXPECTATION)
         self._count = count
@@ -398,12 +399,15 @@ class ContactSearch:
         shift = self._smooth + place.x_model[0] - place.x[0]
         # an edge is rounded by more than it sinks in at first
         inclined = _INCLINED * max(1.0 - place.depth / _EDGE, 0.0) if self.expectation["has_corners"] else 0.0
-        spread = self.hypotheses.doubt**2 + inclined**2
+        spread, held = self.hypotheses.doubt**2 + inclined**2, self.hypotheses.find_held(self.weights)
+        spread += held * self.hypotheses.pull_stddev**2
         smoothing = posterior.own, lessened
         read_out(s, force, modes, self.x, self.log_weights, self.P, shift, smoothing, at, ratios, ratio, spread)
         self.state = s
         if s["magnitude"] > _LEAST_FORCE:
-            self.hypotheses.upright = find_upright_ratio(force, ratio)
+            pull, stddev = self.pull
+            self.hypotheses.upright, slope = find_held_ratio(force, ratio, pull)
+            self.hypotheses.pull_stddev = slope * stddev
 
     def follow_path(self, contact: RigidContact) -> None:
         """Follow how the object uses its friction, which the force of the image did not wait for."""

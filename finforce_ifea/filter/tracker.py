@@ -23,6 +23,7 @@ from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tare import PointNoise, Tare
 from finforce_ifea.tracking.contact_state import MIDDLE_STDDEV, TOUCH_DEPTH, UNSEEN_TRACTION, ContactState
 from finforce_ifea.tracking.influence import explain_offsets, measure_influence, press_lightly
+from finforce_ifea.turn import Turn, TurnTrack
 
 # Images without touch after which the next object may be any.
 _IMAGES_RELEASED = 15
@@ -93,8 +94,11 @@ class ContactTracker:
         self._outline: OutlineIndenter | None = None
         self._is_apart = False
         self._hidden = self._build_hidden(contact_range[0])
-        self._lateral = LateralLoad(torsion, len(keypoints), UNSEEN_TRACTION * settings.friction)
+        self._lateral = LateralLoad(
+            torsion, len(keypoints), UNSEEN_TRACTION * settings.friction, may_be_held=settings.may_be_held
+        )
         self._tare: Tare | None = None
+        self._turns = TurnTrack()
         self.expect_friction(None)
         self.reset()
 
@@ -193,6 +197,7 @@ class ContactTracker:
         self._led = self._mean.copy()
         self._lateral.reset()
         self._released, self._has_moved = 0, False
+        self._turns.reset()
 
     def _forget_contact(self) -> None:
         """Expect any object again, as the next one may be."""
@@ -208,7 +213,7 @@ class ContactTracker:
             dt: time since the last image [s].
             observation: that the points are of.
         """
-        search, measured = self._search, points - tare.offsets
+        search, measured, turn = self._search, points - tare.offsets, self._follow_turn(observation.gravity)
         if tare is not self._tare:
             self._tare = tare
             search.restart()
@@ -231,13 +236,26 @@ class ContactTracker:
         self._complete(state)
         if self._is_known:
             bend = search.positions[:, 0] - self._rest[:, 0]
-            across, may_be_held = (measured - search.positions)[:, 1], self.settings.may_be_held
-            self._lateral.update(across, bend, search.points, state, dt, may_be_held)
+            self._lateral.update((measured - search.positions)[:, 1], bend, search.points, state, dt, turn)
         if self._fidelity and not state["converged"]:
             self._restore_shape()
         self._change_fidelity(state)
         self._has_moved = True
         return state
+
+    def _follow_turn(self, gravity: NDArray | None) -> Turn | None:
+        """Return how the gripper has turned since the last image, which tells whether only the jaws hold the object.
+
+        `gravity` is its direction (3,), None where unknown.
+        """
+        turn, search = self._turns.update(gravity if self.settings.may_be_held else None), self._search
+        search.pull = 0.0, 0.0
+        if turn is not None:
+            weight, stddev = self._lateral.weigh(float(search.state["magnitude"]))
+            search.pull = weight * float(turn.now[2]), stddev * abs(float(turn.now[2]))
+            if search.state["loaded"]:
+                search.hypotheses.turn(turn.angle)
+        return turn
 
     def _fill(self, measured: NDArray, tare: Tare, noise: PointNoise) -> None:
         """Fill in the key points of an image, measured (K, 3) [m]."""

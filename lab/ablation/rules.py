@@ -162,6 +162,8 @@ RULES = (
           {"finforce_ifea.filter.lateral_load:LateralLoad.update": _nothing}, "across", "carried"),
     _rule("weight across the finger", "`_WEIGHT`", "a weight that pulls across the fingers",
           {"finforce_ifea.filter.lateral_load:_LIFTED": -np.inf}, "carried"),
+    _rule("turn of the gripper", "`TurnTrack`", "gravity that is told: what only the jaws hold, and its weight",
+          {"finforce_ifea.turn:TurnTrack.update": _nothing}, "turned"),
     _rule("lateral threshold", "`_CLEAR`", "keeps noise from counting as a lateral force",
           {"finforce_ifea.filter.lateral_load:_CLEAR": 1e-3}, "across", "box"),
     _rule("following a slide", "`_lead`", "objects that slide, as their pose shows",

@@ -34,6 +34,7 @@ _TARE, _REST, _SPEED = 45, 15, 2e-3
 _RADIUS, _HEIGHT = 12.5e-3, 0.040
 _RELAXING = (RelaxationTerm(share=0.5, time_constant=5.0),)
 _HELD = {"held": "either"}
+_LIFTED = 100  # images after a lift
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -454,16 +455,26 @@ def build_carried(bench: Bench, random: np.random.Generator) -> Scene:
     return _load_across(bench, random, 0.0, 0.3, _HELD)
 
 
+def build_turned(bench: Bench, random: np.random.Generator) -> Scene:
+    """Press a cylinder by two jaws, and roll them once round with its weight; gravity is told."""
+    angles = np.r_[np.zeros(10), np.linspace(0.0, 2.0 * np.pi, _LIFTED - 10)]
+    gravity = np.stack([np.sin(angles), -np.cos(angles), 0.0 * angles], axis=1)
+    scene = _load_across(bench, random, 0.0, 0.2 * gravity[:, 1], _HELD)
+    told = np.vstack([np.tile(gravity[:1], (len(scene.images) - _LIFTED, 1)), gravity])
+    return replace(scene, images=[replace(one, gravity=down) for one, down in zip(scene.images, told, strict=True)])
+
+
 def _load_across(
-    bench: Bench, random: np.random.Generator, y: float, share: float, settings: Mapping[str, Any]
+    bench: Bench, random: np.random.Generator, y: float, share: float | NDArray, settings: Mapping[str, Any]
 ) -> Scene:
-    """Press a cylinder at y [m], with a lateral force as a share of the normal one from the middle of the hold on."""
+    """Press a cylinder at y [m], with a lateral force as a share of the normal one in the last `_LIFTED` images."""
     depths, polygon = ramp(4, hold=150), circle(_RADIUS)
     pressed = press(bench, depths, indenter=OutlineIndenter((polygon,)), shape=0.0)
     torsion = measure_torsion(bench.jaw, bench.mechanics.mesh)
     by_moment, by_force, roll = torsion.at(_HEIGHT)
-    along_x, lifted = pressed.forces[:, 0], np.arange(len(depths)) >= len(depths) - 100
-    across = along_x**2 * roll * y - share * lifted * along_x
+    along_x, lifted = pressed.forces[:, 0], np.zeros(len(depths))
+    lifted[-_LIFTED:] = share
+    across = along_x**2 * roll * y - lifted * along_x
     points = pressed.points - (y * along_x)[:, None, None] * by_moment + across[:, None, None] * by_force
     forces = pressed.forces + np.outer(across, [0.0, 1.0, 0.0])
     moved = replace(pressed, points=points, forces=forces)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,9 @@ from numpy.typing import NDArray
 from finforce.gripper_frames import SIDES
 from finforce_eval.evaluation.batch import evaluate_all
 from finforce_eval.evaluation.scoring import join_net, measure_sharpness, rms
+from finforce_eval.recordings.tracks import Recording
 from finforce_eval.table import AXES, ForceSeries
+from finforce_ifea.grasp_force import to_jaw
 from finforce_sim.footage import START
 from finforce_sim.scenarios import build_scenario, write_script
 from lab.experiments.experiment import SHARP, Case, Experiment, RunOptions, average, build_setup, tabulate
@@ -52,14 +55,11 @@ def list_cases(options: RunOptions) -> Sequence[Case]:
 
 def run(options: RunOptions, case: Case, folder: Path) -> dict[str, Any]:
     """Return the figures of a turn."""
-    setup = build_setup(case.settings)
     with options.open_case(case, folder) as recording:
-        results = evaluate_all([recording], setup).results
-        jaws = {side: results[f"{recording.name}/{side}"] for side in SIDES}
-    figures = score_weight(join_net(jaws))
-    if options.bags:
-        return figures
-    told = score_weight(join_net(jaws, true_gravity(case.settings)))
+        figures = score_turn(recording, case)
+        if options.bags:
+            return figures
+        told = score_turn(recording, case, true_gravity(case.settings))
     return figures | {f"told_{name}": told[name] for name in ("along_rmse_N", "within_3_sigma_pct")}
 
 
@@ -80,6 +80,17 @@ def find(options: RunOptions, figures: Mapping[str, Mapping[str, Any]], folder: 
         "standard deviation over the turns; with gravity: its direction in the gripper is known."
     )
     return Figures(tables={"By axis and light": lights}, notes=[note])
+
+
+def score_turn(recording: Recording, case: Case, gravity: Mapping[int, NDArray] | None = None) -> dict[str, Any]:
+    """Return the figures of a recording of both jaws; see `true_gravity`, None where it is not known."""
+    jaws = {}
+    for side, jaw in recording.jaws.items() if gravity else ():
+        told = np.array([to_jaw(gravity[stamp], side) for stamp in jaw.keypoints.stamps_ns.tolist()])
+        jaws[side] = replace(jaw, keypoints=replace(jaw.keypoints, gravity=told))
+    recording = replace(recording, jaws={**recording.jaws, **jaws})
+    results = evaluate_all([recording], build_setup(case.settings)).results
+    return score_weight(join_net({side: results[f"{recording.name}/{side}"] for side in SIDES}, gravity))
 
 
 def true_gravity(settings: Mapping[str, Any]) -> dict[int, NDArray]:

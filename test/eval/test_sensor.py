@@ -7,6 +7,7 @@ import finforce as ff
 from finforce.gripper_frames import BENCH_CAMERA, ROBOT_CAMERA, read_extrinsics
 from finforce.transforms import pose_numbers
 from finforce_eval.sensor import combine_solutions, read_intrinsics
+from finforce_ifea.grasp_force import R_GRIPPER_JAW
 from finforce_ifea.observation import blank_solution
 
 INTRINSICS = (430.0, 430.0, 320.0, 240.0)
@@ -44,6 +45,22 @@ def test_arrays_go_through_the_detector_to_both_jaws():
         with pytest.raises(ValueError, match="expected a direction"):
             sensor.update(rgb, None, stamp=2.0, gravity=gravity)
     assert sensor.update(rgb[::-1], None, stamp=2.0, gravity=[0.0, 0.0, -9.81]).stamp == 2.0
+
+
+@pytest.mark.parametrize(("held", "expected"), [("auto", True), ("no", False)])
+def test_each_jaw_is_told_which_way_things_fall_if_it_may_hold_something(held, expected):
+    about = {"camera": INTRINSICS, "extrinsics": "robot", "contact_height": 0.04, "settings": {"held": held}}
+    sensor, told = ff.ForceSensor("bench", **about), {}
+    for side, loop in sensor._loops.items():
+        update = loop.update
+        loop.update = lambda seen, *a, side=side, update=update: (told.update({side: seen.gravity}), update(seen, *a))[
+            1
+        ]
+    sensor.update(np.full((480, 640, 3), 90, np.uint8), None, stamp=1.0, gravity=[0.0, 3.0, -4.0])
+    for side, gravity in told.items():
+        assert (gravity is not None) == expected
+        assert not expected or R_GRIPPER_JAW[side] @ gravity == pytest.approx([0.0, 0.6, -0.8])
+    assert len(told) == 2
 
 
 @pytest.fixture(scope="module")

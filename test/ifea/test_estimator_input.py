@@ -314,6 +314,14 @@ def test_steel_finger_works_with_the_same_estimator():
     assert force > 2.0
 
 
+@pytest.mark.parametrize("gravity", [np.array([0.0, 0.0, 9.81]), np.array([0.0, 1.0]), np.full(3, np.nan)])
+def test_a_direction_of_gravity_is_a_unit_vector(gravity):
+    one = Observation(stamp=0.0, points=np.zeros((2, 3)), likelihood=np.ones(2), gravity=np.array([0.0, 0.6, 0.8]))
+    check_observation(one, 2)
+    with pytest.raises(ObservationError, match="expected a unit vector"):
+        check_observation(replace(one, gravity=gravity), 2)
+
+
 def test_key_points_in_millimetres_are_refused_with_their_unit_and_a_gross_error_is_not():
     millimetres = Observation(stamp=1.0, points=1e3 * BENCH.keypoints)
     with pytest.raises(ObservationError, match=r"key points up to \d+.* expected metres .* divided by 1000"):

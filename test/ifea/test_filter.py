@@ -23,6 +23,7 @@ from finforce_ifea.filter.friction_path import NODES, TractionHypotheses
 from finforce_ifea.filter.jump import BUMPED, MISPLACED, NUDGED, JumpWatch, weigh_jump
 from finforce_ifea.filter.measurement import FREEDOM, NO_WEIGHT, Measurement, measure_distances, weigh
 from finforce_ifea.filter.process import CAMERA_TIME, FREE_DEPTH, Expectation, expect_state, find_decay, predict
+from finforce_ifea.filter.readout import find_held_ratio
 from finforce_ifea.filter.search import _follow_scatter
 from finforce_ifea.filter.slip_path import PathState, SlipPath, turn_path
 from finforce_ifea.filter.state import DEPTH, SHARED, TRACTION, state_size
@@ -343,6 +344,25 @@ class TestHypotheses:
             held.append(float(np.exp(each.bound_held(each.prior)[-1])))
         assert held[0] < 1e-3
         assert held[1] == pytest.approx(0.5, abs=0.01)
+
+    def test_what_is_turned_has_left_behind_what_else_held_it(self):
+        either, weights = TractionHypotheses(Coefficient(0.5, 0.2), "either"), []
+        for _ in range(3):
+            weights.append(either.bound_held(weights[-1] if weights else either.prior))
+            either.turn(0.4)
+        held = [either.find_held(np.exp(each)) for each in weights]
+        assert held[0] == pytest.approx(0.5, abs=0.02) and 0.9 < held[1] < held[2] < 0.99
+        assert TractionHypotheses(Coefficient(0.5, 0.2), "no").find_held(np.ones(NODES) / NODES) == 0.0
+
+    def test_a_held_weight_pulls_along_the_finger(self):
+        ahead, ratio = np.array([-2.0, 0.0, 0.3]), 0.1
+        upright, slope = find_held_ratio(ahead, ratio, 0.0)
+        pulled, _ = find_held_ratio(ahead, ratio, 0.5)
+        normal = (ahead[0] - ratio * ahead[2]) / (1.0 + ratio**2)
+        base = (ahead[2] + ratio * ahead[0]) / (1.0 + ratio**2)
+        assert base - upright * normal == pytest.approx(0.0)
+        assert base - pulled * normal == pytest.approx(0.5)
+        assert abs(pulled - upright) == pytest.approx(0.5 * slope)
 
     def test_jaws_alone_need_no_path(self):
         only = TractionHypotheses(Coefficient(0.5, 0.2), "yes")

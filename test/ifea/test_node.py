@@ -19,6 +19,7 @@ from finforce.health import Level
 from finforce.messages import stamp_of
 from finforce.ros import node as ros
 from finforce.transforms import pose_numbers
+from finforce_ifea.grasp_force import R_GRIPPER_JAW
 from finforce_ifea.node import IfeaSolverNode
 from finforce_ifea.payload import Payload
 
@@ -120,7 +121,9 @@ def hold(probe, side="left", **parameters):
     """A solver of one of two jaws, and what gives it an image of both."""
     peer = "left" if side == "right" else "right"
     node = start_solver(probe, jaw_name=side, peer=peer, **parameters)
-    node.payload = RecordedPayload()
+    node.payload, node.told = RecordedPayload(), []
+    update = node.estimator.update
+    node.estimator.update = lambda seen, contact: node.told.append(seen.gravity) or update(seen, contact)
     prefix = parameters.get("frame_prefix", "")
     out, other = probe.speak(f"{side}/keypoints"), probe.speak(f"{peer}/wrench", WrenchStamped)
     probe.hear("manipulation_wrench")
@@ -140,13 +143,14 @@ def hold(probe, side="left", **parameters):
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
-def test_which_way_things_fall_reaches_the_payload(probe, side):
+def test_which_way_things_fall_reaches_estimator_and_payload(probe, side):
     node, show = hold(probe, side)
     down = probe.speak("gravity", Vector3Stamped)
     probe.connected(down)
     down.publish(gravity_message((0.0, 3.0, -4.0)))
     probe.wait_for(lambda: node.gravity.at(time_ns()) is not None)
     np.testing.assert_allclose(show(), [0.0, 0.6, -0.8], atol=1e-12)
+    np.testing.assert_allclose(R_GRIPPER_JAW[side] @ node.told[-1], [0.0, 0.6, -0.8], atol=1e-12)
     assert np.isfinite(node.payload.stddev)
     probe.wait_for(lambda: probe.got["manipulation_wrench"])
     probe.wait_for(lambda: any("payload" in told for told in reported(probe)))

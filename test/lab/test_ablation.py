@@ -10,7 +10,7 @@ import pytest
 
 from finforce_ifea.observation import check_contact, check_observation
 from lab.ablation.rules import RULES
-from lab.ablation.run import find_compiled, list_runs, run_child, switch_off
+from lab.ablation.run import find_compiled, list_runs, play, run_child, switch_off
 from lab.ablation.scenes import SCENES, Press, build_scene, film, tell_height
 from lab.stress.session import Bench
 from lab.stress.stress import Plan
@@ -53,6 +53,12 @@ def test_the_estimator_takes_every_image_of_a_scene(name, bench, monkeypatch):
         check_observation(image, len(bench.jaw.keypoints), before)
         check_contact(contact, bench.jaw)
         before = image.stamp
+
+
+def test_a_turn_that_gravity_shows_tells_the_weight_across_the_finger(bench):
+    turned = build_scene(bench, "turned")
+    untold = replace(turned, images=[replace(image, gravity=None) for image in turned.images])
+    assert play(turned)["vector/N"] < 0.8 * play(untold)["vector/N"]
 
 
 def test_a_place_that_is_gone_is_an_error():
