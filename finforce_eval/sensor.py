@@ -29,6 +29,7 @@ from finforce_ifea.jaw.calibration import Calibration
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_ifea.observation import Contact, Observation, Solution, check_stamp
 from finforce_ifea.payload import Payload
+from finforce_ifea.posture import Posture, check_posture
 from finforce_ifea.settings import EstimatorSettings
 from finforce_keypoints.build import build_detector
 from finforce_keypoints.geometry.jaw_localizer import JawKeypoints
@@ -132,6 +133,7 @@ class ForceSensor:
         stamp: float,
         T_camera_object: ArrayLike | None = None,
         gravity: ArrayLike | None = None,
+        elevation: float = np.nan,
     ) -> GripperForces:
         """Return the forces in an image.
 
@@ -146,6 +148,8 @@ class ForceSensor:
             T_camera_object: (4, 4) pose of the object's mesh in this image, if it is known.
             gravity: (3,) direction in which things fall, of any length, in `gripper_base`, if it is known. With it, a
                 turn of the gripper tells what hangs from the jaws alone, and its weight; see `Payload`.
+            elevation: of the gripper above any level [m], if it is known. With it and gravity, what was grasped is
+                still where it lay until it is lifted or turned.
 
         Raises:
             ImageError: the image has another shape, shows nothing, or its stamp does not rise.
@@ -154,7 +158,7 @@ class ForceSensor:
         """
         check_stamp(stamp)
         gravity = None if gravity is None else check_direction(gravity, "gravity")
-        down = gravity if self._may_be_held else None
+        posture = None if gravity is None or not self._may_be_held else check_posture(Posture(gravity, elevation))
         if not isinstance(self.camera, CameraIntrinsics):
             self.camera = read_intrinsics(self.camera, rgb.shape[:2])
         if depth is not None:
@@ -163,10 +167,11 @@ class ForceSensor:
         seen = self._detector.detect(image)
         T = None if T_camera_object is None else check_pose(T_camera_object, "T_camera_object")
         found = {
-            side: self._solve(loop, seen.get(side), stamp, T, to_jaw(down, side)) for side, loop in self._loops.items()
+            side: self._solve(loop, seen.get(side), stamp, T, to_jaw(posture, side))
+            for side, loop in self._loops.items()
         }
         known = {side: found[side] if side in seen else None for side in found}
-        return combine_solutions(stamp, known, self._payload, down)
+        return combine_solutions(stamp, known, self._payload, posture)
 
     def skip(self, stamp: float, reason: str) -> GripperForces:
         """Let time pass for an image at `stamp` [s] that `update` has rejected, and return a result without forces."""
@@ -196,10 +201,10 @@ class ForceSensor:
         seen: JawKeypoints | None,
         stamp: float,
         T_camera_object: NDArray | None,
-        gravity: NDArray | None = None,
+        posture: Posture | None = None,
     ) -> Solution:
-        """Return the force on one jaw, which may not have been found; gravity (3,) in its frame."""
-        observation = replace(observe_jaw(seen, stamp, len(loop.force.jaw.keypoints)), gravity=gravity)
+        """Return the force on one jaw, which may not have been found."""
+        observation = replace(observe_jaw(seen, stamp, len(loop.force.jaw.keypoints)), posture=posture)
         if seen is None or T_camera_object is None:
             return loop.update(observation)
         return loop.update(observation, [(stamp, invert_pose(seen.T_camera_jaw) @ T_camera_object)])
@@ -219,7 +224,7 @@ def observe_jaw(seen: JawKeypoints | None, stamp: float, count: int) -> Observat
 
 
 def combine_solutions(
-    stamp: float, found: Mapping[str, Solution | None], payload: Payload | None = None, gravity: NDArray | None = None
+    stamp: float, found: Mapping[str, Solution | None], payload: Payload | None = None, posture: Posture | None = None
 ) -> GripperForces:
     """Return what the solutions of one jaw or two in one image, None where a jaw was not seen, say of the gripper."""
     jaws = {side: solution for side, solution in found.items() if solution is not None}
@@ -236,7 +241,7 @@ def combine_solutions(
     stddevs = [each.force_stddev for each in jaws.values()]
     if both:
         grasp = combine_wrenches(**wrenches, distance=None, stddevs=stddevs)
-        grasp = grasp if payload is None else payload.update(grasp, stamp, gravity)
+        grasp = grasp if payload is None else payload.update(grasp, stamp, posture)
     else:
         grasp = single_jaw_grasp(wrenches[side], side)
     return GripperForces(

@@ -12,15 +12,16 @@ from numpy.typing import NDArray
 
 from finforce.gripper_frames import SIDES, jaw_in_gripper
 from finforce.messages import SECOND, Synchronizer
+from finforce_ifea.posture import Posture
 
 Side = Literal["left", "right"]
 
 R_GRIPPER_JAW = {side: jaw_in_gripper(side, 0.0)[:3, :3] for side in SIDES}
 
 
-def to_jaw(direction: NDArray | None, side: str) -> NDArray | None:
-    """Return a direction (3,) of `gripper_base` in the frame of a jaw; None for None."""
-    return None if direction is None else direction @ R_GRIPPER_JAW[side]
+def to_jaw(posture: Posture | None, side: str) -> Posture | None:
+    """Return the posture of a jaw for that of `gripper_base`; None for None."""
+    return None if posture is None else posture._replace(gravity=posture.gravity @ R_GRIPPER_JAW[side])
 
 
 class Wrench(NamedTuple):

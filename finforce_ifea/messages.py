@@ -14,6 +14,7 @@ from finforce.errors import ObservationError
 from finforce.messages import check_cloud, decode_columns, decode_keypoints, direction_from_message, stamp_of
 from finforce_ifea.errors import ContactError
 from finforce_ifea.observation import Contact, ObjectOutline, Observation, are_same_polygons
+from finforce_ifea.posture import Posture
 
 if TYPE_CHECKING:
     from finforce_ifea.jaw.jaw import Jaw
@@ -27,13 +28,13 @@ CONTACT_DIAMETER = 0.005
 ARROW = (0.002, 0.004, 0.005)  # shaft, head, head length
 
 
-def observation_from_cloud(cloud: Any, frame: str, gravity: NDArray | None = None) -> Observation:
+def observation_from_cloud(cloud: Any, frame: str, posture: Posture | None = None) -> Observation:
     """Return the key points of a sensor_msgs/PointCloud2 in the jaw frame `frame`.
 
     Args:
         cloud: one row per key point.
         frame: the jaw frame.
-        gravity: its direction (3,) there, None where unknown.
+        posture: of the jaw, None where unknown.
 
     Raises:
         ObservationError: the frame, the height, the fields, a standard deviation or the buffer are wrong.
@@ -41,7 +42,7 @@ def observation_from_cloud(cloud: Any, frame: str, gravity: NDArray | None = Non
     check_cloud(cloud, frame, "the key points")
     seen = decode_keypoints(cloud)
     stamp = cloud.header.stamp.sec + 1e-9 * cloud.header.stamp.nanosec
-    return Observation(stamp=stamp, gravity=gravity, **seen._asdict())
+    return Observation(stamp=stamp, posture=posture, **seen._asdict())
 
 
 def contact_from_cloud(cloud: Any, frame: str, *, free: bool) -> Contact:
@@ -260,8 +261,8 @@ def _check_size(cloud: Any, most: int, what: str) -> None:
         raise ObservationError(f"{what} came with several numbers in the field {', '.join(wide)}; expected one each")
 
 
-class GravityFeed:
-    """Keeps which way things fall, and gives it away while it is fresh.
+class PostureFeed:
+    """Keeps the posture of the gripper, and gives it away while it is fresh.
 
     Args:
         parameters: of the node.
@@ -270,7 +271,7 @@ class GravityFeed:
     def __init__(self, parameters: NodeParameters) -> None:
         self._frame = parameters.base_frame
         self._max_age = round(1e9 * parameters.max_age)
-        self._direction: NDArray | None = None
+        self._posture: Posture | None = None
         self._stamp = 0
 
     def take(self, message: Any) -> None:
@@ -279,15 +280,15 @@ class GravityFeed:
         Raises:
             ObservationError: it is in another frame, or no direction.
         """
-        self.keep(stamp_of(message), direction_from_message(message, self._frame, "gravity"))
+        self.keep(stamp_of(message), Posture(direction_from_message(message, self._frame, "gravity")))
 
-    def keep(self, stamp: int, direction: NDArray) -> None:
-        """Keep a direction (3,) in the gripper's frame, of a time [ns]."""
-        self._direction, self._stamp = direction, stamp
+    def keep(self, stamp: int, posture: Posture) -> None:
+        """Keep a posture of the gripper, of a time [ns]."""
+        self._posture, self._stamp = posture, stamp
 
-    def at(self, stamp: int) -> NDArray | None:
-        """Return the direction (3,) in the gripper's frame; None farther from an image [ns] than `max_age`."""
-        return self._direction if abs(stamp - self._stamp) <= self._max_age else None
+    def at(self, stamp: int) -> Posture | None:
+        """Return the posture of the gripper; None farther from an image [ns] than `max_age`."""
+        return self._posture if abs(stamp - self._stamp) <= self._max_age else None
 
 
 def build_contact_feed(jaw: Jaw, parameters: NodeParameters) -> ContactFeed:

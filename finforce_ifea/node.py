@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped, Vector3Stamped, WrenchStamped
-from numpy.typing import NDArray
 from sensor_msgs.msg import PointCloud2
 
 from finforce.errors import MissingDependencyError
@@ -28,13 +27,14 @@ from finforce_ifea.messages import (
     CONTACT_DIAMETER,
     FORCE,
     NEWTONS_PER_METRE,
-    GravityFeed,
+    PostureFeed,
     build_contact_feed,
     observation_from_cloud,
 )
 from finforce_ifea.observation import Observation, Solution
 from finforce_ifea.parameters import NodeParameters, build_estimator
 from finforce_ifea.payload import Payload
+from finforce_ifea.posture import Posture
 from finforce_ifea.resting import RestingContact
 from finforce_ifea.settings import EstimatorSettings
 
@@ -181,7 +181,7 @@ class IfeaSolverNode(ros.ImageNode):
         self.skips, self.frame = Skips(parameters.skip_off), parameters.frame
         jaw = load_jaw(parameters.jaw_file, parameters.jaw_name)
         self.contacts = build_contact_feed(jaw, parameters)
-        self.gravity = GravityFeed(parameters) if settings.may_be_held else None
+        self.posture = PostureFeed(parameters) if settings.may_be_held else None
         self.frames = ros.Frames(self)
         if parameters.gravity_frame and not self.frames.listen():
             raise MissingDependencyError(f"gravity_frame {parameters.gravity_frame} needs tf2_ros: source ROS 2")
@@ -236,7 +236,7 @@ class IfeaSolverNode(ros.ImageNode):
             for jaw in SIDES:
                 self.stage.subscription(PoseStamped, f"{jaw}/jaw_pose", partial(self._on_jaw_pose, jaw), ros.SENSOR)
         # of what one jaw presses, friction tells nothing of its weight
-        if self.gravity is not None and not self.parameters.gravity_frame:
+        if self.posture is not None and not self.parameters.gravity_frame:
             self.stage.subscription(Vector3Stamped, "gravity", self._on_gravity, ros.SENSOR)
         self.stage.subscription(PointCloud2, f"{side}/keypoints", self._on_keypoints, ros.NEWEST)
 
@@ -264,8 +264,8 @@ class IfeaSolverNode(ros.ImageNode):
         """Solve an image and publish its wrench, if it can be trusted."""
         header, stamp = cloud.header, stamp_of(cloud)
         with self.rejections():
-            gravity = to_jaw(self._find_gravity(stamp), self.parameters.jaw_name)
-            observation = observation_from_cloud(cloud, self.frame, gravity)
+            posture = to_jaw(self._find_posture(stamp), self.parameters.jaw_name)
+            observation = observation_from_cloud(cloud, self.frame, posture)
             if self.gate.enter(stamp, self.now()):
                 self._restart("the stamps went back: a new recording")
             contact = self.resting.complete(self.contacts.at(stamp), observation.stamp)
@@ -287,20 +287,20 @@ class IfeaSolverNode(ros.ImageNode):
             self.stage.afterwards(partial(self._finish, header, observation, solution))
 
     def _send_grasp(self, header: Any, stamp: int, grasp: Grasp | None) -> None:
-        """Send the grasp of both jaws in an image [ns], with the weight that they carry where gravity is known."""
+        """Send the grasp of both jaws in an image [ns], with the weight that they carry where the posture is known."""
         if grasp is not None:
-            grasp = self.payload.update(grasp, SECOND * stamp, self._find_gravity(stamp))
+            grasp = self.payload.update(grasp, SECOND * stamp, self._find_posture(stamp))
             self.out.send_grasp(header, grasp)
 
-    def _find_gravity(self, stamp: int) -> NDArray | None:
-        """Return which way things fall at an image [ns] (3,), in the gripper's frame; None where nobody says."""
-        if self.gravity is None:
+    def _find_posture(self, stamp: int) -> Posture | None:
+        """Return the posture of the gripper at an image [ns]; None where nobody says."""
+        if self.posture is None:
             return None
         upright = self.parameters.gravity_frame
         T = self.frames.find(self.parameters.base_frame, upright) if upright else None
         if T is not None:
-            self.gravity.keep(stamp, -T[:3, 2])
-        return self.gravity.at(stamp)
+            self.posture.keep(stamp, Posture(-T[:3, 2], float(-T[:3, 2] @ T[:3, 3])))
+        return self.posture.at(stamp)
 
     def _finish(self, header: Any, observation: Observation, solution: Solution) -> None:
         """Do what no force waits for."""
@@ -330,7 +330,7 @@ class IfeaSolverNode(ros.ImageNode):
     def _on_gravity(self, direction: Vector3Stamped) -> None:
         """Keep which way things fall."""
         with self.rejections():
-            self.gravity.take(direction)
+            self.posture.take(direction)
 
     def _on_jaw_pose(self, side: str, pose: PoseStamped) -> None:
         """Keep where a jaw is, for the torque on the gripper."""

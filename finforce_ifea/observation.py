@@ -15,12 +15,12 @@ from finforce.errors import ObservationError
 from finforce.messages import NOTHING_SHARED, SharedStddev, check_stddev
 from finforce_ifea.errors import ContactError
 from finforce_ifea.jaw.jaw import Jaw
+from finforce_ifea.posture import Posture, check_posture
 
 TRUSTED = ("ok", "unloaded")
 # Standard deviations of a force from which it shows that the object touches: on bench recordings it does in 0 to 3 % of
 # the images of an unloaded jaw.
 _TOUCHING = 0.5
-_UNIT = 1e-3  # by which the length of a unit vector may be off
 _SAME_IMAGE = 0.5e-3  # [s] between two stamps within which one image came twice
 _SHORTEST_PERIOD = 1e-3  # [s] between three images in a row: no RGB-D camera takes 1000 a second
 _LONGEST_PERIOD = 5.0  # [s] between three images in a row: rarer ones show no grasp
@@ -45,8 +45,8 @@ class Observation:
         stddev: (K, 3) standard deviation of each point [m] along the axes of the jaw frame, above zero where there is a
             point; None if the detector states none.
         shared: standard deviations of additional errors that all points of the image have in common.
-        gravity: (3,) direction in which things fall, unit vector in the jaw frame; None if unknown. With it, a turn of
-            the gripper tells whether only the jaws hold the object, and its weight across the fingers.
+        posture: of the jaw; None if unknown. With it, turns and lifts tell whether only the jaws hold the object, and
+            turns its weight across the fingers.
     """
 
     stamp: float
@@ -54,7 +54,7 @@ class Observation:
     likelihood: NDArray | None = None
     stddev: NDArray | None = None
     shared: SharedStddev = NOTHING_SHARED
-    gravity: NDArray | None = None
+    posture: Posture | None = None
 
     def __post_init__(self) -> None:
         if self.likelihood is None:
@@ -187,7 +187,7 @@ def check_observation(observation: Observation, count: int, last_stamp: float | 
 
     Raises:
         ObservationError: Wrong shapes, infinite values, a likelihood outside [0, 1], a standard deviation that is none,
-            a direction of gravity of another length than 1, stamps that do not rise.
+            a posture that is none, stamps that do not rise.
     """
     points, likelihood = np.asarray(observation.points, float), np.asarray(observation.likelihood, float)
     if points.shape != (count, 3) or likelihood.shape != (count,):
@@ -212,9 +212,8 @@ def check_observation(observation: Observation, count: int, last_stamp: float | 
     shared = observation.shared
     if not (isinstance(shared, SharedStddev) and all(0.0 <= stddev < np.inf for stddev in shared)):
         raise ObservationError(f"shared standard deviations {shared}, expected SharedStddev with numbers from zero up")
-    gravity = observation.gravity
-    if gravity is not None and not (np.shape(gravity) == (3,) and abs(np.linalg.norm(gravity) - 1.0) < _UNIT):
-        raise ObservationError(f"gravity {np.asarray(gravity).tolist()}, expected a unit vector of three numbers")
+    if observation.posture is not None:
+        check_posture(observation.posture)
     check_stamp(observation.stamp)
     if last_stamp is not None and observation.stamp <= last_stamp:
         raise ObservationError(

@@ -1,14 +1,14 @@
-"""Weight of what two jaws hold, and the net force that it leaves, where the direction of gravity is known.
+"""Weight of what two jaws hold, and the net force that it leaves, where its posture is known.
 
 Key points show the net force s along the closing axis and across the fingers, but hardly along them. What hangs from
 the jaws alone has one weight W along gravity g, whichever way the gripper turns,
 
     s = W g + e + b + white noise,
 
-with the force e of a support, and an error b of the estimated forces. What is turned by more than a little has left
-its support behind: e is forgotten with the angle, and may come back with time. So a turn tells W, and W the force along
-the fingers. Lifting alone tells nothing: a support may bear any part of the weight. Nor does a turn with a handle or
-against an obstacle, where e stays: that is the other hypothesis, and the likelihoods of both decide.
+with the force e of a support, and an error b of the estimated forces. What is turned or lifted by more than a little
+has left its support behind: e is forgotten with the motion, and may come back with time. So a turn tells W, and W the
+force along the fingers; a lift tells it if gravity points along the other axes. Neither does with a handle or against
+an obstacle, where e stays: that is the other hypothesis, and the likelihoods of both decide.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce_ifea.grasp_force import Grasp
-from finforce_ifea.turn import LEFT_BEHIND, TurnTrack
+from finforce_ifea.posture import Posture, PostureTrack
 
 # 1 sigma of the weight, and of a support's force, as a share of the grasp force [-].
 _WEIGHT = 0.3
@@ -49,33 +49,34 @@ class Payload:
     """
 
     def __init__(self) -> None:
-        self._turns = TurnTrack()
+        self._postures = PostureTrack()
         self.reset()
 
     def reset(self) -> None:
         """Forget what was held."""
         self._stamp = -np.inf
-        self._turns.reset()
+        self._postures.reset()
         # of the hypotheses that a turn leaves the support behind, and that it does not: W, e (3,), b (2,)
         self._x, self._P, self._log_odds = np.zeros((2, 6)), np.zeros((2, 6, 6)), _FREE
         self._expected, self._variance = 0.0, np.zeros(2)
         self.weight, self.stddev = 0.0, np.inf
 
-    def update(self, grasp: Grasp, stamp: float, gravity: NDArray | None) -> Grasp:
+    def update(self, grasp: Grasp, stamp: float, posture: Posture | None) -> Grasp:
         """Return a grasp with the net force of what hangs from the jaws.
 
         Args:
             grasp: of both jaws, with the standard deviation of its net force.
             stamp: of the image [s]; one that is not later than the last is left as it is.
-            gravity: direction in which things fall (3,), unit vector in `gripper_base`; None if unknown.
+            posture: of `gripper_base`; None if unknown.
         """
         held = float(grasp.grasp[0])
         if held < _LEAST_FORCE:
             self.reset()
             return grasp
-        if gravity is None or grasp.stddev is None or not np.isfinite(grasp.stddev).all() or stamp <= self._stamp:
+        if posture is None or grasp.stddev is None or not np.isfinite(grasp.stddev).all() or stamp <= self._stamp:
             return grasp
-        self._predict(stamp, gravity, (_WEIGHT * held) ** 2, np.maximum(grasp.stddev[_SEEN], _LEAST_STDDEV) ** 2)
+        gravity = posture.gravity
+        self._predict(stamp, posture, (_WEIGHT * held) ** 2, np.maximum(grasp.stddev[_SEEN], _LEAST_STDDEV) ** 2)
         self._correct(grasp.manipulation[_SEEN], gravity)
         self._stamp = stamp
         weights = self._weigh()
@@ -87,14 +88,14 @@ class Payload:
         self.weight, self.stddev = float(weight), sqrt(spread + (_SCALE * weight) ** 2)
         return replace(grasp, manipulation=mean, stddev=np.sqrt(np.maximum(variance, _LEAST_STDDEV**2)))
 
-    def _predict(self, stamp: float, gravity: NDArray, expected: float, variance: NDArray) -> None:
+    def _predict(self, stamp: float, posture: Posture, expected: float, variance: NDArray) -> None:
         """Predict an image in which weight and support are expected with a variance, and forces with theirs (2,)."""
-        dt, kept, turn = 0.0, 0.0, self._turns.update(gravity).angle
+        dt, kept, parting = 0.0, 0.0, self._postures.update(posture).parting
         if np.isfinite(self._stamp):
             dt = stamp - self._stamp
             kept = np.exp(-dt / _ERROR_TIME)
             a = np.ones((2, 6))
-            a[0, 1:4], a[:, 4:] = np.exp(-turn / LEFT_BEHIND), kept * np.sqrt(variance / self._variance)
+            a[0, 1:4], a[:, 4:] = np.exp(-parting), kept * np.sqrt(variance / self._variance)
             self._x, self._P = a * self._x, a[:, :, None] * self._P * a[:, None, :]
             self._log_odds = _FREE + np.exp(-dt / _COUNTED) * (self._log_odds - _FREE)
         more = max(expected - self._expected, 0.0)

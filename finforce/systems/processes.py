@@ -410,6 +410,7 @@ class RobotOptions(GripperOptions):
     arm_description: str = setting("", "xacro file of arm and gripper; none: the gripper on the flange of a Gen3")
     robot_ip: str = setting("192.168.1.10", "Address of the arm")
     dof: int = setting(7, "Joints of the arm", choices=(6, 7))
+    gravity_frame: str = setting("", "Upright frame on /tf in which the gripper moves; none: world with arm")
 
 
 @dataclass(frozen=True, kw_only=True)

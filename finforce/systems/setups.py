@@ -36,6 +36,7 @@ SIM_CALIBRATION, SIM_JAWS = "twin", ("", "bench")
 # of a camera, behind its name; a D405 had the other colour topic before realsense2_camera 4.57.4
 COLOR, OLD_COLOR = "color/image_raw", "color/image_rect_raw"
 DEPTH, INFO = "aligned_depth_to_color/image_raw", "color/camera_info"
+WORLD = "world"  # upright root of an arm's description
 POSE_AXES = ("x", "y", "z", "qx", "qy", "qz", "qw")
 
 
@@ -70,12 +71,13 @@ def robot_processes(options: RobotOptions, share: Path) -> list[Process | Includ
         ValueError: the simulated robot is asked for what it has not got, or a camera that is to be started has no name.
     """
     options = complete(options, share, "robot")
+    upright = options.gravity_frame or (WORLD if options.arm else "")
     parts = [
         *[see_camera(process, options) for process in twin_processes("grasp_cylinder", options)],
         *camera_includes(options, share),
         *arm_includes(options, share),
-        solver_process("left", options, peer="right"),
-        solver_process("right", options, paired=True),
+        solver_process("left", options, peer="right", gravity_frame=upright),
+        solver_process("right", options, paired=True, gravity_frame=upright),
         *[see_camera(process, options) for process in contact_processes("both", options, waits=True)],
         *[see_camera(process, options) for process in detector_processes("both", options)],
         *([gripper_process(options)] if options.gripper else []),

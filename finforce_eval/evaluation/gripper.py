@@ -14,6 +14,7 @@ from finforce_eval.recordings.tracks import Recording
 from finforce_eval.table import ForceSeries
 from finforce_ifea.grasp_force import Grasp, JawDistance, Wrench, combine_wrenches, single_jaw_grasp
 from finforce_ifea.payload import Payload
+from finforce_ifea.posture import Posture
 
 _SAME = 0.2  # [s] within which a jaw's pose is still that of an image
 
@@ -61,18 +62,18 @@ def combine_jaws(jaws: Mapping[str, ForceSeries]) -> ForceSeries:
     )
 
 
-def carry_payload(net: ForceSeries, gravity: Mapping[int, NDArray]) -> ForceSeries:
+def carry_payload(net: ForceSeries, postures: Mapping[int, Posture]) -> ForceSeries:
     """Return the series of a gripper with the weight that it carries; see `Payload`.
 
     Args:
         net: by `combine_jaws`.
-        gravity: direction (3,) in the gripper's frame by stamps [ns].
+        postures: of the gripper by stamps [ns].
     """
     payload, told, stated = Payload(), net.force.copy(), net.column("force_stddev").copy()
     for row in np.flatnonzero(np.isfinite(told).all(axis=1)):
         held, stamp = np.array([net.column("grasp_force")[row], 0.0, 0.0]), int(net.stamps_ns[row])
         grasp = Grasp(grasp=held, manipulation=told[row], torque=None, stddev=stated[row])
-        grasp = payload.update(grasp, 1e-9 * stamp, gravity.get(stamp))
+        grasp = payload.update(grasp, 1e-9 * stamp, postures.get(stamp))
         told[row], stated[row] = grasp.manipulation, grasp.stddev
     return net.with_columns(force=told, force_stddev=stated)
 

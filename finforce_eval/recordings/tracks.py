@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from finforce.messages import NANOSECONDS, NOTHING_SHARED, SECOND, SharedStddev
 from finforce_eval.errors import RecordingError
 from finforce_ifea.observation import Observation
+from finforce_ifea.posture import Posture
 
 if TYPE_CHECKING:
     from finforce_eval.recordings.images import ImageTrack
@@ -43,7 +44,7 @@ class KeypointTrack(Timed):
         likelihood: (n, K) in [0, 1].
         stddev: (n, K, 3) one standard deviation [m], jaw frame, NaN = not known; None when nothing says.
         shared: (n, 3) standard deviations of what the points of an image share, see `SharedStddev`; None: 0.
-        gravity: (n, 3) its direction, jaw frame; None when nothing says.
+        postures: (n, 4) of the jaw, direction of gravity and elevation [m]; None when nothing says.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -51,7 +52,7 @@ class KeypointTrack(Timed):
     likelihood: NDArray[np.float64]
     stddev: NDArray[np.float64] | None = None
     shared: NDArray[np.float64] | None = None
-    gravity: NDArray[np.float64] | None = None
+    postures: NDArray[np.float64] | None = None
 
     @classmethod
     def empty(cls, count: int = 0) -> KeypointTrack:
@@ -71,7 +72,9 @@ class KeypointTrack(Timed):
             likelihood=self.likelihood[index],
             stddev=None if self.stddev is None else self.stddev[index],
             shared=NOTHING_SHARED if self.shared is None else SharedStddev(*self.shared[index].tolist()),
-            gravity=None if self.gravity is None else self.gravity[index],
+            posture=None
+            if self.postures is None
+            else Posture(self.postures[index, :3], float(self.postures[index, 3])),
         )
 
 

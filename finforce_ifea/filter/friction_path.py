@@ -14,7 +14,6 @@ from finforce_ifea.contact_mechanics.friction import Coefficient
 from finforce_ifea.contact_mechanics.pressed_jaw import RigidContact
 from finforce_ifea.filter.readout import LARGEST_RATIO
 from finforce_ifea.filter.slip_path import PathState, SlipPath, find_turn, turn_path
-from finforce_ifea.turn import LEFT_BEHIND
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
 # Coefficients of friction that are weighed against each other, and the deviation of a coefficient up to which one is
@@ -26,8 +25,9 @@ _SPAN = 2.5
 _LARGEST = 1.2
 # Prior probability that only the jaws hold an object between two of them [-].
 _HELD = 0.5
-# The largest log odds that turns of the gripper give to that: it may hold a handle.
-_TURNED = 4.0
+# The least log odds that the gripper's moves give to that: what was grasped is still where it lay until it is lifted;
+# and the largest: it may hold a handle.
+_AT_REST, _PARTED = -4.0, 4.0
 # A motion back by less than this is noise [sigma] while the object moves, and where it has stopped; and one along the
 # finger by less than this [m].
 _REVERSAL = 2.5
@@ -93,7 +93,7 @@ class TractionHypotheses:
     def reset(self) -> None:
         """Expect an object that does not touch yet."""
         self.upright, self._bears, self.motion = 0.0, 0.0, 0.0
-        self.pull_stddev, self._turned, self._left_behind = 0.0, 0.0, 0.0
+        self.pull_stddev, self._parted, self._parting, self._is_at_rest = 0.0, 0.0, 0.0, False
         self.leave()
 
     def leave(self) -> None:
@@ -159,12 +159,13 @@ class TractionHypotheses:
         """Return the probability that only the jaws hold the object, for the weights of the hypotheses (N,)."""
         return float(weights[-1]) if self._held > 0.0 else 0.0
 
-    def turn(self, angle: float) -> None:
-        """Count a turn of the gripper [rad], which leaves behind whatever else held the object."""
-        self._turned += angle
+    def part(self, parting: float, *, shows_lifts: bool) -> None:
+        """Count a move of the gripper, which leaves behind whatever else held the object; see `Move`."""
+        self._parted += parting
+        self._is_at_rest = shows_lifts
 
     def bound_held(self, log_weights: NDArray) -> NDArray:
-        """Return the log weights (N,) with that of "held" by turns, and less what friction does not bear.
+        """Return the log weights (N,) with that of "held" by moves, and less what friction does not bear.
 
         It bears a ratio with P(mu > |kappa|).
         """
@@ -174,9 +175,9 @@ class TractionHypotheses:
         bears = self._prior @ np.clip((self.mu + 0.5 * step - abs(self.upright)) / step, 0.0, 1.0)
         bears = float(np.log(max(bears, _LEAST_PROBABILITY)))
         weighed = log_weights.copy()
-        left_behind = min(self._turned / LEFT_BEHIND, _TURNED)
-        weighed[-1] += bears - self._bears + (left_behind - self._left_behind)
-        self._bears, self._left_behind = bears, left_behind
+        parting = min(self._parted + (_AT_REST if self._is_at_rest else 0.0), _PARTED)
+        weighed[-1] += bears - self._bears + (parting - self._parting)
+        self._bears, self._parting = bears, parting
         return weighed - np.log(np.exp(weighed).sum())
 
     def take_motion(self) -> float:

@@ -12,7 +12,7 @@ about its own inclined axis, though: with the turn f(z) of its sections about z 
     y(z) += int f'(s) (u(z) - u(s) - u'(s) (z - s)) ds.
 
 y_c is expected where the object's mesh is nearest. Where the direction of gravity g is known, the lateral force t N is
-w g_y + e, with this jaw's share w of the weight, and the force e of a support, which a turn leaves behind.
+w g_y + e, with this jaw's share w of the weight, and the force e of a support, which a turn or a lift leaves behind.
 """
 
 from dataclasses import dataclass
@@ -28,8 +28,8 @@ from finforce_ifea.fem.solid import SolidModel
 from finforce_ifea.filter.filter import solve_lower
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE, Jaw
 from finforce_ifea.jaw.mesh import VolumeMesh
+from finforce_ifea.posture import Move
 from finforce_ifea.tracking.contact_state import MIDDLE_STDDEV, ContactState
-from finforce_ifea.turn import LEFT_BEHIND, Turn
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
 _HEIGHTS = 13
@@ -206,7 +206,7 @@ class LateralLoad:
 
     Its state is the location of the pressure [m], the lateral traction ratio [-], an offset along y for each key point
     [m], and the jaw's share of the weight [N]. Two hypotheses differ in the ratio: it stays as it was, or the jaws have
-    lifted a weight. Their likelihoods decide, or a turn that leaves a support behind.
+    lifted a weight. Their likelihoods decide, or a move that leaves a support behind.
 
     Attributes:
         motions: of the key points by what acts laterally (K, 3) [m]; zero where nothing does.
@@ -227,7 +227,7 @@ class LateralLoad:
     def reset(self) -> None:
         """Forget what was seen; where the object is expected stays."""
         self._known: _Estimate | None = None
-        self._depth, self._is_lifted, self._turned, self._largest = 0.0, False, 0.0, 0.0
+        self._depth, self._is_lifted, self._parted, self._largest = 0.0, False, 0.0, 0.0
         self.motions = np.zeros((self._count, 3))
         self.load = np.array([*self._expected, 0.0, self._traction])
 
@@ -246,7 +246,7 @@ class LateralLoad:
         return float(self._known.x[-1]), sqrt(max(self._known.P[-1, -1], 0.0))
 
     def update(
-        self, motions: NDArray, bend: NDArray, points: NDArray, state: ContactState, dt: float, turn: Turn | None
+        self, motions: NDArray, bend: NDArray, points: NDArray, state: ContactState, dt: float, move: Move | None
     ) -> None:
         """Take the motions of the key points along y in an image.
 
@@ -256,7 +256,7 @@ class LateralLoad:
             points: see `KEYPOINT`.
             state: see `CONTACT_STATE`.
             dt: time since the last image [s].
-            turn: in the jaw's frame, for one that may lift a weight; None where gravity is not known.
+            move: of a jaw that may lift a weight; None where its posture is not known.
         """
         torsion, force, height = self._torsion, state["force"], float(state["pressure_location"][2])
         normal = hypot(force[0], force[2])
@@ -266,7 +266,7 @@ class LateralLoad:
         place = height, normal, force[0], self.load[0]
         measured, (by_moment, by_force, rolled) = _observe(points, motions, bend, torsion.packed, place)
         moved, self._depth = abs(float(state["depth"]) - self._depth), float(state["depth"])
-        self._follow(measured, points["offset_variance"], (moved, dt), turn, normal)
+        self._follow(measured, points["offset_variance"], (moved, dt), move, normal)
         x, P, half = *self._known, torsion.half_width
         location, stddev = min(max(float(x[0]), -half), half), hypot(sqrt(P[1, 1]), _NONLINEAR)
         # unless a weight was lifted, chance and what the linear jaw errs by are no force
@@ -280,7 +280,7 @@ class LateralLoad:
         measured: tuple[NDArray, ...],
         offsets: NDArray,
         passed: tuple[float, float],
-        turn: Turn | None,
+        move: Move | None,
         normal: float,
     ) -> None:
         """Take an image into both hypotheses, and decide between them.
@@ -289,7 +289,7 @@ class LateralLoad:
             measured: see `_observe`.
             offsets: stationary variance of each key point's offset (K,) [m^2].
             passed: motion of the object in depth [m] and time [s] since the last image.
-            turn: see `update`.
+            move: see `update`.
             normal: force [N].
         """
         if self._known is None:
@@ -297,12 +297,12 @@ class LateralLoad:
             self._odds = 0.0
         light, lifted = (*self._expected, _TRACTION**2, _TRACTION_TIME), (*self._expected, *_LIFTED_RATIO)
         prior, weight = _LIFTED, (0.0, 0.0, 0.0, normal, 0.0, 0.0)
-        if turn is not None:
-            self._turned += turn.angle
-            self._is_lifted |= self._turned > LEFT_BEHIND
+        if move is not None:
+            self._parted += move.parting
+            self._is_lifted |= self._parted > 1.0
             lifted, prior, before = (*self._expected, _REST**2, _WEIGHT_TIME), _LIFTED_ALONG, self._largest
             self._largest = max((_SHARE * normal) ** 2, before)
-            told = float(turn.before[1]), float(turn.now[1]), turn.angle
+            told = float(move.before[1]), float(move.now[1]), move.parting
             weight = (*told, normal, self._largest, self._largest - before)
         if self._is_lifted:
             self._known = _step(tuple(self._known), lifted, offsets, passed, measured, weight)[0]
@@ -371,13 +371,13 @@ def _step(estimate, expected, offsets, passed, measured, weight):
         offsets: stationary variance of each key point's offset (K,) [m^2].
         passed: motion [m] and time [s] since the last image.
         measured: see `_observe`.
-        weight: gravity along y in the last image and in this one [-], turn between them [rad], normal force [N],
+        weight: gravity along y in the last image and in this one [-], see `Move.parting`, normal force [N],
             variance of the share of the weight, and by how much that has grown [N^2].
     """
     (moved, dt), (seen, H, z, R), estimate = passed, measured, _Estimate(*estimate)
-    (location, stddev, variance, time), (before, now, angle, normal, carried, more) = expected, weight
+    (location, stddev, variance, time), (before, now, parting, normal, carried, more) = expected, weight
     n, m, kept = len(estimate.x), len(seen), np.exp(-moved / _OFFSET_LENGTH - dt / _OFFSET_TIME)
-    rates, left = (np.exp(-dt / _LOCATION_TIME), np.exp(-dt / time)), np.exp(-angle / LEFT_BEHIND)
+    rates, left = (np.exp(-dt / _LOCATION_TIME), np.exp(-dt / time)), np.exp(-parting)
     x, P, a = estimate.x.copy(), estimate.P.copy(), np.empty(n)
     w = n - 1
     for i in range(w):

@@ -19,11 +19,11 @@ from finforce_ifea.filter.lateral_load import LateralLoad, Torsion
 from finforce_ifea.filter.search import ContactSearch, find_x_model
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE
 from finforce_ifea.observation import Contact, Observation
+from finforce_ifea.posture import Move, Posture, PostureTrack
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tare import PointNoise, Tare
 from finforce_ifea.tracking.contact_state import MIDDLE_STDDEV, TOUCH_DEPTH, UNSEEN_TRACTION, ContactState
 from finforce_ifea.tracking.influence import explain_offsets, measure_influence, press_lightly
-from finforce_ifea.turn import Turn, TurnTrack
 
 # Images without touch after which the next object may be any.
 _IMAGES_RELEASED = 15
@@ -98,7 +98,7 @@ class ContactTracker:
             torsion, len(keypoints), UNSEEN_TRACTION * settings.friction, may_be_held=settings.may_be_held
         )
         self._tare: Tare | None = None
-        self._turns = TurnTrack()
+        self._postures = PostureTrack()
         self.expect_friction(None)
         self.reset()
 
@@ -197,7 +197,7 @@ class ContactTracker:
         self._led = self._mean.copy()
         self._lateral.reset()
         self._released, self._has_moved = 0, False
-        self._turns.reset()
+        self._postures.reset()
 
     def _forget_contact(self) -> None:
         """Expect any object again, as the next one may be."""
@@ -213,7 +213,7 @@ class ContactTracker:
             dt: time since the last image [s].
             observation: that the points are of.
         """
-        search, measured, turn = self._search, points - tare.offsets, self._follow_turn(observation.gravity)
+        search, measured, move = self._search, points - tare.offsets, self._follow_posture(observation.posture)
         if tare is not self._tare:
             self._tare = tare
             search.restart()
@@ -236,26 +236,22 @@ class ContactTracker:
         self._complete(state)
         if self._is_known:
             bend = search.positions[:, 0] - self._rest[:, 0]
-            self._lateral.update((measured - search.positions)[:, 1], bend, search.points, state, dt, turn)
+            self._lateral.update((measured - search.positions)[:, 1], bend, search.points, state, dt, move)
         if self._fidelity and not state["converged"]:
             self._restore_shape()
         self._change_fidelity(state)
         self._has_moved = True
         return state
 
-    def _follow_turn(self, gravity: NDArray | None) -> Turn | None:
-        """Return how the gripper has turned since the last image, which tells whether only the jaws hold the object.
-
-        `gravity` is its direction (3,), None where unknown.
-        """
-        turn, search = self._turns.update(gravity if self.settings.may_be_held else None), self._search
+    def _follow_posture(self, posture: Posture | None) -> Move | None:
+        """Return how the jaw has moved since the last image, which tells whether only the jaws hold the object."""
+        move, search = self._postures.update(posture if self.settings.may_be_held else None), self._search
         search.pull = 0.0, 0.0
-        if turn is not None:
+        if move is not None:
             weight, stddev = self._lateral.weigh(float(search.state["magnitude"]))
-            search.pull = weight * float(turn.now[2]), stddev * abs(float(turn.now[2]))
-            if search.state["loaded"]:
-                search.hypotheses.turn(turn.angle)
-        return turn
+            search.pull = weight * float(move.now[2]), stddev * abs(float(move.now[2]))
+            search.hypotheses.part(move.parting if search.state["loaded"] else 0.0, shows_lifts=move.shows_lifts)
+        return move
 
     def _fill(self, measured: NDArray, tare: Tare, noise: PointNoise) -> None:
         """Fill in the key points of an image, measured (K, 3) [m]."""

@@ -248,6 +248,15 @@ def test_the_camera_of_somebody_else_publishes_its_own_frames():
     assert "static_transform_publisher" not in robot(camera=False)
 
 
+@pytest.mark.parametrize(
+    ("options", "frame"), [({}, None), ({"arm": True}, "world"), ({"gravity_frame": "map"}, "map")]
+)
+def test_solvers_follow_the_posture_of_an_arm_that_is_there(options, frame):
+    parts = robot(**options)
+    for side in ("left", "right"):
+        assert parts[f"{side}_ifea_solver"].parameters.get("gravity_frame") == frame
+
+
 def test_the_arm_comes_with_our_description_and_its_own_frames():
     parts = robot(arm=True, robot_ip="10.0.0.2", dof=6)
     told = parts["kortex_bringup"].arguments

@@ -53,13 +53,13 @@ def test_each_jaw_is_told_which_way_things_fall_if_it_may_hold_something(held, e
     sensor, told = ff.ForceSensor("bench", **about), {}
     for side, loop in sensor._loops.items():
         update = loop.update
-        loop.update = lambda seen, *a, side=side, update=update: (told.update({side: seen.gravity}), update(seen, *a))[
+        loop.update = lambda seen, *a, side=side, update=update: (told.update({side: seen.posture}), update(seen, *a))[
             1
         ]
     sensor.update(np.full((480, 640, 3), 90, np.uint8), None, stamp=1.0, gravity=[0.0, 3.0, -4.0])
-    for side, gravity in told.items():
-        assert (gravity is not None) == expected
-        assert not expected or R_GRIPPER_JAW[side] @ gravity == pytest.approx([0.0, 0.6, -0.8])
+    for side, posture in told.items():
+        assert (posture is not None) == expected
+        assert not expected or R_GRIPPER_JAW[side] @ posture.gravity == pytest.approx([0.0, 0.6, -0.8])
     assert len(told) == 2
 
 

@@ -349,7 +349,7 @@ class TestHypotheses:
         either, weights = TractionHypotheses(Coefficient(0.5, 0.2), "either"), []
         for _ in range(3):
             weights.append(either.bound_held(weights[-1] if weights else either.prior))
-            either.turn(0.4)
+            either.part(2.7, shows_lifts=False)
         held = [either.find_held(np.exp(each)) for each in weights]
         assert held[0] == pytest.approx(0.5, abs=0.02) and 0.9 < held[1] < held[2] < 0.99
         assert TractionHypotheses(Coefficient(0.5, 0.2), "no").find_held(np.ones(NODES) / NODES) == 0.0

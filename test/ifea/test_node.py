@@ -97,15 +97,15 @@ def gravity_message(vector, frame="gripper_base"):
 
 
 class RecordedPayload(Payload):
-    """Keeps which gravity it was told."""
+    """Keeps which posture it was told."""
 
     def __init__(self):
         super().__init__()
         self.told = []
 
-    def update(self, grasp, stamp, gravity):
-        self.told.append(gravity)
-        return super().update(grasp, stamp, gravity)
+    def update(self, grasp, stamp, posture):
+        self.told.append(posture)
+        return super().update(grasp, stamp, posture)
 
 
 def reported(probe):
@@ -123,7 +123,7 @@ def hold(probe, side="left", **parameters):
     node = start_solver(probe, jaw_name=side, peer=peer, **parameters)
     node.payload, node.told = RecordedPayload(), []
     update = node.estimator.update
-    node.estimator.update = lambda seen, contact: node.told.append(seen.gravity) or update(seen, contact)
+    node.estimator.update = lambda seen, contact: node.told.append(seen.posture) or update(seen, contact)
     prefix = parameters.get("frame_prefix", "")
     out, other = probe.speak(f"{side}/keypoints"), probe.speak(f"{peer}/wrench", WrenchStamped)
     probe.hear("manipulation_wrench")
@@ -137,7 +137,7 @@ def hold(probe, side="left", **parameters):
             ros.wrench_message(Header(stamp=ros.stamp_message(stamp), frame_id=f"{prefix}{peer}_jaw"), (-2.0, 0.0, 0.5))
         )
         probe.wait_for(lambda: node.payload.told)
-        return node.payload.told[-1]
+        return node.payload.told[-1] and node.payload.told[-1].gravity
 
     return node, show
 
@@ -148,9 +148,9 @@ def test_which_way_things_fall_reaches_estimator_and_payload(probe, side):
     down = probe.speak("gravity", Vector3Stamped)
     probe.connected(down)
     down.publish(gravity_message((0.0, 3.0, -4.0)))
-    probe.wait_for(lambda: node.gravity.at(time_ns()) is not None)
+    probe.wait_for(lambda: node.posture.at(time_ns()) is not None)
     np.testing.assert_allclose(show(), [0.0, 0.6, -0.8], atol=1e-12)
-    np.testing.assert_allclose(R_GRIPPER_JAW[side] @ node.told[-1], [0.0, 0.6, -0.8], atol=1e-12)
+    np.testing.assert_allclose(R_GRIPPER_JAW[side] @ node.told[-1].gravity, [0.0, 0.6, -0.8], atol=1e-12)
     assert np.isfinite(node.payload.stddev)
     probe.wait_for(lambda: probe.got["manipulation_wrench"])
     probe.wait_for(lambda: any("payload" in told for told in reported(probe)))

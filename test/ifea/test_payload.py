@@ -5,8 +5,10 @@ import pytest
 
 from finforce_ifea.grasp_force import Grasp
 from finforce_ifea.payload import Payload
+from finforce_ifea.posture import Posture
 
 RATE, HELD, WEIGHT = 30.0, 3.0, 0.98  # [Hz], [N], [N]
+DOWN = Posture(np.array([0.0, 0.0, 1.0]))
 STDDEV = np.array([0.1, 0.35, 0.6])  # [N], as of grasps of the twin
 
 
@@ -28,10 +30,11 @@ def disturb(forces, seed):
     return found
 
 
-def follow(payload, found, gravity, begin=0.0):
+def follow(payload, found, gravity, elevation=()):
+    postures = [Posture(*each) for each in (zip(gravity, elevation, strict=True) if len(elevation) else zip(gravity))]
     told = [
-        payload.update(grasp_of(force), begin + k / RATE, g)
-        for k, (force, g) in enumerate(zip(found, gravity, strict=True))
+        payload.update(grasp_of(force), k / RATE, posture)
+        for k, (force, posture) in enumerate(zip(found, postures, strict=True))
     ]
     return np.array([each.manipulation for each in told]), np.array([each.stddev for each in told])
 
@@ -93,26 +96,40 @@ def test_a_handle_that_turns_with_the_jaws_is_no_weight():
     assert (np.abs(told - true)[:, 0] <= 3.0 * stddev[:, 0]).mean() > 0.9
 
 
+def test_a_lift_tells_a_weight_that_does_not_pull_along_the_fingers():
+    gravity, weights = np.tile([0.0, 1.0, 0.0], (120, 1)), {}
+    lift = np.clip(np.arange(120) / 30.0 - 1.0, 0.0, 0.5)
+    true = WEIGHT * np.clip(lift / 0.01, 0.0, 1.0)[:, None] * gravity
+    for elevation in ((), lift):
+        payloads = [Payload() for _ in range(20)]
+        for seed, payload in enumerate(payloads):
+            follow(payload, disturb(true, seed), gravity, elevation)
+        weights[len(elevation)] = np.array([(each.weight, each.stddev) for each in payloads])
+    (untold, _), (told, stddev) = weights[0].T, weights[120].T
+    assert abs(told - WEIGHT).mean() < 0.7 * abs(untold - WEIGHT).mean()
+    assert (abs(told - WEIGHT) < 3.0 * stddev).all()
+
+
 @pytest.mark.parametrize(
-    ("grasp", "gravity"),
+    ("grasp", "posture"),
     [
         (grasp_of([0.1, 0.2, 0.3]), None),
-        (grasp_of([0.1, 0.2, 0.3], stddev=None), np.array([0.0, 0.0, 1.0])),
-        (grasp_of([0.1, 0.2, 0.3], stddev=np.full(3, np.nan)), np.array([0.0, 0.0, 1.0])),
-        (grasp_of([0.1, 0.2, 0.3], held=0.1), np.array([0.0, 0.0, 1.0])),
+        (grasp_of([0.1, 0.2, 0.3], stddev=None), DOWN),
+        (grasp_of([0.1, 0.2, 0.3], stddev=np.full(3, np.nan)), DOWN),
+        (grasp_of([0.1, 0.2, 0.3], held=0.1), DOWN),
     ],
 )
-def test_without_gravity_deviations_or_a_held_object_forces_stay_as_they_are(grasp, gravity):
-    assert Payload().update(grasp, 0.0, gravity) is grasp
+def test_without_posture_deviations_or_a_held_object_forces_stay_as_they_are(grasp, posture):
+    assert Payload().update(grasp, 0.0, posture) is grasp
 
 
 def test_an_image_of_before_stays_as_it_is_and_a_release_forgets():
-    payload, down = Payload(), np.array([0.0, 0.0, 1.0])
-    payload.update(grasp_of([0.0, 0.0, 0.0]), 1.0, down)
+    payload = Payload()
+    payload.update(grasp_of([0.0, 0.0, 0.0]), 1.0, DOWN)
     late = grasp_of([0.5, 0.0, 0.0])
-    assert payload.update(late, 1.0, down) is late
+    assert payload.update(late, 1.0, DOWN) is late
     assert np.isfinite(payload.stddev)
-    payload.update(grasp_of([0.0, 0.0, 0.0], held=0.0), 2.0, down)
+    payload.update(grasp_of([0.0, 0.0, 0.0], held=0.0), 2.0, DOWN)
     assert payload.stddev == np.inf
 
 
@@ -122,5 +139,5 @@ def test_hours_of_images_with_deviations_from_next_to_nothing_to_large_stay_fini
         gravity = random.normal(size=3)
         stddev = 10.0 ** random.uniform(-9.0, 2.0, size=3)
         grasp = grasp_of(random.normal(size=3), held=random.uniform(0.3, 50.0), stddev=stddev)
-        told = payload.update(grasp, k * 10.0 ** random.uniform(0.0, 0.5), gravity / np.linalg.norm(gravity))
+        told = payload.update(grasp, k * 10.0 ** random.uniform(0.0, 0.5), Posture(gravity / np.linalg.norm(gravity)))
         assert np.isfinite(told.manipulation).all() and np.isfinite(told.stddev).all() and (told.stddev > 0.0).all()

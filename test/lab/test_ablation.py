@@ -57,7 +57,7 @@ def test_the_estimator_takes_every_image_of_a_scene(name, bench, monkeypatch):
 
 def test_a_turn_that_gravity_shows_tells_the_weight_across_the_finger(bench):
     turned = build_scene(bench, "turned")
-    untold = replace(turned, images=[replace(image, gravity=None) for image in turned.images])
+    untold = replace(turned, images=[replace(image, posture=None) for image in turned.images])
     assert play(turned)["vector/N"] < 0.8 * play(untold)["vector/N"]
 
 
