@@ -63,7 +63,7 @@ NO_JUMP, UNDECIDED = -1, -2
 LARGEST_MOVE = 0.7e-3
 # Correlation between the errors by which a detector misplaces two key points of one shape [-]: that of the shipped
 # network in drawn scenes.
-_ALIKE = 0.2
+ALIKE = 0.2
 # Error of the linearisation about the last state, as a share of the object's motion since.
 _NONLINEAR = 0.2
 
@@ -193,15 +193,21 @@ class JumpWatch:
         self.F = np.zeros((self._size, count))
         self._information, self._score = np.zeros((count, count)), np.zeros(count)
 
-    def update(self, measured: Measurement, posterior: Posterior, sight: float) -> tuple[NDArray, NDArray] | None:
+    def update(
+        self, measured: Measurement, posterior: Posterior, sight: float, common: NDArray
+    ) -> tuple[NDArray, NDArray] | None:
         """Take an image; once it has jumped, return the change of the mean (n,) and of P (n, n).
 
-        `sight` is the share of the offsets' variance by which a detector errs in the sight of one shape. Its errors are
-        alike and tell less than independent ones of the same size.
+        Args:
+            measured: see `correct`.
+            posterior: see `correct`.
+            sight: share of the offsets' variance by which a detector errs in the sight of one shape. Its errors are
+                alike and tell less than independent ones of the same size.
+            common: variances (j,) of what all key points err by alike, which looks like a jump.
         """
-        jump, independence = self._jump, 1.0 / (1.0 + _ALIKE * sight * (len(measured.R) - 1))
+        jump, independence = self._jump, 1.0 / (1.0 + ALIKE * sight * (len(measured.R) - 1))
         given = measured.H, measured.rows, measured.u, posterior.L, posterior.A, posterior.white
-        odds = _watch(given, tuple(jump), self.F, self._information, self._score, independence)
+        odds = _watch(given, tuple(jump), self.F, self._information, self._score, independence, common)
         if odds <= 0.0:
             if odds - np.log(jump.probability) < _UNLIKELY:
                 self.reset()
@@ -216,7 +222,7 @@ class JumpWatch:
 
 
 @njit(**_OPTIONS)
-def _watch(given, jump, F, information, score, independence):
+def _watch(given, jump, F, information, score, independence, common):
     """Return the log odds of a jump by one more image; F (n, j), information (j, j) and score (j,) are updated.
 
     Args:
@@ -226,6 +232,7 @@ def _watch(given, jump, F, information, score, independence):
         information: I of the module.
         score: y of the module.
         independence: share of what independent errors would tell.
+        common: see `JumpWatch.update`.
     """
     (H, rows, u, L, A, white), jump = given, Jump(*jump)
     count = F.shape[1]
@@ -240,4 +247,5 @@ def _watch(given, jump, F, information, score, independence):
                 information[j, k] += independence * G[i, j] * G[i, k]
             for k in range(len(F)):
                 F[k, j] += A[i, k] * G[i, j]
-    return weigh_jump(jump, information, score)
+    kept = np.linalg.inv(np.eye(count) + information * common)
+    return weigh_jump(jump, np.dot(kept, information), np.dot(kept, score))

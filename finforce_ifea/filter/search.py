@@ -20,6 +20,7 @@ from finforce_ifea.contact_mechanics.pressed_jaw import PressedState, RigidConta
 from finforce_ifea.filter.filter import Posterior, reduce_covariance
 from finforce_ifea.filter.friction_path import TractionHypotheses
 from finforce_ifea.filter.jump import (
+    ALIKE,
     BUMPED,
     JUMPS,
     LARGEST_MOVE,
@@ -359,8 +360,10 @@ class ContactSearch:
     def _watch(self, measured: Measurement, posterior: Posterior) -> None:
         """Look for jumps that show over several images only."""
         sight = float(self.points["sight"].sum() / self.points["offset_variance"].sum())
-        for watch, is_possible in zip(self._watches, (True, not self._misplaced), strict=True):
-            change = watch.update(measured, posterior, sight) if is_possible else None
+        shift = ALIKE * float(np.median(self.points["sight"]))
+        common = shift * np.array([1.0, 1.0, 1.0 / float(self.points["rest"][:, 2].var())]), np.zeros(1)
+        for watch, is_possible, alike in zip(self._watches, (True, not self._misplaced), common, strict=True):
+            change = watch.update(measured, posterior, sight, alike) if is_possible else None
             if change is not None:
                 self.x, self.P = self.x + change[0], self.P + change[1]
                 self._bumped |= watch is self._watches[0]

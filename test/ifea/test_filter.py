@@ -135,10 +135,21 @@ class TestJump:
         told = {}
         for sight in (0.0, 1.0):
             watch = JumpWatch(NUDGED, SIZE)
-            watch.update(measured, posterior, sight)
+            watch.update(measured, posterior, sight, np.zeros(3))
             told[sight] = np.r_[watch._information.ravel(), watch._score]
         assert told[0.0].any()
         np.testing.assert_allclose(told[1.0], told[0.0] / 1.4)
+
+    def test_what_a_detector_errs_by_in_all_key_points_is_no_bump_however_long_it_lasts(self):
+        measured, _, P, x = draw()
+        HP, S = innovate(measured.H, measured.rows, measured.u, P, measured.R)
+        posterior, seen = update(measured, np.ones(3), np.zeros(2), x, np.log([0.5, 0.5]), HP, S), {}
+        for share in (0.0, 0.2):
+            watch = JumpWatch(NUDGED, SIZE)
+            watch._information = np.diag(1e6 / NUDGED.stddev**2)
+            watch._score = watch._information @ (0.3 * NUDGED.stddev)
+            seen[share] = watch.update(measured, posterior, 1.0, (share * NUDGED.stddev) ** 2)
+        assert seen[0.0] is not None and seen[0.2] is None
 
 
 def learn_scatter(depths, R=1e-10):

@@ -16,7 +16,7 @@ from scipy.interpolate import interp1d
 from finforce_ifea.contact_mechanics.friction import Coefficient, Traction, constant_traction
 from finforce_ifea.contact_mechanics.indenter import OutlineIndenter, RoundIndenter
 from finforce_ifea.estimator import ForceEstimator
-from finforce_ifea.filter.readout import find_upright_ratio
+from finforce_ifea.filter.readout import find_held_ratio
 from finforce_ifea.jaw.calibration import Calibration, load_calibration
 from finforce_ifea.observation import Observation
 from finforce_ifea.settings import EstimatorSettings
@@ -174,13 +174,13 @@ class TestHeld:
     def test_the_upright_ratio_takes_up_what_the_faces_are_inclined(self, ratio):
         normal = np.array([-5.0, 0.0, -1.0])
         force = np.array([normal[0] + ratio * normal[2], 0.0, normal[2] - ratio * normal[0]])
-        upright = find_upright_ratio(force, ratio)
+        upright, _ = find_held_ratio(force, ratio, 0.0)
         assert upright == pytest.approx(0.2)
         assert normal[2] - upright * normal[0] == pytest.approx(0.0)
 
     def test_friction_has_its_bounds(self):
-        assert find_upright_ratio(np.array([-1.0, 0.0, -5.0]), 0.0) == 0.9
-        assert find_upright_ratio(np.zeros(3), 0.0) == 0.0
+        assert find_held_ratio(np.array([-1.0, 0.0, -5.0]), 0.0, 0.0)[0] == 0.9
+        assert find_held_ratio(np.zeros(3), 0.0, 0.5) == (0.0, 0.0)
 
     def test_what_the_jaws_hold_has_no_force_along_them(self):
         free, _, _ = played(False, "lower")
