@@ -297,9 +297,10 @@ class IfeaSolverNode(ros.ImageNode):
         if self.posture is None:
             return None
         upright = self.parameters.gravity_frame
-        T = self.frames.find(self.parameters.base_frame, upright) if upright else None
-        if T is not None:
-            self.posture.keep(stamp, Posture(-T[:3, 2], float(-T[:3, 2] @ T[:3, 3])))
+        found = self.frames.find_stamped(self.parameters.base_frame, upright) if upright else None
+        if found is not None:
+            T, told = found
+            self.posture.keep(told or stamp, Posture(-T[:3, 2], float(-T[:3, 2] @ T[:3, 3])))
         return self.posture.at(stamp)
 
     def _finish(self, header: Any, observation: Observation, solution: Solution) -> None:

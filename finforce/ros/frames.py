@@ -42,14 +42,20 @@ class Frames:
         Raises:
             PoseError: The transform of /tf is no pose.
         """
+        found = self.find_stamped(target, source)
+        return None if found is None else found[0]
+
+    def find_stamped(self, target: str, source: str) -> tuple[NDArray, int] | None:
+        """Return the same with its stamp [ns], 0 for frames that never move; see `find`."""
         if self._buffer is None:
             return None
         try:
-            found = self._buffer.lookup_transform(target, source, Time()).transform
+            found = self._buffer.lookup_transform(target, source, Time())
         except self._tf2.TransformException:
             return None
-        place, turn = found.translation, found.rotation
-        return pose_from_quaternion((place.x, place.y, place.z), (turn.x, turn.y, turn.z, turn.w))
+        place, turn = found.transform.translation, found.transform.rotation
+        T = pose_from_quaternion((place.x, place.y, place.z), (turn.x, turn.y, turn.z, turn.w))
+        return T, Time.from_msg(found.header.stamp).nanoseconds
 
     def send(self, header: Any, child: str, T: NDArray) -> None:
         """Send the pose (4, 4) of a frame in that of a header."""

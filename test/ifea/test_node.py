@@ -160,8 +160,16 @@ def test_which_way_things_fall_is_told_by_a_frame_that_stands_upright(probe, tf)
     tilt = np.eye(4)
     tilt[1:3, 1:3] = [[0.8, -0.6], [0.6, 0.8]]  # the base's z points along (0, -0.6, 0.8) of the gripper
     tf["r1/gripper_base", "base_link"] = tilt
-    _, show = hold(probe, gravity_frame="base_link", frame_prefix="r1/")
+    tilt[:3, 3] = [0.1, 0.3, -0.4]  # 0.5 m below the gripper
+    node, show = hold(probe, gravity_frame="base_link", frame_prefix="r1/")
     np.testing.assert_allclose(show(), [0.0, 0.6, -0.8], atol=1e-12)
+    assert node.payload.told[-1].elevation == pytest.approx(0.5)
+
+
+def test_a_posture_of_long_ago_is_none(probe, tf):
+    tf["gripper_base", "world"], tf["stamp"] = np.eye(4), time_ns() - 5 * SECOND
+    _, show = hold(probe, gravity_frame="world")
+    assert show() is None
 
 
 @pytest.mark.parametrize(
