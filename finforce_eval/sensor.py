@@ -29,7 +29,7 @@ from finforce_ifea.jaw.calibration import Calibration
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_ifea.observation import Contact, Observation, Solution, check_stamp
 from finforce_ifea.payload import Payload
-from finforce_ifea.posture import Posture, check_posture
+from finforce_ifea.posture import WristPosture, check_posture
 from finforce_ifea.settings import EstimatorSettings
 from finforce_keypoints.build import build_detector
 from finforce_keypoints.geometry.jaw_localizer import JawKeypoints
@@ -158,7 +158,7 @@ class ForceSensor:
         """
         check_stamp(stamp)
         gravity = None if gravity is None else check_direction(gravity, "gravity")
-        posture = None if gravity is None or not self._may_be_held else check_posture(Posture(gravity, elevation))
+        posture = None if gravity is None or not self._may_be_held else check_posture(WristPosture(gravity, elevation))
         if not isinstance(self.camera, CameraIntrinsics):
             self.camera = read_intrinsics(self.camera, rgb.shape[:2])
         if depth is not None:
@@ -201,7 +201,7 @@ class ForceSensor:
         seen: JawKeypoints | None,
         stamp: float,
         T_camera_object: NDArray | None,
-        posture: Posture | None = None,
+        posture: WristPosture | None = None,
     ) -> Solution:
         """Return the force on one jaw, which may not have been found."""
         observation = replace(observe_jaw(seen, stamp, len(loop.force.jaw.keypoints)), posture=posture)
@@ -224,7 +224,10 @@ def observe_jaw(seen: JawKeypoints | None, stamp: float, count: int) -> Observat
 
 
 def combine_solutions(
-    stamp: float, found: Mapping[str, Solution | None], payload: Payload | None = None, posture: Posture | None = None
+    stamp: float,
+    found: Mapping[str, Solution | None],
+    payload: Payload | None = None,
+    posture: WristPosture | None = None,
 ) -> GripperForces:
     """Return what the solutions of one jaw or two in one image, None where a jaw was not seen, say of the gripper."""
     jaws = {side: solution for side, solution in found.items() if solution is not None}

@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 from finforce.gripper_frames import SIDES, jaw_in_gripper
 from finforce.messages import SECOND, Synchronizer
-from finforce_ifea.posture import Posture
+from finforce_ifea.posture import WristPosture
 
 Side = Literal["left", "right"]
 
 R_GRIPPER_JAW = {side: jaw_in_gripper(side, 0.0)[:3, :3] for side in SIDES}
 
 
-def to_jaw(posture: Posture | None, side: str) -> Posture | None:
+def to_jaw(posture: WristPosture | None, side: str) -> WristPosture | None:
     """Return the posture of a jaw for that of `gripper_base`; None for None."""
     return None if posture is None else posture._replace(gravity=posture.gravity @ R_GRIPPER_JAW[side])
 

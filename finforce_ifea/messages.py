@@ -14,7 +14,7 @@ from finforce.errors import ObservationError
 from finforce.messages import check_cloud, decode_columns, decode_keypoints, direction_from_message, stamp_of
 from finforce_ifea.errors import ContactError
 from finforce_ifea.observation import Contact, ObjectOutline, Observation, are_same_polygons
-from finforce_ifea.posture import Posture
+from finforce_ifea.posture import WristPosture
 
 if TYPE_CHECKING:
     from finforce_ifea.jaw.jaw import Jaw
@@ -28,7 +28,7 @@ CONTACT_DIAMETER = 0.005
 ARROW = (0.002, 0.004, 0.005)  # shaft, head, head length
 
 
-def observation_from_cloud(cloud: Any, frame: str, posture: Posture | None = None) -> Observation:
+def observation_from_cloud(cloud: Any, frame: str, posture: WristPosture | None = None) -> Observation:
     """Return the key points of a sensor_msgs/PointCloud2 in the jaw frame `frame`.
 
     Args:
@@ -271,7 +271,7 @@ class PostureFeed:
     def __init__(self, parameters: NodeParameters) -> None:
         self._frame = parameters.base_frame
         self._max_age = round(1e9 * parameters.max_age)
-        self._posture: Posture | None = None
+        self._posture: WristPosture | None = None
         self._stamp = 0
 
     def take(self, message: Any) -> None:
@@ -280,13 +280,13 @@ class PostureFeed:
         Raises:
             ObservationError: it is in another frame, or no direction.
         """
-        self.keep(stamp_of(message), Posture(direction_from_message(message, self._frame, "gravity")))
+        self.keep(stamp_of(message), WristPosture(direction_from_message(message, self._frame, "gravity")))
 
-    def keep(self, stamp: int, posture: Posture) -> None:
+    def keep(self, stamp: int, posture: WristPosture) -> None:
         """Keep a posture of the gripper, of a time [ns]."""
         self._posture, self._stamp = posture, stamp
 
-    def at(self, stamp: int) -> Posture | None:
+    def at(self, stamp: int) -> WristPosture | None:
         """Return the posture of the gripper; None farther from an image [ns] than `max_age`."""
         return self._posture if abs(stamp - self._stamp) <= self._max_age else None
 

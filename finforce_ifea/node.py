@@ -34,7 +34,7 @@ from finforce_ifea.messages import (
 from finforce_ifea.observation import Observation, Solution
 from finforce_ifea.parameters import NodeParameters, build_estimator
 from finforce_ifea.payload import Payload
-from finforce_ifea.posture import Posture
+from finforce_ifea.posture import WristPosture
 from finforce_ifea.resting import RestingContact
 from finforce_ifea.settings import EstimatorSettings
 
@@ -289,10 +289,11 @@ class IfeaSolverNode(ros.ImageNode):
     def _send_grasp(self, header: Any, stamp: int, grasp: Grasp | None) -> None:
         """Send the grasp of both jaws in an image [ns], with the weight that they carry where the posture is known."""
         if grasp is not None:
-            grasp = self.payload.update(grasp, SECOND * stamp, self._find_posture(stamp))
+            posture = None if self.posture is None else self.posture.at(stamp)  # which its image has looked up
+            grasp = self.payload.update(grasp, SECOND * stamp, posture)
             self.out.send_grasp(header, grasp)
 
-    def _find_posture(self, stamp: int) -> Posture | None:
+    def _find_posture(self, stamp: int) -> WristPosture | None:
         """Return the posture of the gripper at an image [ns]; None where nobody says."""
         if self.posture is None:
             return None
@@ -300,7 +301,7 @@ class IfeaSolverNode(ros.ImageNode):
         found = self.frames.find_stamped(self.parameters.base_frame, upright) if upright else None
         if found is not None:
             T, told = found
-            self.posture.keep(told or stamp, Posture(-T[:3, 2], float(-T[:3, 2] @ T[:3, 3])))
+            self.posture.keep(told or stamp, WristPosture(-T[:3, 2], float(-T[:3, 2] @ T[:3, 3])))
         return self.posture.at(stamp)
 
     def _finish(self, header: Any, observation: Observation, solution: Solution) -> None:

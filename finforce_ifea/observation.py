@@ -15,7 +15,7 @@ from finforce.errors import ObservationError
 from finforce.messages import NOTHING_SHARED, SharedStddev, check_stddev
 from finforce_ifea.errors import ContactError
 from finforce_ifea.jaw.jaw import Jaw
-from finforce_ifea.posture import Posture, check_posture
+from finforce_ifea.posture import WristPosture, check_posture
 
 TRUSTED = ("ok", "unloaded")
 # Standard deviations of a force from which it shows that the object touches: on bench recordings it does in 0 to 3 % of
@@ -54,7 +54,7 @@ class Observation:
     likelihood: NDArray | None = None
     stddev: NDArray | None = None
     shared: SharedStddev = NOTHING_SHARED
-    posture: Posture | None = None
+    posture: WristPosture | None = None
 
     def __post_init__(self) -> None:
         if self.likelihood is None:

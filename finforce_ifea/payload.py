@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce_ifea.grasp_force import Grasp
-from finforce_ifea.posture import Posture, PostureTrack
+from finforce_ifea.posture import PostureTrack, WristPosture
 
 # 1 sigma of the weight, and of a support's force, as a share of the grasp force [-].
 _WEIGHT = 0.3
@@ -61,7 +61,7 @@ class Payload:
         self._expected, self._variance = 0.0, np.zeros(2)
         self.weight, self.stddev = 0.0, np.inf
 
-    def update(self, grasp: Grasp, stamp: float, posture: Posture | None) -> Grasp:
+    def update(self, grasp: Grasp, stamp: float, posture: WristPosture | None) -> Grasp:
         """Return a grasp with the net force of what hangs from the jaws.
 
         Args:
@@ -88,7 +88,7 @@ class Payload:
         self.weight, self.stddev = float(weight), sqrt(spread + (_SCALE * weight) ** 2)
         return replace(grasp, manipulation=mean, stddev=np.sqrt(np.maximum(variance, _LEAST_STDDEV**2)))
 
-    def _predict(self, stamp: float, posture: Posture, expected: float, variance: NDArray) -> None:
+    def _predict(self, stamp: float, posture: WristPosture, expected: float, variance: NDArray) -> None:
         """Predict an image in which weight and support are expected with a variance, and forces with theirs (2,)."""
         dt, kept, parting = 0.0, 0.0, self._postures.update(posture).parting
         if np.isfinite(self._stamp):

@@ -16,7 +16,7 @@ _TURN_NOISE, _LIFT_NOISE = 0.05, 1e-3
 _UNIT = 1e-3
 
 
-class Posture(NamedTuple):
+class WristPosture(NamedTuple):
     """Posture of a gripper or a jaw.
 
     Attributes:
@@ -28,7 +28,7 @@ class Posture(NamedTuple):
     elevation: float = nan
 
 
-def check_posture(posture: Posture) -> Posture:
+def check_posture(posture: WristPosture) -> WristPosture:
     """Return a posture as it is.
 
     Raises:
@@ -42,7 +42,7 @@ def check_posture(posture: Posture) -> Posture:
     return posture
 
 
-class Move(NamedTuple):
+class WristMove(NamedTuple):
     """A change of posture.
 
     Attributes:
@@ -66,9 +66,9 @@ class PostureTrack:
 
     def reset(self) -> None:
         """Forget the posture."""
-        self._last: Posture | None = None
+        self._last: WristPosture | None = None
 
-    def update(self, posture: Posture | None) -> Move | None:
+    def update(self, posture: WristPosture | None) -> WristMove | None:
         """Return what has changed since the last image; None where the posture is not known."""
         if posture is None:
             return None
@@ -78,5 +78,5 @@ class PostureTrack:
         rise = posture.elevation - level
         if rise > _LIFT_NOISE:
             parting += rise / _LIFT
-        self._last = Posture(now, level if 0.0 <= rise <= _LIFT_NOISE else posture.elevation)
-        return Move(before, now, parting, isfinite(posture.elevation))
+        self._last = WristPosture(now, level if 0.0 <= rise <= _LIFT_NOISE else posture.elevation)
+        return WristMove(before, now, parting, isfinite(posture.elevation))

@@ -14,7 +14,7 @@ from finforce_eval.recordings.tracks import Recording
 from finforce_eval.table import ForceSeries
 from finforce_ifea.grasp_force import Grasp, JawDistance, Wrench, combine_wrenches, single_jaw_grasp
 from finforce_ifea.payload import Payload
-from finforce_ifea.posture import Posture
+from finforce_ifea.posture import WristPosture
 
 _SAME = 0.2  # [s] within which a jaw's pose is still that of an image
 
@@ -62,7 +62,7 @@ def combine_jaws(jaws: Mapping[str, ForceSeries]) -> ForceSeries:
     )
 
 
-def carry_payload(net: ForceSeries, postures: Mapping[int, Posture]) -> ForceSeries:
+def carry_payload(net: ForceSeries, postures: Mapping[int, WristPosture]) -> ForceSeries:
     """Return the series of a gripper with the weight that it carries; see `Payload`.
 
     Args:

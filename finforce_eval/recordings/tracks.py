@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from finforce.messages import NANOSECONDS, NOTHING_SHARED, SECOND, SharedStddev
 from finforce_eval.errors import RecordingError
 from finforce_ifea.observation import Observation
-from finforce_ifea.posture import Posture
+from finforce_ifea.posture import WristPosture
 
 if TYPE_CHECKING:
     from finforce_eval.recordings.images import ImageTrack
@@ -74,7 +74,7 @@ class KeypointTrack(Timed):
             shared=NOTHING_SHARED if self.shared is None else SharedStddev(*self.shared[index].tolist()),
             posture=None
             if self.postures is None
-            else Posture(self.postures[index, :3], float(self.postures[index, 3])),
+            else WristPosture(self.postures[index, :3], float(self.postures[index, 3])),
         )
 
 

@@ -160,7 +160,7 @@ class TractionHypotheses:
         return float(weights[-1]) if self._held > 0.0 else 0.0
 
     def part(self, parting: float, *, shows_lifts: bool) -> None:
-        """Count a move of the gripper, which leaves behind whatever else held the object; see `Move`."""
+        """Count a move of the gripper, which leaves behind whatever else held the object; see `WristMove`."""
         self._parted += parting
         self._is_at_rest = shows_lifts
 

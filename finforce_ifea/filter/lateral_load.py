@@ -28,7 +28,7 @@ from finforce_ifea.fem.solid import SolidModel
 from finforce_ifea.filter.filter import solve_lower
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE, Jaw
 from finforce_ifea.jaw.mesh import VolumeMesh
-from finforce_ifea.posture import Move
+from finforce_ifea.posture import WristMove
 from finforce_ifea.tracking.contact_state import MIDDLE_STDDEV, ContactState
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
@@ -246,7 +246,7 @@ class LateralLoad:
         return float(self._known.x[-1]), sqrt(max(self._known.P[-1, -1], 0.0))
 
     def update(
-        self, motions: NDArray, bend: NDArray, points: NDArray, state: ContactState, dt: float, move: Move | None
+        self, motions: NDArray, bend: NDArray, points: NDArray, state: ContactState, dt: float, move: WristMove | None
     ) -> None:
         """Take the motions of the key points along y in an image.
 
@@ -280,7 +280,7 @@ class LateralLoad:
         measured: tuple[NDArray, ...],
         offsets: NDArray,
         passed: tuple[float, float],
-        move: Move | None,
+        move: WristMove | None,
         normal: float,
     ) -> None:
         """Take an image into both hypotheses, and decide between them.
@@ -371,7 +371,7 @@ def _step(estimate, expected, offsets, passed, measured, weight):
         offsets: stationary variance of each key point's offset (K,) [m^2].
         passed: motion [m] and time [s] since the last image.
         measured: see `_observe`.
-        weight: gravity along y in the last image and in this one [-], see `Move.parting`, normal force [N],
+        weight: gravity along y in the last image and in this one [-], see `WristMove.parting`, normal force [N],
             variance of the share of the weight, and by how much that has grown [N^2].
     """
     (moved, dt), (seen, H, z, R), estimate = passed, measured, _Estimate(*estimate)

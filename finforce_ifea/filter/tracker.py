@@ -19,7 +19,7 @@ from finforce_ifea.filter.lateral_load import LateralLoad, Torsion
 from finforce_ifea.filter.search import ContactSearch, find_x_model
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE
 from finforce_ifea.observation import Contact, Observation
-from finforce_ifea.posture import Move, Posture, PostureTrack
+from finforce_ifea.posture import PostureTrack, WristMove, WristPosture
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tare import PointNoise, Tare
 from finforce_ifea.tracking.contact_state import MIDDLE_STDDEV, TOUCH_DEPTH, UNSEEN_TRACTION, ContactState
@@ -243,7 +243,7 @@ class ContactTracker:
         self._has_moved = True
         return state
 
-    def _follow_posture(self, posture: Posture | None) -> Move | None:
+    def _follow_posture(self, posture: WristPosture | None) -> WristMove | None:
         """Return how the jaw has moved since the last image, which tells whether only the jaws hold the object."""
         move, search = self._postures.update(posture if self.settings.may_be_held else None), self._search
         search.pull = 0.0, 0.0

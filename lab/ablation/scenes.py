@@ -20,7 +20,7 @@ from finforce_ifea.contact_mechanics.pressed_jaw import RigidContact
 from finforce_ifea.filter.lateral_load import measure_torsion
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE
 from finforce_ifea.observation import Contact, Observation
-from finforce_ifea.posture import Posture
+from finforce_ifea.posture import WristPosture
 from finforce_ifea.relaxation import RelaxationTerm
 from lab.presses import circle, keep_shear
 from lab.stress.objects import rectangle
@@ -463,7 +463,7 @@ def build_turned(bench: Bench, random: np.random.Generator) -> Scene:
     scene = _load_across(bench, random, 0.0, 0.2 * gravity[:, 1], _HELD)
     told = np.vstack([np.tile(gravity[:1], (len(scene.images) - _LIFTED, 1)), gravity])
     return replace(
-        scene, images=[replace(one, posture=Posture(down)) for one, down in zip(scene.images, told, strict=True)]
+        scene, images=[replace(one, posture=WristPosture(down)) for one, down in zip(scene.images, told, strict=True)]
     )
 
 

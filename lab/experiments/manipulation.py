@@ -15,7 +15,7 @@ from finforce_eval.evaluation.scoring import join_net, measure_sharpness, rms
 from finforce_eval.recordings.tracks import Recording
 from finforce_eval.table import AXES, ForceSeries
 from finforce_ifea.grasp_force import to_jaw
-from finforce_ifea.posture import Posture
+from finforce_ifea.posture import WristPosture
 from finforce_sim.footage import START
 from finforce_sim.scenarios import build_scenario, write_script
 from lab.experiments.experiment import SHARP, Case, Experiment, RunOptions, average, build_setup, tabulate
@@ -82,8 +82,8 @@ def find(options: RunOptions, figures: Mapping[str, Mapping[str, Any]], folder: 
     return Figures(tables={"By axis and light": lights}, notes=[note])
 
 
-def score_turn(recording: Recording, case: Case, postures: Mapping[int, Posture] | None = None) -> dict[str, Any]:
-    """Return the figures of a recording of both jaws; those of the gripper by stamps [ns], None if unknown."""
+def score_turn(recording: Recording, case: Case, postures: Mapping[int, WristPosture] | None = None) -> dict[str, Any]:
+    """Return the figures of a recording of both jaws, with postures of the gripper by stamps [ns]; None if unknown."""
     jaws = {}
     for side, jaw in recording.jaws.items() if postures else ():
         told = [np.hstack(to_jaw(postures[stamp], side)) for stamp in jaw.keypoints.stamps_ns.tolist()]
@@ -93,11 +93,11 @@ def score_turn(recording: Recording, case: Case, postures: Mapping[int, Posture]
     return score_weight(join_net({side: results[f"{recording.name}/{side}"] for side in SIDES}, postures))
 
 
-def true_postures(settings: Mapping[str, Any]) -> dict[int, Posture]:
+def true_postures(settings: Mapping[str, Any]) -> dict[int, WristPosture]:
     """Return the postures of the gripper in a scene of the twin by stamps [ns]; its elevation is not known."""
     script = write_script(build_scenario(settings["scene"], **settings["changes"]))
     stamps = (START + np.round(1e9 * script.stamps).astype(int)).tolist()
-    return dict(zip(stamps, map(Posture, script.gravity), strict=True))
+    return dict(zip(stamps, map(WristPosture, script.gravity), strict=True))
 
 
 def score_weight(net: ForceSeries) -> dict[str, Any]:

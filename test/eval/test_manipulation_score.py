@@ -12,7 +12,7 @@ from finforce_eval.evaluation.gripper import with_distances
 from finforce_eval.evaluation.score_tables import format_manipulation
 from finforce_eval.evaluation.scoring import join_net, score_manipulation, score_net
 from finforce_eval.recordings.tracks import PoseTrack
-from finforce_ifea.posture import Posture
+from finforce_ifea.posture import WristPosture
 
 
 def jaws(count=10):
@@ -98,7 +98,7 @@ def test_gravity_tells_the_weight_along_the_fingers_of_what_is_turned():
     left = left.with_columns(force=shown - closed, true_force=true - closed)
     right = right.with_columns(force=shown * mirrored - closed, true_force=true * mirrored - closed)
     both = {"left": left, "right": right}
-    postures = dict(zip(left.stamps_ns.tolist(), map(Posture, down), strict=True))
+    postures = dict(zip(left.stamps_ns.tolist(), map(WristPosture, down), strict=True))
     blind, told = score_net(join_net(both)), score_net(join_net(both, postures))
     assert told.axis_rmse_N[2] < 0.5 * blind.axis_rmse_N[2]
     assert min(told.within_3_sigma_pct) > 98.0

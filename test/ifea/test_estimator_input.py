@@ -28,7 +28,7 @@ from finforce_ifea.estimator import ForceEstimator
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE, load_jaw
 from finforce_ifea.mechanics import build_mechanics
 from finforce_ifea.observation import Contact, Observation, check_observation
-from finforce_ifea.posture import Posture
+from finforce_ifea.posture import WristPosture
 from finforce_ifea.settings import EstimatorSettings
 from lab.presses import RigidCylinder, press_jaw
 
@@ -318,13 +318,13 @@ def test_steel_finger_works_with_the_same_estimator():
 @pytest.mark.parametrize("gravity", [np.array([0.0, 0.0, 9.81]), np.array([0.0, 1.0]), np.full(3, np.nan)])
 def test_a_direction_of_gravity_is_a_unit_vector(gravity):
     one = Observation(
-        stamp=0.0, points=np.zeros((2, 3)), likelihood=np.ones(2), posture=Posture(np.array([0.0, 0.6, 0.8]))
+        stamp=0.0, points=np.zeros((2, 3)), likelihood=np.ones(2), posture=WristPosture(np.array([0.0, 0.6, 0.8]))
     )
     check_observation(one, 2)
     with pytest.raises(ObservationError, match="an elevation of inf"):
         check_observation(replace(one, posture=one.posture._replace(elevation=np.inf)), 2)
     with pytest.raises(ObservationError, match="expected a unit vector"):
-        check_observation(replace(one, posture=Posture(gravity)), 2)
+        check_observation(replace(one, posture=WristPosture(gravity)), 2)
 
 
 def test_key_points_in_millimetres_are_refused_with_their_unit_and_a_gross_error_is_not():

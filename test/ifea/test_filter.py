@@ -363,6 +363,11 @@ class TestHypotheses:
             either.part(2.7, shows_lifts=False)
         held = [either.find_held(np.exp(each)) for each in weights]
         assert held[0] == pytest.approx(0.5, abs=0.02) and 0.9 < held[1] < held[2] < 0.99
+        told, weights = TractionHypotheses(Coefficient(0.5, 0.2), "either"), either.prior
+        for parting, expected in ((0.0, 0.018), (4.0, 0.5), (10.0, 0.98)):
+            told.part(parting, shows_lifts=True)
+            weights = told.bound_held(weights)
+            assert told.find_held(np.exp(weights)) == pytest.approx(expected, rel=0.1)
         assert TractionHypotheses(Coefficient(0.5, 0.2), "no").find_held(np.ones(NODES) / NODES) == 0.0
 
     def test_a_held_weight_pulls_along_the_finger(self):

@@ -5,10 +5,10 @@ import pytest
 
 from finforce_ifea.grasp_force import Grasp
 from finforce_ifea.payload import Payload
-from finforce_ifea.posture import Posture
+from finforce_ifea.posture import WristPosture
 
 RATE, HELD, WEIGHT = 30.0, 3.0, 0.98  # [Hz], [N], [N]
-DOWN = Posture(np.array([0.0, 0.0, 1.0]))
+DOWN = WristPosture(np.array([0.0, 0.0, 1.0]))
 STDDEV = np.array([0.1, 0.35, 0.6])  # [N], as of grasps of the twin
 
 
@@ -31,7 +31,9 @@ def disturb(forces, seed):
 
 
 def follow(payload, found, gravity, elevation=()):
-    postures = [Posture(*each) for each in (zip(gravity, elevation, strict=True) if len(elevation) else zip(gravity))]
+    postures = [
+        WristPosture(*each) for each in (zip(gravity, elevation, strict=True) if len(elevation) else zip(gravity))
+    ]
     told = [
         payload.update(grasp_of(force), k / RATE, posture)
         for k, (force, posture) in enumerate(zip(found, postures, strict=True))
@@ -139,5 +141,7 @@ def test_hours_of_images_with_deviations_from_next_to_nothing_to_large_stay_fini
         gravity = random.normal(size=3)
         stddev = 10.0 ** random.uniform(-9.0, 2.0, size=3)
         grasp = grasp_of(random.normal(size=3), held=random.uniform(0.3, 50.0), stddev=stddev)
-        told = payload.update(grasp, k * 10.0 ** random.uniform(0.0, 0.5), Posture(gravity / np.linalg.norm(gravity)))
+        told = payload.update(
+            grasp, k * 10.0 ** random.uniform(0.0, 0.5), WristPosture(gravity / np.linalg.norm(gravity))
+        )
         assert np.isfinite(told.manipulation).all() and np.isfinite(told.stddev).all() and (told.stddev > 0.0).all()
