@@ -30,6 +30,7 @@ VECTORS = {
     "true_torque": "N m",
     "contact_location": "m",  # where the force acts on the undeformed jaw
     "contact_point": "m",  # the same on the deformed one
+    "gravity": "",  # its direction in the gripper's frame
 }
 # All other columns and their units; those with "each" hold a list per row.
 UNITS = {
@@ -64,6 +65,7 @@ UNITS = {
     "accepted": "each key point",  # it was handed on to the solver
     "jaw_distance": "m",  # between the jaws, as it was seen
     "true_jaw_distance": "m",
+    "elevation": "m",  # of the gripper
     "grasp_force": "N",  # of the gripper: the smaller of the jaws' forces
     "grasp_stddev": "N",
 }

@@ -90,6 +90,9 @@ def add_run_options(parser: argparse.ArgumentParser, *, calibration: bool = True
     contact.add_argument("--object-unit", default="m", choices=UNITS, help="unit of the mesh (m)")
     text = "compare the mesh with the depth images (compared); off for objects that depth cameras see through"
     contact.add_argument("--compare-mesh", action=argparse.BooleanOptionalAction, default=True, help=text)
+    if settings:
+        text = "upright frame on the bag's /tf, such as base_link, for gravity and elevation (the topic /gravity)"
+        contact.add_argument("--gravity-frame", default="", metavar="FRAME", help=text)
     images = parser.add_argument_group("key points and camera")
     text = "key points: from images, keypoints as recorded, or truth of a simulated recording "
     text += "(keypoints if recorded, else images)"

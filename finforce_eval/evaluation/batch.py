@@ -59,6 +59,7 @@ def evaluate(
     sides: Sequence[str] = (),
     stills: bool = False,
     episode: int = 0,
+    gravity_frame: str = "",
     detector: Mapping[str, Any] | None = None,
     settings: EstimatorSettings | Mapping[str, Any] | None = None,
 ) -> pd.DataFrame:
@@ -83,6 +84,8 @@ def evaluate(
         sides: jaws in the images, if no topic names them.
         stills: True if every image is a separate photograph, without a tare.
         episode: number of the episode of a dataset.
+        gravity_frame: upright frame on the /tf of bags, from which gravity and the elevation of the gripper are taken;
+            "" for the topic /gravity.
         detector: parameters of the detector that differ from their defaults.
         settings: settings of the estimator, or only those that differ from the defaults, by name.
 
@@ -103,7 +106,13 @@ def evaluate(
         episode=episode,
     )
     keypoints = KeypointSource(
-        source=source, jaw_file=jaw, parameters=parameters, stills=stills, choice=choice, sides=tuple(sides)
+        source=source,
+        jaw_file=jaw,
+        parameters=parameters,
+        stills=stills,
+        choice=choice,
+        sides=tuple(sides),
+        gravity_frame=gravity_frame,
     )
     announce_compilation()
     settings = settings if isinstance(settings, EstimatorSettings) else EstimatorSettings(**(settings or {}))

@@ -16,13 +16,14 @@ from finforce.health import Idling
 from finforce_contact.estimator import CONTRADICTED
 from finforce_contact.loop import ContactSource, ForceLoop, GivenContact
 from finforce_eval.errors import RecordingError
-from finforce_eval.evaluation.gripper import with_distances
+from finforce_eval.evaluation.gripper import with_gripper
 from finforce_eval.evaluation.pressure_centre import InnerSurface, true_lines
 from finforce_eval.evaluation.scoring import ONSET_FORCE, compare_detection, match_samples, match_truth
 from finforce_eval.recordings.objects import read_friction
 from finforce_eval.recordings.tracks import DetectionTrack, Recording
 from finforce_eval.table import AXES, ForceSeries
 from finforce_eval.tasks import progress_bar
+from finforce_ifea.grasp_force import to_jaw
 
 if TYPE_CHECKING:
     from finforce_eval.evaluation.setup import EvaluationSetup
@@ -120,7 +121,7 @@ def estimate_forces(
         if tares:
             estimator.adopt_tare(tares[side])
         found[side] = find_forces(recording, own.jaw, source, estimator, side, run)
-    return with_distances(found, recording) if both else found
+    return with_gripper(found, recording) if both else found
 
 
 def estimate_shown(
@@ -262,7 +263,7 @@ class _JawRun:
     def __init__(self, recording: Recording, side: str, jaw: Any, loop: ForceLoop, stills: bool) -> None:
         self._name, self._stills, self._seen = recording.name, stills, None
         self._loop, self._track = loop, recording.jaw(side).keypoints
-        self._lines = None
+        self._lines, self._side, self._gravity = None, side, recording.gravity
         if recording.jaw(side).truth is not None:
             self._face = InnerSurface(np.array(loop.force.surface()), jaw.face)
             self._lines = true_lines(recording, side, self._track.stamps_ns, self._face.face_x)
@@ -285,6 +286,9 @@ class _JawRun:
             RecordingError: the contact estimator refuses a pose.
         """
         loop, observation = self._loop, self._track.observation(index)
+        if self._gravity is not None:
+            posture = to_jaw(self._gravity.at(int(self._track.stamps_ns[index])), self._side)
+            observation = replace(observation, posture=posture)
         solution = self._solve_still(observation) if self._stills else loop.update(observation)
         row = self.row(solution.status, "" if solution.trusted else solution.message)
         row |= {"step_ms": loop.force_ms, "contact_ms": loop.contact_ms}

@@ -19,10 +19,14 @@ from finforce_ifea.posture import WristPosture
 _SAME = 0.2  # [s] within which a jaw's pose is still that of an image
 
 
-def with_distances(jaws: Mapping[str, ForceSeries], recording: Recording) -> dict[str, ForceSeries]:
-    """Return the series of both jaws with the distance between them, as it was seen and as it was."""
+def with_gripper(jaws: Mapping[str, ForceSeries], recording: Recording) -> dict[str, ForceSeries]:
+    """Return the series of both jaws with what a recording says of the gripper.
+
+    That is the distance between the jaws, as it was seen and as it was, and gravity and elevation where known.
+    """
     return {
         side: series.with_columns(
+            **_find_postures(recording, series.stamps_ns),
             jaw_distance=find_distances(recording, series.stamps_ns),
             true_jaw_distance=find_distances(recording, series.stamps_ns, true=True),
         )
@@ -34,7 +38,7 @@ def combine_jaws(jaws: Mapping[str, ForceSeries]) -> ForceSeries:
     """Return what the gripper feels, in its frame, in every image of one of its jaws.
 
     Args:
-        jaws: by side; both, or the only one. Where both have distances, see `with_distances`, torques are known.
+        jaws: by side; both, or the only one. See `with_gripper` for torques, and for the weight that is carried.
 
     Returns:
         Net force and torque about the gripper's origin, their truth, and the grasp force with its standard deviation;
@@ -46,7 +50,7 @@ def combine_jaws(jaws: Mapping[str, ForceSeries]) -> ForceSeries:
         side: ForceSeries(each.table.set_index("stamp").reindex(stamps).reset_index()) for side, each in jaws.items()
     }
     found, true = _combine(jaws, ""), _combine(jaws, "true_")
-    return ForceSeries.build(
+    net = ForceSeries.build(
         first.name.removesuffix(f"/{first.side}"),
         "gripper",
         stamps,
@@ -60,22 +64,27 @@ def combine_jaws(jaws: Mapping[str, ForceSeries]) -> ForceSeries:
         force_stddev=np.sqrt(np.sum([each.column("force_stddev") ** 2 for each in jaws.values()], axis=0)),
         scored=np.all([each.table["scored"].fillna(False).astype(bool) for each in jaws.values()], axis=0),
     )
+    return _carry_payload(net, next(iter(jaws.values()))) if first.has("gravity") else net
 
 
-def carry_payload(net: ForceSeries, postures: Mapping[int, WristPosture]) -> ForceSeries:
-    """Return the series of a gripper with the weight that it carries; see `Payload`.
-
-    Args:
-        net: by `combine_jaws`.
-        postures: of the gripper by stamps [ns].
-    """
+def _carry_payload(net: ForceSeries, jaw: ForceSeries) -> ForceSeries:
+    """Return the series of a gripper with the weight that it carries, by the posture in a jaw's rows; see `Payload`."""
     payload, told, stated = Payload(), net.force.copy(), net.column("force_stddev").copy()
+    held, gravity, elevation = net.column("grasp_force"), jaw.column("gravity"), jaw.column("elevation")
     for row in np.flatnonzero(np.isfinite(told).all(axis=1)):
-        held, stamp = np.array([net.column("grasp_force")[row], 0.0, 0.0]), int(net.stamps_ns[row])
-        grasp = Grasp(grasp=held, manipulation=told[row], torque=None, stddev=stated[row])
-        grasp = payload.update(grasp, 1e-9 * stamp, postures.get(stamp))
+        grasp = Grasp(grasp=np.array([held[row], 0.0, 0.0]), manipulation=told[row], torque=None, stddev=stated[row])
+        posture = WristPosture(gravity[row], float(elevation[row])) if np.isfinite(gravity[row]).all() else None
+        grasp = payload.update(grasp, float(net.stamps[row]), posture)
         told[row], stated[row] = grasp.manipulation, grasp.stddev
     return net.with_columns(force=told, force_stddev=stated)
+
+
+def _find_postures(recording: Recording, stamps: NDArray) -> dict[str, NDArray]:
+    """Return gravity (n, 3) and elevation (n,) of the gripper in images (n,) [ns] as columns; none if nothing says."""
+    if recording.gravity is None:
+        return {}
+    found = [recording.gravity.at(stamp) or WristPosture(np.full(3, np.nan)) for stamp in stamps.tolist()]
+    return {"gravity": np.array([one.gravity for one in found]), "elevation": np.array([one.elevation for one in found])}
 
 
 def _weakest_stddev(jaws: Collection[ForceSeries], grasp: NDArray) -> NDArray:

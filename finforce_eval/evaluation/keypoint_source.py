@@ -71,6 +71,7 @@ class KeypointSource:
         stills: True if nothing of one image is known in the next.
         choice: images to read.
         sides: jaws that are in the images, whether or not a topic tells of them.
+        gravity_frame: see `read_recording`.
     """
 
     source: str = ""
@@ -81,10 +82,13 @@ class KeypointSource:
     stills: bool = False
     choice: ImageChoice = field(default_factory=ImageChoice)
     sides: tuple[str, ...] = ()
+    gravity_frame: str = ""
 
     def read(self, path: str | Path) -> Recording:
         """Return a recording as it lies there; see `read_recording`."""
-        return read_recording(path, self.choice, self.sides, strict=self.strict)
+        return read_recording(
+            path, self.choice, self.sides, strict=self.strict, gravity_frame=self.gravity_frame
+        )
 
     def source_of(self, recording: Recording) -> str:
         """Return "images", "keypoints" or "truth" for a recording.
@@ -255,9 +259,14 @@ def parse_source(options: argparse.Namespace) -> KeypointSource:
         T_gripper_camera=pose_of(parameters),
         pairing=None if seconds is None or math.isnan(seconds) else round(seconds * NANOSECONDS),
     )
-    sides = sides_of(options)
     return KeypointSource(
-        source=source, jaw_file=options.jaw, parameters=parameters, choice=choice, sides=sides, **switches
+        source=source,
+        jaw_file=options.jaw,
+        parameters=parameters,
+        choice=choice,
+        sides=sides_of(options),
+        gravity_frame=getattr(options, "gravity_frame", ""),
+        **switches,
     )
 
 

@@ -14,10 +14,9 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from finforce.errors import FinforceError
-from finforce_eval.evaluation.gripper import carry_payload, combine_jaws
+from finforce_eval.evaluation.gripper import combine_jaws
 from finforce_eval.recordings.tracks import DetectionTrack, DetectionTruth, Recording, WrenchTrack
 from finforce_eval.table import ForceSeries
-from finforce_ifea.posture import WristPosture
 
 LEAST_FORCE = 0.2  # [N], below which the pressure centre is not scored
 ONSET_FORCE = 0.02  # [N] of true force, from which on something presses
@@ -546,15 +545,9 @@ def score_manipulation(results: Iterable[ForceSeries]) -> dict[str, Stats]:
     return {name: score_net(join_net(pair)) for name, pair in pairs.items() if len(pair) == 2}
 
 
-def join_net(jaws: Mapping[str, ForceSeries], postures: Mapping[int, WristPosture] | None = None) -> ForceSeries:
-    """Return what `combine_jaws` does, in the images of the record phases in which both jaws were measured.
-
-    Args:
-        jaws: by side.
-        postures: see `carry_payload`; None if unknown.
-    """
+def join_net(jaws: Mapping[str, ForceSeries]) -> ForceSeries:
+    """Return what `combine_jaws` does, in the images of the record phases in which both jaws were measured."""
     net = combine_jaws(jaws)
-    net = carry_payload(net, postures) if postures else net
     return net.at(net.scored & np.isfinite(net.true_force).all(axis=1))
 
 

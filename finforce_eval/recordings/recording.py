@@ -17,10 +17,20 @@ from finforce_eval.errors import DamagedError, RecordingError
 from finforce_eval.recordings.bags import bag_source, check_messages, check_types, is_buffer, is_frames, open_bag
 from finforce_eval.recordings.dataset import is_dataset, read_episode
 from finforce_eval.recordings.frames import read_frames
+from finforce_eval.recordings.gravity import (
+    FIXED,
+    GRAVITY,
+    MOVING,
+    TRANSFORMS,
+    VECTOR,
+    read_gravity,
+    read_transforms,
+)
 from finforce_eval.recordings.images import ImageChoice, ImageTrack, find_images
 from finforce_eval.recordings.salvage import SalvagedCopy
 from finforce_eval.recordings.tracks import (
     DetectionTruth,
+    GravityTrack,
     JawTrack,
     KeypointTrack,
     PoseTrack,
@@ -39,7 +49,7 @@ STRING = "std_msgs/msg/String"
 TRUTH_COLUMNS = ("x", "y", "z", "u", "v", "visible")
 TRUE_KEYPOINTS, TRUE_POSE = "ground_truth_keypoints", "ground_truth_jaw_pose"
 PHASE = "/bench/phase"
-TOPICS = {"/object_pose": POSE, PHASE: STRING}
+TOPICS = {"/object_pose": POSE, PHASE: STRING, GRAVITY: VECTOR}
 for _side in SIDES:
     TOPICS |= {
         f"/{_side}/keypoints": CLOUD,
@@ -67,7 +77,12 @@ class _Content(NamedTuple):
 
 
 def read_recording(
-    path: str | Path, choice: ImageChoice | None = None, sides: Sequence[str] = (), *, strict: bool = False
+    path: str | Path,
+    choice: ImageChoice | None = None,
+    sides: Sequence[str] = (),
+    *,
+    strict: bool = False,
+    gravity_frame: str = "",
 ) -> Recording:
     """Read a bag with its `case.json`, an episode of a dataset or of a buffer of UMI, a video, or pictures.
 
@@ -80,29 +95,29 @@ def read_recording(
         choice: images to read.
         sides: jaws in the images, whether or not a topic names them; both if no topic names any.
         strict: True to reject a damaged recording.
+        gravity_frame: upright frame on /tf for gravity and elevation; "" for the topic /gravity.
 
     Raises:
         RecordingError: the recording is missing, empty, malformed or out of bounds, or holds neither key points nor
             images.
     """
     choice = choice or ImageChoice()
-    if is_dataset(Path(path)):
-        return read_episode(Path(path), choice, sides)
-    if is_buffer(Path(path)):
-        return read_buffer(Path(path), choice, sides)
-    if is_frames(Path(path)):
-        return read_frames(Path(path), choice, sides)
+    for is_such, read in ((is_dataset, read_episode), (is_buffer, read_buffer), (is_frames, read_frames)):
+        if is_such(Path(path)):
+            if gravity_frame:
+                raise RecordingError(f"{Path(path).name}: --gravity-frame {gravity_frame}: only bags have {MOVING}")
+            return read(Path(path), choice, sides)
     source = bag_source(Path(path))
     folder = source if source.is_dir() else source.parent
     name = source.name if source.is_dir() else source.stem
     copy = None
     try:
-        samples, phases, images, notes = _read_samples(source, name, choice)
+        samples, phases, images, notes = _read_samples(source, name, choice, gravity_frame)
     except DamagedError as error:
         if strict:
             raise
         copy = SalvagedCopy(source, str(error))
-        samples, phases, images, notes = _read_samples(copy.path, name, choice)
+        samples, phases, images, notes = _read_samples(copy.path, name, choice, gravity_frame)
         notes.append(copy.note.removeprefix(f"{name}: "))
     known = [side for side in SIDES if _has_jaw(samples, side, images is not None) or (images and side in sides)]
     if images and not known:
@@ -121,6 +136,7 @@ def read_recording(
         path=Path(path),
         jaws=jaws,
         object_pose=_pose_track(poses, "/object_pose", name) if poses else None,
+        gravity=_read_posture(samples, gravity_frame, name),
         phases=parse_phases(*zip(*phases, strict=True), name) if phases else None,
         case=_read_case(folder / "case.json"),
         notes=tuple(notes),
@@ -129,19 +145,27 @@ def read_recording(
     )
 
 
+def _read_posture(samples: Mapping[str, list[Any]], gravity_frame: str, name: str) -> GravityTrack | None:
+    """Return how the gripper was turned and lifted; None if nothing says."""
+    if gravity_frame:
+        return read_transforms(samples, gravity_frame, name)
+    return read_gravity(samples[GRAVITY], name) if GRAVITY in samples else None
+
+
 def _has_jaw(samples: Mapping[str, list[Any]], side: str, has_images: bool) -> bool:
     """Say whether a recording tells of a jaw: by its key points, or with images by anything that is the jaw's own."""
     topics = [topic for topic in samples if topic.startswith(f"/{side}/")]
     return f"/{side}/keypoints" in topics or (has_images and bool(topics))
 
 
-def _read_samples(source: Path, name: str, choice: ImageChoice) -> _Content:
+def _read_samples(source: Path, name: str, choice: ImageChoice, gravity_frame: str) -> _Content:
     """Decode the messages of our topics, by topic, and find the images."""
+    topics = TOPICS | (dict.fromkeys((MOVING, FIXED), TRANSFORMS) if gravity_frame else {})
     samples: dict[str, list[Any]] = {}
     phases: list[tuple[int, str]] = []
     with open_bag(source, name) as bag:
-        check_types(bag.connections, {topic: (kind,) for topic, kind in TOPICS.items()}, name)
-        for number, raw in enumerate(bag.raw(TOPICS)):
+        check_types(bag.connections, {topic: (kind,) for topic, kind in topics.items()}, name)
+        for number, raw in enumerate(bag.raw(topics)):
             if not number % _CHECKED:
                 check_messages(number, source)
             message = bag.decode(raw)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.messages import NANOSECONDS, NOTHING_SHARED, SECOND, SharedStddev
+from finforce.settings import TimeParameters
 from finforce_eval.errors import RecordingError
 from finforce_ifea.observation import Observation
 from finforce_ifea.posture import WristPosture
@@ -44,7 +45,6 @@ class KeypointTrack(Timed):
         likelihood: (n, K) in [0, 1].
         stddev: (n, K, 3) one standard deviation [m], jaw frame, NaN = not known; None when nothing says.
         shared: (n, 3) standard deviations of what the points of an image share, see `SharedStddev`; None: 0.
-        postures: (n, 4) of the jaw, direction of gravity and elevation [m]; None when nothing says.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -52,7 +52,6 @@ class KeypointTrack(Timed):
     likelihood: NDArray[np.float64]
     stddev: NDArray[np.float64] | None = None
     shared: NDArray[np.float64] | None = None
-    postures: NDArray[np.float64] | None = None
 
     @classmethod
     def empty(cls, count: int = 0) -> KeypointTrack:
@@ -72,9 +71,6 @@ class KeypointTrack(Timed):
             likelihood=self.likelihood[index],
             stddev=None if self.stddev is None else self.stddev[index],
             shared=NOTHING_SHARED if self.shared is None else SharedStddev(*self.shared[index].tolist()),
-            posture=None
-            if self.postures is None
-            else WristPosture(self.postures[index, :3], float(self.postures[index, 3])),
         )
 
 
@@ -108,6 +104,28 @@ class PoseTrack(Timed):
     position: NDArray[np.float64]
     quaternion: NDArray[np.float64]
     frame_id: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class GravityTrack(Timed):
+    """Direction of gravity and elevation of the gripper over time.
+
+    Attributes:
+        stamps_ns: (n,) [ns], strictly increasing.
+        direction: (n, 3) unit vectors in `gripper_base`.
+        elevation: (n,) above any level [m]; NaN if unknown.
+    """
+
+    stamps_ns: NDArray[np.int64]
+    direction: NDArray[np.float64]
+    elevation: NDArray[np.float64]
+
+    def at(self, stamp: int) -> WristPosture | None:
+        """Return the gripper's posture at a time [ns], the nearest one; None if that is older than the nodes accept."""
+        row = int(np.searchsorted(0.5 * (self.stamps_ns[1:] + self.stamps_ns[:-1]), stamp))
+        if abs(int(self.stamps_ns[row]) - stamp) > NANOSECONDS * TimeParameters.max_age:
+            return None
+        return WristPosture(self.direction[row], float(self.elevation[row]))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -176,6 +194,7 @@ class Recording:
         path: where it was read from.
         jaws: "left" and/or "right" -> what was recorded of that jaw.
         object_pose: T_camera_object over time.
+        gravity: posture of the gripper over time; None if nothing says.
         phases: phases of the bench, None outside the bench.
         case: content of `case.json`, empty without it.
         notes: content that was not read, one sentence each.
@@ -187,6 +206,7 @@ class Recording:
     path: Path
     jaws: Mapping[str, JawTrack]
     object_pose: PoseTrack | None = None
+    gravity: GravityTrack | None = None
     phases: PhaseTrack | None = None
     case: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()

@@ -18,7 +18,9 @@ import numpy as np
 
 from finforce.errors import one_line
 from finforce.messages import NANOSECONDS, STDDEV_COLUMNS, SharedStddev, encode_cloud, shared_columns
+from finforce.settings import GripperParameters
 from finforce_eval.errors import RecordingError
+from finforce_eval.recordings.gravity import GRAVITY, VECTOR
 from finforce_eval.recordings.recording import CLOUD, POSE, STRING, WRENCH
 from finforce_eval.recordings.tracks import KeypointTrack, PhaseTrack, PoseTrack, Recording
 from finforce_ifea.messages import ARROW, CONTACT, CONTACT_DIAMETER, FORCE, NEWTONS_PER_METRE
@@ -226,6 +228,10 @@ def recording_entries(recording: Recording) -> Iterator[Entry]:
             yield from _pose_entries(track.pose, f"/{side}/jaw_pose")
     if recording.object_pose is not None:
         yield from _pose_entries(recording.object_pose, "/object_pose")
+    if recording.gravity is not None:
+        for stamp, direction in zip(recording.gravity.stamps_ns, recording.gravity.direction, strict=True):
+            told = make_message(VECTOR, header=header(stamp, GripperParameters.gripper_frame), vector=_named(direction))
+            yield Entry(int(stamp), GRAVITY, told)
     if recording.phases is not None:
         yield from _phase_entries(recording.phases)
 

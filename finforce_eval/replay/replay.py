@@ -16,7 +16,7 @@ from finforce.systems.processes import Process, ReplayOptions, compose, replay_p
 from finforce_eval.errors import RecordingError, SilentReplayError
 from finforce_eval.evaluation.contact_source import FIXED, ContactChoice
 from finforce_eval.evaluation.forces import check_keypoint_count, truth_sides
-from finforce_eval.evaluation.gripper import with_distances
+from finforce_eval.evaluation.gripper import with_gripper
 from finforce_eval.evaluation.keypoint_source import (
     IMAGES,
     TRUTH,
@@ -246,7 +246,7 @@ def _score(recording: Recording, setup: EvaluationSetup, log: ReplayLog) -> Eval
         result = live_result(recording, side, log, likelihood_threshold=threshold, estimator=estimator)
         results.append(result if len(sides) == 1 else result.renamed(f"{recording.name}/{side}"))
     if len(sides) == len(SIDES):
-        results = list(with_distances(dict(zip(sides, results, strict=True)), recording).values())
+        results = list(with_gripper(dict(zip(sides, results, strict=True)), recording).values())
     return score_results(results, [recording])
 
 

@@ -137,11 +137,10 @@ def blend(table, m, rows, columns, out):
     t, z, w00, w01, w10, w11 = _find_cell(table, m)
     (low, high), (first, last) = rows, columns
     for i in range(high - low):
-        c00, c01 = table[t, z, low + i], table[t, z + 1, low + i]
-        c10, c11 = table[t + 1, z, low + i], table[t + 1, z + 1, low + i]
-        for j in range(last - first):
-            k = first + j
-            out[i, j] = w00 * c00[k] + w01 * c01[k] + w10 * c10[k] + w11 * c11[k]
+        c00, c01 = table[t, z, low + i, first:last], table[t, z + 1, low + i, first:last]
+        c10, c11 = table[t + 1, z, low + i, first:last], table[t + 1, z + 1, low + i, first:last]
+        for k in range(last - first):  # an index from 0: others may be negative, and are not vectorised
+            out[i, k] = w00 * c00[k] + w01 * c01[k] + w10 * c10[k] + w11 * c11[k]
 
 
 @njit(**_OPTIONS)
@@ -152,12 +151,14 @@ def add_product(table, m, vector, step, out):
     """
     t, z, w00, w01, w10, w11 = _find_cell(table, m)
     first, last = find_ends(vector)
+    known = vector[first:last]
     for pair in range(0, len(out), 2 * step):
         for i in range(pair, min(pair + 2, len(out))):
-            c00, c01, c10, c11 = table[t, z, i], table[t, z + 1, i], table[t + 1, z, i], table[t + 1, z + 1, i]
+            c00, c01 = table[t, z, i, first:last], table[t, z + 1, i, first:last]
+            c10, c11 = table[t + 1, z, i, first:last], table[t + 1, z + 1, i, first:last]
             total = 0.0
-            for k in range(first, last):
-                total += (w00 * c00[k] + w01 * c01[k] + w10 * c10[k] + w11 * c11[k]) * vector[k]
+            for k in range(len(known)):
+                total += (w00 * c00[k] + w01 * c01[k] + w10 * c10[k] + w11 * c11[k]) * known[k]
             out[i] += total
 
 

@@ -12,10 +12,8 @@ import numpy as np
 from finforce.gripper_frames import SIDES
 from finforce_eval.evaluation.batch import evaluate_all
 from finforce_eval.evaluation.scoring import join_net, measure_sharpness, rms
-from finforce_eval.recordings.tracks import Recording
+from finforce_eval.recordings.tracks import GravityTrack, Recording
 from finforce_eval.table import AXES, ForceSeries
-from finforce_ifea.grasp_force import to_jaw
-from finforce_ifea.posture import WristPosture
 from finforce_sim.footage import START
 from finforce_sim.scenarios import build_scenario, write_script
 from lab.experiments.experiment import SHARP, Case, Experiment, RunOptions, average, build_setup, tabulate
@@ -59,7 +57,7 @@ def run(options: RunOptions, case: Case, folder: Path) -> dict[str, Any]:
         figures = score_turn(recording, case)
         if options.bags:
             return figures
-        told = score_turn(recording, case, true_postures(case.settings))
+        told = score_turn(replace(recording, gravity=find_gravity(case.settings)), case)
     return figures | {f"told_{name}": told[name] for name in ("along_rmse_N", "within_3_sigma_pct")}
 
 
@@ -82,22 +80,17 @@ def find(options: RunOptions, figures: Mapping[str, Mapping[str, Any]], folder: 
     return Figures(tables={"By axis and light": lights}, notes=[note])
 
 
-def score_turn(recording: Recording, case: Case, postures: Mapping[int, WristPosture] | None = None) -> dict[str, Any]:
-    """Return the figures of a recording of both jaws, with postures of the gripper by stamps [ns]; None if unknown."""
-    jaws = {}
-    for side, jaw in recording.jaws.items() if postures else ():
-        told = [np.hstack(to_jaw(postures[stamp], side)) for stamp in jaw.keypoints.stamps_ns.tolist()]
-        jaws[side] = replace(jaw, keypoints=replace(jaw.keypoints, postures=np.array(told)))
-    recording = replace(recording, jaws={**recording.jaws, **jaws})
+def score_turn(recording: Recording, case: Case) -> dict[str, Any]:
+    """Return the figures of a recording of both jaws."""
     results = evaluate_all([recording], build_setup(case.settings)).results
-    return score_weight(join_net({side: results[f"{recording.name}/{side}"] for side in SIDES}, postures))
+    return score_weight(join_net({side: results[f"{recording.name}/{side}"] for side in SIDES}))
 
 
-def true_postures(settings: Mapping[str, Any]) -> dict[int, WristPosture]:
-    """Return the postures of the gripper in a scene of the twin by stamps [ns]; its elevation is not known."""
+def find_gravity(settings: Mapping[str, Any]) -> GravityTrack:
+    """Return the direction of gravity in a scene of the twin; the elevation is not known."""
     script = write_script(build_scenario(settings["scene"], **settings["changes"]))
-    stamps = (START + np.round(1e9 * script.stamps).astype(int)).tolist()
-    return dict(zip(stamps, map(WristPosture, script.gravity), strict=True))
+    stamps = START + np.round(1e9 * script.stamps).astype(np.int64)
+    return GravityTrack(stamps_ns=stamps, direction=script.gravity, elevation=np.full(len(stamps), np.nan))
 
 
 def score_weight(net: ForceSeries) -> dict[str, Any]:

@@ -8,11 +8,10 @@ from test_scoring import make_result
 
 from finforce.gripper_frames import ROBOT_CAMERA, jaw_in_camera
 from finforce.transforms import quaternion_from_pose
-from finforce_eval.evaluation.gripper import with_distances
+from finforce_eval.evaluation.gripper import with_gripper
 from finforce_eval.evaluation.score_tables import format_manipulation
 from finforce_eval.evaluation.scoring import join_net, score_manipulation, score_net
-from finforce_eval.recordings.tracks import PoseTrack
-from finforce_ifea.posture import WristPosture
+from finforce_eval.recordings.tracks import GravityTrack, PoseTrack
 
 
 def jaws(count=10):
@@ -27,7 +26,7 @@ def jaws(count=10):
 
 def score_pair(left, right, recording=None):
     both = {"left": left, "right": right}
-    return score_net(join_net(both if recording is None else with_distances(both, recording)))
+    return score_net(join_net(both if recording is None else with_gripper(both, recording)))
 
 
 def test_jaws_that_are_right_make_a_net_force_that_is():
@@ -68,7 +67,7 @@ def test_the_torque_is_scored_where_the_jaws_places_are_known():
     torque = np.tile([0.0, -0.12, 0.01], (len(left.stamps_ns), 1))
     left, right = (jaw.with_columns(torque=torque, true_torque=torque) for jaw in (left, right))
     assert score_pair(left, right).torque_rmse_Nm is None
-    recording = SimpleNamespace(jaw=lambda side: SimpleNamespace(pose=poses[side], true_pose=None))
+    recording = SimpleNamespace(gravity=None, jaw=lambda side: SimpleNamespace(pose=poses[side], true_pose=None))
     poses = {side: track(left.stamps_ns, x) for side, x in (("left", -0.03), ("right", 0.03))}
     assert score_pair(left, right, recording).torque_rmse_Nm == pytest.approx(0.0, abs=1e-12)
     left = left.with_columns(torque=torque + [0.0, 0.006, 0.0])
@@ -98,7 +97,8 @@ def test_gravity_tells_the_weight_along_the_fingers_of_what_is_turned():
     left = left.with_columns(force=shown - closed, true_force=true - closed)
     right = right.with_columns(force=shown * mirrored - closed, true_force=true * mirrored - closed)
     both = {"left": left, "right": right}
-    postures = dict(zip(left.stamps_ns.tolist(), map(WristPosture, down), strict=True))
-    blind, told = score_net(join_net(both)), score_net(join_net(both, postures))
+    gravity = GravityTrack(stamps_ns=left.stamps_ns, direction=down, elevation=np.full(count, np.nan))
+    recording = SimpleNamespace(gravity=gravity, jaw=lambda side: SimpleNamespace(pose=None, true_pose=None))
+    blind, told = score_net(join_net(both)), score_net(join_net(with_gripper(both, recording)))
     assert told.axis_rmse_N[2] < 0.5 * blind.axis_rmse_N[2]
     assert min(told.within_3_sigma_pct) > 98.0

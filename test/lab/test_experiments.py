@@ -33,7 +33,7 @@ from lab.experiments.experiment import (
 )
 from lab.experiments.friction import FRICTION
 from lab.experiments.grasp import GRASP, find_phases, score_grasp, thin_poses
-from lab.experiments.manipulation import MANIPULATION, score_weight, true_postures
+from lab.experiments.manipulation import MANIPULATION, score_weight, find_gravity
 from lab.experiments.network import NETWORK, name_condition
 from lab.experiments.paper_tables import PLACES
 from lab.harness import Figures, format_figures
@@ -202,7 +202,7 @@ def test_a_weight_is_scored_along_gravity():
 
 def test_a_level_gripper_that_rolls_is_told_which_way_things_fall():
     case = MANIPULATION.list_cases(RunOptions())[0]
-    directions = np.array([posture.gravity for posture in true_postures(case.settings).values()])
+    directions = find_gravity(case.settings).direction
     assert directions[0] == pytest.approx([0.0, -1.0, 0.0])  # a level gripper that rolls
     assert directions[:, 0].min() == pytest.approx(-1.0, abs=1e-3) and np.abs(directions[:, 2]).max() < 1e-9
 
