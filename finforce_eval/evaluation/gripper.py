@@ -84,7 +84,10 @@ def _find_postures(recording: Recording, stamps: NDArray) -> dict[str, NDArray]:
     if recording.gravity is None:
         return {}
     found = [recording.gravity.at(stamp) or WristPosture(np.full(3, np.nan)) for stamp in stamps.tolist()]
-    return {"gravity": np.array([one.gravity for one in found]), "elevation": np.array([one.elevation for one in found])}
+    return {
+        "gravity": np.array([one.gravity for one in found]),
+        "elevation": np.array([one.elevation for one in found]),
+    }
 
 
 def _weakest_stddev(jaws: Collection[ForceSeries], grasp: NDArray) -> NDArray:

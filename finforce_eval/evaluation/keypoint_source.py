@@ -86,9 +86,7 @@ class KeypointSource:
 
     def read(self, path: str | Path) -> Recording:
         """Return a recording as it lies there; see `read_recording`."""
-        return read_recording(
-            path, self.choice, self.sides, strict=self.strict, gravity_frame=self.gravity_frame
-        )
+        return read_recording(path, self.choice, self.sides, strict=self.strict, gravity_frame=self.gravity_frame)
 
     def source_of(self, recording: Recording) -> str:
         """Return "images", "keypoints" or "truth" for a recording.

@@ -61,7 +61,9 @@ def read_transforms(samples: Mapping[str, Sequence[Any]], upright: str, name: st
     while frame != upright:
         found = moving.get(frame) or fixed.get(frame, ())[-1:]
         if not found or len(chain) > len(moving) + len(fixed):
-            raise RecordingError(f"{name}: --gravity-frame {upright}: {MOVING} connects {_GRIPPER} with {frame} at most")
+            raise RecordingError(
+                f"{name}: --gravity-frame {upright}: {MOVING} connects {_GRIPPER} with {frame} at most"
+            )
         chain.append(_read_link(found, frame in moving, name))
         frame = _name(found[-1].header.frame_id)
     stamps = np.unique(np.concatenate([np.zeros(0, np.int64), *(link.stamps_ns for link in chain)]))

@@ -33,7 +33,7 @@ from lab.experiments.experiment import (
 )
 from lab.experiments.friction import FRICTION
 from lab.experiments.grasp import GRASP, find_phases, score_grasp, thin_poses
-from lab.experiments.manipulation import MANIPULATION, score_weight, find_gravity
+from lab.experiments.manipulation import MANIPULATION, find_gravity, score_weight
 from lab.experiments.network import NETWORK, name_condition
 from lab.experiments.paper_tables import PLACES
 from lab.harness import Figures, format_figures
