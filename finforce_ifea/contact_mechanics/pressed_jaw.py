@@ -119,6 +119,11 @@ class RigidContact:
         return tuple(self.indenter.pressed), tuple(self.profile)
 
     @cached_property
+    def reach(self) -> NDArray:
+        """Largest change of each unknown of the model at once (size,)."""
+        return np.full(self.model.size, self.model.reach, dtype=float)
+
+    @cached_property
     def profile(self) -> FaceProfile:
         """The undeformed surface, for objects to touch."""
         return profile_surface(self.surface, self.face)

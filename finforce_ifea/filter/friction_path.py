@@ -14,6 +14,7 @@ from finforce_ifea.contact_mechanics.friction import Coefficient
 from finforce_ifea.contact_mechanics.pressed_jaw import RigidContact
 from finforce_ifea.filter.readout import LARGEST_RATIO
 from finforce_ifea.filter.slip_path import PathState, SlipPath, find_turn, turn_path
+from finforce_ifea.filter.state import DEPTH, HEIGHT
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
 # Coefficients of friction that are weighed against each other, and the deviation of a coefficient up to which one is
@@ -120,14 +121,10 @@ class TractionHypotheses:
     @property
     def ratios(self) -> NDArray:
         """Traction ratio kappa of each hypothesis (N,) [-]."""
-        return self._bound(self._path.ratios)
+        return _bound(self._path.ratios, self._held, self.upright)
 
-    def _bound(self, ratios: NDArray) -> NDArray:
-        """Return the traction ratio of each hypothesis (N,) for those of the coefficients (M,)."""
-        return _bound(ratios, self._held, self.upright)
-
-    def preview(self, places: NDArray, track: Track, weights: NDArray) -> NDArray:
-        """Return the traction ratio of each hypothesis (N,) with the object in other places; see `follow`."""
+    def preview(self, x: NDArray, shift: float, track: Track, weights: NDArray) -> NDArray:
+        """Return the traction ratio of each hypothesis (N,) with the object elsewhere; see `find_places` and `follow`."""
         if not self.follows_path:
             return self.ratios
         if self._anchor is None:  # it may stick either way
@@ -135,8 +132,9 @@ class TractionHypotheses:
             return self.ratios
         known = self._direction, self._anchor_stddev, self.stddev
         path = self.mu, self._path.parts, self._path.shares, self._path.rates, self._anchor
+        places = x, shift, self._held, self.upright
         ratios, self.doubt = _preview(path, known, places, weights, track.state)
-        return self._bound(ratios)
+        return ratios
 
     @property
     def follows_path(self) -> bool:
@@ -304,21 +302,34 @@ def _find_stddev(ratios, mu, own, rates, shares, stddev):
 
 
 @njit(**_OPTIONS)
-def _preview(path, known, places, weights, track):
-    """Return ratios of the path (M,) with the object in other places, and the doubt; see `TractionHypotheses`.
+def find_places(x, shift):
+    """Return depth and height (N, 2) [m] of hypotheses x (N, n), `shift` [m] deeper."""
+    places = np.empty((len(x), 2))
+    for i in range(len(x)):
+        places[i, 0], places[i, 1] = x[i, DEPTH] + shift, x[i, HEIGHT]
+    return places
+
+
+@njit(**_OPTIONS)
+def _preview(path, known, there, weights, track):
+    """Return the traction ratio of each hypothesis (N,) with the object elsewhere, and the doubt.
+
+    See `TractionHypotheses`.
 
     Args:
         path: coefficients (M,), see `SlipPath` for parts, shares and rates, and the path's end (M, 2) [m].
         known: direction of the path, standard deviation of its end [m], and of the traction ratio by its errors.
-        places: see `_find_motion`.
+        there: x and shift of `find_places`; probability that only the jaws hold the object, and its ratio then.
         weights: see `_find_motion`.
         track: state of the depth, see `Track`.
     """
     (mu, parts, shares, rates, anchor), (direction, anchor_stddev, before) = path, known
+    (x, shift, held, upright), places = there, find_places(there[0], there[1])
     own, motion, deeper, is_along = _find_motion(anchor, places, weights)
     stddev = np.sqrt(max(find_variance(track), 0.0))
     if not is_along and _is_chance(deeper, direction, stddev, anchor_stddev, track[0]):
         ratios = parts @ shares
-        return ratios, find_turn(rates, shares, (own * ratios).sum()) * abs(deeper)
+        return _bound(ratios, held, upright), find_turn(rates, shares, (own * ratios).sum()) * abs(deeper)
     ratios = turn_path(parts, mu, rates, motion) @ shares
-    return ratios, np.sqrt(max(_find_stddev(ratios, mu, own, rates, shares, stddev) ** 2 - before**2, 0.0))
+    doubt = np.sqrt(max(_find_stddev(ratios, mu, own, rates, shares, stddev) ** 2 - before**2, 0.0))
+    return _bound(ratios, held, upright), doubt

@@ -184,7 +184,8 @@ class JumpWatch:
 
     def __init__(self, jump: Jump, size: int) -> None:
         """Watch for a jump of a state that has n = size entries."""
-        self._jump, self._size = jump, size
+        self._jump, self._packed, self._size = jump, tuple(jump), size
+        self._least = _UNLIKELY + float(np.log(jump.probability))
         self.reset()
 
     def reset(self) -> None:
@@ -207,9 +208,9 @@ class JumpWatch:
         """
         jump, independence = self._jump, 1.0 / (1.0 + ALIKE * sight * (len(measured.R) - 1))
         given = measured.H, measured.rows, measured.u, posterior.L, posterior.A, posterior.white
-        odds = _watch(given, tuple(jump), self.F, self._information, self._score, independence, common)
+        odds = _watch(given, self._packed, self.F, self._information, self._score, independence, common)
         if odds <= 0.0:
-            if odds - np.log(jump.probability) < _UNLIKELY:
+            if odds < self._least:
                 self.reset()
             return None
         V = np.linalg.inv(np.diag(jump.stddev**-2.0) + self._information)

@@ -78,6 +78,30 @@ def find_seen(points):
     return seen[:count].copy()
 
 
+class Sight(NamedTuple):
+    """Errors of a detector that last while it sees the same.
+
+    Attributes:
+        share: of the variance of the key points' offsets [-].
+        variance: median over the key points [m^2].
+        height_variance: of the heights of the key points at rest [m^2].
+    """
+
+    share: float
+    variance: float
+    height_variance: float
+
+
+@njit(**_OPTIONS)
+def summarize_sight(points):
+    """Return the `Sight` of an image as a plain tuple."""
+    sight, height, offsets = np.empty(len(points)), np.empty(len(points)), 0.0
+    for k in range(len(points)):
+        sight[k], height[k] = points[k].sight, points[k].rest[2]
+        offsets += points[k].offset_variance
+    return sight.sum() / offsets, np.median(sight), height.var()
+
+
 @njit(**_OPTIONS)
 def observe(points, seen, positions, motions, at, ratio, level):
     """Return the measurement by key points.

@@ -18,7 +18,7 @@ from finforce_ifea.contact_mechanics.friction import Coefficient, constant_tract
 from finforce_ifea.contact_mechanics.indenter import CELL, find_first_touch
 from finforce_ifea.contact_mechanics.pressed_jaw import PressedState, RigidContact
 from finforce_ifea.filter.filter import Posterior, reduce_covariance
-from finforce_ifea.filter.friction_path import TractionHypotheses
+from finforce_ifea.filter.friction_path import TractionHypotheses, find_places
 from finforce_ifea.filter.jump import (
     ALIKE,
     BUMPED,
@@ -32,7 +32,7 @@ from finforce_ifea.filter.jump import (
     JumpWatch,
     correct,
 )
-from finforce_ifea.filter.measurement import Measurement, find_seen, observe
+from finforce_ifea.filter.measurement import Measurement, Sight, find_seen, observe, summarize_sight
 from finforce_ifea.filter.process import (
     APPARENT_SIGHT,
     APPARENT_TRACTION,
@@ -144,7 +144,7 @@ class ContactSearch:
         hypotheses: of the object's traction.
         x: means of the hypotheses (N, n); None before the first image.
         P: covariance (n, n).
-        log_weights: of the hypotheses (N,).
+        weights: probabilities of the hypotheses (N,).
         track: of the depth.
         pull: of the weight along the finger, if only the jaws hold the object, and its standard deviation [N].
     """
@@ -154,7 +154,7 @@ class ContactSearch:
         self.settings, self.pull = settings, (0.0, 0.0)
         self.points, self.positions = np.zeros(count, KEYPOINT), np.zeros((count, 3))
         self.state, self.expectation = blank_contact_state(), np.zeros((), EXPECTATION)
-        self._count = count
+        self._count, self._sight = count, Sight(0.0, 0.0, 1.0)
         self._watches = [JumpWatch(jump, state_size(count)) for jump in (NUDGED, OFFSET)]
         self.expect_friction(Coefficient(settings.friction, settings.friction_stddev))
 
@@ -244,9 +244,13 @@ class ContactSearch:
             self.hypotheses.motion += stddev
 
     @property
-    def weights(self) -> NDArray:
-        """Probabilities of the hypotheses (N,)."""
-        return np.exp(self.log_weights)
+    def log_weights(self) -> NDArray:
+        """Log probabilities of the hypotheses (N,)."""
+        return self._log_weights
+
+    @log_weights.setter
+    def log_weights(self, log_weights: NDArray) -> None:
+        self._log_weights, self.weights = log_weights, np.exp(log_weights)
 
     @property
     def mean(self) -> NDArray:
@@ -273,7 +277,7 @@ class ContactSearch:
         if shared > 0.0:
             camera, time = camera + np.array([shared, shared, PLACE_TURN, PLACE_STRETCH]) ** 2, PLACE_TIME
         mean, traction = self.expectation["mean"].copy(), traction + self.hypotheses.unweighed**2
-        apparent = APPARENT_TRACTION**2 + APPARENT_SIGHT**2 * float(np.median(self.points["sight"]))
+        apparent = APPARENT_TRACTION**2 + APPARENT_SIGHT**2 * self._sight.variance
         return Expectation(mean, variance, traction, apparent, camera, time)
 
     def _predict(self, dt: float) -> None:
@@ -297,8 +301,9 @@ class ContactSearch:
             dt: time since the last image [s].
             iterations: at most; the next image goes on from there.
         """
-        self._predict(dt)
         points, expectation, seen = self.points, self.expectation, find_seen(self.points)
+        self._sight = Sight(*summarize_sight(points))
+        self._predict(dt)
         if len(seen) < max(self.settings.minimum_keypoints, 3):
             return False
         self.log_weights = self.hypotheses.bound_held(self.log_weights)
@@ -308,9 +313,9 @@ class ContactSearch:
         q = self.q + self._modes @ (place.x_model - self.state["x_model"])
         settled, iteration, last = False, 0, (np.zeros(3), 1.0)
         posterior, found, jump, P = None, UNDECIDED, NO_JUMP, self.P.copy()
-        reach, possible = np.full(len(q), contact.model.reach, dtype=float), self._find_possible_jumps()
+        possible = self._find_possible_jumps()
         image = points, seen, self._level, expectation
-        known = contact.packed_object, reach, self.track.state, self._scatter
+        known = contact.packed_object, contact.reach, self.track.state, self._scatter
         prior = ratios, self.x, self.log_weights, P
         while iteration < iterations and not settled:
             iteration += 1
@@ -344,7 +349,7 @@ class ContactSearch:
 
     def _preview(self, x: NDArray, shift: float) -> NDArray:
         """Return the traction ratios (N,) with the object where hypotheses x (N, n) have it, `shift` [m] deeper."""
-        return self.hypotheses.preview(_find_places(x, shift), self.track, self.weights)
+        return self.hypotheses.preview(x, shift, self.track, self.weights)
 
     def _find_possible_jumps(self) -> tuple[bool, bool]:
         """Return which of `JUMPS` are possible now."""
@@ -359,11 +364,10 @@ class ContactSearch:
 
     def _watch(self, measured: Measurement, posterior: Posterior) -> None:
         """Look for jumps that show over several images only."""
-        sight = float(self.points["sight"].sum() / self.points["offset_variance"].sum())
-        shift = ALIKE * float(np.median(self.points["sight"]))
-        common = shift * np.array([1.0, 1.0, 1.0 / float(self.points["rest"][:, 2].var())]), np.zeros(1)
+        shift = ALIKE * self._sight.variance
+        common = np.array([shift, shift, shift / self._sight.height_variance]), np.zeros(1)
         for watch, is_possible, alike in zip(self._watches, (True, not self._misplaced), common, strict=True):
-            change = watch.update(measured, posterior, sight, alike) if is_possible else None
+            change = watch.update(measured, posterior, self._sight.share, alike) if is_possible else None
             if change is not None:
                 self.x, self.P = self.x + change[0], self.P + change[1]
                 self._bumped |= watch is self._watches[0]
@@ -419,7 +423,7 @@ class ContactSearch:
         if self.state["depth"] <= 0.0:
             self.hypotheses.leave()
             return
-        places = _find_places(self.x, self._smooth)
+        places = find_places(self.x, self._smooth)
         self.hypotheses.follow(contact, self.q, self.state["x_model"], places, self.track, self.weights)
 
     def contact_covariance(self) -> NDArray:
@@ -438,15 +442,6 @@ def _find_x_model(touching, x):
     x_model, touch = x.copy(), find_first_touch(*touching, x)
     x_model[DEPTH] = max(x[DEPTH], touch + LEAST_DEPTH)
     return x_model, x[DEPTH] - touch
-
-
-@njit(**_OPTIONS)
-def _find_places(x, shift):
-    """Return depth and height (N, 2) [m] of hypotheses x (N, n), `shift` [m] deeper."""
-    places = np.empty((len(x), 2))
-    for i in range(len(x)):
-        places[i, 0], places[i, 1] = x[i, DEPTH] + shift, x[i, HEIGHT]
-    return places
 
 
 @njit(**_OPTIONS)

@@ -313,13 +313,13 @@ class TestHypotheses:
         q, _ = press(contact, x, 0.0, q)
         track, weights = Track(MotionNoise(1e-12, 1e-6, 1e-6, 3.0, 1.0), 2e-3, (0.1e-3) ** 2), np.exp(unknown.prior)
         places = np.tile([2e-3, 0.040], (NODES, 1))
-        unknown.preview(places, track, weights)
+        unknown.preview(places, 0.0, track, weights)
         assert unknown.doubt == pytest.approx(0.45, abs=0.05)  # nobody knows which way it sticks
         unknown.follow(contact, q, x, places, track, weights)
         back = places - [0.05e-3, 0.0]
-        np.testing.assert_array_equal(unknown.preview(back, track, weights), unknown.ratios)
+        np.testing.assert_array_equal(unknown.preview(back, 0.0, track, weights), unknown.ratios)
         small = unknown.doubt
-        unknown.preview(places - [0.1e-3, 0.0], track, weights)
+        unknown.preview(places, -0.1e-3, track, weights)
         assert 0.0 < small < unknown.doubt
 
     @pytest.mark.parametrize("images", [12, 2])
