@@ -58,6 +58,7 @@ def _list_finger_parts(jaw: str) -> dict[str, str]:
 # Recordings of --recordings that a part takes, by patterns of their names.
 GIVEN = {
     "cylinders": ("mooney_cyl*",),
+    "small": ("mooney_cyl15*",),
     "realistic": ("friction03_*", "spatial_*", "mooney_box*"),
     "bounded": ("mooney_*", "friction*"),
 }
@@ -71,8 +72,9 @@ PARTS = {
     "stress": "stress --count 12 --json {json}",
     **{
         name: f"experiment {name} --report {{report}}"
-        for name in ("grasp", "friction", "manipulation", "chip", "places")
+        for name in ("grasp", "friction", "manipulation", "chip")
     },
+    "places": "experiment places --on {small} --calibration bench --report {report}",
     "network": "experiment network --network {network} --report {report}",
     "bound": "bound {bounded} --calibration bench --json {json}",
     **{
