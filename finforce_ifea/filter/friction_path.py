@@ -124,7 +124,7 @@ class TractionHypotheses:
         return _bound(self._path.ratios, self._held, self.upright)
 
     def preview(self, x: NDArray, shift: float, track: Track, weights: NDArray) -> NDArray:
-        """Return the traction ratio of each hypothesis (N,) with the object elsewhere; see `find_places` and `follow`."""
+        """Return the traction ratio of each hypothesis (N,) with the object elsewhere; see `find_places`."""
         if not self.follows_path:
             return self.ratios
         if self._anchor is None:  # it may stick either way
@@ -324,8 +324,8 @@ def _preview(path, known, there, weights, track):
         track: state of the depth, see `Track`.
     """
     (mu, parts, shares, rates, anchor), (direction, anchor_stddev, before) = path, known
-    (x, shift, held, upright), places = there, find_places(there[0], there[1])
-    own, motion, deeper, is_along = _find_motion(anchor, places, weights)
+    x, shift, held, upright = there
+    own, motion, deeper, is_along = _find_motion(anchor, find_places(x, shift), weights)
     stddev = np.sqrt(max(find_variance(track), 0.0))
     if not is_along and _is_chance(deeper, direction, stddev, anchor_stddev, track[0]):
         ratios = parts @ shares

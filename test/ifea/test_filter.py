@@ -21,7 +21,15 @@ from finforce_ifea.estimator import ForceEstimator
 from finforce_ifea.filter.filter import expect_innovations, innovate, reduce_covariance, update
 from finforce_ifea.filter.friction_path import NODES, TractionHypotheses
 from finforce_ifea.filter.jump import BUMPED, MISPLACED, NUDGED, JumpWatch, weigh_jump
-from finforce_ifea.filter.measurement import FREEDOM, NO_WEIGHT, Measurement, measure_distances, weigh
+from finforce_ifea.filter.measurement import (
+    FREEDOM,
+    NO_WEIGHT,
+    Measurement,
+    Sight,
+    measure_distances,
+    summarize_sight,
+    weigh,
+)
 from finforce_ifea.filter.process import CAMERA_TIME, FREE_DEPTH, Expectation, expect_state, find_decay, predict
 from finforce_ifea.filter.readout import find_held_ratio
 from finforce_ifea.filter.search import _follow_scatter
@@ -98,7 +106,9 @@ class TestProcess:
     def test_errors_of_a_detector_that_last_may_look_like_traction(self):
         search = ForceEstimator(BENCH)._tracker._search
         usual = search._expect().apparent_variance
-        search.points["sight"] = (0.2e-3) ** 2
+        search.points["sight"], search.points["offset_variance"] = (0.2e-3) ** 2, (0.4e-3) ** 2
+        search._sight = Sight(*summarize_sight(search.points))
+        assert search._sight.share == pytest.approx(0.25)
         assert search._expect().apparent_variance == pytest.approx(usual + 0.2**2)
 
     def test_a_prior_counts_once_and_for_ever(self):
@@ -312,14 +322,14 @@ class TestHypotheses:
         q, x = contact.begin(0.040), np.array([2e-3, 12.5e-3, 0.040])
         q, _ = press(contact, x, 0.0, q)
         track, weights = Track(MotionNoise(1e-12, 1e-6, 1e-6, 3.0, 1.0), 2e-3, (0.1e-3) ** 2), np.exp(unknown.prior)
-        places = np.tile([2e-3, 0.040], (NODES, 1))
-        unknown.preview(places, 0.0, track, weights)
+        places, there = np.tile([2e-3, 0.040], (NODES, 1)), np.tile(x, (NODES, 1))
+        unknown.preview(there, 0.0, track, weights)
         assert unknown.doubt == pytest.approx(0.45, abs=0.05)  # nobody knows which way it sticks
         unknown.follow(contact, q, x, places, track, weights)
-        back = places - [0.05e-3, 0.0]
+        back = there - [0.05e-3, 0.0, 0.0]
         np.testing.assert_array_equal(unknown.preview(back, 0.0, track, weights), unknown.ratios)
         small = unknown.doubt
-        unknown.preview(places, -0.1e-3, track, weights)
+        unknown.preview(there, -0.1e-3, track, weights)
         assert 0.0 < small < unknown.doubt
 
     @pytest.mark.parametrize("images", [12, 2])
