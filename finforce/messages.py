@@ -328,6 +328,16 @@ def pose_from_message(message: Any, frame: str, what: str) -> NDArray:
         raise PoseError(f"{what}: {error}") from None
 
 
+def pose_from_transform(transform: Any) -> NDArray:
+    """Return the pose (4, 4) of a geometry_msgs/Transform.
+
+    Raises:
+        PoseError: a number is not finite, or the quaternion is no unit quaternion.
+    """
+    place, turn = transform.translation, transform.rotation
+    return pose_from_quaternion((place.x, place.y, place.z), (turn.x, turn.y, turn.z, turn.w))
+
+
 def wrench_from_message(message: Any, frame: str) -> tuple[NDArray, NDArray]:
     """Return force (3,) [N] and torque (3,) [N m] about the jaw's origin of a geometry_msgs/WrenchStamped.
 

@@ -9,7 +9,8 @@ from geometry_msgs.msg import TransformStamped
 from numpy.typing import NDArray
 from rclpy.time import Time
 
-from finforce.transforms import pose_from_quaternion, pose_numbers
+from finforce.messages import pose_from_transform, stamp_of
+from finforce.transforms import pose_numbers
 
 if TYPE_CHECKING:
     from rclpy.node import Node
@@ -53,9 +54,7 @@ class Frames:
             found = self._buffer.lookup_transform(target, source, Time())
         except self._tf2.TransformException:
             return None
-        place, turn = found.transform.translation, found.transform.rotation
-        T = pose_from_quaternion((place.x, place.y, place.z), (turn.x, turn.y, turn.z, turn.w))
-        return T, Time.from_msg(found.header.stamp).nanoseconds
+        return pose_from_transform(found.transform), stamp_of(found)
 
     def send(self, header: Any, child: str, T: NDArray) -> None:
         """Send the pose (4, 4) of a frame in that of a header."""

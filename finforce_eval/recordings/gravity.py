@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.errors import ObservationError, PoseError
-from finforce.messages import direction_from_message, stamp_of
+from finforce.messages import direction_from_message, pose_from_transform, stamp_of
 from finforce.settings import GripperParameters
-from finforce.transforms import pose_from_quaternion
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.tracks import GravityTrack, check_stamps
 
@@ -94,12 +93,7 @@ def _read_link(transforms: Sequence[Any], moves: bool, name: str) -> _Link:
     stamps = np.array([stamp_of(each) for each in transforms], dtype=np.int64)
     order = np.argsort(stamps, kind="stable")
     try:
-        poses = np.stack([_read_pose(transforms[row].transform) for row in order])
+        poses = np.stack([pose_from_transform(transforms[row].transform) for row in order])
     except PoseError as error:
         raise RecordingError(f"{name}: {MOVING}: the pose of {_name(transforms[0].child_frame_id)}: {error}") from error
     return _Link(poses, stamps[order] if moves else np.zeros(0, np.int64))
-
-
-def _read_pose(transform: Any) -> NDArray[np.float64]:
-    place, turn = transform.translation, transform.rotation
-    return pose_from_quaternion((place.x, place.y, place.z), (turn.x, turn.y, turn.z, turn.w))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -102,11 +102,10 @@ def read_recording(
             images.
     """
     choice = choice or ImageChoice()
-    for is_such, read in ((is_dataset, read_episode), (is_buffer, read_buffer), (is_frames, read_frames)):
-        if is_such(Path(path)):
-            if gravity_frame:
-                raise RecordingError(f"{Path(path).name}: --gravity-frame {gravity_frame}: only bags have {MOVING}")
-            return read(Path(path), choice, sides)
+    if read := _find_reader(Path(path)):
+        if gravity_frame:
+            raise RecordingError(f"{Path(path).name}: --gravity-frame {gravity_frame}: only bags have {MOVING}")
+        return read(Path(path), choice, sides)
     source = bag_source(Path(path))
     folder = source if source.is_dir() else source.parent
     name = source.name if source.is_dir() else source.stem
@@ -143,6 +142,12 @@ def read_recording(
         images=images,
         copy=copy,
     )
+
+
+def _find_reader(path: Path) -> Callable[[Path, ImageChoice, Sequence[str]], Recording] | None:
+    """Return what reads a recording that is no bag; None for bags."""
+    kinds = ((is_dataset, read_episode), (is_buffer, read_buffer), (is_frames, read_frames))
+    return next((read for is_such, read in kinds if is_such(path)), None)
 
 
 def _read_posture(samples: Mapping[str, list[Any]], gravity_frame: str, name: str) -> GravityTrack | None:

@@ -122,7 +122,9 @@ class GravityTrack(Timed):
 
     def at(self, stamp: int) -> WristPosture | None:
         """Return the gripper's posture at a time [ns], the nearest one; None if that is older than the nodes accept."""
-        row = int(np.searchsorted(0.5 * (self.stamps_ns[1:] + self.stamps_ns[:-1]), stamp))
+        after = int(np.searchsorted(self.stamps_ns, stamp))
+        beside = range(max(after - 1, 0), min(after + 1, len(self.stamps_ns)))
+        row = min(beside, key=lambda row: abs(int(self.stamps_ns[row]) - stamp))
         if abs(int(self.stamps_ns[row]) - stamp) > NANOSECONDS * TimeParameters.max_age:
             return None
         return WristPosture(self.direction[row], float(self.elevation[row]))

@@ -123,3 +123,9 @@ def test_rows_of_the_jaws_tell_the_posture_of_their_images():
     assert row["gravity"][:2].tolist() == np.eye(3)[:2].tolist() and row["elevation"][1] == LIFTS[1]
     late = STAMPS[1] + int(0.2 / SECOND) < STAMPS
     assert np.isnan(row["gravity"][late]).all() and late.any()
+
+
+def test_only_bags_have_frames(tmp_path):
+    (tmp_path / "grasps.mp4").write_bytes(b"")
+    with pytest.raises(RecordingError, match="grasps.mp4: --gravity-frame base_link: only bags have /tf"):
+        read_recording(tmp_path / "grasps.mp4", gravity_frame="base_link")
