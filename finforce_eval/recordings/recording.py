@@ -135,7 +135,7 @@ def read_recording(
         path=Path(path),
         jaws=jaws,
         object_pose=_pose_track(poses, "/object_pose", name) if poses else None,
-        gravity=_read_posture(samples, gravity_frame, name),
+        gravity=_read_posture(samples, gravity_frame, name, notes),
         phases=parse_phases(*zip(*phases, strict=True), name) if phases else None,
         case=_read_case(folder / "case.json"),
         notes=tuple(notes),
@@ -150,11 +150,17 @@ def _find_reader(path: Path) -> Callable[[Path, ImageChoice, Sequence[str]], Rec
     return next((read for is_such, read in kinds if is_such(path)), None)
 
 
-def _read_posture(samples: Mapping[str, list[Any]], gravity_frame: str, name: str) -> GravityTrack | None:
-    """Return how the gripper was turned and lifted; None if nothing says."""
+def _read_posture(
+    samples: Mapping[str, list[Any]], gravity_frame: str, name: str, notes: list[str]
+) -> GravityTrack | None:
+    """Return how the gripper was turned and lifted; None if nothing says, or what does is noted as malformed."""
     if gravity_frame:
         return read_transforms(samples, gravity_frame, name)
-    return read_gravity(samples[GRAVITY], name) if GRAVITY in samples else None
+    try:
+        return read_gravity(samples[GRAVITY], name) if GRAVITY in samples else None
+    except RecordingError as error:
+        notes.append(f"gravity is not known: {str(error).removeprefix(f'{name}: ')}")
+        return None
 
 
 def _has_jaw(samples: Mapping[str, list[Any]], side: str, has_images: bool) -> bool:

@@ -1,5 +1,6 @@
 """Gravity and elevation of the gripper are read from /gravity or from /tf of a bag, and reach the estimator."""
 
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -100,11 +101,19 @@ def test_the_topic_gravity_is_read_as_it_was_written(tmp_path):
     assert np.isnan(found.elevation).all()
 
 
-def test_gravity_in_another_frame_is_refused(tmp_path):
-    told = make_message("geometry_msgs/msg/Vector3Stamped", header=header(int(START), "world"), vector={"z": -1.0})
-    bag = write_entries([*recording_entries(make_recording()), Entry(int(START), "/gravity", told)], tmp_path / "bag")
-    with pytest.raises(RecordingError, match="/gravity.*world.*gripper_base"):
-        read_recording(bag)
+@pytest.mark.parametrize(
+    ("frame", "stamps", "reason"),
+    [("world", (0,), "'world'.*gripper_base"), ("gripper_base", (1, 0), "the stamps of /gravity.*go back")],
+)
+def test_gravity_that_cannot_be_used_costs_no_recording(frame, stamps, reason, tmp_path):
+    told = [
+        make_message("geometry_msgs/msg/Vector3Stamped", header=header(int(START) + stamp, frame), vector={"z": -1.0})
+        for stamp in stamps
+    ]
+    entries = [Entry(int(START) + number, "/gravity", each) for number, each in enumerate(told)]
+    found = read_recording(write_entries([*recording_entries(make_recording()), *entries], tmp_path / "bag"))
+    assert found.gravity is None and len(found.jaws["left"].keypoints.stamps_ns)
+    assert any(re.search(f"gravity is not known: .*{reason}", note) for note in found.notes)
 
 
 def test_a_posture_counts_as_long_as_the_nodes_accept_it():

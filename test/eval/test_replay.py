@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 from eval_fakes import cut, with_both_jaws
 from process_fakes import running
-from rclpy.signals import SignalHandlerOptions, get_current_signal_handlers_options
 
 from finforce.ros.transport import free_domain
 from finforce.transforms import pose_from_quaternion, quaternion_from_pose
@@ -62,9 +61,15 @@ def test_a_context_that_a_signal_has_taken_away_is_no_fault(ended, monkeypatch):
 
 
 def test_a_process_that_has_played_ends_at_a_signal_again():
-    with open_player(free_domain()):
-        assert get_current_signal_handlers_options() == SignalHandlerOptions.ALL
-    assert get_current_signal_handlers_options() == SignalHandlerOptions.NO  # the middleware's would let it go on
+    """In a process of its own: the handlers are those of all contexts."""
+    program = (
+        "from rclpy.signals import get_current_signal_handlers_options as handlers;"
+        "from finforce_eval.replay.node import open_player\n"
+        f"with open_player({free_domain()}): print(handlers().name)\n"
+        "print(handlers().name)"
+    )
+    said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=120)
+    assert said.stdout.split() == ["ALL", "NO"]  # the middleware's handlers would let it go on
 
 
 def test_a_signal_ends_the_replay_and_its_nodes():
