@@ -215,6 +215,10 @@ class GraspPlan:
         """Return the nearest step [m] that is not more closed than `opening` [m]."""
         return self._closed + math.ceil((opening - self._closed) / self.step - 1e-6) * self.step
 
+    def snap_closed(self, opening: float) -> float:
+        """Return the nearest step [m] that is not more open than `opening` [m]."""
+        return self._closed + math.floor((opening - self._closed) / self.step + 1e-6) * self.step
+
     def nearest(self, opening: float) -> float:
         """Return the step [m] nearest to a reported opening [m]."""
         return self.snap(opening - 0.5 * self.step)

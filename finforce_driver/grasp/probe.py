@@ -61,4 +61,4 @@ class FrictionProbe:
         """Return how far the jaws may open [m] so that they keep what they have to, by the newest force."""
         way = (load.pressing - self._kept) / max(load.model.safe_stiffness, _LEAST_STIFFNESS)
         opening = min(load.opening + way, self._begin + self._length, plan.widest)
-        return plan.nearest(max(opening, self._begin))
+        return plan.snap_closed(max(opening, self._begin))

@@ -283,6 +283,14 @@ class TestProbe:
         assert forces[np.argmax(forces > 1.5) :].min() > 0.3
         assert course.overshoot(3.0) < max(0.3, stiffness * STEP)
 
+    @pytest.mark.parametrize(("stiffness", "force"), [(4750.0, 2.1), (4900.0, 2.75), (4300.0, 1.8)])
+    def test_an_object_far_stiffer_than_expected_is_not_let_go(self, stiffness, force):
+        fingers = Fingers(force_at=spring(stiffness))
+        forces = np.array(
+            Bench(goal=GraspGoal(force=force), settings=GraspSettings(probe=2e-3), fingers=fingers).run(8.0).forces
+        )
+        assert forces[np.argmax(forces > 0.5 * force) :].min() > 0.3
+
     def test_without_one_they_only_close(self):
         course = Bench(goal=GraspGoal(force=3.0), fingers=Fingers(force_at=spring(800.0))).run(12.0)
         end = course.times.index(next(t for t in course.times if t >= course.held_after()))
