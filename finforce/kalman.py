@@ -9,7 +9,6 @@ than both, the position begins anew.
 from __future__ import annotations
 
 from copy import copy
-from math import exp
 from typing import NamedTuple
 
 import numpy as np
@@ -101,13 +100,11 @@ class Track:
 
     def predict(self, dt: float, rest_time: float | None = None) -> None:
         """Advance by a time [s]; a mean time of rest [s] goes before that of the noise."""
-        starts, stops = 1.0 - exp(-dt / (rest_time or self.noise.rest_time)), 1.0 - exp(-dt / self.noise.motion_time)
-        _mix(self.state, starts, stops, self.noise.start)
-        _advance(self.state, dt, self.noise.drift, self.noise.acceleration)
+        predict(self.state, dt, rest_time or self.noise.rest_time, self.noise)
 
     def update(self, z: float, R: float) -> None:
         """Take a measured position z of a variance R."""
-        _correct(self.state, z, R, tuple(self.noise))
+        correct(self.state, z, R, self.noise)
 
 
 @njit(**_OPTIONS)
@@ -121,6 +118,14 @@ def find_variance(s):
     """Return the variance of the position of a state (8,)."""
     mean = find_mean(s)
     return s[0] * (s[4] + (s[1] - mean) ** 2) + (1.0 - s[0]) * (s[5] + (s[2] - mean) ** 2)
+
+
+@njit(**_OPTIONS)
+def predict(s, dt, rest_time, noise):
+    """Advance a state (8,) by a time [s], for a mean time of rest [s] and a `MotionNoise`."""
+    starts, stops = 1.0 - np.exp(-dt / rest_time), 1.0 - np.exp(-dt / noise.motion_time)
+    _mix(s, starts, stops, noise.start)
+    _advance(s, dt, noise.drift, noise.acceleration)
 
 
 @njit(**_OPTIONS)
@@ -151,9 +156,8 @@ def _advance(s, dt, drift, acceleration):
 
 
 @njit(**_OPTIONS)
-def _correct(s, z, R, noise):
-    """Take a measured position z of a variance R into a state (8,); `noise` is a plain tuple of `MotionNoise`."""
-    noise = MotionNoise(*noise)
+def correct(s, z, R, noise):
+    """Take a measured position z of a variance R into a state (8,), for a `MotionNoise`."""
     nu0, nu1, S0, S1 = z - s[1], z - s[2], s[4] + R, s[5] + R
     likely = s[0] * _density(nu0, S0) + (1.0 - s[0]) * _density(nu1, S1)
     if noise.jump_probability * _density(nu0, s[4] + noise.jump + R) > (1.0 - noise.jump_probability) * likely:
@@ -176,7 +180,7 @@ def _correct(s, z, R, noise):
 def expect_position(s, z, R, noise):
     """Return the position that a measured one z of a variance R would leave of a state (8,)."""
     s = s.copy()
-    _correct(s, z, R, noise)
+    correct(s, z, R, noise)
     return find_mean(s)
 
 

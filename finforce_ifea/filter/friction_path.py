@@ -38,6 +38,7 @@ _HEIGHT_PLAY = 1e-3
 _SHORTEST = 0.01e-3
 # Probability of rest below which the object moves [-].
 _MOVES = 0.2
+_NO_PLACES = np.zeros((0, 2))
 # A stop is known better than the motion before it once its deviation is less by this factor.
 _STOPPED = 0.7
 # 1 sigma of the depth of first touch [m].
@@ -123,18 +124,12 @@ class TractionHypotheses:
         """Traction ratio kappa of each hypothesis (N,) [-]."""
         return _bound(self._path.ratios, self._held, self.upright)
 
-    def preview(self, x: NDArray, shift: float, track: Track, weights: NDArray) -> NDArray:
-        """Return the traction ratio of each hypothesis (N,) with the object elsewhere; see `find_places`."""
-        if not self.follows_path:
-            return self.ratios
-        if self._anchor is None:  # it may stick either way
-            self.doubt = float(self._share(weights) @ self.mu)
-            return self.ratios
-        known = self._direction, self._anchor_stddev, self.stddev
-        path = self.mu, self._path.parts, self._path.shares, self._path.rates, self._anchor
-        places = x, shift, self._held, self.upright
-        ratios, self.doubt = _preview(path, known, places, weights, track.state)
-        return ratios
+    @property
+    def packed(self) -> tuple[tuple, tuple, tuple]:
+        """What `preview` has to know, as plain tuples."""
+        anchor = _NO_PLACES if self._anchor is None else self._anchor
+        path = self.mu, self._path.parts, self._path.shares, self._path.rates, anchor
+        return path, (self._direction, self._anchor_stddev, self.stddev), (self._held, self.upright)
 
     @property
     def follows_path(self) -> bool:
@@ -169,14 +164,11 @@ class TractionHypotheses:
         """
         if not 0.0 < self._held < 1.0:
             return log_weights
-        step = max(self._cell, 2.0 * self.unweighed)
-        bears = self._prior @ np.clip((self.mu + 0.5 * step - abs(self.upright)) / step, 0.0, 1.0)
-        bears = float(np.log(max(bears, _LEAST_PROBABILITY)))
-        weighed = log_weights.copy()
         parting = min(self._parted + (_AT_REST if self._is_at_rest else 0.0), _PARTED)
-        weighed[-1] += bears - self._bears + (parting - self._parting)
-        self._bears, self._parting = bears, parting
-        return weighed - np.log(np.exp(weighed).sum())
+        step, known = max(self._cell, 2.0 * self.unweighed), (self._bears, parting - self._parting)
+        weighed, self._bears = _bound_held(log_weights, self.mu, self._prior, step, self.upright, known)
+        self._parting = parting
+        return weighed
 
     def take_motion(self) -> float:
         """Return the motion [m] since the last call."""
@@ -311,20 +303,50 @@ def find_places(x, shift):
 
 
 @njit(**_OPTIONS)
-def _preview(path, known, there, weights, track):
+def _bound_held(log_weights, mu, prior, step, upright, known):
+    """Return log weights (N,) and log P(mu > |upright|); see `TractionHypotheses.bound_held`.
+
+    Args:
+        log_weights: before (N,).
+        mu: coefficients of friction (M,).
+        prior: their probabilities (M,).
+        step: distance of the coefficients.
+        upright: traction ratio of an object that only the jaws hold.
+        known: the log probability that is counted already, and log odds by moves that are not.
+    """
+    bears, (before, parting) = 0.0, known
+    for i in range(len(mu)):
+        bears += prior[i] * min(max((mu[i] + 0.5 * step - abs(upright)) / step, 0.0), 1.0)
+    bears, weighed = np.log(max(bears, _LEAST_PROBABILITY)), log_weights.copy()
+    weighed[-1] += bears - before + parting
+    return weighed - np.log(np.exp(weighed).sum()), bears
+
+
+@njit(**_OPTIONS)
+def expect_coefficient(packed, weights):
+    """Return the expected coefficient of friction, see `preview`; 0 where only the jaws hold the object for sure."""
+    mu, held = packed[0][0], packed[2][0]
+    return (_share(weights, len(mu)) * mu).sum() if held < 1.0 else 0.0
+
+
+@njit(**_OPTIONS)
+def preview(packed, x, shift, weights, track):
     """Return the traction ratio of each hypothesis (N,) with the object elsewhere, and the doubt.
 
     See `TractionHypotheses`.
 
     Args:
-        path: coefficients (M,), see `SlipPath` for parts, shares and rates, and the path's end (M, 2) [m].
-        known: direction of the path, standard deviation of its end [m], and of the traction ratio by its errors.
-        there: x and shift of `find_places`; probability that only the jaws hold the object, and its ratio then.
-        weights: see `_find_motion`.
+        packed: coefficients (M,), see `SlipPath` for parts, shares and rates, and the path's end (M, 2) [m], none
+            before the path begins; direction of the path, standard deviation of its end [m], and of the traction ratio
+            by its errors; probability that only the jaws hold the object, and its ratio then.
+        x: means of the hypotheses (N, n).
+        shift: how much deeper the object is [m].
+        weights: of the hypotheses (N,).
         track: state of the depth, see `Track`.
     """
-    (mu, parts, shares, rates, anchor), (direction, anchor_stddev, before) = path, known
-    x, shift, held, upright = there
+    (mu, parts, shares, rates, anchor), (direction, anchor_stddev, before), (held, upright) = packed
+    if held >= 1.0 or len(anchor) == 0:  # it may stick either way
+        return _bound(parts @ shares, held, upright), expect_coefficient(packed, weights)
     own, motion, deeper, is_along = _find_motion(anchor, find_places(x, shift), weights)
     stddev = np.sqrt(max(find_variance(track), 0.0))
     if not is_along and _is_chance(deeper, direction, stddev, anchor_stddev, track[0]):

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from finforce.compiled import njit
 from finforce_ifea.filter.filter import (
-    Posterior,
     divide_noise,
     expect_innovations,
     innovate,
@@ -25,7 +24,7 @@ from finforce_ifea.filter.filter import (
     update,
     widen,
 )
-from finforce_ifea.filter.measurement import Measurement, find_depth_jump, measure_distances, weigh
+from finforce_ifea.filter.measurement import find_depth_jump, measure_distances, weigh
 from finforce_ifea.filter.state import CAMERA_TURN, CAMERA_X, CAMERA_Z, DEPTH, HEIGHT
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
@@ -172,75 +171,58 @@ def _weigh_innovations(measured, nu, S, depth_variance, asked):
     return weigh(measure_distances(moved.reshape(-1, 2), blocks, measured.square))
 
 
-class JumpWatch:
+class JumpWatch(NamedTuple):
     """Tells small jumps from the innovations of several images: generalised likelihood ratio.
 
     With F the response of the state's mean so far to a unit jump at the first image, the innovations have the mean
     G b, G = H (E - F), where E selects the entries that jump (Willsky and Jones, 1976).
 
     Attributes:
+        jump: that is watched for.
         F: see above (n, j); changes with the state, see `advance`.
+        information: I of the module (j, j).
+        score: y of the module (j,).
     """
 
-    def __init__(self, jump: Jump, size: int) -> None:
-        """Watch for a jump of a state that has n = size entries."""
-        self._jump, self._packed, self._size = jump, tuple(jump), size
-        self._least = _UNLIKELY + float(np.log(jump.probability))
-        self.reset()
+    jump: Jump
+    F: NDArray
+    information: NDArray
+    score: NDArray
 
-    def reset(self) -> None:
-        """Begin with the next image."""
-        count = len(self._jump.entries)
-        self.F = np.zeros((self._size, count))
-        self._information, self._score = np.zeros((count, count)), np.zeros(count)
 
-    def update(
-        self, measured: Measurement, posterior: Posterior, sight: float, common: NDArray
-    ) -> tuple[NDArray, NDArray] | None:
-        """Take an image; once it has jumped, return the change of the mean (n,) and of P (n, n).
-
-        Args:
-            measured: see `correct`.
-            posterior: see `correct`.
-            sight: share of the offsets' variance by which a detector errs in the sight of one shape. Its errors are
-                alike and tell less than independent ones of the same size.
-            common: variances (j,) of what all key points err by alike, which looks like a jump.
-        """
-        jump, independence = self._jump, 1.0 / (1.0 + ALIKE * sight * (len(measured.R) - 1))
-        given = measured.H, measured.rows, measured.u, posterior.L, posterior.A, posterior.white
-        odds = _watch(given, self._packed, self.F, self._information, self._score, independence, common)
-        if odds <= 0.0:
-            if odds < self._least:
-                self.reset()
-            return None
-        V = np.linalg.inv(np.diag(jump.stddev**-2.0) + self._information)
-        D = -self.F
-        D[jump.entries, np.arange(len(jump.entries))] += 1.0
-        D[DEPTH] = 0.0
-        change = D @ (V @ self._score), D @ V @ D.T
-        self.reset()
-        return change
+def watch_for(jump: Jump, size: int) -> JumpWatch:
+    """Return the watch for a jump of a state that has n = size entries."""
+    count = len(jump.entries)
+    return JumpWatch(jump, np.zeros((size, count)), np.zeros((count, count)), np.zeros(count))
 
 
 @njit(**_OPTIONS)
-def _watch(given, jump, F, information, score, independence, common):
-    """Return the log odds of a jump by one more image; F (n, j), information (j, j) and score (j,) are updated.
+def forget(watched):
+    """Begin a watch with the next image."""
+    watched.F[:] = 0.0
+    watched.information[:] = 0.0
+    watched.score[:] = 0.0
+
+
+@njit(**_OPTIONS)
+def watch(watched, measured, posterior, sight, common):
+    """Take an image into a `JumpWatch`; return whether the state has jumped.
 
     Args:
-        given: H, rows and u of the `Measurement`; L, A and white of the `Posterior`.
-        jump: that is watched for, a plain tuple.
-        F: see `JumpWatch`.
-        information: I of the module.
-        score: y of the module.
-        independence: share of what independent errors would tell.
-        common: see `JumpWatch.update`.
+        watched: see above.
+        measured: see `correct`.
+        posterior: see `correct`.
+        sight: share of the offsets' variance by which a detector errs in the sight of one shape. Its errors are alike
+            and tell less than independent ones of the same size.
+        common: variances (j,) of what all key points err by alike, which looks like a jump.
     """
-    (H, rows, u, L, A, white), jump = given, Jump(*jump)
-    count = F.shape[1]
-    G = -project_columns(H, rows, u, np.ascontiguousarray(F.T)).T.copy()
+    jump, F, information, score = watched
+    independence = 1.0 / (1.0 + ALIKE * sight * (len(measured.R) - 1))
+    H, A, white, count = measured.H, posterior.A, posterior.white, F.shape[1]
+    G = -project_columns(H, measured.rows, measured.u, np.ascontiguousarray(F.T)).T.copy()
     for j in range(count):
         G[:, j] += H[:, jump.entries[j]]
-    G = solve_lower(L, G)
+    G = solve_lower(posterior.L, G)
     for i in range(len(G)):
         for j in range(count):
             score[j] += independence * G[i, j] * white[i]
@@ -249,4 +231,21 @@ def _watch(given, jump, F, information, score, independence, common):
             for k in range(len(F)):
                 F[k, j] += A[i, k] * G[i, j]
     kept = np.linalg.inv(np.eye(count) + information * common)
-    return weigh_jump(jump, np.dot(kept, information), np.dot(kept, score))
+    odds = weigh_jump(jump, np.dot(kept, information), np.dot(kept, score))
+    if odds < _UNLIKELY + np.log(jump.probability):
+        forget(watched)
+    return odds > 0.0
+
+
+@njit(**_OPTIONS)
+def jump_back(watched, x, P):
+    """Correct means (N, n) and covariance (n, n) for the jump that a `JumpWatch` has seen, in place."""
+    jump, F, information, score = watched
+    V = np.linalg.inv(np.diag(jump.stddev**-2.0) + information)
+    D = -F
+    for j in range(len(jump.entries)):
+        D[jump.entries[j], j] += 1.0
+    D[DEPTH] = 0.0
+    gain = np.dot(D, V)
+    x += np.dot(gain, score)
+    P += np.dot(gain, np.ascontiguousarray(D.T))

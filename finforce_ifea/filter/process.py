@@ -157,7 +157,7 @@ def advance(x, P, V, expected, points, positions, passed, depth, weights, respon
         x: means of the hypotheses (N, n).
         P: covariance (n, n).
         V: stationary variance in the last image (n,); becomes that in this one.
-        expected: `Expectation` as a plain tuple.
+        expected: see `Expectation`.
         points: see `KEYPOINT` (K,).
         positions: of the key points in the model (K, 3) [m].
         passed: time [s] and motion of the object [m] since the last image.
@@ -165,8 +165,7 @@ def advance(x, P, V, expected, points, positions, passed, depth, weights, respon
         weights: of the hypotheses (N,).
         responses: of the state to a jump (n, j), see `JumpWatch`.
     """
-    (dt, motion), expected = passed, Expectation(*expected)
-    count = len(points)
+    (dt, motion), count = passed, len(points)
     displacement, sight = np.empty(count), np.empty(count)
     for k in range(count):
         displacement[k] = np.hypot(positions[k, 0] - points[k].rest[0], positions[k, 2] - points[k].rest[2])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from finforce.compiled import njit
 from finforce_ifea.filter.measurement import NO_WEIGHT
@@ -75,7 +74,8 @@ def read_out(state, force, modes, x, log_weights, P, shift, smoothing, at, ratio
     state.quiet, state.loaded = state.depth < TOUCH_DEPTH, state.depth > LOADED_DEPTH
 
 
-def find_held_ratio(force: NDArray, ratio: float, pull: float) -> tuple[float, float]:
+@njit(**_OPTIONS)
+def find_held_ratio(force, ratio, pull):
     """Return the traction ratio at which a force (3,) [N] that has a ratio now is a pull [N] along the finger.
 
     The other number is the size of its derivative by the pull [1/N].

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from finforce.compiled import njit
 from finforce_ifea.contact_mechanics.friction import FRICTIONLESS, Traction
 from finforce_ifea.contact_mechanics.pressed_jaw import RigidContact
+from finforce_ifea.filter.state import DEPTH, HEIGHT
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
 # Coefficient of friction of a contact that does not slide [-].
@@ -160,35 +161,57 @@ def measure_rates(contact: RigidContact, q: NDArray, x: NDArray) -> tuple[NDArra
         traction = Traction(0.0, np.zeros(len(points)), np.zeros(len(points)), points, np.zeros(2))
         for h in sticking:
             traction.coefficient[parts[h]] = _STICKS
-        modes = contact.linearize(q, x, traction).modes[:, [0, 2]]
-        moved = [contact.place_points(q + _SMALL * mode) for mode in modes.T]
+        modes = contact.linearize(q, x, traction).modes
+        moved = [contact.place_points(q + _SMALL * modes[:, i]) for i in (DEPTH, HEIGHT)]
         for h in sticking:
             part = parts[h]
-            motions = np.stack([each[part] - points[part] for each in moved], axis=2) / _SMALL
             own = Traction(0.0, traction.coefficient[part], traction.shear[part], points[part], traction.moved)
             pressed = contact.indenter.press(points[part], contact.surface.stiffness[part], contact.face_x, x, own)
-            change = _find_change(pressed.changes, pressed.springs, motions)
-            turned = _find_change(smooth.changes[part], smooth.springs[part], motions)
-            normal = smooth.forces[part].sum(0)
-            across = np.array([normal[2], 0.0, -normal[0]])
-            rates[case, h] = np.stack([across @ change, normal @ change, across @ turned]) / (normal @ normal)
+            rates[case, h] = _find_rates(tuple(pressed), tuple(smooth), part, points, *moved)
     for i, part in enumerate(parts):
-        shares[i], heights[i] = size[part].sum() / size.sum(), np.average(rest[part], weights=size[part])
+        own = size[part]
+        shares[i], heights[i] = own.sum() / size.sum(), (own * rest[part]).sum() / own.sum()
     return rates, shares, heights
 
 
 def _split(size: NDArray, heights: NDArray) -> list[NDArray]:
     """Return the indices of the points in each part, the lower one first, for forces and heights (p,) [N, m]."""
     touching = np.flatnonzero(size)
-    gaps = np.diff(heights[touching], prepend=heights[touching[:1]])
     if not touching.size:
         return []
-    return np.split(touching, [gaps.argmax()]) if gaps.max() >= _GAP else [touching]
+    gaps = np.diff(heights[touching])
+    widest = int(gaps.argmax()) + 1 if len(gaps) else 0
+    return [touching[:widest], touching[widest:]] if widest and gaps[widest - 1] >= _GAP else [touching]
 
 
-def _find_change(changes: NDArray, springs: NDArray, motions: NDArray) -> NDArray:
-    """Return how the force on points changes by depth and height (3, 2) [N/m] as they move (k, 3, 2).
+@njit(**_OPTIONS)
+def _find_rates(pressed, smooth, part, points, deeper, higher):
+    """Return the rates (3, 2) [1/m] of a part that sticks, see `measure_rates`.
 
-    Changes (k, 3, 4) and springs (k, 3, 3) as of `PenaltyContact`.
+    Args:
+        pressed: `PenaltyContact` of its points (k,) that stick, as a plain tuple.
+        smooth: that of all points (p,) without friction.
+        part: indices of its points (k,).
+        points: where all points are (p, 3) [m].
+        deeper: where they are once the object is by `_SMALL` deeper (p, 3) [m].
+        higher: the same for the height.
     """
-    return changes[:, :, [0, 2]].sum(0) - np.tensordot(springs, motions, axes=((0, 2), (0, 1)))
+    normal, change, turned = np.zeros(3), np.zeros((3, 2)), np.zeros((3, 2))
+    for i in range(len(part)):
+        k = part[i]
+        for c, moved in enumerate((deeper, higher)):
+            for a in range(3):
+                change[a, c] += pressed[2][i, a, 2 * c]
+                turned[a, c] += smooth[2][k, a, 2 * c]
+                for b in range(3):
+                    motion = (moved[k, b] - points[k, b]) / _SMALL
+                    change[a, c] -= pressed[1][i, a, b] * motion
+                    turned[a, c] -= smooth[1][k, a, b] * motion
+        for a in range(3):
+            normal[a] += smooth[0][k, a]
+    rates, square = np.empty((3, 2)), (normal**2).sum()
+    for c in range(2):
+        rates[0, c] = (normal[2] * change[0, c] - normal[0] * change[2, c]) / square
+        rates[1, c] = (normal * change[:, c]).sum() / square
+        rates[2, c] = (normal[2] * turned[0, c] - normal[0] * turned[2, c]) / square
+    return rates

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 
 from finforce.compiled import njit
-from finforce_ifea.filter import jump, measurement, search
+from finforce_ifea.filter import image_update, jump, measurement
 
 _FILTER, _NEVER = "finforce_ifea.filter.", 1e-300
 _PATH, _CONTACT = _FILTER + "friction_path:", "finforce_ifea.tracking.contact_state:"
-_TRACKER, _SEARCH, _PROCESS = (f"{_FILTER}{name}:" for name in ("tracker", "search", "process"))
+_TRACKER, _SEARCH, _IMAGE, _PROCESS = (f"{_FILTER}{name}:" for name in ("tracker", "search", "image_update", "process"))
 _GROSS, _NO_WEIGHT, _FREEDOM = measurement._GROSS, measurement.NO_WEIGHT, measurement.FREEDOM
 _ALWAYS = 1e9  # a time [s] or a length [m] over which nothing changes
 
@@ -53,6 +53,18 @@ def _weigh_alike(measured, nu, S, depth_variance, asked):
     return np.ones(len(measured.R))
 
 
+@njit(error_model="numpy")
+def _keep_level(level, distances):
+    """Return the noise level of the tare."""
+    return 1.0
+
+
+@njit(error_model="numpy")
+def _keep_scatter(scatter, before, z, R):
+    """Return the scatter that the noise of the key points tells."""
+    return 1.0
+
+
 def _nothing(*_: Any) -> None:
     """Do nothing."""
 
@@ -63,11 +75,18 @@ def _without(name: str) -> tuple[Any, ...]:
     return tuple(each._replace(probability=_NEVER) if each is own else each for each in jump.JUMPS)
 
 
+_NOISE = image_update.DEPTH_NOISE
+
+
+def _with_noise(**changes: float) -> dict[str, Any]:
+    """Return another process noise of the depth, where it is used."""
+    return {place + "DEPTH_NOISE": _NOISE._replace(**changes) for place in (_SEARCH, _IMAGE)}
+
+
 def _rule(name: str, implementation: str, purpose: str, off: Mapping[str, Any], *scenes: str) -> Rule:
     return Rule(name=name, implementation=implementation, purpose=purpose, off=off, scenes=scenes)
 
 
-_NOISE = search._DEPTH_NOISE
 RULES = (
     _rule("Student's t", "`FREEDOM`", "reduces the weight of key points with moderate errors",
           {f"{_FILTER}{name}:weigh": _weigh_all_or_nothing for name in ("filter", "jump")},
@@ -79,16 +98,16 @@ RULES = (
     _rule("linearisation error", "`_NONLINEAR`", "larger tolerance of the initial weights after a motion",
           {_FILTER + "jump:_NONLINEAR": 0.0}, "fast", "gross"),
     _rule("noise level", "`_LEVEL_IMAGES`", "noise above that of the tare",
-          {_SEARCH + "_follow_level": lambda level, distances: 1.0}, "noisy", "gross"),
+          {_IMAGE + "_follow_level": _keep_level}, "noisy", "gross"),
     _rule("scatter of the depth", "`_follow_scatter`", "depths noisier than their key points tell",
-          {_SEARCH + "_follow_scatter": lambda scatter, before, z, R: 1.0}, "swaying", "noisy", "paused"),
-    _rule("depth smoothing", "`_DEPTH_NOISE`", "averages the depth over images",
-          {_SEARCH + "_DEPTH_NOISE": _NOISE._replace(drift=1.0)}, "press", "noisy", "rubbed"),
+          {_IMAGE + "_follow_scatter": _keep_scatter}, "swaying", "noisy", "paused"),
+    _rule("depth smoothing", "`DEPTH_NOISE`", "averages the depth over images",
+          _with_noise(drift=1.0), "press", "noisy", "rubbed"),
     _rule("two motion models", "`rest_time`", "a model of rest beside that of motion",
-          {_SEARCH + "_DEPTH_NOISE": _NOISE._replace(rest_time=1e-3), _SEARCH + "_FREE_TIME": 1e-3},
+          _with_noise(rest_time=1e-3) | {_SEARCH + "_FREE_TIME": 1e-3},
           "rested", "press", "noisy"),
     _rule("depth jumps", "`jump_probability`", "missed images, fast jaws",
-          {_SEARCH + "_DEPTH_NOISE": _NOISE._replace(jump_probability=0.0)}, "fast", "press"),
+          _with_noise(jump_probability=0.0), "fast", "press"),
     _rule("short rest of open jaws", "`_FREE_TIME`", "detects the onset of contact early",
           {_SEARCH + "_FREE_TIME": _NOISE.rest_time}, "tapping", "fast", "press"),
     _rule("bumped camera", "`BUMPED`", "a bump that shows in one image",
@@ -109,25 +128,25 @@ RULES = (
           {_PROCESS + "SIGHT_LENGTH": _ALWAYS}, "sight"),
     _rule("traction beyond friction", "`TRACTION_FLOOR`, `TRACTION_SHARE`",
           "traction that the friction path does not explain",
-          {_SEARCH + "TRACTION_FLOOR": 1e-3, _SEARCH + "TRACTION_SHARE": 0.0}, "rubbed", "probed", "paused", "fixed"),
+          {_IMAGE + "TRACTION_FLOOR": 1e-3, _IMAGE + "TRACTION_SHARE": 0.0}, "rubbed", "probed", "paused", "fixed"),
     _rule("correlation length of that traction", "`TRACTION_LENGTH`", "how far the object moves before it changes",
           {_PROCESS + "TRACTION_LENGTH": _ALWAYS},
           "rubbed", "probed", "paused"),
     _rule("apparent traction", "`APPARENT_TRACTION`", "model errors that look like traction",
-          {_SEARCH + "APPARENT_TRACTION": 1e-6}, "other finger", "rubbed", "fixed"),
+          {_IMAGE + "APPARENT_TRACTION": 1e-6}, "other finger", "rubbed", "fixed"),
     _rule("apparent traction of a detector", "`APPARENT_SIGHT`", "lasting detector errors that look like traction",
-          {_SEARCH + "APPARENT_SIGHT": 0.0}, "sight"),
+          {_IMAGE + "APPARENT_SIGHT": 0.0}, "sight"),
     _rule("correlation time of apparent traction", "`APPARENT_TIME`", "how long it lasts",
           {_PROCESS + "APPARENT_TIME": _ALWAYS},
           "other finger", "rubbed", "fixed"),
     _rule("camera drift", "`CAMERA_SHIFT`, `CAMERA_TURN_STDDEV`", "a camera that drifts",
-          {_SEARCH + "_STILL": np.zeros(4)}, "drifting", "nudged", "press"),
+          {_IMAGE + "_STILL": np.zeros(4)}, "drifting", "nudged", "press"),
     _rule("correlation time of the drift", "`CAMERA_TIME`", "how long it lasts",
-          {_SEARCH + "CAMERA_TIME": _ALWAYS}, "drifting", "press"),
+          {_IMAGE + "CAMERA_TIME": _ALWAYS}, "drifting", "press"),
     _rule("rotation and scale of an uncertain pose", "`PLACE_TURN`, `PLACE_STRETCH`", "errors that key points share",
-          {_SEARCH + "PLACE_TURN": 0.0, _SEARCH + "PLACE_STRETCH": 0.0}, "unplaced"),
+          {_IMAGE + "PLACE_TURN": 0.0, _IMAGE + "PLACE_STRETCH": 0.0}, "unplaced"),
     _rule("correlation time of that pose error", "`PLACE_TIME`", "how long it lasts",
-          {_SEARCH + "PLACE_TIME": 20.0}, "unplaced"),
+          {_IMAGE + "PLACE_TIME": 20.0}, "unplaced"),
     _rule("friction path", "`TractionHypotheses`", "the share of its friction that an object uses",
           {_PATH + "TractionHypotheses.follow": _nothing}, "rubbed", "probed", "paused"),
     _rule("two edges", "`_GAP`", "edges of a flat object that stick and slide in turn",
@@ -187,6 +206,6 @@ RULES = (
           {_CONTACT + "_VAGUE_SHARE": np.inf}, "low box", "wide box"),
     _rule("rejection: tensile", "`_LEAST_PULL`", "no force",
           {_CONTACT + "_LEAST_PULL": np.inf, _CONTACT + "_MOST_PULL": np.inf}, "bumped", "misplaced"),
-    _rule("rejection: disagreement", "`_is_believed`", "no force from key points that disagree",
-          {_SEARCH + "_is_believed": lambda mean, weight, V: True}, "cluster", "bumped", "unplaced"),
+    _rule("rejection: disagreement", "`is_believed`", "no force from key points that disagree",
+          {_SEARCH + "is_believed": lambda mean, weight, V: True}, "cluster", "bumped", "unplaced"),
 )  # fmt: skip

@@ -19,8 +19,9 @@ from finforce_ifea.contact_mechanics.indenter import OutlineIndenter, RoundInden
 from finforce_ifea.contact_mechanics.pressed_jaw import limit_step
 from finforce_ifea.estimator import ForceEstimator
 from finforce_ifea.filter.filter import expect_innovations, innovate, reduce_covariance, update
-from finforce_ifea.filter.friction_path import NODES, TractionHypotheses
-from finforce_ifea.filter.jump import BUMPED, MISPLACED, NUDGED, JumpWatch, weigh_jump
+from finforce_ifea.filter.friction_path import NODES, TractionHypotheses, preview
+from finforce_ifea.filter.image_update import _follow_scatter
+from finforce_ifea.filter.jump import BUMPED, MISPLACED, NUDGED, watch, watch_for, weigh_jump
 from finforce_ifea.filter.measurement import (
     FREEDOM,
     NO_WEIGHT,
@@ -32,7 +33,6 @@ from finforce_ifea.filter.measurement import (
 )
 from finforce_ifea.filter.process import CAMERA_TIME, FREE_DEPTH, Expectation, expect_state, find_decay, predict
 from finforce_ifea.filter.readout import find_held_ratio
-from finforce_ifea.filter.search import _follow_scatter
 from finforce_ifea.filter.slip_path import PathState, SlipPath, turn_path
 from finforce_ifea.filter.state import DEPTH, SHARED, TRACTION, state_size
 from finforce_ifea.jaw.calibration import Calibration, load_calibration
@@ -144,9 +144,9 @@ class TestJump:
         posterior = update(measured, np.ones(3), np.zeros(2), x, np.log([0.5, 0.5]), HP, S)
         told = {}
         for sight in (0.0, 1.0):
-            watch = JumpWatch(NUDGED, SIZE)
-            watch.update(measured, posterior, sight, np.zeros(3))
-            told[sight] = np.r_[watch._information.ravel(), watch._score]
+            watched = watch_for(NUDGED, SIZE)
+            watch(watched, measured, posterior, sight, np.zeros(3))
+            told[sight] = np.r_[watched.information.ravel(), watched.score]
         assert told[0.0].any()
         np.testing.assert_allclose(told[1.0], told[0.0] / 1.4)
 
@@ -155,11 +155,11 @@ class TestJump:
         HP, S = innovate(measured.H, measured.rows, measured.u, P, measured.R)
         posterior, seen = update(measured, np.ones(3), np.zeros(2), x, np.log([0.5, 0.5]), HP, S), {}
         for share in (0.0, 0.2):
-            watch = JumpWatch(NUDGED, SIZE)
-            watch._information = np.diag(1e6 / NUDGED.stddev**2)
-            watch._score = watch._information @ (0.3 * NUDGED.stddev)
-            seen[share] = watch.update(measured, posterior, 1.0, (share * NUDGED.stddev) ** 2)
-        assert seen[0.0] is not None and seen[0.2] is None
+            watched = watch_for(NUDGED, SIZE)
+            watched.information[:] = np.diag(1e6 / NUDGED.stddev**2)
+            watched.score[:] = watched.information @ (0.3 * NUDGED.stddev)
+            seen[share] = watch(watched, measured, posterior, 1.0, (share * NUDGED.stddev) ** 2)
+        assert seen[0.0] and not seen[0.2]
 
 
 def learn_scatter(depths, R=1e-10):
@@ -323,14 +323,15 @@ class TestHypotheses:
         q, _ = press(contact, x, 0.0, q)
         track, weights = Track(MotionNoise(1e-12, 1e-6, 1e-6, 3.0, 1.0), 2e-3, (0.1e-3) ** 2), np.exp(unknown.prior)
         places, there = np.tile([2e-3, 0.040], (NODES, 1)), np.tile(x, (NODES, 1))
-        unknown.preview(there, 0.0, track, weights)
-        assert unknown.doubt == pytest.approx(0.45, abs=0.05)  # nobody knows which way it sticks
+
+        def look(there, shift=0.0):
+            return preview(unknown.packed, there, shift, weights, track.state)
+
+        assert look(there)[1] == pytest.approx(0.45, abs=0.05)  # nobody knows which way it sticks
         unknown.follow(contact, q, x, places, track, weights)
-        back = there - [0.05e-3, 0.0, 0.0]
-        np.testing.assert_array_equal(unknown.preview(back, 0.0, track, weights), unknown.ratios)
-        small = unknown.doubt
-        unknown.preview(there, -0.1e-3, track, weights)
-        assert 0.0 < small < unknown.doubt
+        ratios, small = look(there - [0.05e-3, 0.0, 0.0])
+        np.testing.assert_array_equal(ratios, unknown.ratios)
+        assert 0.0 < small < look(there, -0.1e-3)[1]
 
     @pytest.mark.parametrize("images", [12, 2])
     @pytest.mark.parametrize("ways", [(2e-3,), (2e-3, 1.4e-3)])

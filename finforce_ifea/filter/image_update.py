@@ -1,0 +1,374 @@
+"""What one image makes of the filter of a contact, compiled: prediction, iterations, and what is read out of it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from finforce.compiled import njit
+from finforce.kalman import MotionNoise, expect_position, find_mean, find_variance, predict
+from finforce.kalman import correct as correct_track
+from finforce_ifea.contact_mechanics.indenter import CELL, find_first_touch
+from finforce_ifea.filter.filter import Posterior, reduce_covariance
+from finforce_ifea.filter.friction_path import expect_coefficient, preview
+from finforce_ifea.filter.jump import (
+    ALIKE,
+    BUMPED,
+    LARGEST_MOVE,
+    MISPLACED,
+    NO_JUMP,
+    Jump,
+    JumpWatch,
+    correct,
+    forget,
+    jump_back,
+    watch,
+)
+from finforce_ifea.filter.measurement import Measurement, find_seen, observe, summarize_sight
+from finforce_ifea.filter.process import (
+    APPARENT_SIGHT,
+    APPARENT_TRACTION,
+    BUMPED_SHIFT,
+    BUMPED_TIME,
+    BUMPED_TURN,
+    CAMERA_SHIFT,
+    CAMERA_TIME,
+    CAMERA_TURN_STDDEV,
+    PLACE_STRETCH,
+    PLACE_TIME,
+    PLACE_TURN,
+    TRACTION_FLOOR,
+    TRACTION_SHARE,
+    Expectation,
+    advance,
+)
+from finforce_ifea.filter.readout import find_held_ratio, judge_points, read_out
+from finforce_ifea.filter.state import DEPTH, HEIGHT, SHAPE
+from finforce_ifea.tracking.contact_state import LEAST_DEPTH
+
+_OPTIONS = {"cache": True, "error_model": "numpy"}
+# What is expected of an object, and what the search for its contact is allowed.
+EXPECTATION = np.dtype(
+    [
+        ("mean", float, 2),  # of shape and height [m]
+        ("variance", float, 2),  # of both
+        ("lowest", float),  # shape
+        ("highest", float),  # shape
+        ("largest_change", float),  # of the shape at once
+        ("settled_change", float),  # of the shape that no longer matters
+        ("has_corners", bool),  # whether the object may rock
+        ("shared", float),  # standard deviation of a shift that all key points of an image share [m]
+        ("mount", float),  # standard deviation of the height at which the jaw is mounted [m]
+    ],
+    align=True,
+)
+# Process noise of the depth: drift at rest [m/s^0.5], changes of the speed in motion [m/s^1.5], speed at which motion
+# starts [m/s], mean times of rest and motion [s]: jaws close at millimetres per second, and stop. Jumps [m] are images
+# that were missed, or another object.
+DEPTH_NOISE = MotionNoise(
+    drift=(0.01e-3) ** 2,
+    acceleration=0.004**2,
+    start=(5e-3) ** 2,
+    rest_time=3.0,
+    motion_time=1.0,
+    jump=(5e-3) ** 2,
+    jump_probability=1e-3,
+)
+# Images from which the noise is learnt, the largest change that one of them shows, and the largest noise, as variances
+# over that in the tare; and the median of D^2 for three normal numbers, less what the contact takes up.
+_LEVEL_IMAGES = 8.0
+_LARGEST_CHANGE = 9.0
+_LARGEST_LEVEL = 25.0
+_MEDIAN_SQUARE = 2.05
+# Images from which the scatter of the depths is learnt.
+_SCATTER_IMAGES = 15.0
+# Largest change of the height at once [m], and the changes that no longer matter [m].
+_LARGEST_SHIFT = 0.3e-3
+_SETTLED = 0.1e-3
+# Of the model's reach.
+_SETTLED_CORRECTION = 0.05
+# Steps shortened to less than this factor are taken as they are: the key points cannot decide between two corners.
+_UNDECIDED = 0.2
+# Change of a traction ratio that does not matter [-].
+_SAME_RATIO = 0.02
+# 1 sigma of the inclination of a force by an edge that hardly touches [-].
+_INCLINED = 0.5
+# Depth up to which an edge is rounded [m]: half a cell of its field.
+_EDGE = 0.5 * CELL
+# Weight at which a key point still agrees, and the share of them that has to.
+_AGREES = 0.25
+_MAJORITY = 0.5
+# The largest bump of a camera that is believed [sigma].
+_LARGEST_BUMP = 5.0
+# Variances (4,) of the camera's motion where nobody touches it, and where it was bumped.
+_STILL = np.array([CAMERA_SHIFT, CAMERA_SHIFT, CAMERA_TURN_STDDEV, 0.0]) ** 2
+_BUMPED = np.array([BUMPED_SHIFT, BUMPED_SHIFT, BUMPED_TURN, 0.0]) ** 2
+_LEAST_VARIANCE = 1e-14
+
+
+@njit(**_OPTIONS)
+def find_place(touching, x):
+    """Return where the mechanics stands for a state x (3,), never above the surface, and the depth below [m].
+
+    `touching` are object and surface, see `find_first_touch`.
+    """
+    x_model, touch = x.copy(), find_first_touch(*touching, x)
+    x_model[DEPTH] = max(x[DEPTH], touch + LEAST_DEPTH)
+    return x_model, x[DEPTH] - touch
+
+
+@njit(**_OPTIONS)
+def move_along(q, modes, x, before):
+    """Return unknowns (size,) moved along modes (size, 4) as the state of the mechanics (3,) has changed."""
+    out = q.copy()
+    for i in range(3):
+        out += modes[:, i] * (x[i] - before[i])
+    return out
+
+
+@njit(**_OPTIONS)
+def find_expectation(expectation, told, sight_variance, friction):
+    """Return the `Expectation`.
+
+    Args:
+        expectation: see `EXPECTATION`.
+        told: whether the contact is misplaced, and the camera was bumped; see `TractionHypotheses` for `stddev` and
+            `unweighed`.
+        sight_variance: see `Sight`.
+        friction: expected coefficient of friction.
+    """
+    expectation, (misplaced, bumped, path_stddev, unweighed) = expectation[()], told
+    mean, variance, camera = expectation.mean.copy(), expectation.variance.copy(), np.empty(4)
+    variance[1] += (MISPLACED.stddev[0] ** 2 if misplaced else 0.0) + expectation.mount**2
+    traction = TRACTION_FLOOR**2 + (TRACTION_SHARE * friction) ** 2 + min(path_stddev, friction) ** 2 + unweighed**2
+    shared, time = expectation.shared, BUMPED_TIME if bumped else CAMERA_TIME
+    if shared > 0.0:
+        time = PLACE_TIME
+    for i, place in enumerate((shared, shared, PLACE_TURN, PLACE_STRETCH)):
+        camera[i] = (_BUMPED[i] if bumped else _STILL[i]) + (place**2 if shared > 0.0 else 0.0)
+    apparent = APPARENT_TRACTION**2 + APPARENT_SIGHT**2 * sight_variance
+    return Expectation(mean, variance, traction, apparent, camera, time)
+
+
+@njit(**_OPTIONS)
+def predict_image(image, expected, filtered, weights, friction, passed, watches, touching):
+    """Predict the state of an image in place, and where the contact is in it.
+
+    Args:
+        image: `points`, see `KEYPOINT`, and the positions of the key points in the model (K, 3) [m].
+        expected: `expectation` and `told` of `find_expectation`.
+        filtered: means of the hypotheses (N, n), covariance (n, n), stationary variance in the last image (n,), and
+            state of the depth, see `Track`.
+        weights: of the hypotheses in the last image and now (N,).
+        friction: see `preview`.
+        passed: time [s], mean time of rest [s], and the time [s] and motion of the object [m] that the state took.
+        watches: each `JumpWatch` as plain tuples.
+        touching: object and surface, see `find_first_touch`.
+
+    Returns:
+        Key points that are seen (m,); `Sight`; traction ratios (N,), and their mean; the `_Place`.
+    """
+    (points, positions), (x, P, V, track), (before, weights) = image, filtered, weights
+    (expectation, told), (dt, rest_time, taken) = expected, passed
+    sight = summarize_sight(points)
+    prior = find_expectation(expectation, told, sight[1], expect_coefficient(friction, before))
+    predict(track, dt, rest_time, DEPTH_NOISE)
+    responses = watches[0][1], watches[1][1]
+    advance(x, P, V, prior, points, positions, taken, find_mean(track), before, responses)
+    ratios, _ = preview(friction, x, 0.0, weights, track)
+    mean, expectation = np.dot(weights, x), expectation[()]
+    at = np.array([find_mean(track), min(max(mean[SHAPE], expectation.lowest), expectation.highest), mean[HEIGHT]])
+    x_model, depth = find_place(touching, at)
+    return find_seen(points), sight, (ratios, np.dot(weights, ratios)), (at, x_model, depth)
+
+
+@njit(**_OPTIONS)
+def _watch(watches, x, P, measured, posterior, sight, misplaced):
+    """Look for jumps that show over several images only; correct x (N, n) and P (n, n) for one, and return which."""
+    shift, found = ALIKE * sight[1], NO_JUMP
+    common = np.array([shift, shift, shift / sight[2]]), np.zeros(1)
+    unpacked = [JumpWatch(Jump(*each[0]), each[1], each[2], each[3]) for each in watches]
+    for index in range(len(watches)):
+        possible = found == NO_JUMP and (index == 0 or not misplaced)
+        if possible and watch(unpacked[index], measured, posterior, sight[0], common[index]):
+            jump_back(unpacked[index], x, P)
+            found = index
+    if found != NO_JUMP:
+        for each in unpacked:
+            forget(each)
+    return found
+
+
+@njit(**_OPTIONS)
+def _smooth_depth(track, raw, z, own, scatter):
+    """Smooth a depth z [m] of some variance [m^2] by a `Track`.
+
+    Args:
+        track: state, which takes the depth.
+        raw: the last two depths (2,) [m], which become those of this image.
+        z: see above.
+        own: its variance by the noise of the key points [m^2].
+        scatter: variance of depths over that by the noise.
+
+    Returns:
+        The scatter that shows now; what smoothing adds to the depth [m]; by which factor it lessens the deviation.
+    """
+    scatter = _follow_scatter(scatter, raw, z, scatter * own)
+    raw[0], raw[1] = raw[1], z
+    correct_track(track, z, scatter * own, DEPTH_NOISE)
+    return scatter, find_mean(track) - z, np.sqrt(min(find_variance(track) / own, scatter))
+
+
+@njit(**_OPTIONS)
+def finish(state, image, prior, results, friction, filtered, made, where, place, watching):
+    """Return what the last linearisation of an image leaves, and fill in the contact state.
+
+    Args:
+        state: see `CONTACT_STATE`.
+        image: as for `iterate`.
+        prior: as for `iterate`.
+        results: `Measurement` and `Posterior` as plain tuples, and `possible` of `correct`.
+        friction: see `preview`; weights of the hypotheses (N,); the pull of the weight along the finger [N], and the
+            standard deviation of the held ratio by it.
+        filtered: state of the depth's `Track`; stationary variance (n,); variance of depths over that by the noise; the
+            last two depths (2,) [m].
+        made: force, its derivatives, contact state and traction ratio of the linearisation.
+        where: pressure centre on both surfaces, extrapolation and least determinant, see `PressedState`.
+        place: see `_Place`.
+        watching: `Sight`; each `JumpWatch`, as plain tuples; whether the search has settled.
+
+    Returns:
+        Means, covariance, log weights and weights of the hypotheses; noise level, scatter of the depth, what smoothing
+        adds to it [m], and the doubt; the ratio at which only the jaws hold the object, and its slope; the jump.
+    """
+    (points, seen, level, expectation), (before, x, log_weights, P) = image, prior
+    (measured, posterior, possible), (packed, weights, (pull, pull_stddev)) = results, friction
+    (track, V, scatter, raw), (force, modes, at, ratio), (sight, watches, settled) = filtered, made, watching
+    measured, posterior, (at_place, x_model, depth) = Measurement(*measured), Posterior(*posterior), place
+    weight, expectation = posterior.weight, expectation[()]
+    ratios, doubt = preview(packed, posterior.x, at_place[0] - posterior.mean[DEPTH], weights, track)
+    if np.abs(ratios - before).max() > _SAME_RATIO:
+        posterior, _ = correct(measured, weight, ratios, x, log_weights, P, possible, at[DEPTH])
+    level, P, x = _follow_level(level, posterior.distances), reduce_covariance(P, posterior.A), posterior.x
+    log_weights, weights = posterior.log_weights, np.exp(posterior.log_weights)
+    s, jumped = state[()], NO_JUMP
+    if settled:
+        jumped = _watch(watches, x, P, measured, posterior, sight, s.mistaken > 0.0)
+    s.mistaken = 1.0 if jumped == 1 else s.mistaken
+    own = max(posterior.own[0, 0], _LEAST_VARIANCE)
+    scatter, smooth, lessened = _smooth_depth(track, raw, (weights * x[:, DEPTH]).sum(), own, scatter)
+    point, location, extrapolation, smallest_det = where
+    for i in range(3):
+        s.x[i], s.x_model[i] = at_place[i], x_model[i]
+        s.pressure_point[i], s.pressure_location[i] = point[i], location[i]
+    s.depth, s.extrapolation, s.sound = depth, extrapolation, smallest_det > 0.0
+    # an edge is rounded by more than it sinks in at first
+    inclined = _INCLINED * max(1.0 - depth / _EDGE, 0.0) if expectation.has_corners else 0.0
+    held = weights[-1] if packed[2][0] > 0.0 else 0.0
+    spread = doubt**2 + inclined**2 + held * pull_stddev**2
+    shift, smoothing = smooth + x_model[0] - at_place[0], (posterior.own, lessened)
+    read_out(state, force, modes, x, log_weights, P, shift, smoothing, at, ratios, ratio, spread)
+    judge_points(state, points, seen, posterior.mean, V, posterior.left, weight, expectation.mean[1])
+    upright = find_held_ratio(force, ratio, pull)
+    return (x, P, log_weights, weights), (level, scatter, smooth, doubt), upright, jumped
+
+
+@njit(**_OPTIONS)
+def iterate(image, at, prior, weight, possible, known, x, last):
+    """Return what one image makes of one linearisation: the step that it asks for.
+
+    Args:
+        image: `points`, `seen` and `level` of `observe`; see `EXPECTATION`.
+        at: `positions`, `motions`, `at` and `ratio` of `observe`; modes (size, 4) and size of the `PressedState`.
+        prior: `ratios`, `x`, `log_weights` and `P` of `correct`.
+        weight: see `correct`.
+        possible: see `correct`.
+        known: object and surface, see `find_first_touch`; reach of the model (size,); state of the depth's `Track`, and
+            the variance of depths over that by the noise.
+        x: state of the contact (3,).
+        last: step (3,), and the share of a step that this one may have.
+
+    Returns:
+        Measurement, posterior and jump; the next `_Place`; the motion of the mechanics (3,) and of its unknowns
+        (size,); this step, and the next share; whether it changes nothing that matters.
+    """
+    (points, seen, level, expectation), (positions, motions, x_model, ratio, modes, size) = image, at
+    (touching, reach, track, scatter), (before, share) = known, last
+    measured = observe(points, seen, positions, motions, x_model, ratio, level)
+    posterior, found = correct(measured, weight, *prior, possible, x_model[DEPTH])
+    aim, variance = posterior.mean[: HEIGHT + 1] - x, max(posterior.own[0, 0], _LEAST_VARIANCE) * scatter
+    aim[0] = expect_position(track, posterior.mean[DEPTH], variance, DEPTH_NOISE) - x[0]
+    x, step, share = _take_step(x, aim, before, share, expectation)
+    after, depth = find_place(touching, x)
+    moved = after - x_model
+    change = modes[:, 0] * moved[0] + modes[:, 1] * moved[1] + modes[:, 2] * moved[2]
+    change /= max((np.abs(change) / reach).max(), 1.0)
+    is_settled = size < _SETTLED_CORRECTION and _is_settled(moved, aim - step, share, expectation)
+    return (measured, posterior, found), (x, after, depth), (moved, change), (step, share), is_settled
+
+
+@njit(**_OPTIONS)
+def _take_step(x, aim, last, share, expectation):
+    """Return x (3,) after a step (3,) within a share of where the linearisation holds, the step, and the next share.
+
+    Between two corners of an object the linearisation changes its mind: meet in the middle.
+    """
+    expectation, step = expectation[()], np.empty(3)
+    most = (LARGEST_MOVE, share * expectation.largest_change, share * _LARGEST_SHIFT)
+    for i in range(3):
+        step[i] = min(max(aim[i], -most[i]), most[i])
+    if expectation.has_corners and step[1] * last[1] + step[2] * last[2] < 0.0:
+        step[1:] *= 0.5
+        share *= 0.5
+    moved = x + step
+    moved[1] = min(max(moved[1], expectation.lowest), expectation.highest)
+    return moved, step, share
+
+
+@njit(**_OPTIONS)
+def _follow_level(level, distances):
+    """Return the variance of the noise over that in the tare, for what was expected and D^2 (m,) of the residuals."""
+    seen = min(np.median(distances) / _MEDIAN_SQUARE, _LARGEST_CHANGE)
+    return min(max(level * (1.0 + (seen - 1.0) / _LEVEL_IMAGES), 1.0), _LARGEST_LEVEL)
+
+
+@njit(**_OPTIONS)
+def _follow_scatter(scatter, before, z, R):
+    """Return the variance of the depths over that by the noise.
+
+    Noise sends the depth back after each step: the product of two steps is less than zero by its variance, while
+    steps of a motion have the same sign, or any. Those that are far larger are no noise.
+
+    Args:
+        scatter: as it was expected.
+        before: the last two depths (2,) [m], NaN if there are none.
+        z: depth [m].
+        R: its variance, `scatter` included [m^2].
+    """
+    step, last = z - before[1], before[1] - before[0]
+    largest = np.sqrt(2.0 * _LARGEST_LEVEL * R)
+    if not (abs(step) <= largest and abs(last) <= largest):
+        return scatter
+    return min(max(scatter * (1.0 - (1.0 + step * last / R) / _SCATTER_IMAGES), 1.0), _LARGEST_LEVEL)
+
+
+@njit(**_OPTIONS)
+def _is_settled(moved, missing, share, expectation):
+    """Return True if a step that moved the model by (3,), and left (3,) out, changed nothing that matters."""
+    tolerance = (_SETTLED, expectation[()].settled_change, _SETTLED)
+    for i in range(3):
+        if abs(moved[i]) >= tolerance[i] or (share > _UNDECIDED and abs(missing[i]) >= tolerance[i]):
+            return False
+    return True
+
+
+@njit(**_OPTIONS)
+def is_believed(mean, weight, V):
+    """Return True if most key points, by their weight (m,), agree, and the camera has moved as far as a bump may do.
+
+    Where V (n,) allows more, it may have moved farther by the mean of the state (n,).
+    """
+    for i in range(len(BUMPED.entries)):
+        entry = BUMPED.entries[i]
+        if not abs(mean[entry]) < _LARGEST_BUMP * max(BUMPED.stddev[i], np.sqrt(V[entry])):
+            return False
+    return (weight > _AGREES).mean() > _MAJORITY
