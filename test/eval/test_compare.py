@@ -126,6 +126,12 @@ def test_another_file_is_refused(text, files, tmp_path, capsys):
     assert "expected what finforce evaluate --json writes" in said and "Error(" not in said
 
 
+def test_a_folder_without_scores_is_told_what_is_expected(files, tmp_path, capsys):
+    (tmp_path / "annotated").mkdir()
+    assert main(["compare", files[0], str(tmp_path / "annotated")]) == 2
+    assert "no scores in it; expected a folder of finforce evaluate --out" in capsys.readouterr().err
+
+
 def test_the_tables_of_an_evaluation_say_what_its_json_says(tmp_path, capsys):
     recording = make_recording("pressed")
     estimator = FakeEstimator(1.1 * recording.truth("left").force)
