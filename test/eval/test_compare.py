@@ -117,7 +117,10 @@ def test_table_and_json_tell_the_same(files, tmp_path, capsys):
     assert main(["compare", files[0], files[0], "--strict"]) == 0
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", '{"cases": 3}', '{"cases": {"a": {}}}', "[" * 5000])
+NO_NUMBER = '{"cases": {"a": {"all": {"rmse_N": "x"}, "record_frames": 1, "record_skipped": 0}}}'
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"cases": 3}', '{"cases": {"a": {}}}', NO_NUMBER, "[" * 5000])
 def test_another_file_is_refused(text, files, tmp_path, capsys):
     other = tmp_path / "other.json"
     other.write_text(text)
