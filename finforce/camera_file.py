@@ -1,4 +1,4 @@
-"""Intrinsics from the files that people keep them in: ROS, OpenCV, kalibr, BOP, OpenICC, ORB-SLAM, or numbers."""
+"""Intrinsics from the files that people keep them in: ROS, OpenCV, kalibr, BOP, OpenICC, ORB-SLAM, COLMAP, numbers."""
 
 from __future__ import annotations
 
@@ -15,13 +15,22 @@ from finforce.camera import EQUIDISTANT, PLUMB_BOB, RATIONAL, CameraIntrinsics, 
 from finforce.files import LARGEST_YAML, FileError, parse_json, parse_yaml, read_text
 
 INTRINSICS_FORMS = (
-    "fx fy cx cy [k1 k2 p1 p2 k3], or a file of ROS, OpenCV, kalibr, BOP, OpenICC or ORB-SLAM, of a 3x3 matrix, "
-    "or with the names fx, fy, cx, cy"
+    "fx fy cx cy [k1 k2 p1 p2 k3], or a file of ROS, OpenCV, kalibr, BOP, OpenICC, ORB-SLAM or COLMAP, of a 3x3 "
+    "matrix, or with the names fx, fy, cx, cy"
 )
 _NAMES = ("fx", "fy", "cx", "cy")
 _MATRICES = ("K", "k", "camera_matrix", "Camera_Matrix", "cameraMatrix", "cam_K", "intrinsic_matrix")
 _LENS = re.compile(r"d|coeffs|dist(?!ance).*|(?!undist).*distortion.*", re.IGNORECASE)
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+_COLMAP = {  # parameters of its models; f is fx and fy
+    "SIMPLE_PINHOLE": "f cx cy",
+    "PINHOLE": "fx fy cx cy",
+    "SIMPLE_RADIAL": "f cx cy k1",
+    "RADIAL": "f cx cy k1 k2",
+    "OPENCV": "fx fy cx cy k1 k2 p1 p2",
+    "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
+    "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
+}
 _SIZES = {"width": ("width", "image_width", "image_Width"), "height": ("height", "image_height", "image_Height")}
 
 
@@ -30,7 +39,7 @@ def read_camera(path: str | Path, shape: tuple[int, int] | None = None, name: st
 
     Args:
         path: YAML of ROS, OpenCV or kalibr, XML of OpenCV, JSON of BOP (camera, scene_camera) or OpenICC (as UMI uses
-            it), a text of fx fy cx cy or of a 3x3 matrix, or YAML or JSON with these names.
+            it), COLMAP's cameras.txt, a text of fx fy cx cy or of a 3x3 matrix, or YAML or JSON with these names.
         shape: height and width of its images; without it the file has to say.
         name: of the camera (kalibr) or image (BOP), where a file has several that differ.
 
@@ -104,6 +113,8 @@ def _parse(text: str) -> Any:
         pass
     if text.lstrip().startswith("{"):
         return parse_json(text)
+    if colmap := re.findall(r"^\d+ ([A-Z_]+) (\d+ \d+ [^#\n]+)$", text, flags=re.MULTILINE):
+        return _from_colmap(colmap)
     if text.lstrip().startswith("<"):
         return _parse_xml(text)
     if len(text) > LARGEST_YAML:
@@ -119,6 +130,22 @@ def _parse(text: str) -> Any:
 def _leave_out_header(content: Any) -> Any:
     """Return a message without its header, whose stamp is another one in each."""
     return {key: value for key, value in content.items() if key != "header"} if isinstance(content, dict) else content
+
+
+def _from_colmap(lines: Sequence[tuple[str, str]]) -> dict[str, Any]:
+    """Return the entries of the one camera of COLMAP's lines: model, and size and parameters."""
+    (model, words), *others = lines
+    names = f"width height {_COLMAP.get(model, '')}".split()
+    if any(each != lines[0] for each in others):
+        raise IntrinsicsError(f"describes {len(lines)} cameras; expected one")
+    try:
+        named: dict[str, Any] = dict(zip(names, map(float, words.split()), strict=True))
+        named |= {"cx": named["cx"] - 0.5, "cy": named["cy"] - 0.5}  # the middle of its first pixel is 0.5, 0.5
+    except (KeyError, ValueError):
+        raise IntrinsicsError(f"camera model {model[:40]} with {words[:99]}: expected {' or '.join(_COLMAP)}") from None
+    focal = named.get("f")
+    named |= {"fx": focal, "fy": focal} if focal else {}
+    return named | ({"model": EQUIDISTANT} if "FISHEYE" in model else {})
 
 
 def _parse_xml(text: str) -> dict[str, Any]:

@@ -4,11 +4,13 @@ The gripper base has x along the closing axis, from the left to the right jaw, a
 """
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from finforce.errors import PoseError
+from finforce.files import FileError, parse_yaml, read_text
 from finforce.transforms import check_pose, invert_pose, move_pose, pose_from_quaternion
 
 SIDES = ("left", "right")
@@ -126,16 +128,39 @@ def check_camera(T_gripper_camera: NDArray) -> NDArray:
     return T_gripper_camera
 
 
+def _read_hand_eye(path: Path) -> NDArray:
+    """Return the pose (4, 4) of a camera on the gripper from a file of easy_handeye, or easy_handeye2.
+
+    Raises:
+        PoseError: it cannot be read, or the camera stands beside the robot.
+    """
+    try:
+        content = parse_yaml(read_text(path))
+        found = content.get("transformation") or content["transform"]
+        turn = {f"q{axis}": value for axis, value in found.get("rotation", {}).items()}
+        named = {**found, **found.get("translation", {}), **turn}
+        numbers = [float(named[name]) for name in ("x", "y", "z", "qx", "qy", "qz", "qw")]
+        about = content.get("parameters") or {}
+        beside = about.get("eye_on_hand") is False or about.get("calibration_type") == "eye_on_base"
+    except (FileError, AttributeError, KeyError, TypeError, ValueError) as error:
+        raise PoseError(f"extrinsics: {path.name} is no file of easy_handeye: {error}") from error
+    if beside:
+        raise PoseError(f"extrinsics: {path.name} is of a camera beside the robot; expected one on the gripper")
+    return pose_from_quaternion(numbers[:3], numbers[3:])
+
+
 def read_extrinsics(camera: str | ArrayLike) -> NDArray:
-    """Return T_gripper_camera (4, 4) of a camera by its name, its matrix (4, 4), or x, y, z [m], qx, qy, qz, qw.
+    """Return T_gripper_camera (4, 4) of a camera by its name, its matrix (4, 4), x, y, z [m], qx, qy, qz, qw, or file.
 
     Raises:
         PoseError: it is none of these.
     """
-    forms = f"{', '.join(CAMERAS)}, x y z qx qy qz qw, or a (4, 4) matrix"
+    forms = f"{', '.join(CAMERAS)}, x y z qx qy qz qw, a (4, 4) matrix, or a file of easy_handeye"
     if isinstance(camera, str):
         if camera in CAMERAS:
             return CAMERAS[camera]
+        if Path(camera).suffix in (".yaml", ".yml", ".calib"):
+            return check_camera(_read_hand_eye(Path(camera)))
         camera = camera.replace(",", " ").split()
     try:
         numbers = np.asarray(camera, dtype=float)

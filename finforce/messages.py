@@ -433,7 +433,7 @@ def layout_of(image: Any) -> ImageLayout:
 DEPTH_FORMAT = "16UC1; compressedDepth png"
 DEPTH_HEADER = 12  # bytes of compressed_depth_image_transport: an enum and two numbers for 32-bit depth
 _PNG = b"\x89PNG"
-_STEPPED = ("", "16UC1", "mono16")  # what a png of depth can be said to hold; of 32FC1 it holds inverse depths
+_STEPPED = ("", "16UC1", "mono16")  # what a png of depth in steps can be said to hold
 
 
 def depth_from_message(message: Any, scale: float = MILLIMETRE) -> NDArray[np.float32]:
@@ -446,17 +446,23 @@ def depth_from_message(message: Any, scale: float = MILLIMETRE) -> NDArray[np.fl
     """
     if not hasattr(message, "format"):
         return decode_depth(message.data, message.encoding, layout_of(message), scale)
-    return decode_depth(depth_steps(message), "16UC1", scale=scale)
+    pixels = depth_steps(message)
+    return decode_depth(pixels, depth_encoding(pixels), scale=scale)
 
 
-def depth_steps(message: Any) -> NDArray[np.uint16]:
-    """Return the depth image (h, w) in steps, most cameras' are of 1 mm, 0 invalid, of a CompressedImage.
+def depth_encoding(pixels: NDArray) -> str:
+    """Return the encoding of what `depth_steps` returns."""
+    return "32FC1" if pixels.dtype == np.float32 else "16UC1"
+
+
+def depth_steps(message: Any) -> NDArray[np.uint16] | NDArray[np.float32]:
+    """Return the depth image (h, w) in steps, most cameras' are of 1 mm, or of 32FC1 in metres, 0 invalid.
 
     Raises:
-        ImageError: it is no 16-bit png.
+        ImageError: it is no 16-bit png, or its inverse depths have no scale.
     """
     encoding = message.format.partition(";")[0].strip() if ";" in message.format else ""
-    if encoding not in _STEPPED:
+    if encoding not in (*_STEPPED, "32FC1"):
         raise ImageError(f"depth image {message.format!r}: encoding {encoding}; expected '{DEPTH_FORMAT}'")
     data = bytes(message.data)
     begin = data.find(_PNG, 0, DEPTH_HEADER + len(_PNG))
@@ -465,7 +471,20 @@ def depth_steps(message: Any) -> NDArray[np.uint16]:
     image = np.array(open_picture(data[begin:], f"depth image {message.format!r}"))
     if image.ndim != 2 or image.dtype.kind not in "ui" or image.dtype == np.uint8:
         raise ImageError(f"depth image {message.format!r}: {image.dtype} {image.shape}; expected 16 bits, one channel")
-    return np.clip(image, 0, 65535).astype(np.uint16)
+    steps = np.clip(image, 0, 65535).astype(np.uint16)
+    return _metres_of_inverse(steps, data[:begin], message.format) if encoding == "32FC1" else steps
+
+
+def _metres_of_inverse(steps: NDArray[np.uint16], header: bytes, what: str) -> NDArray[np.float32]:
+    """Return depth [m], 0 invalid, of steps of inverse depth, as compressed_depth_image_transport packs 32-bit depth.
+
+    Raises:
+        ImageError: the header does not tell their scale.
+    """
+    scale, shift = struct.unpack_from("<ff", header, 4) if len(header) == DEPTH_HEADER else (0.0, 0.0)
+    if not (np.isfinite(scale) and np.isfinite(shift) and scale > 0.0 and shift < 1.0):
+        raise ImageError(f"depth image {what!r}: its header has no scale of the inverse depths")
+    return np.where(steps > 0, np.float32(scale) / (steps - np.float32(shift)), np.float32(0.0))
 
 
 def mask_from_message(message: Any) -> NDArray[np.bool_]:

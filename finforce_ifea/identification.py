@@ -105,6 +105,7 @@ def fit_calibration(
         raise CalibrationError("calibration: no recordings, expected at least one")
     settings = settings or EstimatorSettings()
     fit = _Fit(jaw, cases, settings, progress)
+    fit.check_unit()
     result = least_squares(
         fit.residuals,
         fit.start,
@@ -203,6 +204,16 @@ class _Fit:
             for force, case in zip(self.forces, self.cases, strict=True)
         ]
         return [elastic[plateau.case][plateau.instants] for plateau in self.plateaus]
+
+    def check_unit(self) -> None:
+        """Refuse true forces that are those of no modulus within the bounds; raises CalibrationError."""
+        true, (_, forces) = self._elastic_forces(self.start), self._solve_shapes(self.start)
+        factor = float(np.median([each.mean() for each in true] / forces))
+        if not self.low[0] < np.log(factor) < self.high[0]:
+            raise CalibrationError(
+                f"calibration: the true forces are {factor:.3g} times those of the jaw file's modulus, "
+                f"{1e-6 * self.jaw.material.young_modulus:g} MPa: expected newtons"
+            )
 
     def _solve_shapes(self, x: NDArray) -> tuple[NDArray, NDArray]:
         """Return the shape residuals and the magnitudes [N] at the drawn modulus; remembers them per geometry."""
@@ -544,6 +555,11 @@ def fit_force_history(
     errors = np.concatenate([_model(fit.x, history) - history.true for history in histories])
     true = np.concatenate([history.true for history in histories])
     loaded = true > _LOADED_FORCE
+    if not loaded.any():
+        raise CalibrationError(
+            f"calibration: true forces of {true.max():.2g} N at most; expected more than {_LOADED_FORCE:g} N: "
+            "are they in newtons?"
+        )
     stddev = np.sqrt(np.diag(np.linalg.inv(fit.jac.T @ fit.jac + 1e-12 * np.eye(5))))[1:]
     return HistoryFit(
         scale=float(np.exp(fit.x[0])),

@@ -119,8 +119,11 @@ def finish(parts: Sequence[Process | Include], options: SolverOptions) -> list[P
     """Return parts of a system in its namespace, with its prefix of frames, and composed where that is asked for.
 
     Raises:
-        ValueError: the parameter file has a section for none of the nodes.
+        ValueError: ROS allows no such namespace, or the parameter file has a section for none of the nodes.
     """
+    if not re.fullmatch(r"/?(?:[A-Za-z_]\w*/?)*", options.namespace, re.ASCII):
+        hint = "letters, digits and underscores, such as robot_1 or lab/robot_1"
+        raise ValueError(f"namespace '{options.namespace}': expected {hint}")
     if options.parameter_file:
         check_sections(options.parameter_file, options.namespace, NODES)
     parts = [_place(part, options) if isinstance(part, Process) else part for part in parts]

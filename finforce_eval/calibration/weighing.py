@@ -183,6 +183,7 @@ def weigh(holds: Sequence[Hold], grams: Sequence[float], name: str = "the record
         )
     if len(weights) != len(holds):
         counts = f"{len(weights)} readings for {len(holds)} holds"
+        counts += " (decimal points, not commas?)" if len(weights) == 2 * len(holds) > 2 else ""
         raise RecordingError(f"{name}: {counts}; holds found: {list_holds(holds)}")
     weighing = _fit_factor(tuple(holds), weights)
     hint = _suspect_offset(weighing)

@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 
 from finforce_eval.cli.parser import CommandResult
+from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.batch import read_evaluations
 from finforce_eval.evaluation.comparison import (
     BETTER,
@@ -56,6 +57,8 @@ def _read(path: Path) -> Mapping[str, Any]:
         FinforceError: it is neither.
     """
     tables = sorted(path.glob("*.parquet"))
+    if not tables and path.is_dir():
+        raise OptionError(f"{path}: no scores in it; expected a folder of finforce evaluate --out, or a file of --json")
     if not tables:
         return read_evaluation(path)
     evaluation, about = read_evaluations(tables)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 import time
 from collections.abc import Iterator
@@ -75,7 +76,8 @@ class Webcam:
 
     def __init__(self, source: str, camera: CameraIntrinsics) -> None:
         cv2 = import_cv2()
-        self._name, self._camera = f"camera {source}", camera
+        name = re.sub("//[^/]*@", "//", source)  # without a password
+        self._name, self._camera = f"camera {name}", camera
         self._capture = cv2.VideoCapture(int(source) if source.isdigit() else source)
         if not self._capture.isOpened():
             there = ", ".join(sorted(each.name for each in Path("/dev").glob("video*"))) or "none"

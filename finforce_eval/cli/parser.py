@@ -116,7 +116,8 @@ def add_detector_options(parser: argparse._ActionsContainer) -> None:
     """Add what changes the key point detector."""
     text = "set a detector parameter such as model=FOLDER or detector.readout=0.02, repeatable"
     parser.add_argument("--detector", action="append", default=[], metavar="NAME=VALUE", help=text)
-    text = "camera pose in the gripper frame: robot, bench, or x,y,z,qx,qy,qz,qw in metres (case.json, else robot)"
+    text = "camera pose in the gripper frame: robot, bench, x,y,z,qx,qy,qz,qw in metres, or a file of "
+    text += "easy_handeye (case.json, else robot)"
     parser.add_argument("--extrinsics", metavar="POSE", help=text)
     text = "rig file of finforce camera, instead of --jaw, --extrinsics and --intrinsics; a --jaw after it has priority"
     parser.add_argument("--rig", action=_UseRig, metavar="FILE", help=text)
@@ -126,8 +127,8 @@ def add_detector_options(parser: argparse._ActionsContainer) -> None:
     parser.add_argument("--depth", metavar="TOPIC", help=text)
     text = "topic of the camera_info (the one next to the colour images)"
     parser.add_argument("--camera-info", metavar="TOPIC", help=text)
-    text = "intrinsics instead of camera_info: fx fy cx cy [k1 k2 p1 p2 k3] in pixels, or a "
-    text += "file of ROS, OpenCV, kalibr, BOP, OpenICC (UMI) or ORB-SLAM, with the name of the camera if it has several"
+    text = "intrinsics instead of camera_info: fx fy cx cy [k1 k2 p1 p2 k3] in pixels, or a file of "
+    text += "ROS, OpenCV, kalibr, BOP, OpenICC (UMI), ORB-SLAM or COLMAP, with the name of the camera if it has several"
     parser.add_argument("--intrinsics", nargs="+", metavar="NUMBER", help=text)
     episode = whole_number(0, 10**9)
     parser.add_argument("--episode", type=episode, default=0, metavar="N", help="episode of a dataset or .zarr (0)")

@@ -72,8 +72,9 @@ def read_evaluation(path: str | Path) -> dict[str, Any]:
         content = read_json(path)
         cases = content["cases"]
         for case in cases.values():
-            case["all"]["rmse_N"], case["record_frames"], case["record_skipped"]
-    except (FileError, KeyError, TypeError, AttributeError) as error:
+            float(case["all"]["rmse_N"] or 0.0), float(case["record_frames"]), float(case["record_skipped"])
+            np.array(case.get("seconds", ()), dtype=float).reshape(-1, 3)
+    except (FileError, KeyError, TypeError, ValueError, AttributeError) as error:
         why = error if isinstance(error, FileError) else "holds no scores"
         raise OptionError(f"{path}: {why}; expected what finforce evaluate --json writes") from error
     return content

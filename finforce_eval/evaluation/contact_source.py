@@ -345,6 +345,11 @@ class ContactChoice:
             raise OptionError(f"--contact {self.mode} has no fixed height; here give fixed:Z_MM or fixed:case")
         if self.height_mm is not None:
             return self.height_mm * 1e-3
+        if self.object_file is not None and self.mode == AUTOMATIC:
+            raise OptionError(
+                f"{recording.name}: --object needs poses of the object: expected PoseStamped on /object_pose, in the "
+                "frame of the images (those of tags on /tf are not read); or give --contact fixed:Z_MM"
+            )
         case_object = recording.case.get("object")
         z = case_object.get("z") if isinstance(case_object, Mapping) else None
         if isinstance(z, bool) or not isinstance(z, int | float) or not math.isfinite(z):

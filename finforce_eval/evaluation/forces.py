@@ -13,6 +13,7 @@ import numpy as np
 from finforce.errors import ObservationError
 from finforce.gripper_frames import SIDES
 from finforce.health import Idling
+from finforce.messages import SECOND
 from finforce_contact.estimator import CONTRADICTED
 from finforce_contact.loop import ContactSource, ForceLoop, GivenContact
 from finforce_eval.errors import RecordingError
@@ -168,7 +169,9 @@ def check_solved(result: ForceSeries, recording: Recording) -> None:
     blind = counted.any() and loaded.any() and not (loaded & result.solved).any()
     if blind or not counted.any():
         if not blind and (result.scored & result.solved).any():
-            raise RecordingError(f"{result.name}: no ground truth at the stamps of the key points")
+            late = SECOND * float(recording.truth(result.side).stamps_ns[0] - result.stamps_ns[0])
+            when = f"it begins {abs(late):.1f} s {'after' if late > 0.0 else 'before'} them: two clocks?"
+            raise RecordingError(f"{result.name}: no ground truth at the stamps of the key points; {when}")
         words, counts = np.unique(result.column("status")[loaded if blind else result.scored], return_counts=True)
         statuses = ", ".join(f"{count} {word}" for word, count in zip(words, counts, strict=True))
         message = result.column("message")[~result.solved][-1]

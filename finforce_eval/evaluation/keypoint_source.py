@@ -297,7 +297,7 @@ def _parse_extrinsics(text: str) -> list[float]:
     try:
         return list(pose_numbers(read_extrinsics(text)))
     except PoseError as error:
-        raise OptionError(f"--{error}") from error
+        raise OptionError(f"--extrinsics: {str(error).removeprefix('extrinsics').lstrip(' :')}") from error
 
 
 def parse_changes(option: str, kind: str, texts: Sequence[str], defaults: Mapping[str, Any]) -> dict[str, Any]:

@@ -8,7 +8,9 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
+from finforce.messages import SECOND
 from finforce_eval.evaluation.comparison import error_blocks
 from finforce_eval.evaluation.scoring import PHASES, CaseScore, Evaluation, Stats
 from finforce_eval.table import AXES, ForceSeries
@@ -37,6 +39,9 @@ _SIGHT = (
 
 UNITS_PER_NEWTON = {"gram-force": 101.97, "kilogram-force": 0.10197, "pound-force": 0.22481, "millinewtons": 1000.0}
 UNIT_TOLERANCE = 0.15  # [-], of the ratio of true and estimated forces, by which a unit is told
+ANOTHER_UNIT = 5.0  # factor that no finger's modulus explains
+LAGS = np.arange(-20, 21) / 20.0  # [s], tried between true and estimated forces
+ONE_CLOCK, CLEARLY = 0.1, 0.5  # [s] that is let pass; share of what does not fit, below which a lag is clear
 IDLE_FORCE, LOADED_FORCE = 0.05, 0.5  # [N], estimates below which nothing presses, and above which much does
 FEWEST = 15  # images by which true forces are doubted
 BIAS = 0.3  # [N], of a sensor at rest, above which it is doubted
@@ -173,12 +178,30 @@ def doubt_truth(case: ForceSeries) -> str:
         unit = min(UNITS_PER_NEWTON, key=lambda name: abs(np.log(max(factor, 1e-9) / UNITS_PER_NEWTON[name])))
         if abs(factor / UNITS_PER_NEWTON[unit] - 1.0) < UNIT_TOLERANCE:
             return f"{case.name}: the true forces are {factor:.3g} times the estimated ones: {unit}? expected newtons"
+        if not 1.0 / ANOTHER_UNIT < factor < ANOTHER_UNIT:
+            return f"{case.name}: the true forces are {factor:.3g} times the estimated ones: counts? expected newtons"
+        if lag := find_lag(SECOND * case.stamps_ns[known], found, true):
+            when = f"{abs(lag):.2f} s {'later' if lag > 0.0 else 'earlier'} than"
+            return f"{case.name}: the true forces come {when} the estimated ones: expected stamps of one clock"
     if drift := find_drift(true[idle]):
         change = f"changes by {drift:+.2f} N where no force is estimated"
         return f"{case.name}: the true force {change}: does the sensor drift?"
     if at_rest > BIAS:
         return f"{case.name}: the true force is {at_rest:.2f} N where no force is estimated: is the sensor tared?"
     return ""
+
+
+def find_lag(stamps: NDArray, found: NDArray, true: NDArray) -> float:
+    """Return by how long true forces come after the estimated ones (n,), at some stamps [s], where that is clear.
+
+    Returns:
+        [s]; 0 where the forces do not resemble each other much more with a lag, whatever their scale.
+    """
+    with np.errstate(invalid="ignore", divide="ignore"):
+        shifted = [np.interp(stamps + lag, stamps, true) for lag in LAGS]
+        unlike = [1.0 - np.corrcoef(found, later)[0, 1] ** 2 for later in shifted]
+    best, now = int(np.argmin(unlike)), unlike[len(LAGS) // 2]
+    return float(LAGS[best]) if abs(LAGS[best]) > ONE_CLOCK and unlike[best] < CLEARLY * now else 0.0
 
 
 def mean_rmse(evaluation: Evaluation) -> str:

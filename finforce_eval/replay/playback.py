@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections import defaultdict, deque
 from collections.abc import Collection, Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from itertools import islice
 from pathlib import Path
+from statistics import median
 from typing import Any, NamedTuple
 
 from finforce.camera_topics import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
-from finforce.messages import color_from_message, depth_steps, read_stamp
+from finforce.messages import NANOSECONDS, color_from_message, depth_encoding, depth_steps, read_stamp
 from finforce.video_packets import MissingFrameError, PacketDecoder
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.bags import BagReader, RawSample, bag_source, open_bag, restamp
@@ -25,6 +27,8 @@ from finforce_eval.recordings.writer import make_message
 from finforce_sim.footage import info_fields
 
 HEADER = "std_msgs/msg/Header"
+FIRST, HEAD = 50, 12  # messages, and their first bytes, that tell whether receipts and stamps are of one clock
+OTHER_CLOCK = 60 * NANOSECONDS  # [ns] between receipt and stamp, beyond all delays: those of a simulation, of a camera
 # where the nodes listen -> the ends of the topics that are played there
 PLAYED = {COLOR_TOPIC: COLOR_ENDS, DEPTH_TOPIC: DEPTH_ENDS, INFO_TOPIC: ("color/camera_info",)}
 
@@ -33,7 +37,7 @@ class RawMessage(NamedTuple):
     """One recorded message.
 
     Attributes:
-        time: when the bag received it [ns].
+        time: when the bag received it [ns], by the clock of the stamps.
         topic: its topic.
         msgtype: its type, `package/msg/Name`.
         data: CDR bytes with their four bytes of encapsulation.
@@ -66,6 +70,9 @@ class Playback:
         without: topics to be left out.
         images: topics to play to the nodes; None: those of the usual names.
 
+    Attributes:
+        begin: receipt of the first message [ns], by the clock of the stamps.
+
     Raises:
         RecordingError: the bag cannot be read, or holds nothing to be played.
     """
@@ -80,12 +87,17 @@ class Playback:
             chosen = [each for each in known if not given or each.topic in given or ours[each.topic] not in PLAYED]
             self._topics = {entry.topic: ours[entry.topic] for entry in chosen}
             self._count = sum({id(entry): entry.msgcount for entry in chosen}.values())
-            first = next(bag.raw(self._topics), None)
             types = {entry.topic: _played_type(entry.msgtype) for entry in chosen}
             self._headed = {topic: _begins_with_header(bag.definition(kind)) for topic, kind in types.items()}
-        if first is None:
+            came = [
+                (raw.time, raw.time - read_stamp(bytes(raw.data[:HEAD])) if self._headed[raw.topic] else None)
+                for raw in islice(bag.raw(self._topics), FIRST)
+            ]
+        if not came:
             raise RecordingError(f"{source.name}: nothing to be played in it")
-        self.begin = first.time
+        lag = round(median([late for _, late in came if late is not None] or [0]))
+        self._lag = lag if abs(lag) > OTHER_CLOCK else 0
+        self.begin = came[0][0] - self._lag
         self.types = {self._topics[topic]: kind for topic, kind in types.items()}
         self._camera = images.camera if images is not None and not images.info else None
         self.types |= {INFO_TOPIC: CAMERA_INFO} if self._camera else {}
@@ -103,10 +115,11 @@ class Playback:
                         data = _decompress(bag, raw, topic, videos[raw.topic])
                     except MissingFrameError:
                         continue
-                yield RawMessage(raw.time, topic, _played_type(kind), data, self._headed[raw.topic])
+                time = raw.time - self._lag
+                yield RawMessage(time, topic, _played_type(kind), data, self._headed[raw.topic])
                 if self._camera and topic == COLOR_TOPIC:
                     info = make_message(CAMERA_INFO, header=bag.decode(raw).header, **info_fields(self._camera))
-                    yield RawMessage(raw.time, INFO_TOPIC, CAMERA_INFO, bag.encode(CAMERA_INFO, vars(info)), True)
+                    yield RawMessage(time, INFO_TOPIC, CAMERA_INFO, bag.encode(CAMERA_INFO, vars(info)), True)
 
 
 def _played_topic(topic: str) -> str:
@@ -126,7 +139,7 @@ def _decompress(bag: BagReader, raw: RawSample, topic: str, video: PacketDecoder
         "header": message.header,
         "height": pixels.shape[0],
         "width": pixels.shape[1],
-        "encoding": "16UC1" if topic == DEPTH_TOPIC else "rgb8",
+        "encoding": depth_encoding(pixels) if topic == DEPTH_TOPIC else "rgb8",
         "is_bigendian": 0,
         "step": pixels.strides[0],
         "data": pixels.reshape(-1).view("u1"),

@@ -23,6 +23,7 @@ distortion_coefficients: !!opencv-matrix
    dt: d
    data: [ 0.1, -0.2, 1e-3, 2e-3, 0.05 ]
 """
+COLMAP = "# Camera list\n#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n1 {} 640 480 {}\n"
 XML = """<?xml version="1.0"?>
 <opencv_storage>
 <calibration_time>"Mon 1 Jan"</calibration_time>
@@ -241,6 +242,25 @@ def test_settings_of_orb_slam_are_those_of_its_first_camera(kind, name, lens, mo
     np.testing.assert_array_equal(camera.distortion, expected)
 
 
+@pytest.mark.parametrize(
+    ("model", "numbers", "lens", "expected"),
+    [
+        ("PINHOLE", "600 601 322.5 243.5", "plumb_bob", [0.0, 0.0, 0.0, 0.0, 0.0]),
+        ("OPENCV", "600 601 322.5 243.5 0.1 -0.2 1e-3 2e-3", "plumb_bob", [0.1, -0.2, 1e-3, 2e-3, 0.0]),
+        ("OPENCV_FISHEYE", "600 601 322.5 243.5 0.1 -0.2 0.3 0.4", "equidistant", [0.1, -0.2, 0.3, 0.4]),
+    ],
+)
+def test_colmap_counts_pixels_from_their_corner(model, numbers, lens, expected, tmp_path):
+    camera = read_camera(write(tmp_path, COLMAP.format(model, numbers)))
+    assert numbers_of(camera) == [640, 480, 600.0, 601.0, 322.0, 243.0] and camera.model == lens
+    np.testing.assert_array_equal(camera.distortion, expected)
+
+
+def test_the_focal_length_of_a_simple_model_of_colmap_is_that_of_both_axes(tmp_path):
+    camera = read_camera(write(tmp_path, COLMAP.format("SIMPLE_RADIAL", "600 322.5 243.5 0.1")))
+    assert (camera.fx, camera.fy, camera.distortion[0]) == (600.0, 600.0, 0.1)
+
+
 def test_of_several_cameras_one_has_to_be_named(tmp_path):
     both = KALIBR.format(model="radtan") + KALIBR.format(model="radtan").partition("\n")[2].replace(
         "cam0", "cam1"
@@ -267,6 +287,10 @@ def test_of_several_cameras_one_has_to_be_named(tmp_path):
         ({"fx": 600, "fy": 600, "cx": 320, "cy": 240}, "intrinsics of no size; expected width and height"),
         (GOPRO | {"image_width": 640, "image_height": 480}, "principal point 1350, 1010 outside images of 640 x 480"),
         ("600 601 322", "3 numbers"),
+        (COLMAP.format("THIN_PRISM_FISHEYE", "600 601 322 243"), "camera model THIN_PRISM_FISHEYE"),
+        (COLMAP.format("PINHOLE", "600 601 322 243 1"), "camera model PINHOLE with 640 480"),
+        (COLMAP.format("PINHOLE", "600 six 322 243"), "camera model PINHOLE with 640 480 600 six"),
+        (COLMAP.format("PINHOLE", "6 6 3 2") + "2 PINHOLE 640 480 7 7 3 2\n", "describes 2 cameras"),
         ({"K": [600, 2, 322, 0, 601, 243, 0, 0, 1], "width": 640, "height": 480}, "no skew"),
         ("\x00", "camera.txt"),
     ],

@@ -367,6 +367,14 @@ def test_a_section_of_a_parameter_file_that_no_node_would_read_is_refused(tmp_pa
             processes(record(parameter_file=file, namespace=namespace), ROOT)
 
 
+@pytest.mark.parametrize("namespace", ["robot-1", "1r", "r 1", "rö", "r1//left"])
+def test_a_namespace_that_ros_does_not_allow_is_refused_with_what_it_allows(namespace):
+    with pytest.raises(ValueError, match=f"namespace '{namespace}': expected letters, digits and underscores"):
+        robot_processes(RobotOptions(namespace=namespace), ROOT)
+    for allowed in ("", "r1", "/lab/robot_1", "r1/"):
+        robot_processes(RobotOptions(namespace=allowed), ROOT)
+
+
 @pytest.mark.parametrize("own", ["/r2/keypoint_detector", "r2/keypoint_detector", "/**/keypoint_detector"])
 def test_one_parameter_file_may_serve_several_robots(tmp_path, own):
     file = Path(parameter_file(tmp_path, own))

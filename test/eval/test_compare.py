@@ -117,13 +117,22 @@ def test_table_and_json_tell_the_same(files, tmp_path, capsys):
     assert main(["compare", files[0], files[0], "--strict"]) == 0
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", '{"cases": 3}', '{"cases": {"a": {}}}', "[" * 5000])
+NO_NUMBER = '{"cases": {"a": {"all": {"rmse_N": "x"}, "record_frames": 1, "record_skipped": 0}}}'
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"cases": 3}', '{"cases": {"a": {}}}', NO_NUMBER, "[" * 5000])
 def test_another_file_is_refused(text, files, tmp_path, capsys):
     other = tmp_path / "other.json"
     other.write_text(text)
     assert main(["compare", files[0], str(other)]) == 2
     said = capsys.readouterr().err
     assert "expected what finforce evaluate --json writes" in said and "Error(" not in said
+
+
+def test_a_folder_without_scores_is_told_what_is_expected(files, tmp_path, capsys):
+    (tmp_path / "annotated").mkdir()
+    assert main(["compare", files[0], str(tmp_path / "annotated")]) == 2
+    assert "no scores in it; expected a folder of finforce evaluate --out" in capsys.readouterr().err
 
 
 def test_the_tables_of_an_evaluation_say_what_its_json_says(tmp_path, capsys):

@@ -186,8 +186,10 @@ def test_extrinsics_are_a_name_or_seven_numbers():
         parse_source(options(extrinsics="0,95,-45,0,0,0,1"))
     with pytest.raises(PoseError, match="in millimetres?"):
         _ = DetectorParameters(T_gripper_camera=(0.0, 95.0, -45.0, 0.0, 0.0, 0.0, 1.0)).camera_pose
-    with pytest.raises(OptionError, match="expected robot, bench"):
+    with pytest.raises(OptionError, match=r"--extrinsics: \['here'\]: expected robot, bench"):
         parse_source(options(extrinsics="here"))
+    with pytest.raises(OptionError, match="--extrinsics: .*a quaternion of norm 0"):
+        parse_source(options(extrinsics="0,0,0.1,0,0,0,0"))
 
 
 def test_key_points_of_two_jaws_come_in_one_pass(tmp_path):

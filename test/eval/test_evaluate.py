@@ -145,7 +145,7 @@ def test_truth_of_another_time_is_refused():
     recording = make_recording()
     track = recording.jaws["left"]
     truth = replace(track.truth, stamps_ns=track.truth.stamps_ns + 10**12)
-    with pytest.raises(RecordingError, match="no ground truth at the stamps of the key points"):
+    with pytest.raises(RecordingError, match="stamps of the key points; it begins 1000.0 s after them: two clocks"):
         run(replace(recording, jaws={"left": replace(track, truth=truth)}), truth.force)
 
 
@@ -271,6 +271,12 @@ def test_height_comes_from_the_option_then_from_the_case():
 def test_case_without_height_is_refused(case):
     with pytest.raises(OptionError, match="give --contact fixed:Z_MM"):
         parse_contacts([]).height(replace(make_recording(), case=case))
+
+
+def test_a_mesh_without_poses_is_told_what_is_missing():
+    choice = replace(parse_contacts([]), object_file="can.stl")
+    with pytest.raises(OptionError, match="--object needs poses of the object: expected PoseStamped on /object_pose"):
+        choice.height(make_recording())
 
 
 @pytest.mark.parametrize("text", ["estimate", "closest", "paper"])

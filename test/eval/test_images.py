@@ -1,6 +1,7 @@
 """Claims about RGB-D recordings: what is written comes back, image by image, and what is wrong is named."""
 
 import copy
+import struct
 import tracemalloc
 from dataclasses import fields, replace
 
@@ -15,7 +16,7 @@ from sensor_msgs.msg import Image
 
 from finforce.camera import ImageError
 from finforce.camera_topics import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
-from finforce.messages import DEPTH_HEADER, depth_from_message, depth_steps
+from finforce.messages import DEPTH_HEADER, depth_encoding, depth_from_message, depth_steps
 from finforce_eval.cli.twin import footage_entries, write_footage
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.bags import PACKETS
@@ -217,6 +218,20 @@ def test_depth_images_survive_packing_and_others_are_refused():
         depth_from_message(grey)
     with pytest.raises(ImageError, match="no png"):
         depth_from_message(Message(format="16UC1; compressedDepth rvl", data=b"\0" * 64))
+
+
+def test_inverse_depths_of_a_packed_float_image_are_metres():
+    depth = np.array([[0.16, 0.5, np.nan], [2.0, 9.0, 0.1]], np.float32)
+    scale = 50.0 * 51.0  # as compressed_depth_image_transport packs it, with depth_quantization 50 and depth_max 10
+    shift = 1.0 - scale / 10.0
+    steps = np.nan_to_num(scale / depth + shift).astype(np.uint16)
+    header = struct.pack("<iff", 0, scale, shift)
+    packed = Message(format="32FC1; compressedDepth png", data=header + compress_depth(steps)[DEPTH_HEADER:])
+    np.testing.assert_allclose(depth_from_message(packed), depth, rtol=4e-3)
+    assert depth_encoding(depth_steps(packed)) == "32FC1"
+    bare = Message(format="32FC1; compressedDepth png", data=compress_depth(steps))
+    with pytest.raises(ImageError, match="its header has no scale of the inverse depths"):
+        depth_from_message(bare)
 
 
 def test_compressed_images_are_played_as_plain_ones_under_the_names_the_nodes_listen_to(tmp_path):

@@ -119,6 +119,7 @@ def test_ctrl_c_ends_it_and_the_forces_are_written(watch):
     [
         ((), "7", "camera 7: cannot be opened; expected a number of /dev/video"),
         ((), "rtsp://10.0.0.1/a", " a file, or the address of a stream that can be reached"),
+        ((), "rtsp://admin:secret@10.0.0.1/a", "camera rtsp://10.0.0.1/a: no image for 0.0 s"),
         ((), "0", "camera 0: no image for 0.0 s, after 0: unplugged, stalled"),
         ((make_image(9), STALLED), "0", "camera 0: no image for 0.0 s, after 1"),
         ((make_image(9), STALLED), "/dev/video2", "camera /dev/video2: no image for 0.0 s, after 1"),

@@ -10,8 +10,10 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 
 from finforce.camera_topics import COLOR_TOPIC
+from finforce.messages import NANOSECONDS
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.writer import write_recording
+from finforce_eval.replay import playback
 from finforce_eval.replay.node import PlayerNode, PlayerParameters, find_awaited
 from finforce_eval.replay.playback import Playback, RawMessage, ReadAhead
 
@@ -57,6 +59,14 @@ def test_big_endian_stamps_are_read_and_written():
     message = RawMessage(0, "/t", "p/msg/N", data, True)
     assert message.stamp == 7_000_000_005
     assert message.restamped(8_000_000_006) == data[:4] + b"\0\0\0\x08\0\0\0\x06rest"
+
+
+@pytest.mark.parametrize(("seconds", "lag"), [(0, 0), (2, 0), (997, 997), (-4247, -4247)])
+def test_receipts_by_another_clock_than_the_stamps_are_brought_to_theirs(seconds, lag, folder, monkeypatch):
+    own = playback.read_stamp
+    monkeypatch.setattr(playback, "read_stamp", lambda data: own(data) - seconds * NANOSECONDS)
+    messages = Playback(folder)
+    assert messages.begin == next(iter(messages)).time == START - lag * NANOSECONDS
 
 
 def test_a_bag_without_anything_to_play_is_refused(folder):

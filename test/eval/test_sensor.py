@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import finforce as ff
+from finforce.errors import PoseError
 from finforce.gripper_frames import BENCH_CAMERA, ROBOT_CAMERA, read_extrinsics
 from finforce.transforms import pose_numbers
 from finforce_eval.sensor import combine_solutions, read_intrinsics
@@ -127,3 +128,27 @@ def test_a_camera_pose_is_read_in_every_form():
     for form in ("robot", ROBOT_CAMERA, numbers, ",".join(map(str, numbers)), " ".join(map(str, numbers))):
         np.testing.assert_allclose(read_extrinsics(form), ROBOT_CAMERA, atol=1e-12)
     np.testing.assert_array_equal(read_extrinsics("bench"), BENCH_CAMERA)
+
+
+HAND_EYE = "parameters: {{eye_on_hand: {}}}\ntransformation: {{x: {}, y: {}, z: {}, qx: {}, qy: {}, qz: {}, qw: {}}}\n"
+HAND_EYE_2 = (
+    "parameters: {{calibration_type: {}}}\n"
+    "transform:\n  translation: {{x: {}, y: {}, z: {}}}\n  rotation: {{x: {}, y: {}, z: {}, w: {}}}\n"
+)
+
+
+@pytest.mark.parametrize(
+    ("form", "name", "mount", "other"),
+    [(HAND_EYE, "a.yaml", "true", "false"), (HAND_EYE_2, "a.calib", "eye_in_hand", "eye_on_base")],
+)
+def test_a_camera_pose_is_read_from_a_file_of_easy_handeye(form, name, mount, other, tmp_path):
+    file, numbers = tmp_path / name, [float(number) for number in pose_numbers(ROBOT_CAMERA)]
+    file.write_text(form.format(mount, *numbers))
+    np.testing.assert_allclose(read_extrinsics(str(file)), ROBOT_CAMERA, atol=1e-9)
+    file.write_text(form.format(other, *numbers))
+    with pytest.raises(PoseError, match="beside the robot"):
+        read_extrinsics(str(file))
+    for damaged in ("", "[1, 2]", "transform: 3", "transformation: {x: one}", "parameters: 3\ntransformation: {x: 1}"):
+        file.write_text(damaged)
+        with pytest.raises(PoseError, match=f"{name} is no file of easy_handeye"):
+            read_extrinsics(str(file))

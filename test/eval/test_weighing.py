@@ -73,6 +73,11 @@ def test_another_number_of_readings_names_the_holds():
         weigh(held([1.0]), [100.0, 200.0])
 
 
+def test_twice_as_many_readings_are_those_with_commas():
+    with pytest.raises(RecordingError, match=r"4 readings for 2 holds \(decimal points, not commas\?\)"):
+        weigh(held([1.0, 2.0]), [101.0, 9.0, 203.0, 8.0])
+
+
 RISING = [0.8, 1.6, 2.3, 3.1, 3.9, 3.1]
 READ = [1e3 * 1.1 * force / GRAVITY for force in [0.4, *RISING, 0.9]]
 

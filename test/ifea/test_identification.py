@@ -190,6 +190,25 @@ def test_a_clock_of_which_held_forces_tell_nothing_is_not_doubted(monkeypatch):
     )
 
 
+def test_forces_too_small_to_fit_are_doubted_in_their_unit(monkeypatch):
+    stamps = np.arange(0.0, 20.0, 1.0 / 30.0)
+    elastic = np.interp(stamps % 10.0, [2.0, 3.0, 6.0, 7.0], [0.0, 2.0, 2.0, 0.0])
+    history = identification._ForceHistory(stamps=stamps, elastic=elastic, true=elastic / 9.8)
+    monkeypatch.setattr(identification, "_track_force", lambda *given: history)
+    with pytest.raises(
+        CalibrationError, match="forces of 0.2 N at most; expected more than 0.3 N: are they in newtons"
+    ):
+        identification.fit_force_history(
+            load_jaw("bench"), [SimpleNamespace(name="held")], [FRAME], None, lambda cost: None
+        )
+
+
+def test_forces_that_no_modulus_explains_are_refused_before_the_jaw_file_is_doubted():
+    case = make_case(40)
+    with pytest.raises(CalibrationError, match="the true forces are 1.* times those of.*expected newtons"):
+        fit_calibration(load_jaw("bench"), [replace(case, forces_true=102.0 * case.forces_true)], FRAME)
+
+
 def test_only_so_many_plateaus_of_a_case_are_taken():
     assert len(find_plateaus([make_case(40), make_case(60)], BENCH, FRAME, per_case=2)) == 4
 
