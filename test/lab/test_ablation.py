@@ -28,8 +28,9 @@ def test_everything_that_a_rule_replaces_is_there_and_a_scene_reaches_it(rule):
 
 
 def test_a_value_that_is_compiled_in_asks_for_another_compilation_of_what_holds_it_and_of_its_callers():
-    assert set(find_compiled(BY_NAME["detector bias"])) == {"process.find_decay-", "process.advance-"}
-    assert {"readout.read_out-"} == {*find_compiled(BY_NAME["direction error"])}
+    callers = {"process.find_decay-", "process.advance-", "image_update.predict_image-"}
+    assert {*find_compiled(BY_NAME["detector bias"])} == callers
+    assert {"readout.read_out-", "image_update.finish-"} == {*find_compiled(BY_NAME["direction error"])}
     assert {"measurement.weigh-", "filter.update-"} <= {*find_compiled(BY_NAME["gross errors"])}
     assert find_compiled(BY_NAME["reset after a release"]) == ()
 
