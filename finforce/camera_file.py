@@ -49,7 +49,7 @@ def read_camera(path: str | Path, shape: tuple[int, int] | None = None, name: st
     """
     path = Path(path)
     try:
-        content = _parse(read_text(path))
+        content = parse_numbers(read_text(path))
         named = camera_numbers(content) if isinstance(content, list) else _name_entries(_choose(content, name))
         return build_camera(named, shape)
     except (FileError, IntrinsicsError) as error:
@@ -105,7 +105,7 @@ def cut_camera(camera: CameraIntrinsics, shape: tuple[int, int], scale: float | 
     return replace(camera, width=width, height=height, **lens)
 
 
-def _parse(text: str) -> Any:
+def parse_numbers(text: str) -> Any:
     """Return the content of a JSON or YAML text, that of OpenCV included, or a list where there are numbers alone."""
     try:
         return [float(part) for part in re.split(r"[\s,;]+", text.strip("[]() \t\r\n"))]

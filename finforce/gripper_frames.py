@@ -3,14 +3,17 @@
 The gripper base has x along the closing axis, from the left to the right jaw, and z along the approach direction.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from finforce.errors import PoseError
-from finforce.files import FileError, parse_yaml, read_text
+from finforce.camera_file import parse_numbers
+from finforce.errors import FinforceError, PoseError
+from finforce.files import read_text
 from finforce.transforms import check_pose, invert_pose, move_pose, pose_from_quaternion
 
 SIDES = ("left", "right")
@@ -129,24 +132,39 @@ def check_camera(T_gripper_camera: NDArray) -> NDArray:
 
 
 def _read_hand_eye(path: Path) -> NDArray:
-    """Return the pose (4, 4) of a camera on the gripper from a file of easy_handeye, or easy_handeye2.
+    """Return the pose (4, 4) of a camera on the gripper from a file of easy_handeye, easy_handeye2 or matrices.
 
     Raises:
         PoseError: it cannot be read, or the camera stands beside the robot.
     """
     try:
-        content = parse_yaml(read_text(path))
+        content = parse_numbers(read_text(path))
+        if (matrix := _find_matrix(content)) is not None:
+            return check_pose(matrix, f"extrinsics: {path.name}")
         found = content.get("transformation") or content["transform"]
         turn = {f"q{axis}": value for axis, value in found.get("rotation", {}).items()}
         named = {**found, **found.get("translation", {}), **turn}
         numbers = [float(named[name]) for name in ("x", "y", "z", "qx", "qy", "qz", "qw")]
         about = content.get("parameters") or {}
         beside = about.get("eye_on_hand") is False or about.get("calibration_type") == "eye_on_base"
-    except (FileError, AttributeError, KeyError, TypeError, ValueError) as error:
-        raise PoseError(f"extrinsics: {path.name} is no file of easy_handeye: {error}") from error
+    except PoseError:
+        raise
+    except (FinforceError, AttributeError, KeyError, TypeError, ValueError) as error:
+        what = "easy_handeye, of a (4, 4) matrix, or of OpenCV's rotation and translation"
+        raise PoseError(f"extrinsics: {path.name} is no file of {what}: {error}") from error
     if beside:
         raise PoseError(f"extrinsics: {path.name} is of a camera beside the robot; expected one on the gripper")
     return pose_from_quaternion(numbers[:3], numbers[3:])
+
+
+def _find_matrix(content: Any) -> NDArray | None:
+    """Return the only matrix (4, 4) of a file, or that of its only rotation (9) and translation (3); None without."""
+    entries = content.values() if isinstance(content, Mapping) else [content]
+    lists = [each.get("data") if isinstance(each, Mapping) else each for each in entries]
+    found = sorted((np.ravel(np.array(each, dtype=float)) for each in lists if isinstance(each, list)), key=len)
+    if [len(each) for each in found] == [3, 9]:
+        return np.vstack((np.column_stack((found[1].reshape(3, 3), found[0])), (0.0, 0.0, 0.0, 1.0)))
+    return found[0].reshape(4, 4) if [len(each) for each in found] == [16] else None
 
 
 def read_extrinsics(camera: str | ArrayLike) -> NDArray:
@@ -155,11 +173,11 @@ def read_extrinsics(camera: str | ArrayLike) -> NDArray:
     Raises:
         PoseError: it is none of these.
     """
-    forms = f"{', '.join(CAMERAS)}, x y z qx qy qz qw, a (4, 4) matrix, or a file of easy_handeye"
+    forms = f"{', '.join(CAMERAS)}, x y z qx qy qz qw, a (4, 4) matrix, or a file of easy_handeye or such a matrix"
     if isinstance(camera, str):
         if camera in CAMERAS:
             return CAMERAS[camera]
-        if Path(camera).suffix in (".yaml", ".yml", ".calib"):
+        if Path(camera).suffix in (".yaml", ".yml", ".calib", ".json", ".xml", ".txt"):
             return check_camera(_read_hand_eye(Path(camera)))
         camera = camera.replace(",", " ").split()
     try:

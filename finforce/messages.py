@@ -467,7 +467,7 @@ def depth_steps(message: Any) -> NDArray[np.uint16] | NDArray[np.float32]:
     data = bytes(message.data)
     begin = data.find(_PNG, 0, DEPTH_HEADER + len(_PNG))
     if begin < 0:
-        raise ImageError(f"depth image {message.format!r}: no png in it; expected '{DEPTH_FORMAT}'")
+        raise ImageError(f"depth image {message.format!r}: no png in it; expected '{DEPTH_FORMAT}', or depth=none")
     image = np.array(open_picture(data[begin:], f"depth image {message.format!r}"))
     if image.ndim != 2 or image.dtype.kind not in "ui" or image.dtype == np.uint8:
         raise ImageError(f"depth image {message.format!r}: {image.dtype} {image.shape}; expected 16 bits, one channel")

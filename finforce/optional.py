@@ -24,8 +24,15 @@ def import_library(name: str, purpose: str, package: str = "", title: str = "") 
     try:
         return import_module(name)
     except ImportError as error:
-        advice = f"{purpose} needs {title or name}: pip install {package or name} ({error})"
-        raise MissingDependencyError(advice) from error
+        how = f"{title or name}: pip install {package or name}"
+        if name.partition(".")[0].endswith("_msgs"):  # which no wheel brings
+            how = f"ROS 2 from apt with {_apt_package(name.partition('.')[0])}"
+        raise MissingDependencyError(f"{purpose} needs {how} ({error})") from error
+
+
+def _apt_package(name: str) -> str:
+    """Return the name of a package of ROS 2 for apt."""
+    return f"ros-{os.environ.get('ROS_DISTRO', 'jazzy')}-{name.replace('_', '-')}"
 
 
 def import_ros(name: str, purpose: str) -> ModuleType:
@@ -46,7 +53,7 @@ def check_middleware() -> None:
     if wanted and known and wanted not in known:
         raise MissingDependencyError(
             f"RMW_IMPLEMENTATION={wanted} is not installed, {', '.join(sorted(known))} is: unset RMW_IMPLEMENTATION, "
-            f"or use ROS 2 from apt with ros-{os.environ.get('ROS_DISTRO', 'jazzy')}-{wanted.replace('_', '-')}"
+            f"or use ROS 2 from apt with {_apt_package(wanted)}"
         )
 
 

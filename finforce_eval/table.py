@@ -256,6 +256,8 @@ def read_table(path: Path) -> tuple[list[ForceSeries], dict[str, Any]]:
     """
     try:
         table = pq.read_table(path)
+        if _ABOUT not in (table.schema.metadata or {}):
+            raise LookupError("a table of another program")
         about = json.loads(table.schema.metadata[_ABOUT])
         jaws = table.to_pandas().groupby(["case", "side"], sort=False, dropna=False)
         series = [ForceSeries(_drop_unknown(rows)) for _, rows in jaws]

@@ -212,7 +212,7 @@ def _check_size(vertices: NDArray, triangles: NDArray, name: str, unit: str) -> 
         advice = "a GLB is in metres by its standard, this one has a scale of its own: scale it to the object's size"
     if likely:
         named = ", or ".join(f'unit="{other}" ({size * 1e3:.0f} mm)' for other, size in likely)
-        advice = f"the file is likely in another unit: {named}"
+        advice = f"the file is likely in another unit: {named}; state it by --object-unit, to twin by --set unit"
     raise ObjectMeshError(
         f"{name}: got a largest extent of {extent * UNITS[unit] * 1e3:.6g} mm in unit {unit!r}, "
         f"expected {SMALLEST * 1e3:g} to {LARGEST * 1e3:g} mm for a graspable object; {advice}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import shutil
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
@@ -148,11 +149,13 @@ def _describe(jaws: Mapping[str, ForceSeries], recording: Recording) -> dict[str
     for side, forces in jaws.items():
         words, counts = np.unique(forces.column("status")[~forces.solved], return_counts=True)
         known, residual = bool(forces.solved.any()), forces.column("residual")[forces.solved]
+        told = Counter(filter(None, no_force_reasons(forces)))
         residual = residual[np.isfinite(residual)]  # an image of a jaw at rest has none
         sides[side] = {
             "images": len(forces),
             "answered": int(forces.solved.sum()),
             "unanswered": dict(zip(words.tolist(), counts.tolist(), strict=True)),
+            "why": told.most_common(1)[0][0] if told else "",
             "largest_N": float(np.nanmax(forces.magnitude)) if known else None,
             "residual_mm": 1e3 * float(np.median(residual)) if len(residual) else None,
             "within_reach": share_reached(forces, recording.jaw(side).detection),

@@ -183,5 +183,6 @@ def _print_outcome(line: dict[str, Any]) -> None:
                 f"key points {jaw['residual_mm']:.2f} mm off, {100 * jaw['within_reach']:.0f} % within the jaw's reach"
             )
         if jaw["answered"] < FEW * jaw["images"] and jaw.get("unanswered"):
-            words.append(f"without: {', '.join(f'{count} {word}' for word, count in jaw['unanswered'].items())}")
+            counts = ", ".join(f"{count} {word}" for word, count in jaw["unanswered"].items())
+            words.append(f"without: {counts}{': ' if jaw.get('why') else ''}{jaw.get('why', '')}")
         print("; ".join(words))

@@ -117,7 +117,7 @@ def add_detector_options(parser: argparse._ActionsContainer) -> None:
     text = "set a detector parameter such as model=FOLDER or detector.readout=0.02, repeatable"
     parser.add_argument("--detector", action="append", default=[], metavar="NAME=VALUE", help=text)
     text = "camera pose in the gripper frame: robot, bench, x,y,z,qx,qy,qz,qw in metres, or a file of "
-    text += "easy_handeye (case.json, else robot)"
+    text += "easy_handeye or a (4, 4) matrix (case.json, else robot)"
     parser.add_argument("--extrinsics", metavar="POSE", help=text)
     text = "rig file of finforce camera, instead of --jaw, --extrinsics and --intrinsics; a --jaw after it has priority"
     parser.add_argument("--rig", action=_UseRig, metavar="FILE", help=text)

@@ -298,8 +298,11 @@ def choose_camera(choice: ImageChoice, shape: tuple[int, int], name: str) -> Cam
     """Return the camera of images (h, w) that say nothing of it.
 
     Raises:
-        OptionError: neither a rig nor intrinsics were given, or they are of other images.
+        OptionError: neither a rig nor intrinsics were given, or they are of other images; a topic was chosen.
     """
+    for option, topic in (("--depth", choice.depth), ("--camera-info", choice.info)):
+        if topic:
+            raise OptionError(f"{name}: {option} {topic}: only bags have such topics")
     if choice.camera is not None and not choice.intrinsics:
         if (choice.camera.height, choice.camera.width) != shape:
             raise OptionError(

@@ -122,4 +122,4 @@ def read_intrinsics(words: Sequence[str], shape: tuple[int, int], *, is_cut: boo
             return read_camera(words[0], shape, *words[1:])
         return cut_camera(read_camera(words[0], None, *words[1:]), shape)
     except IntrinsicsError as error:
-        raise OptionError(f"--intrinsics {' '.join(words)[:80]}: {error}") from error
+        raise OptionError(f"intrinsics {' '.join(words)[:80]}: {error}") from error

@@ -98,6 +98,7 @@ class ImageTrack(Timed):
         depth_scale: one step of a 16-bit depth image [m].
         info: topic of camera_info, "" without.
         is_video: True if the colour images are packets of a video.
+        notes: why recorded depth is not used, one sentence for each topic.
     """
 
     source: Path
@@ -111,6 +112,7 @@ class ImageTrack(Timed):
     depth_scale: float = MILLIMETRE
     info: str = ""
     is_video: bool = False
+    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -245,7 +247,19 @@ def find_images(bag: BagReader, source: Path, choice: ImageChoice | None = None)
         unpaired=stamps[color][~paired],
         info=info,
         is_video=seen[color].is_video,
+        notes=() if depth else _note_depth(bag, seen, seen[color].frame),
     )
+
+
+def _note_depth(bag: BagReader, seen: Mapping[str, _FirstImage], frame: str) -> tuple[str, ...]:
+    """Return why recorded depth is not used: several topics have it, or it is of another frame, or never came."""
+    images = [topic for topic, kind in bag.types.items() if kind in IMAGES]
+    depth = _plain([topic for topic in images if (seen[topic].is_depth if topic in seen else "depth" in topic)])
+    came = {topic for topic in depth if topic in seen}
+    other = f"the colour images are in '{frame}': record aligned depth (RealSense: align_depth.enable:=true)"
+    several = "is not the only one: choose with --depth"
+    why = {topic: several if seen[topic].frame == frame else f"is in '{seen[topic].frame}', {other}" for topic in came}
+    return tuple(f"depth is not used: {topic} {why.get(topic, 'has no messages')}" for topic in sorted(came or depth))
 
 
 def _pair(

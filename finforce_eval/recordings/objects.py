@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from finforce.errors import PoseError
+from finforce.gripper_frames import FARTHEST_CAMERA
 from finforce.messages import SECOND, find_nearest
 from finforce.transforms import invert_pose, pose_from_quaternion
 from finforce_eval.errors import RecordingError
@@ -112,7 +113,7 @@ def track_object(recording: Recording, side: str) -> ObjectTrack:
         side: "left" or "right".
 
     Raises:
-        RecordingError: poses are missing, of different frames, never of the same time, or no poses.
+        RecordingError: poses are missing, of different frames, far away, never of the same time, or no poses.
     """
     objects = recording.object_pose
     if objects is None:
@@ -125,6 +126,12 @@ def track_object(recording: Recording, side: str) -> ObjectTrack:
     if _is_in_jaw(objects, side):
         return ObjectTrack(stamps_ns=stamps, poses=T_parent_object)
     jaw = _require_jaw_poses(recording, side, objects.frame_id)
+    closest = float(np.linalg.norm(T_parent_object[:, :3, 3], axis=1).min())
+    if closest > FARTHEST_CAMERA:
+        raise RecordingError(
+            f"{recording.name}: /object_pose has the object {closest:.3g} m or more from the camera; expected "
+            f"{FARTHEST_CAMERA:g} m at most: is it in millimetres?"
+        )
     T_camera_jaw = _matrices(jaw, f"/{side}/jaw_pose", recording.name)
     nearest = find_nearest(jaw.stamps_ns, stamps)
     apart = np.abs(jaw.stamps_ns[nearest] - stamps)

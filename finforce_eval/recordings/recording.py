@@ -191,6 +191,7 @@ def _read_samples(source: Path, name: str, choice: ImageChoice, gravity_frame: s
             if not any(topic.endswith("/keypoints") for topic in samples):
                 raise
             images, notes = None, [*notes, str(error)]
+        notes += images.notes if images else []
         return _Content(samples, phases, images, notes)
 
 

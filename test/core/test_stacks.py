@@ -7,6 +7,7 @@ import pytest
 import yaml
 
 from finforce.errors import MissingDependencyError
+from finforce.optional import import_library
 from finforce.systems.processes import Process
 from finforce.systems.stacks import StackOptions, control_processes, describe, flatten, moveit_processes
 from finforce_driver.settings import DriverParameters
@@ -121,6 +122,14 @@ def test_a_description_without_xacro_needs_none(tmp_path, monkeypatch):
     assert describe(ROOT / "urdf" / "finray_gripper.urdf").startswith("<?xml")
     with pytest.raises(MissingDependencyError, match="a description with xacro needs xacro"):
         describe(ROOT / "urdf" / "finray_gripper_control.urdf.xacro")
+
+
+def test_messages_that_the_wheels_lack_come_from_apt(monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "control_msgs", None)
+    with pytest.raises(
+        MissingDependencyError, match=r"^the action needs ROS 2 from apt with ros-jazzy-control-msgs \("
+    ):
+        import_library("control_msgs.action", "the action")
 
 
 def test_nested_parameters_have_dots():

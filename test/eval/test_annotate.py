@@ -128,7 +128,8 @@ def test_the_camera_is_looked_at_where_few_images_have_a_force(solved, detection
 
 def test_where_few_images_have_a_force_it_is_said_why_the_others_have_none(capsys):
     jaw = {"images": 100, "answered": 20, "largest_N": 2.0, "unanswered": {"waiting": 78, "diverged": 2}}
-    for answered, words in ((20, "; without: 78 waiting, 2 diverged\n"), (80, "2.00 N at most\n")):
+    jaw["why"] = "check their unit"
+    for answered, words in ((20, "; without: 78 waiting, 2 diverged: check their unit\n"), (80, "2.00 N at most\n")):
         annotate_command._print_outcome(
             {"name": "a", "error": "", "status": OK, "figures": {"jaws": {"left": jaw | {"answered": answered}}}}
         )

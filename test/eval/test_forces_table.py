@@ -8,15 +8,19 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pyarrow
 import pytest
 from eval_fakes import cut
+from pyarrow import parquet
 from rgbd_fakes import make_footage
 
 import finforce as ff
 from finforce_eval.cli.main import main
 from finforce_eval.cli.twin import write_footage
+from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.keypoint_source import KeypointSource
 from finforce_eval.recordings.writer import write_recording
+from finforce_eval.table import read_table
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 IMAGES, FEW = 90, 8
@@ -108,3 +112,11 @@ def test_the_example_prints_a_line_per_image(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["images_to_forces.py", str(path)])
     runpy.run_path(str(EXAMPLES / "images_to_forces.py"))
     assert capsys.readouterr().out.count(" s  ") == 12
+
+
+@pytest.mark.parametrize("metadata", [None, {b"pandas": b"{}"}])
+def test_a_table_of_another_program_is_named_as_such(metadata, tmp_path):
+    table = pyarrow.table({"a": [1.0]}).replace_schema_metadata(metadata)
+    parquet.write_table(table, tmp_path / "a.parquet")
+    with pytest.raises(RecordingError, match="a.parquet: a table of another program; expected what finforce evaluate"):
+        read_table(tmp_path / "a.parquet")

@@ -65,6 +65,8 @@ def test_inverse_depths_of_float_images_are_not_taken_for_millimetres():
         np.testing.assert_allclose(depth_from_message(Compressed(data, said)), DEPTH * 1e-3, rtol=1e-6)
     with pytest.raises(ImageError, match="32FC1"):
         depth_from_message(Compressed(data, "32FC1; compressedDepth png"))
+    with pytest.raises(ImageError, match="no png in it; expected .*depth=none"):
+        depth_from_message(Compressed(data[40:], "16UC1; jpeg compressed mono8"))
 
 
 def test_reasons_that_differ_in_numbers_are_one_note():

@@ -184,3 +184,10 @@ def test_contact_is_estimated_by_itself_only_with_mesh_and_poses(recorded):
     assert automatic.mode_for(recording, "left") == "fixed"
     assert parse_contacts([], object_file="other.ply").mode_for(recording, "left") == "estimate"
     assert parse_contacts(["paper"]).mode_for(recording, "left") == "paper"
+
+
+def test_object_poses_in_millimetres_are_refused():
+    recording = make_recording("pressed")
+    poses = replace(recording.object_pose, position=1e3 * recording.object_pose.position)
+    with pytest.raises(RecordingError, match="/object_pose .* in millimetres?"):
+        track_object(replace(recording, object_pose=poses), "left")

@@ -1,5 +1,7 @@
 """Claims about `ForceSensor`: forces of the gripper from the images of a program of one's own."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -152,3 +154,26 @@ def test_a_camera_pose_is_read_from_a_file_of_easy_handeye(form, name, mount, ot
         file.write_text(damaged)
         with pytest.raises(PoseError, match=f"{name} is no file of easy_handeye"):
             read_extrinsics(str(file))
+
+
+def test_a_camera_pose_is_read_from_what_hand_eye_calibrations_of_opencv_are_saved_as(tmp_path):
+    cv2 = pytest.importorskip("cv2")
+    R, t = ROBOT_CAMERA[:3, :3], ROBOT_CAMERA[:3, 3:]
+    forms = {
+        "both.yaml": {"R": R, "t": t},
+        "whole.yml": {"T_cam2gripper": ROBOT_CAMERA},
+        "whole.xml": {"T": ROBOT_CAMERA},
+    }
+    for name, matrices in forms.items():
+        storage = cv2.FileStorage(str(tmp_path / name), cv2.FILE_STORAGE_WRITE)
+        for key, matrix in matrices.items():
+            storage.write(key, matrix)
+        storage.release()
+    np.savetxt(tmp_path / "whole.txt", ROBOT_CAMERA)
+    (tmp_path / "rows.json").write_text(json.dumps({"T_gripper_camera": ROBOT_CAMERA.tolist()}))
+    for name in (*forms, "whole.txt", "rows.json"):
+        np.testing.assert_allclose(read_extrinsics(str(tmp_path / name)), ROBOT_CAMERA, atol=1e-9, err_msg=name)
+    for damaged in ("1 2 3", "[[1, 2], [3]]", "a: [one, two]", "1 " * 16, "1e9 " * 16):
+        (tmp_path / "whole.txt").write_text(damaged)
+        with pytest.raises(PoseError, match="extrinsics: "):
+            read_extrinsics(str(tmp_path / "whole.txt"))

@@ -9,6 +9,7 @@ import pytest
 from eval_fakes import FakeEstimator, FakeJaw, change_info, evaluate_recording, make_recording
 from rclpy.serialization import deserialize_message
 from rgbd_fakes import CAMERA, FakeDetector, FakeGripper, make_footage
+from rosbags.rosbag2 import StoragePlugin, Writer
 from sensor_msgs.msg import CameraInfo
 
 from finforce.camera_topics import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
@@ -20,10 +21,11 @@ from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.comparison import compare_evaluations
 from finforce_eval.evaluation.forces import ImageRun, check_solved, find_forces, why_unanswered
 from finforce_eval.evaluation.keypoint_source import detect_keypoints
+from finforce_eval.recordings.bags import open_bag
 from finforce_eval.recordings.dataset import open_dataset, read_parquet
 from finforce_eval.recordings.images import ImageChoice
 from finforce_eval.recordings.recording import read_recording
-from finforce_eval.recordings.writer import write_entries
+from finforce_eval.recordings.writer import typestore, write_entries
 from finforce_eval.replay.playback import Playback
 
 OWN = {f"/left/{name}" for name in ("ground_truth_wrench", "ground_truth_keypoints", "ground_truth_jaw_pose")}
@@ -148,8 +150,26 @@ def test_depth_in_another_frame_is_not_taken_for_aligned_depth(tmp_path):
     entries = [elsewhere(each) for each in footage_entries(make_footage(), False)]
     kept = [each._replace(topic=ZED[each.topic]) for each in entries if each.topic in ZED]
     bag = write_entries(kept, tmp_path / "bag")
-    assert not read_recording(bag).images.has_depth
-    assert read_recording(bag, ImageChoice(depth=ZED[DEPTH_TOPIC])).images.has_depth
+    recording = read_recording(bag)
+    assert not recording.images.has_depth
+    (note,) = (note for note in recording.notes if "depth" in note)
+    assert ZED[DEPTH_TOPIC] in note and "'camera_depth_optical_frame'" in note and "align_depth.enable:=true" in note
+    chosen = read_recording(bag, ImageChoice(depth=ZED[DEPTH_TOPIC]))
+    assert chosen.images.has_depth and not any("depth" in note for note in chosen.notes)
+
+
+def test_a_depth_topic_without_images_is_named(tmp_path):
+    bag = write_renamed(tmp_path / "bag", USB)
+    with Writer(tmp_path / "empty", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        writer.add_connection(DEPTH_TOPIC, "sensor_msgs/msg/Image", typestore=typestore())
+        with open_bag(bag, "bag") as read:
+            for connection, stamp, data in read.messages():
+                copied = next((each for each in writer.connections if each.topic == connection.topic), None)
+                copied = copied or writer.add_connection(connection.topic, connection.msgtype, typestore=typestore())
+                writer.write(copied, stamp, data)
+    notes = read_recording(tmp_path / "empty").notes
+    assert f"depth is not used: {DEPTH_TOPIC} has no messages" in notes
+    assert not any("depth" in note for note in read_recording(bag).notes)
 
 
 def test_a_camera_without_camera_info_needs_its_intrinsics(tmp_path):
@@ -360,6 +380,12 @@ def test_a_depth_map_is_no_camera_that_sees_the_jaws(dataset):
     assert open_dataset(dataset).camera == "observation.images.wrist"
     with pytest.raises(OptionError, match="wrist_depth: expected --color with one of observation.images.wrist$"):
         open_dataset(dataset, "observation.images.wrist_depth")
+
+
+@pytest.mark.parametrize("option", ["--depth", "--camera-info"])
+def test_topics_of_a_dataset_are_refused(option, dataset, capsys):
+    assert annotate(dataset, option, "observation.images.wrist_depth") == 2
+    assert f"{option} observation.images.wrist_depth: only bags have such topics" in capsys.readouterr().err
 
 
 def test_what_a_dataset_lacks_is_said_in_one_line_before_its_videos_are_read(dataset, capsys, monkeypatch):
