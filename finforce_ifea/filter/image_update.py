@@ -41,7 +41,7 @@ from finforce_ifea.filter.process import (
     Expectation,
     advance,
 )
-from finforce_ifea.filter.readout import find_held_ratio, judge_points, read_out
+from finforce_ifea.filter.readout import COMMON, find_held_ratio, judge_points, read_out, spread_common
 from finforce_ifea.filter.state import DEPTH, HEIGHT, SHAPE
 from finforce_ifea.tracking.contact_state import LEAST_DEPTH
 
@@ -182,14 +182,13 @@ def predict_image(image, expected, filtered, weights, friction, passed, watches,
 
 
 @njit(**_OPTIONS)
-def _watch(watches, x, P, measured, posterior, sight, misplaced):
+def _watch(watches, x, P, measured, posterior, sight, common, misplaced):
     """Look for jumps that show over several images only; correct x (N, n) and P (n, n) for one, and return which."""
-    shift, found = ALIKE * sight[1], NO_JUMP
-    common = np.array([shift, shift, shift / sight[2]]), np.zeros(1)
+    found, alike = NO_JUMP, (common, np.zeros(1))
     unpacked = [JumpWatch(Jump(*each[0]), each[1], each[2], each[3]) for each in watches]
     for index in range(len(watches)):
         possible = found == NO_JUMP and (index == 0 or not misplaced)
-        if possible and watch(unpacked[index], measured, posterior, sight[0], common[index]):
+        if possible and watch(unpacked[index], measured, posterior, sight[0], alike[index]):
             jump_back(unpacked[index], x, P)
             found = index
     if found != NO_JUMP:
@@ -250,9 +249,9 @@ def finish(state, image, prior, results, friction, filtered, made, where, place,
         posterior, _ = correct(measured, weight, ratios, x, log_weights, P, possible, at[DEPTH])
     level, P, x = _follow_level(level, posterior.distances), reduce_covariance(P, posterior.A), posterior.x
     log_weights, weights = posterior.log_weights, np.exp(posterior.log_weights)
-    s, jumped = state[()], NO_JUMP
+    s, jumped, shared = state[()], NO_JUMP, np.array([sight[1], sight[1], sight[1] / sight[2]])
     if settled:
-        jumped = _watch(watches, x, P, measured, posterior, sight, s.mistaken > 0.0)
+        jumped = _watch(watches, x, P, measured, posterior, sight, ALIKE * shared, s.mistaken > 0.0)
     s.mistaken = 1.0 if jumped == 1 else s.mistaken
     own = max(posterior.own[0, 0], _LEAST_VARIANCE)
     scatter, smooth, lessened = _smooth_depth(track, raw, (weights * x[:, DEPTH]).sum(), own, scatter)
@@ -265,7 +264,8 @@ def finish(state, image, prior, results, friction, filtered, made, where, place,
     inclined = _INCLINED * max(1.0 - depth / _EDGE, 0.0) if expectation.has_corners else 0.0
     held = weights[-1] if packed[2][0] > 0.0 else 0.0
     spread = doubt**2 + inclined**2 + held * pull_stddev**2
-    shift, smoothing = smooth + x_model[0] - at_place[0], (posterior.own, lessened)
+    shift = smooth + x_model[0] - at_place[0]
+    smoothing = posterior.own, lessened, spread_common(measured.H, posterior.A, posterior.L, COMMON * shared)
     read_out(state, force, modes, x, log_weights, P, shift, smoothing, at, ratios, ratio, spread)
     judge_points(state, points, seen, posterior.mean, V, posterior.left, weight, expectation.mean[1])
     upright = find_held_ratio(force, ratio, pull)

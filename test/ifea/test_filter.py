@@ -32,9 +32,9 @@ from finforce_ifea.filter.measurement import (
     weigh,
 )
 from finforce_ifea.filter.process import CAMERA_TIME, FREE_DEPTH, Expectation, expect_state, find_decay, predict
-from finforce_ifea.filter.readout import find_held_ratio
+from finforce_ifea.filter.readout import find_held_ratio, spread_common
 from finforce_ifea.filter.slip_path import PathState, SlipPath, turn_path
-from finforce_ifea.filter.state import DEPTH, SHARED, TRACTION, state_size
+from finforce_ifea.filter.state import CAMERA_TURN, CAMERA_X, CAMERA_Z, DEPTH, SHARED, TRACTION, state_size
 from finforce_ifea.jaw.calibration import Calibration, load_calibration
 from finforce_ifea.mechanics import build_chosen
 from finforce_ifea.observation import Observation
@@ -100,6 +100,19 @@ class TestUpdate:
 
 
 EXPECTED = Expectation(np.ones(2), np.full(2, 4.0), 0.01, 0.04, np.ones(4), CAMERA_TIME)
+
+
+def test_what_all_key_points_err_by_alike_is_told_as_far_as_it_moves_the_state():
+    measured, full, P, x = draw()
+    prior, variances = innovate(measured.H, measured.rows, measured.u, P, measured.R), np.array([0.1, 0.2, 0.3])
+    before = update(measured, np.ones(3), np.zeros(2), x, np.log([0.5, 0.5]), *prior)
+    expected = np.zeros((4, 4))
+    for variance, entry in zip(variances, (CAMERA_X, CAMERA_Z, CAMERA_TURN), strict=True):
+        off = measured._replace(z=measured.z + measured.H[:, entry])
+        moved = (update(off, np.ones(3), np.zeros(2), x, np.log([0.5, 0.5]), *prior).x - before.x)[0, :4]
+        expected += variance * np.outer(moved, moved)
+    found = spread_common(measured.H, before.A, before.L, variances)
+    np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-12)
 
 
 class TestProcess:
