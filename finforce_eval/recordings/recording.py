@@ -109,15 +109,7 @@ def read_recording(
     source = bag_source(Path(path))
     folder = source if source.is_dir() else source.parent
     name = source.name if source.is_dir() else source.stem
-    copy = None
-    try:
-        samples, phases, images, notes = _read_samples(source, name, choice, gravity_frame)
-    except DamagedError as error:
-        if strict:
-            raise
-        copy = SalvagedCopy(source, str(error))
-        samples, phases, images, notes = _read_samples(copy.path, name, choice, gravity_frame)
-        notes.append(copy.note.removeprefix(f"{name}: "))
+    (samples, phases, images, notes), copy = _read_or_salvage(source, name, choice, gravity_frame, strict=strict)
     known = [side for side in SIDES if _has_jaw(samples, side, images is not None) or (images and side in sides)]
     if images and not known:
         known = SIDES
@@ -167,6 +159,21 @@ def _has_jaw(samples: Mapping[str, list[Any]], side: str, has_images: bool) -> b
     """Say whether a recording tells of a jaw: by its key points, or with images by anything that is the jaw's own."""
     topics = [topic for topic in samples if topic.startswith(f"/{side}/")]
     return f"/{side}/keypoints" in topics or (has_images and bool(topics))
+
+
+def _read_or_salvage(
+    source: Path, name: str, choice: ImageChoice, gravity_frame: str, *, strict: bool
+) -> tuple[_Content, SalvagedCopy | None]:
+    """Return the content of a bag, or of the intact part of a damaged one beside its copy; `strict` raises instead."""
+    try:
+        return _read_samples(source, name, choice, gravity_frame), None
+    except DamagedError as error:
+        if strict:
+            raise
+        copy = SalvagedCopy(source, str(error))
+    content = _read_samples(copy.path, name, choice, gravity_frame)
+    content.notes.append(copy.note.removeprefix(f"{name}: "))
+    return content, copy
 
 
 def _read_samples(source: Path, name: str, choice: ImageChoice, gravity_frame: str) -> _Content:

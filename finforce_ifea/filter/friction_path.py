@@ -72,7 +72,6 @@ class TractionHypotheses:
         pull_stddev: standard deviation of that by the object's weight [-].
         motion: of the object along the path since it was last asked for [m].
         stddev: of the traction ratio by errors of the path [-].
-        doubt: change of the traction ratio if a motion back that may be chance is none [-].
         unweighed: standard deviation of the coefficient of friction that no hypothesis stands for [-].
     """
 
@@ -102,7 +101,7 @@ class TractionHypotheses:
         """Forget the path, as once nothing touches."""
         self._path.reset()
         self._anchor: NDArray | None = None
-        self._anchor_stddev, self._direction, self.stddev, self.doubt = _TOUCH_STDDEV, 1.0, 0.0, 0.0
+        self._anchor_stddev, self._direction, self.stddev = _TOUCH_STDDEV, 1.0, 0.0
         self._marks: list[_Mark] = []
 
     @property
@@ -147,10 +146,6 @@ class TractionHypotheses:
     def _share(self, weights: NDArray) -> NDArray:
         """Return the probabilities of the coefficients (M,) where one of them holds, for all weights (N,)."""
         return _share(weights, len(self.mu))
-
-    def find_held(self, weights: NDArray) -> float:
-        """Return the probability that only the jaws hold the object, for the weights of the hypotheses (N,)."""
-        return float(weights[-1]) if self._held > 0.0 else 0.0
 
     def part(self, parting: float, *, shows_lifts: bool) -> None:
         """Count a move of the gripper, which leaves behind whatever else held the object; see `WristMove`."""
@@ -330,10 +325,16 @@ def expect_coefficient(packed, weights):
 
 
 @njit(**_OPTIONS)
+def find_held(packed, weights):
+    """Return the probability that only the jaws hold the object, for weights (N,) of the hypotheses; see `preview`."""
+    return weights[-1] if packed[2][0] > 0.0 else 0.0
+
+
+@njit(**_OPTIONS)
 def preview(packed, x, shift, weights, track):
     """Return the traction ratio of each hypothesis (N,) with the object elsewhere, and the doubt.
 
-    See `TractionHypotheses`.
+    That is the change of the traction ratio if a motion back that may be chance is none; see `TractionHypotheses`.
 
     Args:
         packed: coefficients (M,), see `SlipPath` for parts, shares and rates, and the path's end (M, 2) [m], none

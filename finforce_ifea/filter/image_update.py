@@ -9,7 +9,7 @@ from finforce.kalman import MotionNoise, expect_position, find_mean, find_varian
 from finforce.kalman import correct as correct_track
 from finforce_ifea.contact_mechanics.indenter import CELL, find_first_touch
 from finforce_ifea.filter.filter import Posterior, reduce_covariance
-from finforce_ifea.filter.friction_path import expect_coefficient, preview
+from finforce_ifea.filter.friction_path import expect_coefficient, find_held, preview
 from finforce_ifea.filter.jump import (
     ALIKE,
     BUMPED,
@@ -236,8 +236,8 @@ def finish(state, image, prior, results, friction, filtered, made, where, place,
         watching: `Sight`; each `JumpWatch`, as plain tuples; whether the search has settled.
 
     Returns:
-        Means, covariance, log weights and weights of the hypotheses; noise level, scatter of the depth, what smoothing
-        adds to it [m], and the doubt; the ratio at which only the jaws hold the object, and its slope; the jump.
+        Means, covariance, log weights and weights of the hypotheses; noise level, scatter of the depth, and what
+        smoothing adds to it [m]; the ratio at which only the jaws hold the object, and its slope; the jump.
     """
     (points, seen, level, expectation), (before, x, log_weights, P) = image, prior
     (measured, posterior, possible), (packed, weights, (pull, pull_stddev)) = results, friction
@@ -262,14 +262,13 @@ def finish(state, image, prior, results, friction, filtered, made, where, place,
     s.depth, s.extrapolation, s.sound = depth, extrapolation, smallest_det > 0.0
     # an edge is rounded by more than it sinks in at first
     inclined = _INCLINED * max(1.0 - depth / _EDGE, 0.0) if expectation.has_corners else 0.0
-    held = weights[-1] if packed[2][0] > 0.0 else 0.0
-    spread = doubt**2 + inclined**2 + held * pull_stddev**2
+    spread = doubt**2 + inclined**2 + find_held(packed, weights) * pull_stddev**2
     shift = smooth + x_model[0] - at_place[0]
     smoothing = posterior.own, lessened, spread_common(measured.H, posterior.A, posterior.L, COMMON * shared)
     read_out(state, force, modes, x, log_weights, P, shift, smoothing, at, ratios, ratio, spread)
     judge_points(state, points, seen, posterior.mean, V, posterior.left, weight, expectation.mean[1])
     upright = find_held_ratio(force, ratio, pull)
-    return (x, P, log_weights, weights), (level, scatter, smooth, doubt), upright, jumped
+    return (x, P, log_weights, weights), (level, scatter, smooth), upright, jumped
 
 
 @njit(**_OPTIONS)

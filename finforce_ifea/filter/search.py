@@ -20,7 +20,6 @@ from finforce_ifea.filter.image_update import (
     DEPTH_NOISE,
     EXPECTATION,
     find_expectation,
-    find_place,
     finish,
     is_believed,
     iterate,
@@ -291,7 +290,7 @@ class ContactSearch:
         weighed = friction, self.weights, (self.pull[0], hypotheses.pull_stddev)
         filtered = self.track.state, self._V, self._scatter, self._raw
         watching = tuple(self._sight), self._packed_watches, settled
-        means, (self._level, self._scatter, self._smooth, hypotheses.doubt), upright, jumped = finish(
+        means, (self._level, self._scatter, self._smooth), upright, jumped = finish(
             s, image, prior, results, weighed, filtered, made, where, place, watching
         )
         self.x, self.P, self._log_weights, self.weights = means
@@ -321,8 +320,3 @@ class ContactSearch:
     def contact_covariance(self) -> NDArray:
         """Return the covariance of depth, shape and height (3, 3)."""
         return self.P[: HEIGHT + 1, : HEIGHT + 1]
-
-
-def find_x_model(contact: RigidContact, x: NDArray) -> tuple[NDArray, float]:
-    """Return the state (3,) at which the mechanics stands for x, never above the surface, and the depth below [m]."""
-    return find_place(contact.packed_object, x)

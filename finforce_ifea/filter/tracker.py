@@ -15,8 +15,9 @@ from finforce_ifea.contact_mechanics.friction import Coefficient, constant_tract
 from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, OutlineIndenter, RoundIndenter, expect_object
 from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics, RigidContact, limit_step
 from finforce_ifea.filter.hidden import APART_SIGMAS, HiddenForce, list_clamped_heights
+from finforce_ifea.filter.image_update import find_place
 from finforce_ifea.filter.lateral_load import LateralLoad, Torsion
-from finforce_ifea.filter.search import ContactSearch, find_x_model
+from finforce_ifea.filter.search import ContactSearch
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE
 from finforce_ifea.observation import Contact, Observation
 from finforce_ifea.posture import PostureTrack, WristMove, WristPosture
@@ -268,7 +269,7 @@ class ContactTracker:
     def rest_modes(self) -> NDArray:
         """Return how the key points of the undeformed jaw move in x and z by the depth (K, 2) [m/m]."""
         q = np.zeros(self._contact.model.size)
-        pressed = self._contact.linearize(q, find_x_model(self._contact, np.r_[-1.0, self._mean])[0])
+        pressed = self._contact.linearize(q, find_place(self._contact.packed_object, np.r_[-1.0, self._mean])[0])
         return self._contact.model.project(self._probe, q, pressed.modes)[:, [0, 2], DEPTH]
 
     def forget(self) -> None:

@@ -136,6 +136,8 @@ RULES = (
           {_IMAGE + "APPARENT_TRACTION": 1e-6}, "other finger", "rubbed", "fixed"),
     _rule("apparent traction of a detector", "`APPARENT_SIGHT`", "lasting detector errors that look like traction",
           {_IMAGE + "APPARENT_SIGHT": 0.0}, "sight"),
+    _rule("errors in common", "`COMMON`", "standard deviation of what all key points err by alike",
+          {_IMAGE + "COMMON": 0.0}, "sight"),
     _rule("correlation time of apparent traction", "`APPARENT_TIME`", "how long it lasts",
           {_PROCESS + "APPARENT_TIME": _ALWAYS},
           "other finger", "rubbed", "fixed"),

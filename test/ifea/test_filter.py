@@ -19,7 +19,7 @@ from finforce_ifea.contact_mechanics.indenter import OutlineIndenter, RoundInden
 from finforce_ifea.contact_mechanics.pressed_jaw import limit_step
 from finforce_ifea.estimator import ForceEstimator
 from finforce_ifea.filter.filter import expect_innovations, innovate, reduce_covariance, update
-from finforce_ifea.filter.friction_path import NODES, TractionHypotheses, preview
+from finforce_ifea.filter.friction_path import NODES, TractionHypotheses, find_held, preview
 from finforce_ifea.filter.image_update import _follow_scatter
 from finforce_ifea.filter.jump import BUMPED, MISPLACED, NUDGED, watch, watch_for, weigh_jump
 from finforce_ifea.filter.measurement import (
@@ -385,14 +385,15 @@ class TestHypotheses:
         for _ in range(3):
             weights.append(either.bound_held(weights[-1] if weights else either.prior))
             either.part(2.7, shows_lifts=False)
-        held = [either.find_held(np.exp(each)) for each in weights]
+        held = [find_held(either.packed, np.exp(each)) for each in weights]
         assert held[0] == pytest.approx(0.5, abs=0.02) and 0.9 < held[1] < held[2] < 0.99
         told, weights = TractionHypotheses(Coefficient(0.5, 0.2), "either"), either.prior
         for parting, expected in ((0.0, 0.018), (4.0, 0.5), (10.0, 0.98)):
             told.part(parting, shows_lifts=True)
             weights = told.bound_held(weights)
-            assert told.find_held(np.exp(weights)) == pytest.approx(expected, rel=0.1)
-        assert TractionHypotheses(Coefficient(0.5, 0.2), "no").find_held(np.ones(NODES) / NODES) == 0.0
+            assert find_held(told.packed, np.exp(weights)) == pytest.approx(expected, rel=0.1)
+        supported = TractionHypotheses(Coefficient(0.5, 0.2), "no")
+        assert find_held(supported.packed, np.ones(NODES) / NODES) == 0.0
 
     def test_a_held_weight_pulls_along_the_finger(self):
         ahead, ratio = np.array([-2.0, 0.0, 0.3]), 0.1
