@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce.compiled import njit
 from finforce.errors import ObservationError
 from finforce_ifea.contact_mechanics.friction import Coefficient
 from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics
@@ -57,8 +56,6 @@ _UNTARED = "no tare: the jaw was loaded from the start; key point offsets are un
 _UNCALIBRATED = 0.1
 # Relative error of forces at the distance from stored shapes that those are good for.
 _EXTRAPOLATED = 0.015
-# Share of a force that was found but not told by which it may be off.
-_UNTOLD = 0.5
 # Fingers and settings for which this process has compiled everything.
 _WARM: set[tuple[str, EstimatorSettings]] = set()
 
@@ -126,7 +123,6 @@ class ForceEstimator:
         self._scale_error = 0.0  # relative standard deviation of the displacements that all key points share [-]
         self._relaxed: float | None = None
         self._taring.reset()
-        self._gate.reset()
         self._reach.reset()
         self._relaxation.reset()
         self._untold.reset()
@@ -368,12 +364,10 @@ class ForceEstimator:
             self._tracker.reset()
             self._contact = None
             return self._fail("diverged", "the shape cannot be reached by the jaw", used, iterations)
-        settles = self.settings.solver != "paper"  # whose linear tetrahedra lock, and follow no bent jaw to 1 mm
-        is_far = settles and state["residual"] > LARGEST_RESIDUAL  # the bound is no less
+        # the bound is no less; linear tetrahedra, as of the paper's solver, lock, and follow no bent jaw so far
+        is_far = self.settings.solver != "paper" and state["residual"] > LARGEST_RESIDUAL
         most = bound_residual(self.jaw.keypoints, self._taring.tare.noise) if is_far else np.inf
-        reason = find_rejection_reason(
-            state, largest_residual=most, largest_stddev=self.settings.largest_stddev, settles=settles
-        )
+        reason = find_rejection_reason(state, largest_residual=most, largest_stddev=self.settings.largest_stddev)
         if reason:
             if state["magnitude"] <= state["bearable"]:
                 self._relax(state["force"])
@@ -383,16 +377,16 @@ class ForceEstimator:
 
     def _relax(self, force: NDArray) -> None:
         """Let the material relax under a force (3,) [N] that is not told."""
-        self._relaxation.update(force, self._pass_time(force, _UNTOLD * force))
+        self._relaxation.update(force, self._pass_time(force))
 
-    def _pass_time(self, force: NDArray, untold: NDArray) -> float:
-        """Return the time since the material's last force [s], as it gets one (3,) [N], part of it not told (3,) [N].
+    def _pass_time(self, force: NDArray) -> float:
+        """Return the time since the material's last force [s], as it gets one (3,) [N].
 
         When within that time the force came is not known, either; after an interruption, not even of one that stayed.
         """
         dt = 0.0 if self._relaxed is None else self._stamp - self._relaxed
         self._relaxed = self._stamp
-        self._untold.update(untold, dt)
+        self._untold.update(np.zeros(3), dt)
         before = self._relaxation.packed[0]
         change = np.maximum(np.abs(force), np.abs(before)) if self._was_interrupted else force - before
         self._untold.doubt(change, dt)
@@ -404,7 +398,7 @@ class ForceEstimator:
         self._pressed = state
         extrapolated = _EXTRAPOLATED * state["extrapolation"]
         error = hypot(self._force_error, self._scale_error, state["location_error"], extrapolated)
-        vectors, dt = np.empty((7, 3)), self._pass_time(state["force"], np.zeros(3))
+        vectors, dt = np.empty((7, 3)), self._pass_time(state["force"])
         relaxation, untold, errors = self._relaxation.packed, self._untold.overstress, (error, self._modulus_error)
         magnitude, stddev = compute_force(state, relaxation, untold, dt, errors, vectors)
         force, torque, force_stddev, torque_stddev, point, location, normal = vectors
@@ -461,18 +455,12 @@ def warm_up(jaw: Jaw, tare_frames: int, update: Update, reset: Callable[[], None
     reset()
 
 
-_PRESENCE_GAIN = 0.1
-_LEAST_PRESENCE = 0.5
 # A key point farther than this from its place at rest is refused [m].
 _FARTHEST = 0.03
 
 
 class KeypointGate:
-    """Switches key points off that are hidden, without depth, outside the workspace, ignored, or seen rarely.
-
-    A hidden point comes through now and then with a high likelihood, on the surface of what hides it. A point that was
-    not there in half of the last frames is therefore not believed when it appears.
-    """
+    """Switches key points off that are hidden, without depth, outside the workspace, or ignored."""
 
     def __init__(self, jaw: Jaw, settings: EstimatorSettings) -> None:
         """Keep the key points at rest and the thresholds.
@@ -487,31 +475,10 @@ class KeypointGate:
             if name not in jaw.keypoint_names:
                 raise ObservationError(f"ignored_keypoints: {name!r} is not a key point of the jaw {jaw.name!r}")
             self._allowed[jaw.keypoint_names.index(name)] = False
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget which points were seen."""
-        self._presence: NDArray | None = None
 
     def accept(self, observation: Observation) -> NDArray:
         """Return the points (K, 3) [m] with NaN in the rows that must not be used."""
         points = np.array(observation.points, float)
-        likelihood = np.asarray(observation.likelihood, float)
-        if self._presence is None:
-            self._presence = (likelihood >= self._threshold).astype(float)
-        _close(points, likelihood, self._rest, self._allowed, self._presence, self._threshold)
+        near = (np.abs(points - self._rest) <= _FARTHEST).all(axis=1)
+        points[~(near & self._allowed & (np.asarray(observation.likelihood) >= self._threshold))] = np.nan
         return points
-
-
-@njit(cache=True)
-def _close(points, likelihood, rest, allowed, presence, threshold):
-    """Update the presence (K,) and make the points (K, 3) [m] that must not be used NaN."""
-    for k in range(len(points)):
-        visible = likelihood[k] >= threshold
-        presence[k] += _PRESENCE_GAIN * ((1.0 if visible else 0.0) - presence[k])
-        near = True
-        for a in range(3):
-            near = near and abs(points[k, a] - rest[k, a]) <= _FARTHEST
-        if not (visible and presence[k] >= _LEAST_PRESENCE and allowed[k] and near):
-            for a in range(3):
-                points[k, a] = np.nan

@@ -7,7 +7,7 @@ import numpy as np
 from finforce.compiled import njit
 from finforce.kalman import MotionNoise, expect_position, find_mean, find_variance, predict
 from finforce.kalman import correct as correct_track
-from finforce_ifea.contact_mechanics.indenter import CELL, find_first_touch
+from finforce_ifea.contact_mechanics.indenter import find_first_touch
 from finforce_ifea.filter.filter import Posterior, reduce_covariance
 from finforce_ifea.filter.friction_path import expect_coefficient, find_held, preview
 from finforce_ifea.filter.jump import (
@@ -88,12 +88,6 @@ _SETTLED = 0.1e-3
 _SETTLED_CORRECTION = 0.05
 # Steps shortened to less than this factor are taken as they are: the key points cannot decide between two corners.
 _UNDECIDED = 0.2
-# Change of a traction ratio that does not matter [-].
-_SAME_RATIO = 0.02
-# 1 sigma of the inclination of a force by an edge that hardly touches [-].
-_INCLINED = 0.5
-# Depth up to which an edge is rounded [m]: half a cell of its field.
-_EDGE = 0.5 * CELL
 # Weight at which a key point still agrees, and the share of them that has to.
 _AGREES = 0.25
 _MAJORITY = 0.5
@@ -218,18 +212,17 @@ def _smooth_depth(track, raw, z, own, scatter):
 
 
 @njit(**_OPTIONS)
-def finish(state, image, prior, results, friction, filtered, made, where, place, watching):
+def finish(state, image, P, results, friction, filtered, made, where, place, watching):
     """Return what the last linearisation of an image leaves, and fill in the contact state.
 
     Args:
         state: see `CONTACT_STATE`.
         image: as for `iterate`.
-        prior: as for `iterate`.
-        results: `Measurement` and `Posterior` as plain tuples, and `possible` of `correct`.
+        P: predicted covariance (n, n), see `correct`.
+        results: `Measurement` and `Posterior` as plain tuples.
         friction: see `preview`; weights of the hypotheses (N,); the pull of the weight along the finger [N], and the
             standard deviation of the held ratio by it.
-        filtered: state of the depth's `Track`; stationary variance (n,); variance of depths over that by the noise; the
-            last two depths (2,) [m].
+        filtered: state of the depth's `Track`; variance of depths over that by the noise; the last two depths (2,) [m].
         made: force, its derivatives, contact state and traction ratio of the linearisation.
         where: pressure centre on both surfaces, extrapolation and least determinant, see `PressedState`.
         place: see `_Place`.
@@ -239,14 +232,11 @@ def finish(state, image, prior, results, friction, filtered, made, where, place,
         Means, covariance, log weights and weights of the hypotheses; noise level, scatter of the depth, and what
         smoothing adds to it [m]; the ratio at which only the jaws hold the object, and its slope; the jump.
     """
-    (points, seen, level, expectation), (before, x, log_weights, P) = image, prior
-    (measured, posterior, possible), (packed, weights, (pull, pull_stddev)) = results, friction
-    (track, V, scatter, raw), (force, modes, at, ratio), (sight, watches, settled) = filtered, made, watching
-    measured, posterior, (at_place, x_model, depth) = Measurement(*measured), Posterior(*posterior), place
-    weight, expectation = posterior.weight, expectation[()]
+    (points, seen, level, expectation), (packed, weights, (pull, pull_stddev)) = image, friction
+    (track, scatter, raw), (force, modes, at, ratio), (sight, watches, settled) = filtered, made, watching
+    measured, posterior, (at_place, x_model, depth) = Measurement(*results[0]), Posterior(*results[1]), place
+    weight, offset = posterior.weight, posterior.mean[HEIGHT] - expectation[()].mean[1]
     ratios, doubt = preview(packed, posterior.x, at_place[0] - posterior.mean[DEPTH], weights, track)
-    if np.abs(ratios - before).max() > _SAME_RATIO:
-        posterior, _ = correct(measured, weight, ratios, x, log_weights, P, possible, at[DEPTH])
     level, P, x = _follow_level(level, posterior.distances), reduce_covariance(P, posterior.A), posterior.x
     log_weights, weights = posterior.log_weights, np.exp(posterior.log_weights)
     s, jumped, shared = state[()], NO_JUMP, np.array([sight[1], sight[1], sight[1] / sight[2]])
@@ -260,13 +250,11 @@ def finish(state, image, prior, results, friction, filtered, made, where, place,
         s.x[i], s.x_model[i] = at_place[i], x_model[i]
         s.pressure_point[i], s.pressure_location[i] = point[i], location[i]
     s.depth, s.extrapolation, s.sound = depth, extrapolation, smallest_det > 0.0
-    # an edge is rounded by more than it sinks in at first
-    inclined = _INCLINED * max(1.0 - depth / _EDGE, 0.0) if expectation.has_corners else 0.0
-    spread = doubt**2 + inclined**2 + find_held(packed, weights) * pull_stddev**2
+    spread = doubt**2 + find_held(packed, weights) * pull_stddev**2
     shift = smooth + x_model[0] - at_place[0]
     smoothing = posterior.own, lessened, spread_common(measured.H, posterior.A, posterior.L, COMMON * shared)
     read_out(state, force, modes, x, log_weights, P, shift, smoothing, at, ratios, ratio, spread)
-    judge_points(state, points, seen, posterior.mean, V, posterior.left, weight, expectation.mean[1])
+    judge_points(state, points, seen, posterior.left, weight, offset)
     upright = find_held_ratio(force, ratio, pull)
     return (x, P, log_weights, weights), (level, scatter, smooth), upright, jumped
 
@@ -287,7 +275,7 @@ def iterate(image, at, prior, weight, possible, known, x, last):
         last: step (3,), and the share of a step that this one may have.
 
     Returns:
-        Measurement, posterior and jump; the next `_Place`; the motion of the mechanics (3,) and of its unknowns
+        Measurement, posterior and jump; the next `_Place`; the motion of the unknowns of the mechanics
         (size,); this step, and the next share; whether it changes nothing that matters.
     """
     (points, seen, level, expectation), (positions, motions, x_model, ratio, modes, size) = image, at
@@ -302,7 +290,7 @@ def iterate(image, at, prior, weight, possible, known, x, last):
     change = modes[:, 0] * moved[0] + modes[:, 1] * moved[1] + modes[:, 2] * moved[2]
     change /= max((np.abs(change) / reach).max(), 1.0)
     is_settled = size < _SETTLED_CORRECTION and _is_settled(moved, aim - step, share, expectation)
-    return (measured, posterior, found), (x, after, depth), (moved, change), (step, share), is_settled
+    return (measured, posterior, found), (x, after, depth), change, (step, share), is_settled
 
 
 @njit(**_OPTIONS)

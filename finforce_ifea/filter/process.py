@@ -24,9 +24,8 @@ _OPTIONS = {"cache": True, "error_model": "numpy"}
 FREE_DEPTH = 2e-3
 # Time over which the error of an object's pose stays the same [s]; trackers see an object from one side.
 OBJECT_TIME = 10.0
-# Error of the mechanics at a key point, 1 sigma: constant [m], of a shape [-], and of all shapes [-], the last two
-# relative to the displacement: the default mesh is within 1 % of an independent program.
-MODEL_FLOOR = 0.02e-3
+# Error of the mechanics at a key point, 1 sigma, relative to the displacement [-]: of a shape, and of all shapes. The
+# default mesh is within 1 % of an independent program.
 MODEL_SHAPE = 0.004
 MODEL_RELATIVE = 0.01
 # Motion [m] and time [s] over which such an error stays the same.
@@ -97,7 +96,7 @@ def expect_state(expected, offset_variance, displacement):
     V[TRACTION], V[APPARENT] = expected.traction_variance, expected.apparent_variance
     V[CAMERA_X : CAMERA_STRETCH + 1] = expected.camera_variance
     for k in range(count):
-        own = offset_variance[k] + MODEL_FLOOR**2 + (MODEL_SHAPE * displacement[k]) ** 2
+        own = offset_variance[k] + (MODEL_SHAPE * displacement[k]) ** 2
         V[SHARED + 2 * k] = V[SHARED + 2 * k + 1] = own
     V[SHARED + 2 * count :] = MODEL_RELATIVE**2
     return m, V

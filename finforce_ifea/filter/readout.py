@@ -7,7 +7,7 @@ import numpy as np
 from finforce.compiled import njit
 from finforce_ifea.filter.filter import solve_lower
 from finforce_ifea.filter.measurement import NO_WEIGHT
-from finforce_ifea.filter.state import CAMERA_TURN, CAMERA_X, DEPTH, HEIGHT, SHARED, TRACTION
+from finforce_ifea.filter.state import CAMERA_TURN, CAMERA_X, DEPTH, HEIGHT, TRACTION
 from finforce_ifea.tracking.contact_state import LEAST_DEPTH, LOADED_DEPTH, TOUCH_DEPTH
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
@@ -117,18 +117,16 @@ def find_held_ratio(force, ratio, pull):
 
 
 @njit(**_OPTIONS)
-def judge_points(state, points, seen, mean, V, left, weight, expected_height):
+def judge_points(state, points, seen, left, weight, offset):
     """Fill in how well the key points agree.
 
     Args:
         state: see `CONTACT_STATE`.
         points: all key points of the image (K,), see `KEYPOINT`; get their weights.
         seen: those that were used (m,).
-        mean: of the state (n,).
-        V: its stationary variance (n,).
         left: residuals (m, 2) [m].
         weight: of the key points (m,).
-        expected_height: of the contact [m].
+        offset: of the contact from its expected height [m].
     """
     state, squares = state[()], 0.0
     for k in range(len(points)):
@@ -138,8 +136,4 @@ def judge_points(state, points, seen, mean, V, left, weight, expected_height):
         squares += weight[i] * (left[i, 0] ** 2 + left[i, 1] ** 2)
     state.residual = np.sqrt(squares / (2.0 * weight.sum()))
     state.used = (weight > NO_WEIGHT).sum()
-    misfit, offsets = 0.0, 2 * len(points)
-    for i in range(SHARED, SHARED + offsets):
-        misfit += mean[i] ** 2 / V[i]
-    state.misfit = np.sqrt(misfit / offsets)
-    state.offset = mean[HEIGHT] - expected_height
+    state.offset = offset

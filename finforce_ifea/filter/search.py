@@ -6,7 +6,6 @@ state until nothing changes that matters (iterated Kalman filter). What comes ou
 
 from __future__ import annotations
 
-from math import sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -47,8 +46,6 @@ from finforce_ifea.tracking.contact_state import KEYPOINT, LOADED_DEPTH, blank_c
 _FREE_TIME = 0.15
 # 1 sigma of the depth at the beginning [m].
 _FIRST_DEPTH = 0.1e-3
-# Standard deviation of a slide's length, relative to what the object's pose says [-].
-_SLIDE = 0.3
 # Least force at which the inclination of the faces is asked for [N].
 _LEAST_FORCE = 0.1
 
@@ -113,15 +110,9 @@ class ContactSearch:
         means, variances = np.r_[expected.mean, 0.0], np.r_[expected.variance, expected.traction_variance]
         self.x[:] = self.mean
         for i, mean, variance in zip((SHAPE, HEIGHT, TRACTION), means, variances, strict=True):
-            self._return_entry(i, mean, variance, 1.0)
-
-    def _return_entry(self, i: int, mean: float, variance: float, share: float) -> None:
-        """Let an entry of the state lose a share of what is known of it beyond its prior, in variance."""
-        kept = sqrt(1.0 - share)
-        self.x[:, i] = mean + kept * (self.x[:, i] - mean)
-        self.P[i, :] *= kept
-        self.P[:, i] *= kept
-        self.P[i, i] += share * variance
+            self.x[:, i] = mean
+            self.P[i, :] = self.P[:, i] = 0.0
+            self.P[i, i] = variance
 
     def restart(self) -> None:
         """Start anew where the contact is now, as after another tare; what is known of friction stays."""
@@ -148,14 +139,10 @@ class ContactSearch:
             self.hypotheses.reset()
 
     def lead(self, change: NDArray) -> None:
-        """Take shape and height along by a change (2,), which lessens what is known beyond the object's pose."""
+        """Take shape and height along by a change (2,)."""
         self.state["x"][1:] += change
-        if self.x is None:
-            return
-        expected = self._expect()
-        for i, each, mean, variance in zip((SHAPE, HEIGHT), change, expected.mean, expected.variance, strict=True):
-            self.x[:, i] += each
-            self._return_entry(i, mean, variance, min((_SLIDE * each) ** 2 / variance, 1.0))
+        if self.x is not None:
+            self.x[:, SHAPE : HEIGHT + 1] += change
 
     def shift(self, change: float) -> None:
         """Count the depth `change` [m] more, as of an object that was cut anew."""
@@ -243,16 +230,15 @@ class ContactSearch:
             q, mechanics = q + pressed.correction, (positions, motions, at, ratio, pressed.modes, pressed.size)
             given = np.empty(0) if found == UNDECIDED else posterior.weight
             step = iterate(image, mechanics, prior, given, possible, known, place.x, last)
-            (measured, posterior, found), place, (moved, change), last, settled = step
+            (measured, posterior, found), place, change, last, settled = step
             jump, q, place, made = max(jump, found), q + change, _Place(*place), (pressed, positions, at)
         if posterior is None or not is_believed(posterior.mean, posterior.weight, self._V):
             return False
         (pressed, self.positions, at), self.q, self._modes = made, q, made[0].modes
         self._take_jump(jump)
-        results = tuple(measured), tuple(posterior), possible
-        self._take(image, prior, results, friction, pressed, at, ratio, tuple(place), settled=settled)
+        results = tuple(measured), tuple(posterior)
+        self._take(image, P, results, friction, pressed, at, ratio, tuple(place), settled=settled)
         self.state["iterations"], self.state["converged"] = iteration, settled
-        self.state["ambiguity"] = 0.0 if settled else np.linalg.norm(pressed.force_modes[:, :3] @ moved)
         return True
 
     def _predict(self, dt: float, friction: tuple, touching: tuple) -> tuple[NDArray, tuple[NDArray, float], _Place]:
@@ -281,17 +267,17 @@ class ContactSearch:
         self._sight = Sight(*sight)
         return seen, ratios, _Place(*place)
 
-    def _take(self, image, prior, results, friction, pressed, at, ratio, place, *, settled: bool) -> None:
+    def _take(self, image, P, results, friction, pressed, at, ratio, place, *, settled: bool) -> None:
         """Take what an image has shown; see `finish` for the arguments."""
         hypotheses, s = self.hypotheses, blank_contact_state()
         s["mistaken"] = self._misplaced
         made = pressed.force, np.ascontiguousarray(pressed.force_modes), at, ratio
         where = pressed.pressure_point, pressed.pressure_location, pressed.extrapolation, pressed.smallest_det
         weighed = friction, self.weights, (self.pull[0], hypotheses.pull_stddev)
-        filtered = self.track.state, self._V, self._scatter, self._raw
+        filtered = self.track.state, self._scatter, self._raw
         watching = tuple(self._sight), self._packed_watches, settled
         means, (self._level, self._scatter, self._smooth), upright, jumped = finish(
-            s, image, prior, results, weighed, filtered, made, where, place, watching
+            s, image, P, results, weighed, filtered, made, where, place, watching
         )
         self.x, self.P, self._log_weights, self.weights = means
         self._bumped |= jumped == 0

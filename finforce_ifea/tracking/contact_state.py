@@ -21,7 +21,7 @@ CONTACT_STATE = np.dtype(
     [
         ("x", *_V),
         ("x_model", *_V),  # where the mechanics stands: never above the surface
-        ("covariance", *_M),  # of what was estimated, the misfit included
+        ("covariance", *_M),  # of what was estimated
         ("force", *_V),  # elastic force on the jaw [N]
         ("force_modes", *_M),  # its derivative by what was estimated
         ("pressure_point", *_V),  # pressure centre on the deformed surface [m]
@@ -34,13 +34,11 @@ CONTACT_STATE = np.dtype(
         ("height_stddev", float),  # of the pressure centre [m]
         ("used", int),  # key points with a weight
         ("residual", float),  # weighted root mean square [m]
-        ("misfit", float),  # averaged residuals over their standard deviations, about 1 where the model fits
         ("kkt", float),  # what is left of the objective's gradient, relative to its parts
         ("offset", float),  # contact location that the key points alone ask for, from the stated one [m]
         ("mistaken", float),  # probability that the stated location is wrong
         ("location_error", float),  # relative standard deviation of the force that the location leaves
         ("extrapolation", float),  # distance of the shape from the stored ones, as a share of what these are good for
-        ("ambiguity", float),  # change of the force by an iteration that did not converge [N]
         ("bearable", float),  # force beyond which no equilibrium is believed [N]
         ("y", float),  # of the pressure along the width [m]
         ("y_stddev", float),  # [m]
@@ -91,14 +89,11 @@ def blank_contact_state() -> ContactState:
 
 
 _BLANK = np.zeros((), CONTACT_STATE)
-_BLANK["ambiguity"] = _BLANK["bearable"] = np.inf
+_BLANK["bearable"] = np.inf
 _BLANK["used"] = 1
 _BLANK_BYTES = _BLANK.tobytes()
 
-# An ambiguous state, as between two corners of an object, matters where the force changes by more than this [N].
-_AMBIGUOUS = 0.15
-# Beyond these a force is rejected: misfit of the shape, standard deviation as a share of the force.
-_LARGEST_MISFIT = 2.0
+# A force is rejected beyond this standard deviation, as a share of the force.
 _VAGUE_SHARE = 0.25
 # Shapes so many times as far from the stored ones as they are good for.
 _FARTHEST_SHAPE = 2.0
@@ -123,24 +118,18 @@ def bound_residual(rest: NDArray, noise: NDArray) -> float:
     return float(max(LARGEST_RESIDUAL, _RESIDUAL_SHARE * np.ptp(rest[:, 2]), chance))
 
 
-def find_rejection_reason(state: ContactState, *, largest_residual: float, largest_stddev: float, settles: bool) -> str:
+def find_rejection_reason(state: ContactState, *, largest_residual: float, largest_stddev: float) -> str:
     """Return why the force of a contact state must be rejected, empty where it can be trusted.
 
     Args:
         state: of one image.
         largest_residual: of key points of the jaw, see `bound_residual` [m].
         largest_stddev: standard deviation with which a small force is still of use [N].
-        settles: True if the solver iterates until nothing changes, so that one that has not is rejected.
     """
     state = state[()]
     magnitude = float(state["magnitude"])
-    if settles and not state["converged"] and state["ambiguity"] > _AMBIGUOUS:
-        return f"the shape has not settled within {state['iterations']} iterations; is the contact location right?"
     if state["extrapolation"] > _FARTHEST_SHAPE:
         return "the jaw's shape is too far from the stored ones; solver solid or frame knows any shape"
-    if state["misfit"] > _LARGEST_MISFIT:
-        misfit = f"{state['misfit']:.1f} standard deviations"
-        return f"the key points do not fit this contact ({misfit}); is its location right?"
     if state["mistaken"] > _MISTAKEN and abs(state["offset"]) > _LEAST_OFFSET:
         return f"the contact is off its stated location: the key points have it {1e3 * state['offset']:+.0f} mm away"
     if magnitude > state["bearable"]:
@@ -161,7 +150,7 @@ def _find_ambiguity(state: ContactState, vague: float) -> str:
         bent = f"the jaw is bent towards the object, as if that pulled by {1e3 * pulled:.1f} mm"
         return f"{bent}: open the jaw and tare, or the contact is elsewhere"
     if state["hidden"] > vague:
-        return "the object may press where key points hardly show a force: next to the clamp, or along its face"
+        return "the object may press where key points hardly show a force: next to the clamp"
     if not state["stddev"] <= vague:
         return f"the visible key points tell the force only within {state['stddev']:.2g} N, expected {vague:.2g} N"
     return ""

@@ -30,8 +30,6 @@ _SETTLED = 5e-3
 _FARTHEST_MOVE = 0.2
 # The median of |miss|^2 / variance is this for a normal distribution in three axes.
 _MEDIAN_SQUARE = 2.4
-# A load held at one height leaves more of the shape unexplained than a tracked one does.
-_TOLERATED_MISFIT = 2.0
 
 
 class _Load(NamedTuple):
@@ -72,7 +70,6 @@ class GivenContactTracker:
     def reset(self) -> None:
         """Start anew, unloaded, with the middle candidate."""
         self.q = np.zeros(self.mechanics.model.size)
-        self._misfit = 1.0
         self._watch.reset()
         self._candidate = len(self.jaw.candidates) // 2
         self._heights = (float(self.jaw.candidates[self._candidate, 2]),)
@@ -176,7 +173,6 @@ class GivenContactTracker:
         miss = np.where(known[:, None], self.mechanics.model.positions(self.probe, q) - targets, 0.0)
         distance = (miss**2).sum(1) / variance
         scale = max(1.0, float(np.median(distance[known])) / _MEDIAN_SQUARE)
-        self._misfit = np.sqrt(scale) / _TOLERATED_MISFIT
         return np.where(known, 1.0 / (1.0 + distance / scale / self.settings.gate**2) ** 2, 0.0)
 
     def _report(self, result: InverseResult, targets: NDArray, weights: NDArray, variance: NDArray) -> ContactState:
@@ -198,7 +194,6 @@ class GivenContactTracker:
         state["pressure_location"] = share @ load.points
         for name in ("residual", "kkt", "iterations", "converged"):
             state[name] = getattr(result, name)
-        state["misfit"] = self._misfit
         if result.converged and not self.paper:
             self._watch.judge((targets - positions)[:, ::2], weights / variance, state)
         traction = UNSEEN_TRACTION * self.settings.friction

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import interp1d
 
 from finforce.messages import SharedStddev
 from finforce_ifea.contact_mechanics.friction import FRICTIONLESS, Traction, constant_traction
@@ -335,12 +336,16 @@ def build_other_finger(bench: Bench, random: np.random.Generator) -> Scene:
 
 
 def build_sight(bench: Bench, random: np.random.Generator) -> Scene:
-    """Let the detector err by 0.3 mm, as stated, in a way that lasts while it sees the same, with little scatter."""
-    pressed = press(bench, ramp(2, 3, 4, 5, 3, hold=20))
-    scene = film(bench, pressed, tell_height(bench, pressed, 0.3e-3), random, 0.3)
-    cells = np.floor(pressed.states[:, 0] / 0.1e-3).astype(int)
-    errors = 0.3e-3 * random.normal(size=(cells.max() + 1, *pressed.points.shape[1:]))
-    return shift(scene, errors[cells], stddev=np.full(pressed.points.shape[1:], 0.3e-3))
+    """Rub, with a detector that errs by half of the 0.3 mm that it states, a third of that alike at all key points.
+
+    The errors last while it sees the same, with little scatter.
+    """
+    pressed = press(bench, ramp(4, 3, 5, hold=20), friction=0.4)
+    told = tell_height(bench, pressed, 0.3e-3)
+    scene = film(bench, pressed, told, random, 0.3, friction=0.45, friction_stddev=0.25)
+    depths, shape = np.arange(-0.5e-3, 6e-3, 0.2e-3), pressed.points.shape[1:]
+    errors = 0.15e-3 * random.normal(size=(len(depths), *shape)) + 0.05e-3 * random.normal(size=(len(depths), 1, 3))
+    return shift(scene, interp1d(depths, errors, axis=0)(pressed.states[:, 0]), stddev=np.full(shape, 0.3e-3))
 
 
 def build_rubbed(bench: Bench, random: np.random.Generator) -> Scene:

@@ -82,48 +82,7 @@ def test_unknown_name_is_refused_with_the_name():
         make_gate(ignored_keypoints="elbow")
 
 
-def test_point_seen_once_in_twenty_frames_is_never_believed():
+def test_point_that_comes_back_is_used_at_once():
     gate = make_gate()
-    for i in range(200):
-        assert not accepted(gate, observe(only(5, 0.95 if i % 20 == 19 else 0.1)))[5]
-
-
-def test_point_that_disappears_is_not_believed_when_it_flickers():
-    gate = make_gate()
-    for _ in range(60):
-        assert accepted(gate, observe())[5]
-    hidden = [accepted(gate, observe(only(5, 0.95 if i % 20 == 19 else 0.1)))[5] for i in range(100)]
-    assert not any(hidden)
-
-
-def test_point_that_comes_back_is_believed_after_seven_frames():
-    gate = make_gate()
-    for _ in range(100):
-        gate.accept(observe(only(5, 0.1)))
-    found = [accepted(gate, observe())[5] for _ in range(10)]
-    assert found == [False] * 6 + [True] * 4
-
-
-def test_point_hidden_for_a_moment_is_believed_at_once():
-    gate = make_gate()
-    for _ in range(60):
-        gate.accept(observe())
-    for _ in range(3):
-        gate.accept(observe(only(5, 0.1)))
+    assert not accepted(gate, observe(only(5, 0.1)))[5]
     assert accepted(gate, observe())[5]
-
-
-def test_holes_in_the_depth_do_not_count_as_hidden():
-    gate, points = make_gate(), BENCH.keypoints.copy()
-    points[5] = np.nan
-    for _ in range(60):
-        gate.accept(observe(points=points))
-    assert accepted(gate, observe())[5]
-
-
-def test_reset_forgets_what_was_seen():
-    gate = make_gate()
-    for _ in range(60):
-        gate.accept(observe(0.1))
-    gate.reset()
-    assert accepted(gate, observe()).all()

@@ -87,7 +87,7 @@ def scenes(bench, tmp_path_factory):
 def test_a_rule_that_is_off_moves_its_figure_and_no_other_run(scenes):
     """The mean time of rest stands in Python, the weights of key points in compiled code."""
     plain, compiled, other = (
-        BY_NAME[name] for name in ("short rest of open jaws", "presence", "reset after a release")
+        BY_NAME[name] for name in ("short rest of open jaws", "gross errors", "reset after a release")
     )
     assert list_runs([compiled, plain]) == [[plain], [compiled]]
     # one process for many rules restores each
