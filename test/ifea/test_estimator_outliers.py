@@ -85,7 +85,7 @@ def test_points_of_low_likelihood_may_be_anywhere():
     assert not any(solution.keypoints_used[[3, 4, 10]].any() for solution in second[80:])
 
 
-def test_point_that_appears_once_in_twenty_frames_is_not_believed():
+def test_points_that_appear_once_in_twenty_frames_count_for_little():
     hidden = pressed().changed(range(70, len(STEPS)), lambda _, likelihood: likelihood.put([3, 4, 10], 0.1))
 
     def show(points, likelihood):
@@ -93,7 +93,8 @@ def test_point_that_appears_once_in_twenty_frames_is_not_believed():
         likelihood[[3, 4, 10]] = 0.95
 
     flickering = hidden.changed(range(85, len(STEPS), 20), show)
-    assert_identical(run(hidden, solver="frame"), run(flickering, solver="frame"))
+    usual, found = (np.array([each.force for each in run(steps, solver="frame")]) for steps in (hidden, flickering))
+    assert np.nanmax(np.abs(found - usual)) < 0.01
 
 
 def test_holes_in_the_depth_image_are_bridged():
