@@ -13,7 +13,7 @@ from threading import Event, RLock
 
 from finforce_driver.errors import GripperStateError, TargetError
 from finforce_driver.gripper import Clock, StateCondition, StateSource
-from finforce_driver.machine.knowledge import History
+from finforce_driver.machine.status_tracker import History
 from finforce_driver.settings import GripperSettings, JointSettings, check_numbers, is_number
 from finforce_driver.state import ABSENT, GripperState, MoveOutcome, Phase, describe
 

@@ -37,7 +37,7 @@ from finforce_driver.conversions import (
 )
 from finforce_driver.errors import GraspError, TargetError
 from finforce_driver.grasp.controller import check_force_value
-from finforce_driver.grasp.load_watch import ForceSample
+from finforce_driver.grasp.force_monitor import ForceSample
 from finforce_driver.grasp.session import GraspSession
 from finforce_driver.gripper import Gripper
 from finforce_driver.joint import JointGripper, SendCommand

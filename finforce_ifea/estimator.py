@@ -44,7 +44,7 @@ from finforce_ifea.tracking.contact_state import (
     find_rejection_reason,
 )
 from finforce_ifea.tracking.given_contact import GivenContactTracker
-from finforce_ifea.tracking.influence import OffsetChange, ReachWatch, split_change
+from finforce_ifea.tracking.influence import OffsetChange, UnloadedCheck, split_change
 
 _LONGEST_GAP = 1.0
 _FEWEST_COMPARED = 3
@@ -100,7 +100,7 @@ class ForceEstimator:
         self._tracker: ContactTracker | GivenContactTracker = self._tracked
         self._gate = KeypointGate(self.jaw, self.settings)
         terms = calibration.relaxation if calibration else ()
-        self._relaxation, self._untold = Relaxation(terms), Relaxation(terms)
+        self._relaxation, self._relaxation_stddev = Relaxation(terms), Relaxation(terms)
         self._modulus_error = 0.0 if calibration else self.jaw.material.spread
         self._force_error = calibration.expect_error(self.jaw, self.settings.solver) if calibration else _UNCALIBRATED
         self._taring = TareKeeper(
@@ -109,7 +109,7 @@ class ForceEstimator:
             lambda *chance: self._tracker.significance(*chance),
             self._tracked.rest_modes,
         )
-        self._reach = ReachWatch(self.jaw.keypoints, self.jaw.inner_face_x, self._tracked.rest_modes)
+        self._reach = UnloadedCheck(self.jaw.keypoints, self.jaw.inner_face_x, self._tracked.rest_modes)
         self.reset()
 
     def reset(self) -> None:
@@ -125,7 +125,7 @@ class ForceEstimator:
         self._taring.reset()
         self._reach.reset()
         self._relaxation.reset()
-        self._untold.reset()
+        self._relaxation_stddev.reset()
         self._tracked.reset()
         self._given.reset()
 
@@ -369,7 +369,7 @@ class ForceEstimator:
         most = bound_residual(self.jaw.keypoints, self._taring.tare.noise) if is_far else np.inf
         reason = find_rejection_reason(state, largest_residual=most, largest_stddev=self.settings.largest_stddev)
         if reason:
-            if state["magnitude"] <= state["bearable"]:
+            if state["magnitude"] <= state["max_force"]:
                 self._relax(state["force"])
             return self._fail("unobservable", reason, used, iterations)
         self._taring.note(quiet=bool(state["quiet"]), loaded=bool(state["loaded"]))
@@ -386,10 +386,10 @@ class ForceEstimator:
         """
         dt = 0.0 if self._relaxed is None else self._stamp - self._relaxed
         self._relaxed = self._stamp
-        self._untold.update(np.zeros(3), dt)
+        self._relaxation_stddev.update(np.zeros(3), dt)
         before = self._relaxation.packed[0]
         change = np.maximum(np.abs(force), np.abs(before)) if self._was_interrupted else force - before
-        self._untold.doubt(change, dt)
+        self._relaxation_stddev.doubt(change, dt)
         self._was_interrupted = False
         return dt
 
@@ -399,8 +399,12 @@ class ForceEstimator:
         extrapolated = _EXTRAPOLATED * state["extrapolation"]
         error = hypot(self._force_error, self._scale_error, state["location_error"], extrapolated)
         vectors, dt = np.empty((7, 3)), self._pass_time(state["force"])
-        relaxation, untold, errors = self._relaxation.packed, self._untold.overstress, (error, self._modulus_error)
-        magnitude, stddev = compute_force(state, relaxation, untold, dt, errors, vectors)
+        relaxation, relaxation_stddev, errors = (
+            self._relaxation.packed,
+            self._relaxation_stddev.overstress,
+            (error, self._modulus_error),
+        )
+        magnitude, stddev = compute_force(state, relaxation, relaxation_stddev, dt, errors, vectors)
         force, torque, force_stddev, torque_stddev, point, location, normal = vectors
         return Solution(
             stamp=self._stamp,

@@ -31,7 +31,7 @@ _FARTHEST = 1.0
 # Maximum capture time [s] since 1970: the year 5138. Milliseconds since 1970 are ten times as many.
 _LATEST = 1e11
 # An object is away that stands in front of the undeformed surface by more than this and what its place may err [m].
-AWAY, _SIGMAS = 10e-3, 3.0
+OUT_OF_REACH, _SIGMAS = 10e-3, 3.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -97,11 +97,11 @@ class Contact:
 
 
 def is_out_of_reach(contact: Contact, face_x: float) -> bool:
-    """Return True if a contact's outline is in front of a surface x = face_x [m] by over `AWAY` and its uncertainty."""
+    """Return True if a contact's outline is farther from a face x = face_x [m] than `OUT_OF_REACH`, surely."""
     outline = contact.outline
     if outline is None or contact.touching is not False:
         return False
-    return outline.nearest - face_x > AWAY + _SIGMAS * float(outline.stddev[0])
+    return outline.nearest - face_x > OUT_OF_REACH + _SIGMAS * float(outline.stddev[0])
 
 
 class Solution(NamedTuple):

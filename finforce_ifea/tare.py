@@ -39,14 +39,14 @@ class PointNoise(NamedTuple):
         plane: covariance of each in an image as those of the tare (K, 2, 2) [m^2].
         gain: regression of x and z on y in this image (K, 2).
         width_variance: along y in this image (K,) [m^2].
-        trust: variance in the tare over that in this image (K,), at most 1.
+        noise_ratio: variance in the tare over that in this image (K,), at most 1.
         bias: variance of an error of this image less one of the tare, as far as these do not scatter (K,) [m^2].
     """
 
     plane: NDArray
     gain: NDArray
     width_variance: NDArray
-    trust: NDArray
+    noise_ratio: NDArray
     bias: NDArray
 
 
@@ -90,7 +90,7 @@ def compute_point_noise(usual: StatedNoise, stddev: NDArray | None) -> PointNois
     A key point that states less than in the tare counts as it did there: nothing has shown that it is better.
 
     A detector errs in the same way while it sees the same: what is stated and does not scatter in the tare stands still
-    there, is taken off with the offsets, and comes back in another shape with the next sight. No averaging removes it,
+    there, is taken off with the offsets, and comes back with another shape. No averaging removes it,
 
         b_k = max(0, (s_kx^2 + s_kz^2) / 2 - tr N_k),    bias_k = sqrt(b_k median(b)), zero when nothing is stated;
 
@@ -117,7 +117,7 @@ def _enlarge_noise(covariance, usual, stddev):
     """Return what `PointNoise` holds, where an image states `stddev` (K, 3) [m] and usual ones are (K, 3)."""
     count = len(covariance)
     plane, gain = np.empty((count, 2, 2)), np.empty((count, 2))
-    along, trust, bias = np.empty(count), np.empty(count), np.empty(count)
+    along, noise_ratio, bias = np.empty(count), np.empty(count), np.empty(count)
     growth = np.empty(3)
     for k in range(count):
         noise, own, now, stated = covariance[k], 0.0, 0.0, 0.0
@@ -131,9 +131,9 @@ def _enlarge_noise(covariance, usual, stddev):
             own += plane[k, a, a]
             now += plane[k, a, a] * growth[i] ** 2
             stated += (usual[k, i] * growth[i]) ** 2
-        along[k], trust[k] = noise[1, 1] * growth[1] ** 2, own / now
+        along[k], noise_ratio[k] = noise[1, 1] * growth[1] ** 2, own / now
         bias[k] = max(0.0, stated - noise[0, 0] - noise[2, 2])
-    return plane, gain, along, trust, bias
+    return plane, gain, along, noise_ratio, bias
 
 
 _FARTHEST_OFFSET = 3e-3
@@ -486,6 +486,6 @@ class TareKeeper:
 
 def _measure_bend(deviations: NDArray) -> float:
     """Return the root mean square [m] of the nearer deviations (K, 3) [m], infinite when there are too few."""
-    ways = np.sort(np.linalg.norm(deviations[np.isfinite(deviations[:, 0])], axis=1))
-    nearer = ways[: int(np.ceil(_NEARER * len(ways)))]
+    distances = np.sort(np.linalg.norm(deviations[np.isfinite(deviations[:, 0])], axis=1))
+    nearer = distances[: int(np.ceil(_NEARER * len(distances)))]
     return float(np.sqrt(np.mean(nearer**2))) if len(nearer) >= 3 else np.inf

@@ -35,7 +35,7 @@ _LEAST_SCALE_STDDEV = 5e-4  # images do not err independently: no average is bet
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Sight:
+class _ColorDetections:
     """Contents of the colours of an image: key points by side where nothing has moved, else the pixels found.
 
     `is_watched` says whether anybody looked for motion; `tags` are the corners (4, 2) [px] of those seen, by number.
@@ -114,7 +114,7 @@ class KeypointDetector:
         self._stamp: float | None = None
         self._looks, self._shares = dict.fromkeys(self._jaws, 0), dict.fromkeys(self._jaws, 0.0)
         self._scale = DepthScale(error=0.0, stddev=self.settings.scale_stddev)
-        self._sights: dict[float, _Sight] = {}
+        self._color_detections: dict[float, _ColorDetections] = {}
         self._searches = dict.fromkeys(self._jaws, 0)
         self._searched = dict.fromkeys(self._jaws, -np.inf)
         self.was_still = self._is_mirrored = False
@@ -179,7 +179,7 @@ class KeypointDetector:
         for jaw in self._jaws.values():
             for number in range(2):  # the second is compared with the first
                 later = replace(image, stamp=image.stamp + number / _RATE)
-                jaw.locate(later, jaw.imagine(image.camera), self._scale)
+                jaw.locate(later, jaw.predict_pixels(image.camera), self._scale)
         self.reset()
 
     def detect(self, image: RgbdImage) -> Mapping[str, JawKeypoints]:
@@ -203,20 +203,22 @@ class KeypointDetector:
                 "reset for a new recording"
             )
         self._drift(image.stamp)
-        sight = self._sights.pop(image.stamp, None) or self._see(image)
-        self._sights = {stamp: later for stamp, later in self._sights.items() if stamp > image.stamp}
-        self.was_still = sight.still is not None
-        if sight.still is None:
-            found = self._find(image, sight)
-            if not sight.is_watched:
+        colors = self._color_detections.pop(image.stamp, None) or self._detect_color(image)
+        self._color_detections = {
+            stamp: later for stamp, later in self._color_detections.items() if stamp > image.stamp
+        }
+        self.was_still = colors.still is not None
+        if colors.still is None:
+            found = self._find(image, colors)
+            if not colors.is_watched:
                 return found
             return self._still_watch.take(found if len(found) == len(self._jaws) else {}, image) or found
         for jaw in self._jaws.values():
             jaw.rest(image.stamp)
         self.counts["still"] += 1
-        return sight.still
+        return colors.still
 
-    def look(self, image: RgbdImage) -> None:
+    def detect_color(self, image: RgbdImage) -> None:
         """Look at an image whose depth is yet to come, so that less is left for `detect` to do once it is there.
 
         Raises:
@@ -225,18 +227,18 @@ class KeypointDetector:
         """
         if self._stamp is None or image.stamp > self._stamp:
             check_image(image)
-            self._sights[image.stamp] = self._see(image)
+            self._color_detections[image.stamp] = self._detect_color(image)
 
-    def _see(self, image: RgbdImage) -> _Sight:
+    def _detect_color(self, image: RgbdImage) -> _ColorDetections:
         """Return what the colours of an image show."""
         watch = self._still_watch
         is_watched = watch is not None and all(jaw.is_settled for jaw in self._jaws.values())
         still = watch.confirm(image) if is_watched else None
         if still is not None:
-            return _Sight(is_watched=True, still=still, detections={})
+            return _ColorDetections(is_watched=True, still=still, detections={})
         tags = self._find_tags(image) if self._tags is not None else {}
         detections = self._pixel_detector.detect(image, self._expect(image, tags))
-        return _Sight(is_watched=is_watched, still=None, detections=detections, tags=tags)
+        return _ColorDetections(is_watched=is_watched, still=None, detections=detections, tags=tags)
 
     def _find_tags(self, image: RgbdImage) -> Mapping[int, NDArray]:
         """Return the tags seen; notice whether the mirrored image has them on the jaws, as no mirror in view does."""
@@ -264,9 +266,9 @@ class KeypointDetector:
         tag = self.mounts[side].tag
         return None if tag is None else tags.get(tag.id)
 
-    def _find(self, image: RgbdImage, sight: _Sight) -> dict[str, JawKeypoints]:
+    def _find(self, image: RgbdImage, colors: _ColorDetections) -> dict[str, JawKeypoints]:
         """Return the key points of the jaws in an image that has to be looked at."""
-        found = {} if self._is_mirrored else self._locate(image, sight)
+        found = {} if self._is_mirrored else self._locate(image, colors)
         self.counts["images"] += 1
         if self._off_centre > self.settings.largest_offset:  # intrinsics or place of a camera that bend every finger
             self.counts["off centre"] += 1
@@ -277,12 +279,12 @@ class KeypointDetector:
             self._shares[side] += (seen - self._shares[side]) / min(self._looks[side], _MEMORY)
         return found
 
-    def _locate(self, image: RgbdImage, sight: _Sight) -> dict[str, JawKeypoints]:
+    def _locate(self, image: RgbdImage, colors: _ColorDetections) -> dict[str, JawKeypoints]:
         """Return the key points of the jaws that are found."""
         keypoints = {}
         for side, jaw in self._jaws.items():
-            detection = self._check(side, sight.detections.get(side))
-            found = jaw.locate(image, detection, self._scale, self._corners(side, sight.tags))
+            detection = self._check(side, colors.detections.get(side))
+            found = jaw.locate(image, detection, self._scale, self._corners(side, colors.tags))
             if found is not None:
                 stddev = max(found.scale.stddev, _LEAST_SCALE_STDDEV)
                 self._scale = replace(found.scale, stddev=min(stddev, self.settings.scale_stddev))

@@ -213,7 +213,7 @@ class KeypointDetectorNode(ros.ImageNode):
             if not whole and waiting is not None:  # its pixels are found while its depth is on its way
                 with suppress(FinforceError):  # what is wrong with it is said after that
                     self.gate.check_age(waiting.stamp, self.now())
-                    self.detector.look(waiting.value)
+                    self.detector.detect_color(waiting.value)
             self._answer(whole)
 
     def _on_depth(self, _topic: str, message: Any) -> None:

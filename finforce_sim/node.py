@@ -22,18 +22,18 @@ from finforce.transforms import pose_numbers
 from finforce_sim.emulator.adapter import EmulatedAdapter
 from finforce_sim.emulator.firmware import EmulatedGripper
 from finforce_sim.emulator.pty_port import PtyPort
-from finforce_sim.footage import (
-    Footage,
+from finforce_sim.scenarios import RATE, Scenario, build_scenario
+from finforce_sim.sensor import Flicker
+from finforce_sim.simulated_camera import Shot
+from finforce_sim.simulated_recording import (
+    SimulatedRecording,
     TwinFrame,
-    build_footage,
+    build_simulated_recording,
     detection_truth_columns,
     encode_depth,
     info_fields,
     parse_size,
 )
-from finforce_sim.photographer import Shot
-from finforce_sim.scenarios import RATE, Scenario, build_scenario
-from finforce_sim.sensor import Flicker
 from finforce_sim.stored_grasp import LiveScene, build_live_scene
 
 PIXEL_TYPES = {"rgb8": np.uint8, "16UC1": np.uint16}
@@ -48,7 +48,7 @@ class TwinCameraNode(Node):
     them, or, with a link to a gripper, as the emulated gripper there moves.
 
     Args:
-        build: makes the footage of a scenario with a seed and a camera.
+        build: makes the recording of a scenario with a seed and a camera.
         build_live: makes of the same a scene that follows a gripper.
         options: of `rclpy.node.Node`.
 
@@ -58,7 +58,7 @@ class TwinCameraNode(Node):
 
     def __init__(
         self,
-        build: Callable[..., Footage] = build_footage,
+        build: Callable[..., SimulatedRecording] = build_simulated_recording,
         build_live: Callable[..., LiveScene] = build_live_scene,
         **options: Any,
     ) -> None:

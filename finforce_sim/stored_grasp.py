@@ -13,10 +13,10 @@ from finforce.camera import CameraIntrinsics
 from finforce.transforms import invert_pose
 from finforce_ifea.grasp_force import Wrench
 from finforce_sim.emulator.mechanism import STROKE
-from finforce_sim.footage import WORKERS, disturb_pose
 from finforce_sim.gripper import PressedGrasp
-from finforce_sim.photographer import Photographer, Shot
 from finforce_sim.scenarios import Scenario, ScenarioError
+from finforce_sim.simulated_camera import Shot, SimulatedCamera
+from finforce_sim.simulated_recording import WORKERS, disturb_pose
 
 LEAST_CLEARANCE = 2e-3  # [m] of opening that the open gripper leaves around the object
 TRACKED_EVERY = 3  # images: the object is tracked at 10 Hz
@@ -47,25 +47,25 @@ class LiveScene:
 
     Args:
         grasp: the grasp to render.
-        photographer: that renders it.
+        simulated_camera: that renders it.
         seed: of the object tracker's noise.
 
     Raises:
         ScenarioError: the object is too wide for the gripper.
     """
 
-    def __init__(self, grasp: PressedGrasp, photographer: Photographer, seed: int) -> None:
+    def __init__(self, grasp: PressedGrasp, simulated_camera: SimulatedCamera, seed: int) -> None:
         if grasp.touch_opening + LEAST_CLEARANCE > STROKE:
             raise ScenarioError(
                 f"{grasp.scenario.name}: the object is {1e3 * grasp.touch_opening:.0f} mm wide between the "
                 f"jaws, expected at most {1e3 * (STROKE - LEAST_CLEARANCE):.0f} mm; give another object or scene"
             )
         self.grasp = grasp
-        self.camera, self.depth_step = photographer.camera, photographer.depth_step
+        self.camera, self.depth_step = simulated_camera.camera, simulated_camera.depth_step
         self.openings, self._takes = np.zeros(0), []
-        self._photographer = photographer
+        self._simulated_camera = simulated_camera
         self._relaxation = grasp.relaxation()
-        self._T_camera_gripper = invert_pose(photographer.T_gripper_camera)
+        self._T_camera_gripper = invert_pose(simulated_camera.T_gripper_camera)
         self._rng = np.random.default_rng((seed, 3))
         self._count, self._last = 0, None
 
@@ -87,8 +87,8 @@ class LiveScene:
 
     def _shoot(self, opening: float, index: int) -> list[Shot]:
         """Return all takes at one opening [m]."""
-        view = self._photographer.look(self.grasp.state(opening))
-        return [self._photographer.develop(view, _APART * (TAKES * index + take)) for take in range(TAKES)]
+        view = self._simulated_camera.look(self.grasp.state(opening))
+        return [self._simulated_camera.develop(view, _APART * (TAKES * index + take)) for take in range(TAKES)]
 
     def find(self, opening: float) -> int:
         """Return the index of the image that was taken nearest to an opening [m]."""
@@ -114,13 +114,13 @@ class LiveScene:
 def build_live_scene(
     scenario: Scenario, seed: int, camera: CameraIntrinsics, *, finger: int, depth_step: float
 ) -> LiveScene:
-    """Return the scene of a scenario's jaws and object that waits for a gripper; see `build_footage`.
+    """Return the scene of a scenario's jaws and object that waits for a gripper; see `build_simulated_recording`.
 
     Raises:
         FinforceError: the scenario's object or jaw cannot be used, or a library is missing.
     """
     grasp = PressedGrasp(scenario, finger)
-    return LiveScene(grasp, Photographer(grasp, camera, seed, depth_step), seed)
+    return LiveScene(grasp, SimulatedCamera(grasp, camera, seed, depth_step), seed)
 
 
 TAKES = 2  # of every opening: a camera that stands still never gives the same image twice

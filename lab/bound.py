@@ -94,7 +94,7 @@ class TrueImages:
     Attributes:
         stamps: (n,) [s].
         depth: below first touch, 0 where nothing touches (n,) [m].
-        mobilised: share of friction that is used, -1 to 1 (n,).
+        mobilization: share of friction that is used, -1 to 1 (n,).
         motions: of the key points along x and z by depth, tilt, height and traction ratio (n, K, 2, 4).
         displacement: of the key points (n, K) [m].
         places: of the key points, x and z (n, K, 2) [m].
@@ -108,7 +108,7 @@ class TrueImages:
 
     stamps: NDArray
     depth: NDArray
-    mobilised: NDArray
+    mobilization: NDArray
     motions: NDArray
     displacement: NDArray
     places: NDArray
@@ -138,7 +138,7 @@ def bound_forces(images: TrueImages, stated: Stated | None = None) -> NDArray:
         P = _update(P, H, images.noise)
         J = np.zeros((3, size))
         J[:, [_D, _TILT, _HEIGHT, _DK]] = images.modes[i]
-        J[:, _MU] = images.mobilised[i] * images.modes[i, :, 3]
+        J[:, _MU] = images.mobilization[i] * images.modes[i, :, 3]
         bounds[i] = J @ P @ J.T
     return bounds
 
@@ -186,7 +186,7 @@ def _observe(images: TrueImages, i: int) -> NDArray:
     H = np.zeros((len(seen), 2, _SHARED + 4 * count))
     H[:, :, [_D, _TILT, _HEIGHT, _DK]] = images.motions[i, seen]
     H[:, :, _E] = images.motions[i, seen, :, 3]
-    H[:, :, _MU] = images.mobilised[i] * images.motions[i, seen, :, 3]
+    H[:, :, _MU] = images.mobilization[i] * images.motions[i, seen, :, 3]
     H[:, 0, _CX], H[:, 1, _CZ] = 1.0, 1.0
     H[:, 0, _CPHI], H[:, 1, _CPHI] = places[:, 1], -places[:, 0]
     for axis in range(2):
@@ -234,13 +234,13 @@ def read_truth(recording: Recording, side: str, setup: EvaluationSetup) -> TrueI
     deepest = 1e-3 * float(recording.phases.displacement_mm.max())
     depths, table, smooth = tabulate(mechanics, jaw.keypoints, indenter, height, deepest)
     depth = np.where(size > _TOUCH, np.interp(size, np.linalg.norm(smooth, axis=1), depths), 0.0)
-    mobilised = np.ones_like(depth)
+    mobilization = np.ones_like(depth)
     if friction is None:
         settings = own.settings.resolve_friction(jaw.material)
         friction = Coefficient(settings.friction, settings.friction_stddev)
         flat = np.interp(depth, depths, np.arctan2(smooth[:, 2], -smooth[:, 0]))
         ratio = np.where(size > 5 * _TOUCH, np.tan(np.arctan2(force[:, 2], -force[:, 0]) - flat), 0.0)
-        mobilised = np.clip(ratio / np.quantile(np.abs(ratio[size > 5 * _TOUCH]), 0.9), -1.0, 1.0)
+        mobilization = np.clip(ratio / np.quantile(np.abs(ratio[size > 5 * _TOUCH]), 0.9), -1.0, 1.0)
     values = table(np.maximum(depth, _LEAST_DEPTH))
     count = len(jaw.keypoints)
     motions, places = np.split(values[:, : 10 * count].reshape(-1, count, 10), [8], axis=2)
@@ -257,7 +257,7 @@ def read_truth(recording: Recording, side: str, setup: EvaluationSetup) -> TrueI
     return TrueImages(
         stamps=track.stamps,
         depth=depth,
-        mobilised=mobilised,
+        mobilization=mobilization,
         motions=motions,
         displacement=np.linalg.norm(places - rest, axis=2),
         places=places,

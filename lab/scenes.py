@@ -84,8 +84,10 @@ def fingerprint(scene: TwinScene) -> str:
 
 def _render(scene: TwinScene, path: Path) -> None:
     """Render a scene into a new folder."""
-    from finforce_eval.cli.twin import record_footage
-    from finforce_sim.footage import build_footage, parse_size
+    from finforce_eval.cli.twin import record_simulation
+    from finforce_sim.simulated_recording import build_simulated_recording, parse_size
 
     scenario = scene.build()
-    record_footage(build_footage(scenario, scene.seed, parse_size(scene.size)), scenario, scene.seed, path)
+    record_simulation(
+        build_simulated_recording(scenario, scene.seed, parse_size(scene.size)), scenario, scene.seed, path
+    )

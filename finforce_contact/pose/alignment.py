@@ -43,7 +43,7 @@ class Samples:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Glance:
+class RenderedView:
     """The predicted view of an object in one pose, on the grid of every `step`-th pixel.
 
     Attributes:
@@ -63,15 +63,15 @@ class Comparison:
 
     Attributes:
         residuals: (n,) way along its direction from a sample to what was measured [m], NaN where nothing was.
-        sights: (n,) of type `Visibility`.
+        visibility: (n,) of type `Visibility`.
     """
 
     residuals: NDArray
-    sights: NDArray
+    visibility: NDArray
 
     def count(self, sight: Visibility) -> int:
         """Return how many samples have this sight."""
-        return int(np.count_nonzero(self.sights == sight))
+        return int(np.count_nonzero(self.visibility == sight))
 
 
 class DepthImage:
@@ -131,11 +131,11 @@ class DepthImage:
         measured = self._rays[nearest] * depth[:, None]
         residuals = np.einsum("ij,ij->i", surface.directions, measured - surface.points)
         foreign = self.is_masked_out(pixels)
-        sights = np.where(depth < surface.points[:, 2], Visibility.HIDDEN, Visibility.ABSENT)
-        sights[np.isnan(depth) & ~foreign] = Visibility.UNKNOWN
+        visibility = np.where(depth < surface.points[:, 2], Visibility.HIDDEN, Visibility.ABSENT)
+        visibility[np.isnan(depth) & ~foreign] = Visibility.UNKNOWN
         near = (np.abs(residuals) < gate) & (np.abs(depth - surface.points[:, 2]) < 2.0 * gate)
-        sights[near & ~foreign] = Visibility.SEEN
-        return Comparison(residuals=np.where(sights == Visibility.SEEN, residuals, np.nan), sights=sights)
+        visibility[near & ~foreign] = Visibility.SEEN
+        return Comparison(residuals=np.where(visibility == Visibility.SEEN, residuals, np.nan), visibility=visibility)
 
     def _nearest(self, pixels: NDArray) -> tuple[tuple[NDArray, NDArray], NDArray]:
         """Return row and column (...,) of the nearest pixels, and which are inside the image."""
@@ -188,16 +188,16 @@ class _MeshOutline:
         """Put points along the edges, no farther apart than the mesh's size divided by `samples`."""
         self._edges = _place_points(mesh, np.ptp(mesh.vertices, axis=0).max() / samples)
 
-    def find(self, T_camera_object: NDArray, glance: Glance, camera: CameraIntrinsics, most: int) -> Outline:
+    def find(self, T_camera_object: NDArray, view: RenderedView, camera: CameraIntrinsics, most: int) -> Outline:
         """Return at most `most` points of the outline behind which the object ends, with their outward normals.
 
         A point of an edge is on the outline where one of its faces looks at the camera and the other away. Its
         direction is perpendicular to the ray, and to the edge where that is sharp.
 
         Args:
-            T_camera_object: pose (4, 4) of the glance.
-            glance: the visible part of the mesh there, which tells hidden edges.
-            camera: of the glance.
+            T_camera_object: pose (4, 4) of the view.
+            view: the visible part of the mesh there, which tells hidden edges.
+            camera: of the view.
             most: points that are kept.
 
         Returns:
@@ -211,7 +211,7 @@ class _MeshOutline:
             points=edges.points[chosen],
             directions=_across(rays[chosen], edges.tangents[chosen], edges.first[chosen], edges.second[chosen]),
         ).moved(T_camera_object)
-        bulges = _find_bulges(outline, glance, camera)
+        bulges = _find_bulges(outline, view, camera)
         kept = np.flatnonzero(np.isfinite(bulges))
         kept = kept[:: max(1, -(-len(kept) // most))]
         samples = Samples(points=outline.points[kept], directions=outline.directions[kept])
@@ -242,7 +242,7 @@ def compare_outline(outline: Outline, image: DepthImage, reach: float) -> Compar
     clear = (agreement > 0.7 * votes.shape[1]) & (after - before < 3.1 * (along[:, -1] - along[:, 0]) / along.shape[1])
     clear &= (votes[rows, split - 1] == 1) & (votes[rows, split] == -1)
     residuals = np.where(clear, 0.5 * (before + after), np.nan)
-    return Comparison(residuals=residuals, sights=np.where(clear, Visibility.SEEN, Visibility.UNKNOWN))
+    return Comparison(residuals=residuals, visibility=np.where(clear, Visibility.SEEN, Visibility.UNKNOWN))
 
 
 def _walk_across(outline: Samples, camera: CameraIntrinsics, reach: float) -> tuple[NDArray, NDArray]:
@@ -265,26 +265,26 @@ def _best_split(votes: NDArray) -> tuple[NDArray, NDArray]:
     return split + 1, agreement[np.arange(len(split)), split]
 
 
-def _find_bulges(outline: Samples, glance: Glance, camera: CameraIntrinsics) -> NDArray:
+def _find_bulges(outline: Samples, view: RenderedView, camera: CameraIntrinsics) -> NDArray:
     """Return the bulges (n,) [m] of points of an outline, NaN where the mesh does not end behind them."""
     pixels = project(outline.points, camera)
-    metres = glance.step * outline.points[:, 2] / camera.fx
+    metres = view.step * outline.points[:, 2] / camera.fx
     outward = project(outline.points + outline.directions * metres[:, None], camera) - pixels
     depth = outline.points[:, 2]
-    outer = _look(glance, pixels + 1.5 * outward)
-    inner = np.array([depth - _look(glance, pixels - steps * outward) for steps in (1.5, 3.0)])
+    outer = _look(view, pixels + 1.5 * outward)
+    inner = np.array([depth - _look(view, pixels - steps * outward) for steps in (1.5, 3.0)])
     bulges = np.maximum(inner[0], np.nan_to_num(inner[1], nan=0.0))
     ends = (np.abs(bulges) < _DEEPEST) & ~(outer < depth + _STEP_BACK)
     return np.where(ends, np.maximum(bulges, 0.0), np.nan)
 
 
-def _look(glance: Glance, pixels: NDArray) -> NDArray:
-    """Return the depths (n,) of a glance next to pixels (n, 2), NaN outside."""
-    height, width = glance.depth.shape
-    whole = np.rint(np.nan_to_num(pixels, nan=-1e6) / glance.step).astype(np.intp)
+def _look(view: RenderedView, pixels: NDArray) -> NDArray:
+    """Return the depths (n,) of a view next to pixels (n, 2), NaN outside."""
+    height, width = view.depth.shape
+    whole = np.rint(np.nan_to_num(pixels, nan=-1e6) / view.step).astype(np.intp)
     inside = ((whole >= 0) & (whole < (width, height))).all(axis=1)
     whole[~inside] = 0
-    return np.where(inside, glance.depth[whole[:, 1], whole[:, 0]], np.nan)
+    return np.where(inside, view.depth[whole[:, 1], whole[:, 0]], np.nan)
 
 
 def _across(rays: NDArray, tangents: NDArray, first: NDArray, second: NDArray) -> NDArray:
@@ -395,14 +395,14 @@ class _Normal:
     told: NDArray
     counted: NDArray
     stddev: float
-    sights: NDArray
+    visibility: NDArray
     outlined: float = 0.0
 
     def plus(self, other: "_Normal") -> "_Normal":
         """Return both together, the other being that of the outline."""
         return replace(
             self,
-            outlined=float((other.sights == Visibility.SEEN).mean()) if len(other.sights) else 0.0,
+            outlined=float((other.visibility == Visibility.SEEN).mean()) if len(other.visibility) else 0.0,
             information=self.information + other.information,
             gradient=self.gradient + other.gradient,
             told=self.told + other.told,
@@ -423,7 +423,7 @@ class _Normal:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Expected:
-    """The predicted view in the object frame; `step` as of `Glance`."""
+    """The predicted view in the object frame; `step` as of `RenderedView`."""
 
     surface: Samples
     outline: Outline | None
@@ -457,7 +457,7 @@ class MeshAligner:
         """Return the middle of the object's bounding box (3,) [m] in the camera frame, for a pose (4, 4)."""
         return T_camera_object[:3, :3] @ self.middle + T_camera_object[:3, 3]
 
-    def glance(self, T_camera_object: NDArray, points: int) -> Glance:
+    def render_view(self, T_camera_object: NDArray, points: int) -> RenderedView:
         """Return what should be seen of the object in a pose (4, 4), in about so many points."""
         distance = max(float(self.middle_of(T_camera_object)[2]), 0.02)
         # from the side, a box fills about a third of the disc around its bounding sphere
@@ -466,7 +466,7 @@ class MeshAligner:
         view = self._view.render(T_camera_object, self.camera, step)
         cosine = -np.einsum("ij,ij->i", view.normals, view.points) / np.linalg.norm(view.points, axis=1)
         kept = cosine > _GRAZING
-        return Glance(
+        return RenderedView(
             depth=view.depth, surface=Samples(points=view.points[kept], directions=view.normals[kept]), step=step
         )
 
@@ -490,11 +490,11 @@ class MeshAligner:
 
     def _expect(self, T: NDArray, effort: Effort) -> _Expected:
         """Return what should be seen in a pose (4, 4), in the object's frame."""
-        glance, back = self.glance(T, effort.points), invert_pose(T)
+        view, back = self.render_view(T, effort.points), invert_pose(T)
         outline = None
         if effort.outline:
-            outline = self._outline.find(T, glance, self.camera, _EDGE_POINTS).moved(back)
-        return _Expected(surface=glance.surface.moved(back), outline=outline, step=glance.step)
+            outline = self._outline.find(T, view, self.camera, _EDGE_POINTS).moved(back)
+        return _Expected(surface=view.surface.moved(back), outline=outline, step=view.step)
 
     def _build(self, T: NDArray, expected: _Expected, image: DepthImage, gate: float) -> _Normal:
         middle = self.middle_of(T)
@@ -525,7 +525,7 @@ class MeshAligner:
     def _judge(self, T: NDArray, image: DepthImage, effort: Effort) -> Alignment:
         expected = self._expect(T, effort)
         normal = self._build(T, expected, image, effort.gates[-1])
-        counts = np.bincount(normal.sights, minlength=len(Visibility))
+        counts = np.bincount(normal.visibility, minlength=len(Visibility))
         basis = normal.sure_directions()
         # neighbouring depths err alike: so many pixels count as one
         alike = max(1.0, _NOISE_WIDTH / expected.step) ** 2
@@ -550,7 +550,7 @@ class MeshAligner:
 
 
 def _spread(comparison: Comparison, least: float) -> float:
-    known = comparison.residuals[comparison.sights == Visibility.SEEN]
+    known = comparison.residuals[comparison.visibility == Visibility.SEEN]
     return max(_MAD * float(np.median(np.abs(known))), least) if len(known) else least
 
 
@@ -560,7 +560,7 @@ def _normal_equations(samples: Samples, seen: Comparison, about: _About, error: 
     Directions d that are off by an angle `error` make a motion along the surface look like one across it, this much
     smaller: the information must exceed error^2 sum w.
     """
-    chosen = seen.sights == Visibility.SEEN
+    chosen = seen.visibility == Visibility.SEEN
     directions, residuals = samples.directions[chosen], seen.residuals[chosen]
     J = np.hstack([directions, np.cross(samples.points[chosen] - about.middle, directions) / about.radius])
     weights = 1.0 / (1.0 + (residuals / (_CAUCHY * about.stddev)) ** 2) / about.stddev**2
@@ -573,5 +573,5 @@ def _normal_equations(samples: Samples, seen: Comparison, about: _About, error: 
         told=information / (error**2 * max(float(weights.sum()), fewest)),
         counted=information / (error**2 * fewest),
         stddev=about.stddev,
-        sights=seen.sights,
+        visibility=seen.visibility,
     )

@@ -148,7 +148,7 @@ class MeshCheck:
         Raises:
             ImageError: the image has another size than the camera, or no depth.
         """
-        step = self._aligner.glance(T_camera_object, PIXELS).step
+        step = self._aligner.render_view(T_camera_object, PIXELS).step
         view = _View(DepthImage(depth, self._camera), T_camera_object, step)
         posed = self._compare(view)
         effort = Effort(gates=_NEAR if posed.fits else _FAR, steps=2, points=PIXELS)

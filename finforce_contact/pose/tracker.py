@@ -61,15 +61,15 @@ def compute_agreement(aligner: MeshAligner, T_camera_object: NDArray, image: Dep
     One minus the mean of min(|z_mesh - z|, 10 mm) / 10 mm over the pixels of mesh and mask; a pixel of one of them
     alone disagrees altogether, unless something stands in front of the mesh there.
     """
-    glance = aligner.glance(T_camera_object, _MIDDLE.points)
-    depth, mask = image.depth[:: glance.step, :: glance.step], image.mask[:: glance.step, :: glance.step]
-    on_mesh, on_mask = np.isfinite(glance.depth), mask & np.isfinite(depth)
-    hidden = ~mask & on_mesh & (depth < glance.depth)
+    view = aligner.render_view(T_camera_object, _MIDDLE.points)
+    depth, mask = image.depth[:: view.step, :: view.step], image.mask[:: view.step, :: view.step]
+    on_mesh, on_mask = np.isfinite(view.depth), mask & np.isfinite(depth)
+    hidden = ~mask & on_mesh & (depth < view.depth)
     unknown = mask & ~np.isfinite(depth)
     counted = (on_mesh | on_mask) & ~hidden & ~unknown
     if not counted.any():
         return 0.0
-    cost = np.where(on_mesh & on_mask, np.minimum(np.abs(glance.depth - depth) / _WORST, 1.0), 1.0)
+    cost = np.where(on_mesh & on_mask, np.minimum(np.abs(view.depth - depth) / _WORST, 1.0), 1.0)
     return 1.0 - float(cost[counted].mean())
 
 
@@ -82,7 +82,7 @@ def _place(aligner: MeshAligner, image: DepthImage, rotation: NDArray) -> NDArra
     T[:3, :3] = rotation
     T[:3, 3] = image.ray(box) * (depth + 0.5 * aligner.radius) - rotation @ aligner.middle
     for _ in range(2):
-        seen = aligner.glance(T, _COARSE.points).surface.points
+        seen = aligner.render_view(T, _COARSE.points).surface.points
         if not len(seen):
             break
         pixels = project(seen, image.camera)

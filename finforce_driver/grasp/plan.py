@@ -15,7 +15,7 @@ import math
 from collections.abc import Callable
 
 from finforce_driver.errors import GraspError
-from finforce_driver.grasp.load_watch import ForceFeed, JawPosition, LoadWatch
+from finforce_driver.grasp.force_monitor import ForceInput, ForceMonitor, JawPosition
 from finforce_driver.settings import GraspGoal, GraspSettings, GripperSettings
 from finforce_driver.state import GripperState
 
@@ -69,8 +69,8 @@ class GraspPlan:
         self,
         goal: GraspGoal,
         settings: GraspSettings,
-        load: LoadWatch,
-        feed: ForceFeed,
+        load: ForceMonitor,
+        feed: ForceInput,
         jaws: GripperSettings,
         step: float | None = None,
     ) -> None:

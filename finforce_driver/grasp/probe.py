@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from finforce_driver.grasp.load_watch import LoadWatch
+from finforce_driver.grasp.force_monitor import ForceMonitor
 from finforce_driver.grasp.plan import GraspPlan
 
 # Share of the set force from which on the jaws go back, and the share of their force that they keep.
@@ -34,7 +34,7 @@ class FrictionProbe:
         """True if the jaws are on their way back."""
         return not math.isnan(self._back)
 
-    def find_target(self, plan: GraspPlan, load: LoadWatch, set_force: float) -> float:
+    def find_target(self, plan: GraspPlan, load: ForceMonitor, set_force: float) -> float:
         """Return the opening to go to [m]; the one commanded last to go on as before.
 
         Args:
@@ -57,7 +57,7 @@ class FrictionProbe:
         self.is_due = self._back > load.opening + 0.5 * plan.step
         return self._back
 
-    def _reach(self, plan: GraspPlan, load: LoadWatch) -> float:
+    def _reach(self, plan: GraspPlan, load: ForceMonitor) -> float:
         """Return how far the jaws may open [m] so that they keep what they have to, by the newest force."""
         way = (load.pressing - self._kept) / max(load.model.safe_stiffness, _LEAST_STIFFNESS)
         opening = min(load.opening + way, self._begin + self._length, plan.widest)

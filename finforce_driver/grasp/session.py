@@ -10,7 +10,7 @@ from threading import Condition
 
 from finforce_driver.errors import BackOffError, DriverError, GraspError, GripperTimeoutError
 from finforce_driver.grasp.controller import ForceGrasp
-from finforce_driver.grasp.load_watch import ForceSample, TouchSample
+from finforce_driver.grasp.force_monitor import ForceSample, TouchSample
 from finforce_driver.gripper import Gripper
 from finforce_driver.settings import GraspGoal, GraspSettings
 from finforce_driver.state import USABLE, GraspPhase, GraspStatus, GripperState

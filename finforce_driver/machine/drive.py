@@ -17,9 +17,9 @@ from finforce_driver.can.protocol import (
     encode_move,
     encode_watchdog,
 )
-from finforce_driver.machine.knowledge import Knowledge
 from finforce_driver.machine.move import CLEAR_CURRENT, CONTACT_TIME, GRACE, Arrival, MoveJob, Orders, push_direction
 from finforce_driver.machine.procedures import CalibrationRun, EmergencyStop, Recovery, Step
+from finforce_driver.machine.status_tracker import StatusTracker
 from finforce_driver.settings import SLOWEST_BYTE, GripperSettings
 from finforce_driver.state import HALF_CALIBRATED, STOP_PENDING, USABLE, GripperState, MoveOutcome, Phase, describe
 
@@ -180,7 +180,7 @@ class Drive:
 
     def __init__(self, settings: GripperSettings, salt: int = 0) -> None:
         self.settings = settings
-        self.known = Knowledge(settings)
+        self.known = StatusTracker(settings)
         self.exchange = Exchange(settings.node_id)
         self.orders = Orders(salt)
         self.order_sent = -math.inf
@@ -230,7 +230,7 @@ class Drive:
         if self.calibration is not None:
             return Phase.CALIBRATING
         if not self.known.calibrated:
-            return Phase.LOST if self.known.distrust not in ("", HALF_CALIBRATED) else Phase.UNCALIBRATED
+            return Phase.LOST if self.known.calibration_invalid not in ("", HALF_CALIBRATED) else Phase.UNCALIBRATED
         if self.arrival is not None and not self.moving:
             return Phase.MOVING if self.arrival.moving else Phase.PROBING
         return Phase.MOVING if self.moving else Phase.READY
@@ -324,7 +324,7 @@ class Drive:
             contact=DIRECTIONS[self._push()] if placed else "",
             at_target=known.driving and bool(reply and reply.at_target) and placed and settled,
             calibrated=placed,
-            activated=bool(reply and reply.activated) and not known.asleep,
+            activated=bool(reply and reply.activated) and not known.power_off,
             faults=faults,
             stop_pending=self.stop.pending,
             estopped=stopped or "E-stop" in faults,
@@ -358,8 +358,8 @@ class Drive:
             return STOP_PENDING
         if self.note and phase is not Phase.FAULT:
             return self.note
-        if phase in (Phase.UNCALIBRATED, Phase.LOST) and self.known.distrust:
-            return self.known.distrust
+        if phase in (Phase.UNCALIBRATED, Phase.LOST) and self.known.calibration_invalid:
+            return self.known.calibration_invalid
         return describe(phase, self.outcome, faults)
 
     # What is sent next

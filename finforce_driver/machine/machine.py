@@ -15,9 +15,9 @@ from typing import Any
 from finforce_driver.can.protocol import CanMessage, Command, Flag, Reply, decode_move, decode_reply, encode_watchdog
 from finforce_driver.errors import GripperStateError
 from finforce_driver.machine.drive import GO, Drive, Request
-from finforce_driver.machine.knowledge import Telemetry
 from finforce_driver.machine.move import CLEAR_CURRENT, Arrival, Goal, MoveJob, OrderWatch
 from finforce_driver.machine.procedures import CalibrationRun, Recovery, Step, Travel
+from finforce_driver.machine.status_tracker import Telemetry
 from finforce_driver.settings import SLOWEST_BYTE, GripperSettings, check_numbers
 from finforce_driver.state import (
     HALF_CALIBRATED,
@@ -159,7 +159,7 @@ class GripperMachine(Drive):
         self._watch.forget()
         self.note, self._enabled = "", True
         self.calibration = CalibrationRun(
-            self.settings, calibrated=self.known.calibrated, reset=bool(self.known.distrust)
+            self.settings, calibrated=self.known.calibrated, reset=bool(self.known.calibration_invalid)
         )
 
     @_command
@@ -256,7 +256,9 @@ class GripperMachine(Drive):
         """Forget what can have changed by the time the link is back, and want nothing."""
         if self.calibration is not None:
             # without an earlier calibration the gripper's flag will say whether it was completed
-            self.known.distrust = self.known.distrust or (HALF_CALIBRATED if self.known.calibrated else "")
+            self.known.calibration_invalid = self.known.calibration_invalid or (
+                HALF_CALIBRATED if self.known.calibrated else ""
+            )
             self.calibration = None
         self.recovery = None
         self._abort(reason)
@@ -383,8 +385,8 @@ class GripperMachine(Drive):
     def _break_calibration(self) -> None:
         """Note that a calibration under way is cut short."""
         if self.calibration is not None:
-            self.calibration, self.known.distrust = None, HALF_CALIBRATED
-            self.known.asleep = True
+            self.calibration, self.known.calibration_invalid = None, HALF_CALIBRATED
+            self.known.power_off = True
 
     def _postpone_hold(self) -> None:
         """Hold as soon as it is known where: at an old position, to hold would be to go back."""
@@ -409,7 +411,7 @@ class GripperMachine(Drive):
 
     def _take_echo(self, request: Request, now: float) -> None:
         """Note that an order was answered."""
-        self.known.asleep = False
+        self.known.power_off = False
         if self.recovery is not None:
             self.recovery.unflagged()
         elif request.move == self.orders.wanted:
@@ -424,7 +426,7 @@ class GripperMachine(Drive):
         """Draw the conclusions from a reply that is believed; `before` is the one before it."""
         if self.silent or before is None:
             self.silent, self.note = False, ""
-        self.known.asleep |= reply.error
+        self.known.power_off |= reply.error
         if self.recovery is None:
             self.stop.take(reply)
         self._follow_recovery(reply)
@@ -433,9 +435,9 @@ class GripperMachine(Drive):
             self._follow_calibration(reply)
         elif before is not None and before.calibrated and not reply.calibrated:
             self._abort(REBOOTED)
-            self.known.distrust = ""
-        elif before is not None and reply.calibrated and not before.calibrated and not self.known.distrust:
-            self._lose_place("the gripper was calibrated, but not by this driver", False)
+            self.known.calibration_invalid = ""
+        elif before is not None and reply.calibrated and not before.calibrated and not self.known.calibration_invalid:
+            self._invalidate_calibration("the gripper was calibrated, but not by this driver", False)
         elif not reply.error:
             self._follow_orders(reply)
         self._follow_arrival(reply)
@@ -466,7 +468,7 @@ class GripperMachine(Drive):
             return
         recovery.take(reply)
         if recovery.step.over:
-            self.recovery, self.known.asleep = None, True
+            self.recovery, self.known.power_off = None, True
             self._abort()
             if recovery.step is Step.DONE:
                 self.stop.end()
@@ -487,22 +489,22 @@ class GripperMachine(Drive):
         run.take(reply)
         if run.step.over:
             self.calibration = None
-            self.known.distrust = HALF_CALIBRATED if run.step is Step.FAILED else ""
-            self.known.asleep = True
+            self.known.calibration_invalid = HALF_CALIBRATED if run.step is Step.FAILED else ""
+            self.known.power_off = True
             self.known.restart_history()
             self._abort(run.reason)
             self.ended = MoveOutcome.NONE
 
     def _follow_orders(self, reply: Reply) -> None:
         """Judge the move, and whether the gripper has our order."""
-        fault, runs = self._watch.judge(reply, self.known.asleep), abs(reply.current_mA) >= CLEAR_CURRENT
+        fault, runs = self._watch.judge(reply, self.known.power_off), abs(reply.current_mA) >= CLEAR_CURRENT
         if fault and not self._watch.heard and not runs:
             if not self.orders.repeat():
                 self._watch.forget()
         elif fault and not runs and not self._watch.strays(reply):
-            self._yield_to_other(fault)
+            self._release_control(fault)
         elif fault and not (self.orders.pending or (not self._watch.heard and self.orders.repeat())):
-            self._lose_place(fault, self.known.driving)
+            self._invalidate_calibration(fault, self.known.driving)
         if self.job is not None:
             self.job.take(reply)
             if self.job.outcome is MoveOutcome.TIMED_OUT and self.orders.pending:
@@ -517,30 +519,30 @@ class GripperMachine(Drive):
         elif message.remote:
             self.counts["unexpected messages"] += 1
         elif message.command == Command.MOVE and len(message.data) == 5:
-            self._meet_order("a move was seen on the bus", decode_move(message).drives)
+            self._handle_foreign_command("a move was seen on the bus", decode_move(message).drives)
         elif message.command == Command.CALIBRATE and not message.data:
-            self._meet_order("a calibration was seen on the bus", True)
+            self._handle_foreign_command("a calibration was seen on the bus", True)
         elif message.command in FOREIGN and not message.data:
-            self._yield_to_other(f"command {message.command} was seen on the bus")
+            self._release_control(f"command {message.command} was seen on the bus")
         else:
             self.counts["unexpected messages"] += 1
 
-    def _yield_to_other(self, what: str) -> None:
+    def _release_control(self, what: str) -> None:
         """Yield to another program: the gripper has its order, and gets none of ours until one is asked for."""
         self.counts["foreign commands"] += 1
         self._break_calibration()
         self._abort(OTHER_MASTER.format(what=what))
-        self.known.asleep = True
+        self.known.power_off = True
         self.refresh()
 
-    def _meet_order(self, what: str, drives: bool) -> None:
+    def _handle_foreign_command(self, what: str, drives: bool) -> None:
         """Answer another program's order: one that moves the jaws takes them from us."""
         if drives:
-            self._lose_place(f"another program commands this gripper ({what})", self.known.driving)
+            self._invalidate_calibration(f"another program commands this gripper ({what})", self.known.driving)
         else:
-            self._yield_to_other(what)
+            self._release_control(what)
 
-    def _lose_place(self, what: str, hold: bool) -> None:
+    def _invalidate_calibration(self, what: str, hold: bool) -> None:
         """Trust the end stops no more, and stop the jaws, once: two drivers that stop each other must come to rest.
 
         Args:
@@ -555,6 +557,6 @@ class GripperMachine(Drive):
         stop = self.order(position=position, flags=flags)
         self._break_calibration()
         self._abort()
-        self.known.distrust = LOST.format(what=what)
+        self.known.calibration_invalid = LOST.format(what=what)
         self.orders.want(stop, urgent=True)
         self.refresh()

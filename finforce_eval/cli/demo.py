@@ -15,12 +15,12 @@ from finforce.systems.launch import find_share
 from finforce_eval.cli.main import parse
 from finforce_eval.cli.parser import CONTACT_HELP, CommandResult
 from finforce_eval.cli.replay import ENOUGH
-from finforce_eval.cli.twin import record_footage
+from finforce_eval.cli.twin import record_simulation
 from finforce_eval.errors import RecordingError, SilentReplayError
 from finforce_eval.evaluation.keypoint_source import IMAGES
 from finforce_eval.recordings.recording import DEMO, read_recording
-from finforce_sim.footage import FINGER, build_footage, parse_size
 from finforce_sim.scenarios import build_scenario
+from finforce_sim.simulated_recording import FINGER, build_simulated_recording, parse_size
 
 CALIBRATION = "bench"
 # the synthetic scene of a run from images, and the calibration of its finger
@@ -102,5 +102,5 @@ def prepare_recording(folder: Path) -> Path:
         rmtree(folder)
     print(f"Rendering the scene {SCENE} into {folder}, once ...", flush=True)
     scenario = build_scenario(SCENE)
-    record_footage(build_footage(scenario, SEED, parse_size(SIZE)), scenario, SEED, folder)
+    record_simulation(build_simulated_recording(scenario, SEED, parse_size(SIZE)), scenario, SEED, folder)
     return folder

@@ -37,18 +37,18 @@ from finforce_eval.recordings.writer import (
     write_entries,
 )
 from finforce_eval.tasks import progress_bar
-from finforce_sim.footage import (
+from finforce_sim.scenarios import SCENARIOS, Scenario, build_scenario, write_script
+from finforce_sim.simulated_camera import TrueJaw
+from finforce_sim.simulated_recording import (
     FINGER,
-    Footage,
+    SimulatedRecording,
     TwinFrame,
-    build_footage,
+    build_simulated_recording,
     detection_truth_columns,
     encode_depth,
     info_fields,
     parse_size,
 )
-from finforce_sim.photographer import TrueJaw
-from finforce_sim.scenarios import SCENARIOS, Scenario, build_scenario, write_script
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -111,8 +111,8 @@ def run_record(options: argparse.Namespace) -> CommandResult:
     with new_folder(folder) as new:
         scenario = scenario_from_options(options)
         camera, step = parse_size(options.size, options.lens), 1e-3 * options.depth_step
-        footage = build_footage(scenario, options.seed, camera, finger=options.finger, depth_step=step)
-        record_footage(footage, scenario, options.seed, new, compressed=not options.raw, finger=options.finger)
+        simulated = build_simulated_recording(scenario, options.seed, camera, finger=options.finger, depth_step=step)
+        record_simulation(simulated, scenario, options.seed, new, compressed=not options.raw, finger=options.finger)
     size = sum(path.stat().st_size for path in folder.iterdir()) / 1e6
     print(f"Recording: {folder} ({size:.1f} MB)")
     print(f"Score it with: finforce evaluate {folder} --from images")
@@ -140,18 +140,18 @@ FRAME = "camera_color_optical_frame"
 MESH = "object.stl"
 
 
-def write_footage(
-    footage: Footage,
+def write_simulated_recording(
+    simulated: SimulatedRecording,
     folder: str | Path,
     *,
     compressed: bool = True,
     case: Mapping[str, Any] | None = None,
     seen: Callable[[TwinFrame], Any] = lambda frame: None,
 ) -> Path:
-    """Write footage as a rosbag2 folder with its `case.json` and the object's mesh.
+    """Write a simulated recording as a rosbag2 folder with its `case.json` and the object's mesh.
 
     Args:
-        footage: images and truth; one image after the other, never all of them in memory.
+        simulated: images and truth; one image after the other, never all of them in memory.
         folder: the new folder, which must not exist.
         compressed: jpeg colour and png depth; else plain images.
         case: further content of the `case.json`.
@@ -162,27 +162,29 @@ def write_footage(
 
     Raises:
         RecordingError: the folder exists.
-        FinforceError: the footage cannot be made.
+        FinforceError: the recording cannot be made.
     """
     folder, content = Path(folder), dict(case or {})
     with new_folder(folder) as new:
-        write_entries(footage_entries(footage, compressed, seen), new)
-        if footage.mesh is not None:
-            mesh = import_trimesh().Trimesh(vertices=footage.mesh.vertices, faces=footage.mesh.triangles, process=False)
+        write_entries(simulated_entries(simulated, compressed, seen), new)
+        if simulated.mesh is not None:
+            mesh = import_trimesh().Trimesh(
+                vertices=simulated.mesh.vertices, faces=simulated.mesh.triangles, process=False
+            )
             mesh.export(new / MESH)
             content["mesh"] = f"{folder.name}/{MESH}"
-        content["depth_scale"] = footage.depth_step
-        content["T_gripper_camera"] = list(pose_numbers(footage.T_gripper_camera))
+        content["depth_scale"] = simulated.depth_step
+        content["T_gripper_camera"] = list(pose_numbers(simulated.T_gripper_camera))
         (new / "case.json").write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
     return folder
 
 
-def footage_entries(
-    footage: Footage, compressed: bool, seen: Callable[[TwinFrame], Any] = lambda frame: None
+def simulated_entries(
+    simulated: SimulatedRecording, compressed: bool, seen: Callable[[TwinFrame], Any] = lambda frame: None
 ) -> Iterator[Entry]:
-    """Yield every message of the footage in the order of its stamps."""
+    """Yield every message of a simulated recording in the order of its stamps."""
     phase = None
-    for frame in footage:
+    for frame in simulated:
         if frame.phase != phase:
             phase = frame.phase
             yield Entry(frame.stamp, "/bench/phase", make_message(STRING, data=phase))
@@ -190,7 +192,7 @@ def footage_entries(
             yield from _truth_entries(frame.stamp, side, jaw)
         if frame.T_camera_object is not None:
             yield Entry(frame.stamp, "/object_pose", _pose(frame.stamp, frame.T_camera_object))
-        yield from _image_entries(frame, footage, compressed)
+        yield from _image_entries(frame, simulated, compressed)
         seen(frame)
 
 
@@ -206,11 +208,11 @@ def _pose(stamp: int, pose: NDArray) -> Any:
     return pose_message(stamp, FRAME, pose[:3, 3], quaternion_from_pose(pose))
 
 
-def _image_entries(frame: TwinFrame, footage: Footage, compressed: bool) -> Iterator[Entry]:
+def _image_entries(frame: TwinFrame, simulated: SimulatedRecording, compressed: bool) -> Iterator[Entry]:
     """Yield colour, depth and intrinsics of an image."""
     stamp, told = frame.stamp, {"header": header(frame.stamp, FRAME)}
-    yield Entry(stamp, INFO_TOPIC, make_message(CAMERA_INFO, **told, **info_fields(footage.camera)))
-    steps = encode_depth(frame.depth, footage.depth_step)
+    yield Entry(stamp, INFO_TOPIC, make_message(CAMERA_INFO, **told, **info_fields(simulated.camera)))
+    steps = encode_depth(frame.depth, simulated.depth_step)
     if compressed:
         color = encode_color(frame.color)
         yield Entry(stamp, f"{COLOR_TOPIC}/compressed", _packed(told, "rgb8; jpeg compressed bgr8", color))
@@ -231,10 +233,16 @@ def _plain(told: Mapping[str, Any], encoding: str, pixels: NDArray) -> Any:
     return make_message(IMAGE, **told, **size, encoding=encoding, data=pixels.reshape(-1).view(np.uint8))
 
 
-def record_footage(
-    footage: Footage, scenario: Scenario, seed: int, folder: Path, *, compressed: bool = True, finger: int = FINGER
+def record_simulation(
+    simulated: SimulatedRecording,
+    scenario: Scenario,
+    seed: int,
+    folder: Path,
+    *,
+    compressed: bool = True,
+    finger: int = FINGER,
 ) -> None:
-    """Render the footage of a scene into a new folder, under a progress bar."""
+    """Render the recording of a scene into a new folder, under a progress bar."""
     case = {
         "scene": scenario.name,
         "seed": seed,
@@ -245,5 +253,5 @@ def record_footage(
     }
     if scenario.is_guided and not scenario.roughness:
         case["friction"] = FRICTIONLESS
-    with progress_bar(len(footage), "image", scenario.name) as bar:
-        write_footage(footage, folder, compressed=compressed, case=case, seen=lambda _: bar.update())
+    with progress_bar(len(simulated), "image", scenario.name) as bar:
+        write_simulated_recording(simulated, folder, compressed=compressed, case=case, seen=lambda _: bar.update())

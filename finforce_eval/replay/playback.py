@@ -24,7 +24,7 @@ from finforce_eval.recordings.images import (
     ImageTrack,
 )
 from finforce_eval.recordings.writer import make_message
-from finforce_sim.footage import info_fields
+from finforce_sim.simulated_recording import info_fields
 
 HEADER = "std_msgs/msg/Header"
 FIRST, HEAD = 50, 12  # messages, and their first bytes, that tell whether receipts and stamps are of one clock

@@ -84,10 +84,10 @@ class RigidContact:
 
     Attributes:
         indenter: the object.
-        bearable: force beyond which no equilibrium is believed [N], infinite where unknown.
+        max_force: force beyond which no equilibrium is believed [N], infinite where unknown.
     """
 
-    bearable = np.inf
+    max_force = np.inf
 
     def __init__(self, model: JawModel, surface: ContactSurface, face: FaceLine) -> None:
         """Keep the model, its contact surface and the undeformed inner face.

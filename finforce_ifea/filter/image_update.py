@@ -23,7 +23,7 @@ from finforce_ifea.filter.jump import (
     jump_back,
     watch,
 )
-from finforce_ifea.filter.measurement import Measurement, find_seen, observe, summarize_sight
+from finforce_ifea.filter.measurement import Measurement, find_seen, observe, summarize_detector_errors
 from finforce_ifea.filter.process import (
     APPARENT_SIGHT,
     APPARENT_TRACTION,
@@ -120,14 +120,14 @@ def move_along(q, modes, x, before):
 
 
 @njit(**_OPTIONS)
-def find_expectation(expectation, told, sight_variance, friction):
+def find_expectation(expectation, told, detector_variance, friction):
     """Return the `Expectation`.
 
     Args:
         expectation: see `EXPECTATION`.
         told: whether the contact is misplaced, and the camera was bumped; see `TractionHypotheses` for `stddev` and
             `unweighed`.
-        sight_variance: see `Sight`.
+        detector_variance: see `DetectorErrors`.
         friction: expected coefficient of friction.
     """
     expectation, (misplaced, bumped, path_stddev, unweighed) = expectation[()], told
@@ -139,7 +139,7 @@ def find_expectation(expectation, told, sight_variance, friction):
         time = PLACE_TIME
     for i, place in enumerate((shared, shared, PLACE_TURN, PLACE_STRETCH)):
         camera[i] = (_BUMPED[i] if bumped else _STILL[i]) + (place**2 if shared > 0.0 else 0.0)
-    apparent = APPARENT_TRACTION**2 + APPARENT_SIGHT**2 * sight_variance
+    apparent = APPARENT_TRACTION**2 + APPARENT_SIGHT**2 * detector_variance
     return Expectation(mean, variance, traction, apparent, camera, time)
 
 
@@ -159,12 +159,12 @@ def predict_image(image, expected, filtered, weights, friction, passed, watches,
         touching: object and surface, see `find_first_touch`.
 
     Returns:
-        Key points that are seen (m,); `Sight`; traction ratios (N,), and their mean; the `_Place`.
+        Key points that are seen (m,); `DetectorErrors`; traction ratios (N,), and their mean; the `_Place`.
     """
     (points, positions), (x, P, V, track), (before, weights) = image, filtered, weights
     (expectation, told), (dt, rest_time, taken) = expected, passed
-    sight = summarize_sight(points)
-    prior = find_expectation(expectation, told, sight[1], expect_coefficient(friction, before))
+    detector = summarize_detector_errors(points)
+    prior = find_expectation(expectation, told, detector[1], expect_coefficient(friction, before))
     predict(track, dt, rest_time, DEPTH_NOISE)
     responses = watches[0][1], watches[1][1]
     advance(x, P, V, prior, points, positions, taken, find_mean(track), before, responses)
@@ -172,17 +172,17 @@ def predict_image(image, expected, filtered, weights, friction, passed, watches,
     mean, expectation = np.dot(weights, x), expectation[()]
     at = np.array([find_mean(track), min(max(mean[SHAPE], expectation.lowest), expectation.highest), mean[HEIGHT]])
     x_model, depth = find_place(touching, at)
-    return find_seen(points), sight, (ratios, np.dot(weights, ratios)), (at, x_model, depth)
+    return find_seen(points), detector, (ratios, np.dot(weights, ratios)), (at, x_model, depth)
 
 
 @njit(**_OPTIONS)
-def _watch(watches, x, P, measured, posterior, sight, common, misplaced):
+def _watch(watches, x, P, measured, posterior, detector, common, misplaced):
     """Look for jumps that show over several images only; correct x (N, n) and P (n, n) for one, and return which."""
     found, alike = NO_JUMP, (common, np.zeros(1))
     unpacked = [JumpWatch(Jump(*each[0]), each[1], each[2], each[3]) for each in watches]
     for index in range(len(watches)):
         possible = found == NO_JUMP and (index == 0 or not misplaced)
-        if possible and watch(unpacked[index], measured, posterior, sight[0], alike[index]):
+        if possible and watch(unpacked[index], measured, posterior, detector[0], alike[index]):
             jump_back(unpacked[index], x, P)
             found = index
     if found != NO_JUMP:
@@ -226,22 +226,22 @@ def finish(state, image, P, results, friction, filtered, made, where, place, wat
         made: force, its derivatives, contact state and traction ratio of the linearisation.
         where: pressure centre on both surfaces, extrapolation and least determinant, see `PressedState`.
         place: see `_Place`.
-        watching: `Sight`; each `JumpWatch`, as plain tuples; whether the search has settled.
+        watching: `DetectorErrors`; each `JumpWatch`, as plain tuples; whether the search has settled.
 
     Returns:
         Means, covariance, log weights and weights of the hypotheses; noise level, scatter of the depth, and what
         smoothing adds to it [m]; the ratio at which only the jaws hold the object, and its slope; the jump.
     """
     (points, seen, level, expectation), (packed, weights, (pull, pull_stddev)) = image, friction
-    (track, scatter, raw), (force, modes, at, ratio), (sight, watches, settled) = filtered, made, watching
+    (track, scatter, raw), (force, modes, at, ratio), (detector, watches, settled) = filtered, made, watching
     measured, posterior, (at_place, x_model, depth) = Measurement(*results[0]), Posterior(*results[1]), place
     weight, offset = posterior.weight, posterior.mean[HEIGHT] - expectation[()].mean[1]
     ratios, doubt = preview(packed, posterior.x, at_place[0] - posterior.mean[DEPTH], weights, track)
     level, P, x = _follow_level(level, posterior.distances), reduce_covariance(P, posterior.A), posterior.x
     log_weights, weights = posterior.log_weights, np.exp(posterior.log_weights)
-    s, jumped, shared = state[()], NO_JUMP, np.array([sight[1], sight[1], sight[1] / sight[2]])
+    s, jumped, shared = state[()], NO_JUMP, np.array([detector[1], detector[1], detector[1] / detector[2]])
     if settled:
-        jumped = _watch(watches, x, P, measured, posterior, sight, ALIKE * shared, s.mistaken > 0.0)
+        jumped = _watch(watches, x, P, measured, posterior, detector, ALIKE * shared, s.mistaken > 0.0)
     s.mistaken = 1.0 if jumped == 1 else s.mistaken
     own = max(posterior.own[0, 0], _LEAST_VARIANCE)
     scatter, smooth, lessened = _smooth_depth(track, raw, (weights * x[:, DEPTH]).sum(), own, scatter)

@@ -203,19 +203,19 @@ def forget(watched):
 
 
 @njit(**_OPTIONS)
-def watch(watched, measured, posterior, sight, common):
+def watch(watched, measured, posterior, detector_share, common):
     """Take an image into a `JumpWatch`; return whether the state has jumped.
 
     Args:
         watched: see above.
         measured: see `correct`.
         posterior: see `correct`.
-        sight: share of the offsets' variance by which a detector errs in the sight of one shape. Its errors are alike
-            and tell less than independent ones of the same size.
+        detector_share: share of the offsets' variance by which a detector errs in the view of one shape. Its errors
+            are alike and tell less than independent ones of the same size.
         common: variances (j,) of what all key points err by alike, which looks like a jump.
     """
     jump, F, information, score = watched
-    independence = 1.0 / (1.0 + ALIKE * sight * (len(measured.R) - 1))
+    independence = 1.0 / (1.0 + ALIKE * detector_share * (len(measured.R) - 1))
     H, A, white, count = measured.H, posterior.A, posterior.white, F.shape[1]
     G = -project_columns(H, measured.rows, measured.u, np.ascontiguousarray(F.T)).T.copy()
     for j in range(count):

@@ -346,7 +346,7 @@ def _observe(points, motions, bend, torsion, place):
             across = by_force[k, 1] + aside[k]
             seen[m], z[m] = k, motions[k] - across * rolled
             H[m, 0], H[m, 1] = normal * (by_moment[k, 1] + turns[k]), normal * across
-            R[m] = points[k].width_variance / (points[k].trust * max(points[k].weight, 1e-9))
+            R[m] = points[k].width_variance / (points[k].noise_ratio * max(points[k].weight, 1e-9))
             R[m] += (_TURN_ERROR * turns[k] * location * normal) ** 2
             m += 1
     return (seen[:m], H[:m], z[:m], R[:m]), (by_moment, by_force, rolled)

@@ -72,13 +72,13 @@ def find_seen(points):
     count = 0
     for k in range(len(points)):
         measured = points[k].measured
-        if np.isfinite(measured[0] + measured[1] + measured[2]) and points[k].trust > 0.0:
+        if np.isfinite(measured[0] + measured[1] + measured[2]) and points[k].noise_ratio > 0.0:
             seen[count] = k
             count += 1
     return seen[:count].copy()
 
 
-class Sight(NamedTuple):
+class DetectorErrors(NamedTuple):
     """Errors of a detector that last while it sees the same.
 
     Attributes:
@@ -93,13 +93,13 @@ class Sight(NamedTuple):
 
 
 @njit(**_OPTIONS)
-def summarize_sight(points):
-    """Return the `Sight` of an image as a plain tuple."""
-    sight, height, offsets = np.empty(len(points)), np.empty(len(points)), 0.0
+def summarize_detector_errors(points):
+    """Return the `DetectorErrors` of an image as a plain tuple."""
+    variance, height, offsets = np.empty(len(points)), np.empty(len(points)), 0.0
     for k in range(len(points)):
-        sight[k], height[k] = points[k].sight, points[k].rest[2]
+        variance[k], height[k] = points[k].detector_variance, points[k].rest[2]
         offsets += points[k].offset_variance
-    return sight.sum() / offsets, np.median(sight), height.var()
+    return variance.sum() / offsets, np.median(variance), height.var()
 
 
 @njit(**_OPTIONS)
@@ -123,7 +123,9 @@ def observe(points, seen, positions, motions, at, ratio, level):
         point, p = points[k], positions[k]
         lateral = point.measured[1] - p[1]
         square[i] = (
-            lateral * lateral / (level * point.width_variance / point.trust + point.offset_variance + LATERAL_ERROR**2)
+            lateral
+            * lateral
+            / (level * point.width_variance / point.noise_ratio + point.offset_variance + LATERAL_ERROR**2)
         )
         size = np.hypot(p[0] - point.rest[0], p[2] - point.rest[2])
         for a in range(2):
@@ -134,7 +136,7 @@ def observe(points, seen, positions, motions, at, ratio, level):
             z[row] = point.measured[2 * a] - p[2 * a] - point.gain[a] * lateral + motion[3] * ratio
             z[row] += motion[0] * at[0] + motion[1] * at[1] + motion[2] * at[2]
             for b in range(2):
-                R[i, a, b] = level * point.tare_noise[a, b] / point.trust
+                R[i, a, b] = level * point.tare_noise[a, b] / point.noise_ratio
         H[2 * i, CAMERA_X], H[2 * i + 1, CAMERA_Z] = 1.0, 1.0
         H[2 * i, CAMERA_TURN], H[2 * i + 1, CAMERA_TURN] = p[2], -p[0]
         H[2 * i + 1, CAMERA_STRETCH] = p[2]

@@ -31,7 +31,7 @@ MODEL_RELATIVE = 0.01
 # Motion [m] and time [s] over which such an error stays the same.
 MODEL_LENGTH = 10e-3
 MODEL_TIME = 60.0
-# Motion over which what a detector errs by in the sight of one shape stays the same [m]: half a pixel.
+# Motion over which what a detector errs by in the view of one shape stays the same [m]: half a pixel.
 SIGHT_LENGTH = 0.1e-3
 # Time over which the relative error stays the same [s].
 RELATIVE_TIME = 200.0
@@ -103,16 +103,16 @@ def expect_state(expected, offset_variance, displacement):
 
 
 @njit(**_OPTIONS)
-def find_decay(sight, dt, motion, camera_time):
+def find_decay(detector_share, dt, motion, camera_time):
     """Return a (n,) after a time dt [s] and a motion of the object [m].
 
     Args:
-        sight: share of each key point's offset that a detector errs by in the sight of one shape (K,) [-].
+        detector_share: share of each key point's offset that a detector errs by in the view of one shape (K,) [-].
         dt: see above.
         motion: see above.
         camera_time: see `Expectation`.
     """
-    keypoints = len(sight)
+    keypoints = len(detector_share)
     a = np.ones(SHARED + 4 * keypoints)
     a[SHAPE] = a[HEIGHT] = np.exp(-dt / OBJECT_TIME)
     a[TRACTION] = np.exp(-motion / TRACTION_LENGTH - dt / MODEL_TIME)
@@ -120,7 +120,7 @@ def find_decay(sight, dt, motion, camera_time):
     a[CAMERA_X : CAMERA_STRETCH + 1] = np.exp(-dt / camera_time)
     lasts, seen = np.exp(-motion / MODEL_LENGTH - dt / MODEL_TIME), np.exp(-motion / SIGHT_LENGTH)
     for k in range(keypoints):
-        a[SHARED + 2 * k : SHARED + 2 * k + 2] = lasts * (1.0 - sight[k] + sight[k] * seen)
+        a[SHARED + 2 * k : SHARED + 2 * k + 2] = lasts * (1.0 - detector_share[k] + detector_share[k] * seen)
     a[SHARED + 2 * keypoints :] = np.exp(-dt / RELATIVE_TIME)
     return a
 
@@ -165,14 +165,14 @@ def advance(x, P, V, expected, points, positions, passed, depth, weights, respon
         responses: of the state to a jump (n, j), see `JumpWatch`.
     """
     (dt, motion), count = passed, len(points)
-    displacement, sight = np.empty(count), np.empty(count)
+    displacement, detector_share = np.empty(count), np.empty(count)
     for k in range(count):
         displacement[k] = np.hypot(positions[k, 0] - points[k].rest[0], positions[k, 2] - points[k].rest[2])
     m, after = expect_state(expected, points.offset_variance, displacement)
     growth = find_growth(V, after, count)
     for k in range(count):
-        sight[k] = points[k].sight / after[SHARED + 2 * k]
-    a = find_decay(sight, dt, motion, expected.camera_time)
+        detector_share[k] = points[k].detector_variance / after[SHARED + 2 * k]
+    a = find_decay(detector_share, dt, motion, expected.camera_time)
     predict(x, P, a, m, after, growth)
     V[:] = after
     x[:, DEPTH] += depth - (weights * x[:, DEPTH]).sum()

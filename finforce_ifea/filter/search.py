@@ -36,7 +36,7 @@ from finforce_ifea.filter.jump import (
     forget,
     watch_for,
 )
-from finforce_ifea.filter.measurement import Sight, summarize_sight
+from finforce_ifea.filter.measurement import DetectorErrors, summarize_detector_errors
 from finforce_ifea.filter.process import Expectation, start
 from finforce_ifea.filter.state import DEPTH, HEIGHT, SHAPE, TRACTION, state_size
 from finforce_ifea.settings import EstimatorSettings
@@ -80,7 +80,7 @@ class ContactSearch:
         self.settings, self.pull = settings, (0.0, 0.0)
         self.points, self.positions = np.zeros(count, KEYPOINT), np.zeros((count, 3))
         self.state, self.expectation = blank_contact_state(), np.zeros((), EXPECTATION)
-        self._count, self._sight = count, Sight(0.0, 0.0, 1.0)
+        self._count, self._detector_errors = count, DetectorErrors(0.0, 0.0, 1.0)
         self._watches = tuple(watch_for(jump, state_size(count)) for jump in (NUDGED, OFFSET))
         self._packed_watches = tuple((tuple(each.jump), *each[1:]) for each in self._watches)
         self.expect_friction(Coefficient(settings.friction, settings.friction_stddev))
@@ -191,11 +191,11 @@ class ContactSearch:
 
     def _expect(self) -> Expectation:
         """Return what the state returns to."""
-        return find_expectation(self.expectation, self._told, self._sight.variance, self.friction.mean)
+        return find_expectation(self.expectation, self._told, self._detector_errors.variance, self.friction.mean)
 
     def _start(self) -> None:
         """Begin with the first image."""
-        self._sight = Sight(*summarize_sight(self.points))
+        self._detector_errors = DetectorErrors(*summarize_detector_errors(self.points))
         m, self._V = start(self._expect(), self.points, self.state["x"])
         self.x, self.P = np.tile(m, (len(self.log_weights), 1)), np.diag(self._V)
         self.track = Track(DEPTH_NOISE, float(m[DEPTH]), _FIRST_DEPTH**2)
@@ -261,10 +261,10 @@ class ContactSearch:
         rest_time = _FREE_TIME if self.state["depth"] < LOADED_DEPTH else DEPTH_NOISE.rest_time
         image, expected, weights = (self.points, positions), (self.expectation, self._told), (weights, self.weights)
         times, watches = (dt, rest_time, passed), self._packed_watches
-        seen, sight, ratios, place = predict_image(
+        seen, detector, ratios, place = predict_image(
             image, expected, filtered, weights, friction, times, watches, touching
         )
-        self._sight = Sight(*sight)
+        self._detector_errors = DetectorErrors(*detector)
         return seen, ratios, _Place(*place)
 
     def _take(self, image, P, results, friction, pressed, at, ratio, place, *, settled: bool) -> None:
@@ -275,7 +275,7 @@ class ContactSearch:
         where = pressed.pressure_point, pressed.pressure_location, pressed.extrapolation, pressed.smallest_det
         weighed = friction, self.weights, (self.pull[0], hypotheses.pull_stddev)
         filtered = self.track.state, self._scatter, self._raw
-        watching = tuple(self._sight), self._packed_watches, settled
+        watching = tuple(self._detector_errors), self._packed_watches, settled
         means, (self._level, self._scatter, self._smooth), upright, jumped = finish(
             s, image, P, results, weighed, filtered, made, where, place, watching
         )

@@ -259,8 +259,8 @@ class ContactTracker:
         points = self._search.points
         points["measured"], points["rest"] = measured, self._rest
         points["tare_noise"], points["gain"] = noise.plane, noise.gain
-        points["width_variance"], points["trust"] = noise.width_variance, noise.trust
-        points["offset_variance"], points["sight"] = tare.offset_variance() + noise.bias, noise.bias
+        points["width_variance"], points["noise_ratio"] = noise.width_variance, noise.noise_ratio
+        points["offset_variance"], points["detector_variance"] = tare.offset_variance() + noise.bias, noise.bias
 
     def significance(self, tare: Tare, stddev: float) -> float:
         """Return by how many standard deviations a force explains the offsets of a tare; see `explain_offsets`."""
@@ -361,8 +361,8 @@ class ContactTracker:
         traction = UNSEEN_TRACTION * self.settings.friction
         load = self._lateral.load if self._is_known else (0.0, MIDDLE_STDDEV, nan, traction)
         state["y"], state["y_stddev"], state["lateral_force"], state["lateral_stddev"] = load
-        state["hidden"] = self._find_hidden(state)
-        state["bearable"] = self._fidelities[0].contact.bearable
+        state["unobserved_stddev"] = self._find_hidden(state)
+        state["max_force"] = self._fidelities[0].contact.max_force
 
     def _find_hidden(self, state: ContactState) -> float:
         """Return the standard deviation of a force next to the clamp [N], see `HiddenForce`."""

@@ -216,7 +216,7 @@ def _share_rows(heights: NDArray, places: NDArray) -> NDArray:
 
 # A shape this share of the finger's length from a stored one has an error of about a per cent of its force.
 _FARTHEST_SHAPE = 0.0056
-_BEARABLE = 0.5
+_MAX_FORCE_RATIO = 0.5
 # A step larger than this share of what is allowed is cut where the energy rises by this share of the fall at its start.
 _LARGE_STEP, _TOO_FAR, _BISECTIONS = 0.3, 0.5, 6
 
@@ -226,7 +226,7 @@ class ReducedContact(RigidContact):
 
     Attributes:
         packed: `_Jaw` as a plain tuple.
-        bearable: force beyond which no equilibrium is believed [N]: half of the largest that is stored, beside the
+        max_force: force beyond which no equilibrium is believed [N]: half of the largest that is stored, beside the
             clamp; in its middle the bench finger bears a sixth of that.
     """
 
@@ -241,7 +241,7 @@ class ReducedContact(RigidContact):
         # the rest alone is stored on purpose where no rod was pressed in
         farthest = _FARTHEST_SHAPE * length if model.manifold.depths.any() else np.inf
         x, z = (model.loads[:, :, axis::2].sum(axis=2) for axis in (0, 1))
-        self.bearable = _BEARABLE * float(np.hypot(x, z).max()) if np.isfinite(farthest) else np.inf
+        self.max_force = _MAX_FORCE_RATIO * float(np.hypot(x, z).max()) if np.isfinite(farthest) else np.inf
         self._jaw = _Jaw(
             moves=model.manifold.moves,
             compliance=model.compliance,

@@ -28,7 +28,7 @@ CONTACT_STATE = np.dtype(
         ("pressure_location", *_V),  # the same on the undeformed surface [m]
         ("magnitude", float),  # of the force [N]
         ("stddev", float),  # of the force along itself [N]
-        ("hidden", float),  # standard deviation of a force elsewhere, which key points hardly show [N]
+        ("unobserved_stddev", float),  # standard deviation of a force elsewhere, which key points hardly show [N]
         ("depth", float),  # below first touch [m]
         ("depth_variance", float),  # [m^2]
         ("height_stddev", float),  # of the pressure centre [m]
@@ -39,7 +39,7 @@ CONTACT_STATE = np.dtype(
         ("mistaken", float),  # probability that the stated location is wrong
         ("location_error", float),  # relative standard deviation of the force that the location leaves
         ("extrapolation", float),  # distance of the shape from the stored ones, as a share of what these are good for
-        ("bearable", float),  # force beyond which no equilibrium is believed [N]
+        ("max_force", float),  # force beyond which no equilibrium is believed [N]
         ("y", float),  # of the pressure along the width [m]
         ("y_stddev", float),  # [m]
         ("lateral_force", float),  # along y [N]; NaN where it is unknown
@@ -65,10 +65,10 @@ KEYPOINT = np.dtype(
         ("tare_noise", float, (2, 2)),  # covariance in the plane in an image like those of the tare [m^2]
         ("gain", float, 2),  # regression of the noise along x and z on that along y
         ("width_variance", float),  # along y in such an image [m^2]
-        ("trust", float),  # variance in the tare over that in this image
+        ("noise_ratio", float),  # variance in the tare over that in this image
         ("offset_variance", float),  # of what is constant [m^2]
-        ("sight", float),  # part of it that the detector errs by in the sight of this shape [m^2]
-        ("weight", float),  # agreement times trust, 0 to 1
+        ("detector_variance", float),  # part of it that the detector errs by in the view of this shape [m^2]
+        ("weight", float),  # agreement times the noise ratio, 0 to 1
     ]
 )
 
@@ -89,7 +89,7 @@ def blank_contact_state() -> ContactState:
 
 
 _BLANK = np.zeros((), CONTACT_STATE)
-_BLANK["bearable"] = np.inf
+_BLANK["max_force"] = np.inf
 _BLANK["used"] = 1
 _BLANK_BYTES = _BLANK.tobytes()
 
@@ -132,8 +132,8 @@ def find_rejection_reason(state: ContactState, *, largest_residual: float, large
         return "the jaw's shape is too far from the stored ones; solver solid or frame knows any shape"
     if state["mistaken"] > _MISTAKEN and abs(state["offset"]) > _LEAST_OFFSET:
         return f"the contact is off its stated location: the key points have it {1e3 * state['offset']:+.0f} mm away"
-    if magnitude > state["bearable"]:
-        most = f"expected {state['bearable']:.0f} N at most"
+    if magnitude > state["max_force"]:
+        most = f"expected {state['max_force']:.0f} N at most"
         return f"the shape would take {magnitude:.0f} N, {most}; is the contact elsewhere?"
     ambiguity = _find_ambiguity(state, max(largest_stddev, _VAGUE_SHARE * magnitude))
     if ambiguity or state["residual"] <= largest_residual:
@@ -149,7 +149,7 @@ def _find_ambiguity(state: ContactState, vague: float) -> str:
     if pulled > min(max(_PULLING * sqrt(state["depth_variance"]), _LEAST_PULL), _MOST_PULL):
         bent = f"the jaw is bent towards the object, as if that pulled by {1e3 * pulled:.1f} mm"
         return f"{bent}: open the jaw and tare, or the contact is elsewhere"
-    if state["hidden"] > vague:
+    if state["unobserved_stddev"] > vague:
         return "the object may press where key points hardly show a force: next to the clamp"
     if not state["stddev"] <= vague:
         return f"the visible key points tell the force only within {state['stddev']:.2g} N, expected {vague:.2g} N"
@@ -185,7 +185,7 @@ _CURVED = 0.87
 
 
 @njit(**_OPTIONS)
-def compute_force(state, relaxation, untold, dt, errors, out):
+def compute_force(state, relaxation, relaxation_stddev, dt, errors, out):
     """Write the force that the material gives now, and what belongs to it, to out (7, 3).
 
     The rows are force [N], torque about the jaw frame's origin [N m], their standard deviations, contact point [m],
@@ -194,7 +194,7 @@ def compute_force(state, relaxation, untold, dt, errors, out):
     Args:
         state: see `CONTACT_STATE`.
         relaxation: the finger's, see `Relaxation.packed`, which is advanced by dt.
-        untold: standard deviation of what forces that were not told have left in it (3,) [N].
+        relaxation_stddev: standard deviation of that by forces whose onset is unknown (3,) [N].
         dt: time since the last force [s].
         errors: relative standard deviations, of the mechanics, in magnitude and direction alike, and of the material's
             modulus, which leaves the direction as it is.
@@ -217,10 +217,10 @@ def compute_force(state, relaxation, untold, dt, errors, out):
     # a larger force is more inclined: where it is hardly known, its direction is not known either
     inclination = (UNSEEN_ALONG * fit**2 / max(magnitude + fit, 1e-300)) ** 2
     lateral = (state.lateral_stddev * magnitude) ** 2
-    more = (wrong + leaked[0] ** 2 + state.hidden**2, lateral, wrong + inclination + leaked[2] ** 2)
+    more = (wrong + leaked[0] ** 2 + state.unobserved_stddev**2, lateral, wrong + inclination + leaked[2] ** 2)
     along = (leaked * force).sum() / max(magnitude, 1e-300)
     for a in range(3):
-        variance = more[a] + (stiffness_error * force[a]) ** 2 + untold[a] ** 2
+        variance = more[a] + (stiffness_error * force[a]) ** 2 + relaxation_stddev[a] ** 2
         for i in range(3):
             for j in range(3):
                 variance += modes[a, i] * covariance[i, j] * modes[a, j]
@@ -239,10 +239,10 @@ def compute_force(state, relaxation, untold, dt, errors, out):
             normal[a] = force[a] / magnitude
         else:
             arm[a] = undeformed[a] = normal[a] = np.nan
-    scaled, left = (stiffness_error * magnitude) ** 2, _measure_length(untold) ** 2
+    scaled, left = (stiffness_error * magnitude) ** 2, _measure_length(relaxation_stddev) ** 2
     across = max(stddev[0] ** 2 + stddev[2] ** 2 - fit**2 - wrong - scaled - left, 0.0)
     turned = (_CURVED * across / max(magnitude + fit, 1e-300)) ** 2
-    return magnitude, np.sqrt(fit**2 + wrong + scaled + along**2 + state.hidden**2 + left + turned)
+    return magnitude, np.sqrt(fit**2 + wrong + scaled + along**2 + state.unobserved_stddev**2 + left + turned)
 
 
 @njit(**_OPTIONS)

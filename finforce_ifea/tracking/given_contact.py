@@ -145,7 +145,7 @@ class GivenContactTracker:
         targets = points - tare.offsets
         known = np.isfinite(targets[:, 0])
         noise = tare.point_noise(observation.stddev)
-        scatter = np.trace(noise.plane, axis1=1, axis2=2) / 2.0 / noise.trust
+        scatter = np.trace(noise.plane, axis1=1, axis2=2) / 2.0 / noise.noise_ratio
         # the points are taken to err independently, and would average away what they share
         scatter += np.count_nonzero(known) * observation.shared.shift**2
         variance = scatter + noise.bias + tare.offset_variance()

@@ -179,7 +179,7 @@ _FARTHEST, _FEWEST, _VAGUE = 3e-3, 4, 0.3e-3
 _NEARER, _REST_REACH = 0.75, 1e-3
 
 
-class ReachWatch:
+class UnloadedCheck:
     """Watches an unloaded jaw while its object is away.
 
     Args:
@@ -212,12 +212,12 @@ class ReachWatch:
 
     def _is_at_rest(self, deviations: NDArray, tare: Tare) -> bool:
         """Return True if deviations (K, 3) [m] from the tared jaw are chance."""
-        ways = np.sqrt((deviations * deviations).sum(axis=1))
-        near = (ways < _FARTHEST) & (tare.counts > 0)
-        known = int(np.isfinite(ways).sum())
+        distances = np.sqrt((deviations * deviations).sum(axis=1))
+        near = (distances < _FARTHEST) & (tare.counts > 0)
+        known = int(np.isfinite(distances).sum())
         if near.sum() < max(_FEWEST, _NEARER * known):
             return False
-        if np.mean(np.sort(ways[near])[: int(_NEARER * known) + 1] ** 2) > _REST_REACH**2:
+        if np.mean(np.sort(distances[near])[: int(_NEARER * known) + 1] ** 2) > _REST_REACH**2:
             return False
         modes, deviations = self._modes[near], deviations[near][:, [0, 2]]
         gain = float((modes * modes).sum()) + 1e-12

@@ -171,7 +171,7 @@ class JawLocalizer:
         """T_camera_jaw (4, 4) in the middle of the opening range."""
         return self._origin.place(self._origin.middle)
 
-    def imagine(self, camera: CameraIntrinsics) -> PixelDetection:
+    def predict_pixels(self, camera: CameraIntrinsics) -> PixelDetection:
         """Return the detection of a jaw at rest, seen without error in the middle of the opening range."""
         T, count = self.middle, len(self._rest)
         return PixelDetection(

@@ -21,7 +21,7 @@ from finforce.messages import magnitude_stddev
 from finforce.transforms import invert_pose
 from finforce_contact.estimator import ContactEstimator
 from finforce_contact.loop import ForceLoop
-from finforce_driver.grasp.load_watch import ForceSample, TouchSample
+from finforce_driver.grasp.force_monitor import ForceSample, TouchSample
 from finforce_driver.grasp.session import hold_force
 from finforce_driver.gripper import Gripper
 from finforce_driver.settings import GraspGoal, GraspSettings
@@ -39,9 +39,9 @@ from finforce_keypoints.parameters import DetectorParameters, DetectorSettings, 
 from finforce_sim.emulator.adapter import EmulatedAdapter
 from finforce_sim.emulator.firmware import EmulatedGripper
 from finforce_sim.emulator.virtual import VirtualBus, VirtualClock
-from finforce_sim.footage import disturb_pose, parse_size
 from finforce_sim.gripper import PressedGrasp, TwinState
-from finforce_sim.photographer import Photographer
+from finforce_sim.simulated_camera import SimulatedCamera
+from finforce_sim.simulated_recording import disturb_pose, parse_size
 
 IMAGES = 30.0  # [Hz]
 LOST = 0.02  # share of the images
@@ -312,14 +312,14 @@ class ImageSensor(EstimatorSensor):
     def __init__(self, pressed: PressedGrasp, seed: int, size: str = "640x480") -> None:
         super().__init__(pressed, seed)
         self._camera, depth_step = parse_size(size), 1e-3
-        self._photographer = Photographer(pressed, self._camera, seed, depth_step)
+        self._simulated_camera = SimulatedCamera(pressed, self._camera, seed, depth_step)
         self._before: TwinState | None = None
         parameters = DetectorParameters()
         settings = DetectorSettings(quantum=depth_step)
         self._detector = build_detector(load_jaws(parameters), parameters, settings, DotSettings())
 
     def _look(self, state: TwinState) -> Mapping[str, Observation]:
-        shot = self._photographer.shoot(state, self._before)
+        shot = self._simulated_camera.shoot(state, self._before)
         self._before = state
         image = RgbdImage(stamp=state.stamp, color=shot.color, depth=shot.depth, camera=self._camera)
         found = self._detector.detect(image)

@@ -14,8 +14,8 @@ from finforce_eval.evaluation.batch import evaluate_all
 from finforce_eval.evaluation.scoring import join_net, measure_sharpness, rms
 from finforce_eval.recordings.tracks import GravityTrack, Recording
 from finforce_eval.table import AXES, ForceSeries
-from finforce_sim.footage import START
 from finforce_sim.scenarios import build_scenario, write_script
+from finforce_sim.simulated_recording import START
 from lab.experiments.experiment import SHARP, Case, Experiment, RunOptions, average, build_setup, tabulate
 from lab.harness import Figures
 

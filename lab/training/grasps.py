@@ -18,10 +18,10 @@ from tqdm import tqdm
 from finforce.optional import import_cv2
 from finforce_eval.cli.parser import add_engine_options, read_engine, whole_number
 from finforce_eval.tasks import Task
-from finforce_sim.footage import parse_size
 from finforce_sim.gripper import PressedGrasp, TwinState
-from finforce_sim.photographer import Photographer
 from finforce_sim.scenarios import RATE, build_scenario
+from finforce_sim.simulated_camera import SimulatedCamera
+from finforce_sim.simulated_recording import parse_size
 from lab.training.commands import TrainingError, one_line_errors
 from lab.training.pictures import make_all
 
@@ -81,9 +81,9 @@ def write_grasps(scene: str, height: float, count: int, seed: int, path: str) ->
     pressed = PressedGrasp(build_scenario(scene, height=height), step=STEP)
     camera, images, force, starts = parse_size(SIZE), [], [], [0]
     for number in range(seed, seed + count):
-        photographer, before = Photographer(pressed, camera, number), None
+        simulated_camera, before = SimulatedCamera(pressed, camera, number), None
         for state, truth in play_grasp(pressed, np.random.default_rng((number, 21))):
-            images.append(shrink_image(photographer.shoot(state, before).color))
+            images.append(shrink_image(simulated_camera.shoot(state, before).color))
             force.append(truth)
             before = state
         starts.append(len(force))

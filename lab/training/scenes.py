@@ -25,7 +25,6 @@ from finforce_eval.tasks import EngineOptions, Task
 from finforce_keypoints.geometry.side_picture import PlaneGrid
 from finforce_keypoints.geometry.template import MARK_RADIUS, SideShape, draw_template, fit_grid
 from finforce_sim.objects import OBJECT_NAMES, build_object
-from finforce_sim.photographer import build_box
 from finforce_sim.render import (
     Body,
     Decal,
@@ -38,6 +37,7 @@ from finforce_sim.render import (
     draw_paint,
 )
 from finforce_sim.sensor import expose
+from finforce_sim.simulated_camera import build_box
 from lab.training.commands import one_line_errors, read_share
 from lab.training.fingers import FIRST_VALIDATION, SEED, BentFinger, draw_finger, outline
 from lab.training.pictures import MARGIN, TRAIN, VALIDATION, FingerPictures, make_all, save_shard

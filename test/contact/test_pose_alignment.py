@@ -66,7 +66,7 @@ def test_image_tells_seen_hidden_absent_and_unknown_apart():
     mask = np.ones(depth.shape, bool)
     mask[:, 250] = False
     comparison = DepthImage(depth, CAMERA, mask).compare_surface(surface, 0.003)
-    assert comparison.sights.tolist() == [
+    assert comparison.visibility.tolist() == [
         Visibility.SEEN,
         Visibility.HIDDEN,
         Visibility.ABSENT,

@@ -11,9 +11,9 @@ from finforce_ifea.estimator import ForceEstimator
 from finforce_ifea.jaw.calibration import load_calibration
 from finforce_ifea.observation import Observation
 from finforce_ifea.settings import EstimatorSettings
-from finforce_sim.footage import disturb_pose
 from finforce_sim.gripper import TwinGripper
 from finforce_sim.scenarios import build_scenario
+from finforce_sim.simulated_recording import disturb_pose
 
 NOISE = 0.05e-3  # [m] of key points
 

@@ -10,7 +10,7 @@ from estimator_fakes import BENCH, CALIBRATION, magnitudes, ramp, record
 
 from finforce.health import ALL, IDLE, RULES, STILL, Idling, SkippingError, Skips
 from finforce_ifea.estimator import ForceEstimator
-from finforce_ifea.observation import AWAY, Contact, ObjectOutline, is_out_of_reach
+from finforce_ifea.observation import OUT_OF_REACH, Contact, ObjectOutline, is_out_of_reach
 from finforce_ifea.settings import EstimatorSettings
 
 RADIUS, HEIGHT = 0.0125, 0.040
@@ -119,7 +119,9 @@ class TestAnObjectOutOfReach:
             object.__setattr__(contact, name, value)
         assert is_out_of_reach(contact, BENCH.inner_face_x) is away
 
-    @pytest.mark.parametrize(("gap", "away"), [(AWAY + 1.6e-3, True), (AWAY + 1.4e-3, False), (-FAR, False)])
+    @pytest.mark.parametrize(
+        ("gap", "away"), [(OUT_OF_REACH + 1.6e-3, True), (OUT_OF_REACH + 1.4e-3, False), (-FAR, False)]
+    )
     def test_what_the_place_may_err_counts_as_near(self, gap, away):
         contact = circle(gap)
         object.__setattr__(contact, "touching", False)

@@ -28,7 +28,7 @@ from fault_trials import Tally
 from grasp_fakes import build_spring
 
 from finforce_driver.errors import BackOffError, DriverError, GripperTimeoutError
-from finforce_driver.grasp.load_watch import ForceSample
+from finforce_driver.grasp.force_monitor import ForceSample
 from finforce_driver.grasp.session import hold_force
 from finforce_driver.settings import GraspGoal, GraspSettings
 from finforce_driver.state import GraspPhase, GraspStatus, GripperState, MoveOutcome, Phase

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from finforce_driver.grasp.controller import ForceGrasp
-from finforce_driver.grasp.load_watch import ForceSample
+from finforce_driver.grasp.force_monitor import ForceSample
 from finforce_driver.settings import GraspGoal, GraspSettings
 from finforce_driver.state import GraspPhase, GraspStatus, GripperState, Phase
 

@@ -11,7 +11,7 @@ from fault_trials import FaultRun, choose_kinds
 from faulty_grasp_trials import play_all
 
 from finforce_driver.machine.drive import Exchange
-from finforce_driver.machine.knowledge import ReplyFilter
+from finforce_driver.machine.status_tracker import ReplyFilter
 
 
 def total(tally):

@@ -8,7 +8,7 @@ import pytest
 from emulator_faults import FaultyAdapter, FaultyBus
 
 from finforce_driver.errors import GraspError
-from finforce_driver.grasp.load_watch import ForceSample
+from finforce_driver.grasp.force_monitor import ForceSample
 from finforce_driver.grasp.session import hold_force
 from finforce_driver.gripper import Gripper
 from finforce_driver.settings import GraspGoal

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 from grasp_fakes import STEP, Bench, Camera, Fingers, Jaws, spring
 
-from finforce_driver.grasp.load_watch import ForceSample
+from finforce_driver.grasp.force_monitor import ForceSample
 from finforce_driver.settings import GraspGoal, GraspSettings
 from finforce_driver.state import GraspPhase, Phase
 

@@ -7,9 +7,9 @@ from emulator_fakes import reply
 
 from finforce_driver.can.protocol import CanMessage, Command, Flag, Move, encode
 from finforce_driver.machine.drive import MARKERS, Exchange, Request
-from finforce_driver.machine.knowledge import History, Telemetry
 from finforce_driver.machine.move import GRACE, Goal, MoveJob, Orders
 from finforce_driver.machine.procedures import CalibrationRun, Step
+from finforce_driver.machine.status_tracker import History, Telemetry
 from finforce_driver.settings import GripperSettings
 from finforce_driver.state import MoveOutcome
 

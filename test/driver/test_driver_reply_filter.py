@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from finforce_driver.can.protocol import CanMessage, decode_reply
-from finforce_driver.machine.knowledge import MOST_UNCONFIRMED, ReplyFilter
+from finforce_driver.machine.status_tracker import MOST_UNCONFIRMED, ReplyFilter
 
 REST = (0.0, 100.0)  # speed and greatest speed that is possible [counts/s]
 SOON, POLL = 0.0015, 0.02  # [s]

@@ -16,7 +16,7 @@ from finforce_driver.conversions import (
     outcome_of_state,
 )
 from finforce_driver.errors import DriverError, GraspError, GripperStateError, TargetError
-from finforce_driver.grasp.load_watch import ForceSample
+from finforce_driver.grasp.force_monitor import ForceSample
 from finforce_driver.grasp.session import GraspSession
 from finforce_driver.services import GripperTasks, MoveAction
 from finforce_driver.settings import DriverParameters, GraspGoal, GraspSettings

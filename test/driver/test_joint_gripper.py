@@ -9,7 +9,7 @@ from grasp_fakes import build_spring
 from joint_fakes import LEROBOT, ROBOTIQ, EmulatedJoint
 
 from finforce_driver.errors import GraspError, GripperStateError, GripperTimeoutError, TargetError
-from finforce_driver.grasp.load_watch import ForceSample
+from finforce_driver.grasp.force_monitor import ForceSample
 from finforce_driver.grasp.session import hold_force
 from finforce_driver.settings import GraspGoal, GraspSettings, JointSettings
 from finforce_driver.state import GraspPhase, MoveOutcome, Phase

@@ -8,13 +8,13 @@ import pytest
 from eval_fakes import PERIOD, START, FakeContactEstimator, FakeJaw, make_recording
 from keypoint_node_fakes import CameraBench
 from node_fakes import KEYPOINTS, FakeEstimator, keypoint_cloud, start_solver
-from rgbd_fakes import FakeDetector, make_footage
+from rgbd_fakes import FakeDetector, make_simulated
 
 from finforce.health import IDLE, Idling
 from finforce.messages import stamp_of
 from finforce_contact.loop import GivenContact
 from finforce_eval.cli.main import parse
-from finforce_eval.cli.twin import write_footage
+from finforce_eval.cli.twin import write_simulated_recording
 from finforce_eval.evaluation.contact_source import RecordedContact
 from finforce_eval.evaluation.forces import ImageRun, find_forces
 from finforce_eval.evaluation.keypoint_source import detect_keypoints, parse_source
@@ -71,7 +71,7 @@ def test_images_that_the_solver_passes_over_have_no_row(probe):
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
-    return read_recording(write_footage(make_footage(), tmp_path_factory.mktemp("bags") / "twin"))
+    return read_recording(write_simulated_recording(make_simulated(), tmp_path_factory.mktemp("bags") / "twin"))
 
 
 class StillAt(FakeDetector):

@@ -9,11 +9,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from eval_fakes import FakeEstimator, FakeJaw, evaluate_recording
-from rgbd_fakes import FakeDetector, FakeGripper, make_footage
+from rgbd_fakes import FakeDetector, FakeGripper, make_simulated
 
 from finforce_contact.loop import GivenContact
 from finforce_eval.cli import demo, replay
-from finforce_eval.cli.twin import write_footage
+from finforce_eval.cli.twin import write_simulated_recording
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.keypoint_source import KeypointSource, detect_keypoints
 from finforce_eval.evaluation.scoring import score_grasp, score_results
@@ -25,14 +25,14 @@ from finforce_ifea.jaw.jaw import load_jaw
 
 @pytest.fixture
 def rendered(monkeypatch):
-    """What was asked of the renderer, which answers with footage by rule."""
+    """What was asked of the renderer, which answers with recordings by rule."""
     calls = []
 
     def build(scenario, seed, camera):
         calls.append((scenario.name, seed))
-        return make_footage(seed=seed)
+        return make_simulated(seed=seed)
 
-    monkeypatch.setattr("finforce_eval.cli.demo.build_footage", build)
+    monkeypatch.setattr("finforce_eval.cli.demo.build_simulated_recording", build)
     return calls
 
 
@@ -78,7 +78,9 @@ def test_what_the_demo_has_not_made_is_left_alone(rendered, tmp_path, name):
 @pytest.fixture(scope="module")
 def played(tmp_path_factory):
     """A recording from images; the force rises by 0.1 N an image from image 20 on."""
-    path = write_footage(make_footage(FakeGripper(count=40, onset=20)), tmp_path_factory.mktemp("bags") / "twin")
+    path = write_simulated_recording(
+        make_simulated(FakeGripper(count=40, onset=20)), tmp_path_factory.mktemp("bags") / "twin"
+    )
     recording = read_recording(path)
     return detect_keypoints(recording, FakeDetector(recording))
 

@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rgbd_fakes import FakeDetector, FakeGripper, FakePhotographer, make_footage
+from rgbd_fakes import FakeCamera, FakeDetector, FakeGripper, make_simulated
 
 from finforce.errors import PoseError
 from finforce_eval.cli.main import main
-from finforce_eval.cli.twin import write_footage
+from finforce_eval.cli.twin import write_simulated_recording
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.keypoint_source import KeypointSource, awaiting_keypoints, detect_keypoints, parse_source
 from finforce_eval.evaluation.scoring import compare_detection, detection_stats
@@ -23,7 +23,7 @@ from finforce_keypoints.parameters import DetectorParameters
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
-    return read_recording(write_footage(make_footage(), tmp_path_factory.mktemp("bags") / "twin"))
+    return read_recording(write_simulated_recording(make_simulated(), tmp_path_factory.mktemp("bags") / "twin"))
 
 
 def is_found(track):
@@ -93,7 +93,7 @@ def test_images_without_depth_are_a_note(recording):
 
 
 def test_a_black_picture_gives_no_key_points(tmp_path):
-    folder = write_footage(make_footage(photographer=FakePhotographer(black=(5,))), tmp_path / "twin")
+    folder = write_simulated_recording(make_simulated(simulated_camera=FakeCamera(black=(5,))), tmp_path / "twin")
     found, detector = detect(read_recording(folder))
     assert not is_found(found.jaws["left"])[5] and len(detector.stamps) == 11
     assert any("black" in note for note in found.notes)
@@ -193,7 +193,7 @@ def test_extrinsics_are_a_name_or_seven_numbers():
 
 
 def test_key_points_of_two_jaws_come_in_one_pass(tmp_path):
-    folder = write_footage(make_footage(FakeGripper(sides=("left", "right"))), tmp_path / "both")
+    folder = write_simulated_recording(make_simulated(FakeGripper(sides=("left", "right"))), tmp_path / "both")
     recording = read_recording(folder)
     found, detector = detect(recording)
     assert len(detector.stamps) == 12 and found.jaws.keys() == {"left", "right"}
@@ -221,8 +221,10 @@ def detect_with(recording, monkeypatch, *changes):
 
 
 def test_a_camera_is_frozen_offline_when_it_is_in_the_node(tmp_path, monkeypatch):
-    photographer = FakePhotographer(frozen=(3, 4, 5, 6, 7))
-    recording = read_recording(write_footage(make_footage(photographer=photographer), tmp_path / "twin"))
+    simulated_camera = FakeCamera(frozen=(3, 4, 5, 6, 7))
+    recording = read_recording(
+        write_simulated_recording(make_simulated(simulated_camera=simulated_camera), tmp_path / "twin")
+    )
     found, detector = detect_with(recording, monkeypatch)
     assert len(detector.stamps) == 12 - 3
     assert any("frozen" in note for note in found.notes)

@@ -6,11 +6,11 @@ from importlib import resources
 import numpy as np
 import pytest
 from eval_fakes import FakeEstimator, FakeJaw, evaluate_recording
-from rgbd_fakes import FakeDetector, FakeGripper, make_footage
+from rgbd_fakes import FakeDetector, FakeGripper, make_simulated
 
 from finforce_contact.loop import GivenContact
 from finforce_eval.cli.main import main, parse
-from finforce_eval.cli.twin import write_footage
+from finforce_eval.cli.twin import write_simulated_recording
 from finforce_eval.evaluation.keypoint_source import detect_keypoints
 from finforce_eval.evaluation.score_tables import evaluation_json, format_tables, sight_table
 from finforce_eval.evaluation.scoring import score_results
@@ -21,14 +21,14 @@ from finforce_sim.scenarios import SCENARIOS
 
 @pytest.fixture
 def asked(monkeypatch):
-    """What `twin record` asks the renderer for, which answers with footage by rule."""
+    """What `twin record` asks the renderer for, which answers with recordings by rule."""
     calls = []
 
     def build(scenario, seed, camera, *, finger, depth_step):
         calls.append((scenario, seed, camera, finger, depth_step))
-        return make_footage(seed=seed)
+        return make_simulated(seed=seed)
 
-    monkeypatch.setattr("finforce_eval.cli.twin.build_footage", build)
+    monkeypatch.setattr("finforce_eval.cli.twin.build_simulated_recording", build)
     return calls
 
 
@@ -142,7 +142,9 @@ def test_a_folder_that_cannot_be_made_is_named_before_anything_is_rendered(asked
 def evaluation(tmp_path_factory):
     """A run from images whose estimate follows the truth one image late."""
     gripper = FakeGripper(count=40, onset=20)
-    recording = read_recording(write_footage(make_footage(gripper), tmp_path_factory.mktemp("bags") / "twin"))
+    recording = read_recording(
+        write_simulated_recording(make_simulated(gripper), tmp_path_factory.mktemp("bags") / "twin")
+    )
     found = detect_keypoints(recording, FakeDetector(recording))
     late = np.vstack((np.zeros((1, 3)), recording.truth("left").force[:-1]))
     jaw = FakeJaw(keypoints=np.zeros((4, 3)))
@@ -171,7 +173,7 @@ def test_the_table_shows_them_and_says_what_they_are(evaluation):
 
 def test_the_detector_of_two_jaws_is_timed_once(tmp_path):
     gripper = FakeGripper(sides=("left", "right"))
-    recording = read_recording(write_footage(make_footage(gripper), tmp_path / "both"))
+    recording = read_recording(write_simulated_recording(make_simulated(gripper), tmp_path / "both"))
     found = detect_keypoints(recording, FakeDetector(recording))
     results = [
         evaluate_recording(

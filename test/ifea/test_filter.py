@@ -25,10 +25,10 @@ from finforce_ifea.filter.jump import BUMPED, MISPLACED, NUDGED, watch, watch_fo
 from finforce_ifea.filter.measurement import (
     FREEDOM,
     NO_WEIGHT,
+    DetectorErrors,
     Measurement,
-    Sight,
     measure_distances,
-    summarize_sight,
+    summarize_detector_errors,
     weigh,
 )
 from finforce_ifea.filter.process import CAMERA_TIME, FREE_DEPTH, Expectation, expect_state, find_decay, predict
@@ -119,9 +119,9 @@ class TestProcess:
     def test_errors_of_a_detector_that_last_may_look_like_traction(self):
         search = ForceEstimator(BENCH)._tracker._search
         usual = search._expect().apparent_variance
-        search.points["sight"], search.points["offset_variance"] = (0.2e-3) ** 2, (0.4e-3) ** 2
-        search._sight = Sight(*summarize_sight(search.points))
-        assert search._sight.share == pytest.approx(0.25)
+        search.points["detector_variance"], search.points["offset_variance"] = (0.2e-3) ** 2, (0.4e-3) ** 2
+        search._detector_errors = DetectorErrors(*summarize_detector_errors(search.points))
+        assert search._detector_errors.share == pytest.approx(0.25)
         assert search._expect().apparent_variance == pytest.approx(usual + 0.2**2)
 
     def test_a_prior_counts_once_and_for_ever(self):

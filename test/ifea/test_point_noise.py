@@ -97,8 +97,8 @@ def test_points_without_scatter_keep_the_floor():
 def test_a_point_counts_less_when_it_states_more_than_in_the_tare_and_never_more():
     usual = match_stated(scatter_of(STATED), stated_by(STATED, 4000), FLOOR)
     noise = compute_point_noise(usual, np.where(np.arange(K)[:, None] == 2, 3.0, 0.1) * STATED)
-    assert noise.trust[2] == pytest.approx(1 / 9)
-    np.testing.assert_array_equal(np.delete(noise.trust, 2), 1.0)
+    assert noise.noise_ratio[2] == pytest.approx(1 / 9)
+    np.testing.assert_array_equal(np.delete(noise.noise_ratio, 2), 1.0)
     assert noise.width_variance[2] == pytest.approx(9 * usual.covariance[2, 1, 1])
 
 
@@ -110,10 +110,10 @@ def test_nothing_stated_is_the_pooled_noise_for_all():
     for k in range(K):
         np.testing.assert_allclose(noise.plane[k], tare.noise[::2, ::2] - np.outer(gain, shared), rtol=1e-12)
         np.testing.assert_allclose(noise.gain[k], gain, rtol=1e-12)
-    np.testing.assert_array_equal(noise.trust, 1.0)
+    np.testing.assert_array_equal(noise.noise_ratio, 1.0)
     np.testing.assert_allclose(noise.bias, 0.0, atol=1e-12 * np.trace(tare.noise))
     stated = tare.point_noise(np.sqrt(np.diag(tare.noise)) * COARSE[:, None])
-    np.testing.assert_allclose(stated.trust, COARSE**-2.0)
+    np.testing.assert_allclose(stated.noise_ratio, COARSE**-2.0)
 
 
 def record(coarse, *, seed, stated, noise=1.0):

@@ -21,14 +21,14 @@ from finforce.transforms import invert_pose, pose_numbers
 from finforce_eval.cli.camera import try_rig
 from finforce_eval.cli.check import record_camera
 from finforce_eval.cli.main import main
-from finforce_eval.cli.twin import write_footage
+from finforce_eval.cli.twin import write_simulated_recording
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.check import FAULT, OK, WARNING, Finding, explain_camera, judge_picture
 from finforce_eval.evaluation.keypoint_source import KeypointSource
 from finforce_eval.recordings.bags import open_bag
 from finforce_eval.recordings.images import CAMERA_INFO, COMPRESSED
-from finforce_sim.footage import build_footage
 from finforce_sim.scenarios import build_scenario
+from finforce_sim.simulated_recording import build_simulated_recording
 
 IMAGES = 6
 
@@ -37,7 +37,7 @@ IMAGES = 6
 class StillFrames:
     """The first images of a scene, each changed, and no word of a jaw but what they show."""
 
-    footage: object
+    simulated: object
     frames: tuple
     change: object
 
@@ -48,19 +48,19 @@ class StillFrames:
         return (replace(frame, color=np.ascontiguousarray(self.change(frame.color))) for frame in self.frames)
 
     def __getattr__(self, name):
-        return getattr(self.footage, name)
+        return getattr(self.simulated, name)
 
 
 @pytest.fixture(scope="module")
-def footage():
-    found = build_footage(build_scenario("grasp_cylinder"), 3)
+def simulated():
+    found = build_simulated_recording(build_scenario("grasp_cylinder"), 3)
     return found, tuple(replace(frame, jaws={}) for frame in islice(found, IMAGES))
 
 
 @pytest.fixture(scope="module")
-def record(footage, tmp_path_factory):
+def record(simulated, tmp_path_factory):
     def write(name, change=lambda color: color):
-        return write_footage(StillFrames(*footage, change), tmp_path_factory.mktemp("check") / name)
+        return write_simulated_recording(StillFrames(*simulated, change), tmp_path_factory.mktemp("check") / name)
 
     return write
 
@@ -158,12 +158,12 @@ def test_a_camera_elsewhere_is_named_by_what_the_first_images_show(still, off, w
     assert all(re.match(word, text) for word, text in zip(words, said, strict=True))
 
 
-def test_a_mesh_that_is_not_what_the_camera_sees_is_named(footage, capsys, tmp_path):
+def test_a_mesh_that_is_not_what_the_camera_sees_is_named(simulated, capsys, tmp_path):
     import trimesh
 
-    found, count = footage[0], 9  # of which every third has a pose of the object
+    found, count = simulated[0], 9  # of which every third has a pose of the object
     frames = tuple(replace(frame, jaws={}) for frame in islice(found, count))
-    still = write_footage(StillFrames(found, frames, lambda color: color), tmp_path / "still")
+    still = write_simulated_recording(StillFrames(found, frames, lambda color: color), tmp_path / "still")
     mesh = trimesh.load(next(still.glob("*.stl")))
     mesh.apply_scale(1.5)
     mesh.export(tmp_path / "large.stl")
@@ -205,12 +205,12 @@ def test_a_picture_that_is_wrong_is_named(two_fingers, record, capsys, tmp_path)
     assert status == 1 and "upside down" in said and "mean brightness" in said
 
 
-def test_pictures_turned_without_their_intrinsics_are_named(footage, two_fingers, capsys, tmp_path):
+def test_pictures_turned_without_their_intrinsics_are_named(simulated, two_fingers, capsys, tmp_path):
     folder = tmp_path / "pictures"
     folder.mkdir()
-    for number, frame in enumerate(footage[1]):
+    for number, frame in enumerate(simulated[1]):
         cv2.imwrite(str(folder / f"{number}.png"), np.rot90(frame.color)[..., ::-1])
-    camera = footage[0].camera
+    camera = simulated[0].camera
     numbers = [f"{each:.2f}" for each in (camera.fx, camera.fy, camera.cx, camera.cy)]
     assert main(["check", str(folder), "--images", "6", "--report", str(tmp_path), "--intrinsics", *numbers]) == 1
     assert "was the image turned by 90 degrees, but not the intrinsics?" in capsys.readouterr().out
@@ -245,8 +245,8 @@ def test_jaws_that_are_nowhere_are_said_to_be_so(two_fingers, record, capsys, tm
         (lambda color: np.where(np.arange(640)[None, :, None] < 320, 90, color).astype(np.uint8), WARNING, "covered"),
     ],
 )
-def test_a_picture_is_judged_by_light_focus_and_what_it_shows(footage, change, level, words):
-    mean = np.mean([frame.color for frame in footage[1]], axis=0).astype(np.uint8)
+def test_a_picture_is_judged_by_light_focus_and_what_it_shows(simulated, change, level, words):
+    mean = np.mean([frame.color for frame in simulated[1]], axis=0).astype(np.uint8)
     said = judge_picture(change(mean))
     assert any(line.severity == level and words in line.text for line in said)
 

@@ -11,13 +11,13 @@ from finforce.camera import project
 from finforce.gripper_frames import BENCH_CAMERA, BENCH_ORIGIN_X, ROBOT_CAMERA, jaw_in_camera
 from finforce.transforms import move_pose, pose_from_quaternion, pose_numbers, rotation_between
 from finforce_eval.cli.main import main
-from finforce_eval.cli.twin import write_footage
+from finforce_eval.cli.twin import write_simulated_recording
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints.errors import GeometryError
 from finforce_keypoints.geometry.extrinsics import SeenJaw, find_extrinsics
-from finforce_sim.footage import Footage, build_footage
 from finforce_sim.scenarios import build_scenario
 from finforce_sim.sensor import build_d405_vga
+from finforce_sim.simulated_recording import SimulatedRecording, build_simulated_recording
 
 CAMERA = build_d405_vga()
 WRONG = np.array([4e-3, -6e-3, 5e-3, 0.03, -0.04, 0.03])  # [m], [rad]
@@ -78,23 +78,25 @@ IMAGES = 8
 class StillFootage:
     """The first images of a scene, and no word of a jaw but what they show."""
 
-    footage: Footage
+    simulated: SimulatedRecording
 
     def __len__(self):
         return IMAGES
 
     def __iter__(self):
-        return (replace(frame, jaws={}) for frame in islice(self.footage, IMAGES))
+        return (replace(frame, jaws={}) for frame in islice(self.simulated, IMAGES))
 
     def __getattr__(self, name):
-        return getattr(self.footage, name)
+        return getattr(self.simulated, name)
 
 
 @pytest.fixture(scope="module")
 def still(tmp_path_factory):
     """A recording of open jaws at rest."""
     folder = tmp_path_factory.mktemp("still") / "still"
-    return write_footage(StillFootage(build_footage(build_scenario("grasp_cylinder"), 3)), folder)
+    return write_simulated_recording(
+        StillFootage(build_simulated_recording(build_scenario("grasp_cylinder"), 3)), folder
+    )
 
 
 def find(folder, capsys, *options):

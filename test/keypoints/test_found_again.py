@@ -12,9 +12,9 @@ from finforce_keypoints.build import build_detector
 from finforce_keypoints.images import RgbdImage
 from finforce_keypoints.parameters import DetectorParameters
 from finforce_sim.gripper import TwinGripper
-from finforce_sim.photographer import Photographer
 from finforce_sim.scenarios import build_scenario
 from finforce_sim.sensor import build_d405_vga
+from finforce_sim.simulated_camera import SimulatedCamera
 
 CAMERA, STRIDE, SIDE = build_d405_vga(), 2, 17  # input pixels per cell; px, of the patches a network knows
 GREY = np.array([0.299, 0.587, 0.114], np.float32)[None, :, None, None]
@@ -24,14 +24,14 @@ GREY = np.array([0.299, 0.587, 0.114], np.float32)[None, :, None, None]
 def scene():
     """The gripper, who takes its pictures, what a perfect sensor sees of the jaws at rest, and their true pixels."""
     gripper = TwinGripper(build_scenario("grasp_cylinder"), 3, density="coarse")
-    photographer = Photographer(gripper, CAMERA, 3)
-    photographer.mesh = None
-    view = photographer.look(next(iter(gripper.states())))
+    simulated_camera = SimulatedCamera(gripper, CAMERA, 3)
+    simulated_camera.mesh = None
+    view = simulated_camera.look(next(iter(gripper.states())))
     pixels = {}
     for side, true in view.jaws.items():
         points = np.vstack((true.points, gripper.jaws[side].reference_point))
         pixels[side] = project(points @ true.T_camera_jaw[:3, :3].T + true.T_camera_jaw[:3, 3], CAMERA)
-    return gripper, photographer, view, pixels
+    return gripper, simulated_camera, view, pixels
 
 
 def correlate(patches, sees_whole):
@@ -83,9 +83,9 @@ def correlate(patches, sees_whole):
 
 def learn(scene, folder, sees_whole):
     """A folder as DeepLabCut's export writes it, of a network that knows the picture around every point."""
-    gripper, photographer, view, pixels = scene
+    gripper, simulated_camera, view, pixels = scene
     names = [f"{side}_{name}" for side in pixels for name in (*gripper.jaws[side].keypoint_names, "reference")]
-    grey = photographer.develop(view, 0.0).color @ GREY.ravel() / 255.0
+    grey = simulated_camera.develop(view, 0.0).color @ GREY.ravel() / 255.0
     half = SIDE // 2
     patches = []
     for x, y in np.round(np.vstack(list(pixels.values())) / STRIDE).astype(int) * STRIDE:
@@ -100,9 +100,9 @@ def learn(scene, folder, sees_whole):
 
 def picture(scene, number, has_jaws):
     """The image of a number, at 30 Hz: of the jaws, or of a grey wall in their place."""
-    _, photographer, view, _ = scene
+    _, simulated_camera, view, _ = scene
     stamp = number / 30.0
-    shot = photographer.develop(view, stamp)
+    shot = simulated_camera.develop(view, stamp)
     color, depth = shot.color, shot.depth
     if not has_jaws:
         noise = np.random.default_rng(number).normal(0.0, 2.0, color.shape)

@@ -99,7 +99,7 @@ def test_an_image_that_was_looked_at_before_its_depth_came_is_found_the_same():
     ahead, at_once = Watched(), Watched()
     for seed in range(LEARNING):
         color, stamp = picture(seed), seed * PERIOD
-        ahead.detector.look(replace(bare_image(stamp, None), color=color))
+        ahead.detector.detect_color(replace(bare_image(stamp, None), color=color))
         looks = ahead.looks
         found, expected = ahead.show(color), at_once.show(color)
         assert ahead.looks == looks == at_once.looks  # nothing was left to look at
@@ -111,5 +111,5 @@ def test_an_image_that_was_looked_at_before_its_depth_came_is_found_the_same():
 def test_an_image_that_is_not_younger_than_the_last_one_is_not_looked_at():
     watched = Watched()
     watched.show(picture(0), 1.0)
-    watched.detector.look(replace(bare_image(0.5, None), color=picture(1)))
+    watched.detector.detect_color(replace(bare_image(0.5, None), color=picture(1)))
     assert watched.looks == 1

@@ -12,22 +12,22 @@ from finforce_keypoints.build import build_pixel_detector
 from finforce_keypoints.detector import KeypointDetector
 from finforce_keypoints.images import RgbdImage
 from finforce_keypoints.parameters import DetectorParameters, DetectorSettings
-from finforce_sim.footage import build_footage
 from finforce_sim.scenarios import build_scenario
+from finforce_sim.simulated_recording import build_simulated_recording
 
 IMAGES = 16  # half a second: what is said by then is said within three
 
 
 @pytest.fixture(scope="module")
-def footage():
-    found = build_footage(build_scenario("grasp_cylinder"), 3)
+def simulated():
+    found = build_simulated_recording(build_scenario("grasp_cylinder"), 3)
     return found.camera, tuple(islice(found, IMAGES))
 
 
 @pytest.fixture(scope="module")
-def few(footage):
+def few(simulated):
     """A quarter of the images: in each the jaws are looked for everywhere."""
-    return footage[0], footage[1][::4]
+    return simulated[0], simulated[1][::4]
 
 
 def build(jaw):
@@ -42,9 +42,9 @@ def detector():
     return build("bench")
 
 
-def look(detector, footage, picture=lambda layer: layer, lens=lambda camera: camera, depth=lambda layer: layer):
+def look(detector, simulated, picture=lambda layer: layer, lens=lambda camera: camera, depth=lambda layer: layer):
     """What the detector says of each image, of changed pictures, intrinsics and depth."""
-    camera, frames = footage
+    camera, frames = simulated
     detector.reset()
     for number, frame in enumerate(frames):
         color, away = (np.ascontiguousarray(layer) for layer in (picture(frame.color), depth(frame.depth)))
@@ -82,30 +82,30 @@ def test_no_key_point_is_believed_with_intrinsics_of_another_picture(detector, f
     assert not any(found for _, found in look(detector, few, lens=lens))
 
 
-def test_a_focal_length_slightly_off_is_said_at_rest(detector, footage):
-    for _ in look(detector, footage, lens=lambda camera: replace(camera, fx=1.05 * camera.fx, fy=1.05 * camera.fy)):
+def test_a_focal_length_slightly_off_is_said_at_rest(detector, simulated):
+    for _ in look(detector, simulated, lens=lambda camera: replace(camera, fx=1.05 * camera.fx, fy=1.05 * camera.fy)):
         pass
     assert all("extrinsics right?" in words for words in detector.warnings.values()) and len(detector.warnings) == 2
-    for _ in look(detector, footage):
+    for _ in look(detector, simulated):
         pass
     assert not detector.warnings
 
 
-def test_a_lens_that_is_half_covered_hides_one_jaw_and_spoils_nothing_of_the_other(detector, footage):
+def test_a_lens_that_is_half_covered_hides_one_jaw_and_spoils_nothing_of_the_other(detector, simulated):
     def cover(layer):
         return np.where(np.arange(layer.shape[1])[None, :, None] < 320, 20, layer).astype(np.uint8)
 
-    pairs = [(found, frame.jaws) for frame, found in look(detector, footage, picture=cover)]
+    pairs = [(found, frame.jaws) for frame, found in look(detector, simulated, picture=cover)]
     assert all(set(found) == {"right"} for found, _ in pairs)
     assert share_within_deviations(pairs) > 0.95
 
 
 @pytest.mark.parametrize("blur", [0.0, 3.5])
-def test_points_out_of_focus_lie_within_their_deviations(detector, footage, blur):
+def test_points_out_of_focus_lie_within_their_deviations(detector, simulated, blur):
     def soften(layer):
         return cv2.GaussianBlur(layer, (0, 0), blur) if blur else layer
 
-    pairs = [(found, frame.jaws) for frame, found in look(detector, footage, picture=soften)]
+    pairs = [(found, frame.jaws) for frame, found in look(detector, simulated, picture=soften)]
     assert share_within_deviations(pairs) > 0.95
 
 
@@ -119,5 +119,5 @@ def share_within_deviations(pairs):
     return np.mean(np.concatenate(off) < 3.0)
 
 
-def test_no_key_point_of_another_finger_than_in_the_jaw_file_is_believed(footage):
-    assert not any(keypoints.valid.any() for _, found in look(build("umi"), footage) for keypoints in found.values())
+def test_no_key_point_of_another_finger_than_in_the_jaw_file_is_believed(simulated):
+    assert not any(keypoints.valid.any() for _, found in look(build("umi"), simulated) for keypoints in found.values())

@@ -13,9 +13,9 @@ from finforce_keypoints.detectors.side_plane import AnyFinger
 from finforce_keypoints.networks.side_network import SideNetwork
 from finforce_keypoints.parameters import JawMount
 from finforce_keypoints.picture_change import SURE, PictureChange, PictureChanges, describe_changes
-from finforce_sim.footage import build_footage
 from finforce_sim.scenarios import build_scenario
 from finforce_sim.sensor import build_d405_vga
+from finforce_sim.simulated_recording import build_simulated_recording
 
 WIDTH = 640
 
@@ -23,7 +23,7 @@ WIDTH = 640
 @pytest.fixture(scope="module")
 def picture():
     """The twin's left jaw, open; what is right of it is grey."""
-    (frame,) = islice(build_footage(build_scenario("grasp_cylinder"), 712), 1)
+    (frame,) = islice(build_simulated_recording(build_scenario("grasp_cylinder"), 712), 1)
     color = frame.color.copy()
     color[:, 320:] = 90
     return color

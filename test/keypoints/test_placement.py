@@ -315,7 +315,7 @@ def test_the_place_of_a_jaw_in_a_holder_is_stated_apart_from_its_points():
     found = []
     for mount in (JawMount(), JawMount(covered=LOW, stddev=(1e-3, 0.02))):
         localizer = JawLocalizer(jaw, ROBOT_CAMERA, DetectorSettings(plane_depth=True), mount)
-        found.append(localizer.locate(image, localizer.imagine(CAMERA), DepthScale(error=0.0, stddev=0.015)))
+        found.append(localizer.locate(image, localizer.predict_pixels(CAMERA), DepthScale(error=0.0, stddev=0.015)))
     straight, held = found
     used = held.valid & straight.valid
     assert held.shared[1:] == (1e-3, 0.02) and straight.shared[1:] == (0.0, 0.0)

@@ -6,7 +6,7 @@ import pytest
 from finforce.messages import NANOSECONDS
 from finforce_eval.replay.answers import ReplayLog
 from finforce_eval.replay.node_run import NodeRun
-from finforce_sim.footage import START
+from finforce_sim.simulated_recording import START
 from lab.bench.chain import (
     IMAGES,
     TOGETHER,

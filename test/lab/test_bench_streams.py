@@ -1,18 +1,20 @@
 """What the benchmark of the chain plays: all that a camera sees, or true key points, and nothing else."""
 
 import pytest
-from rgbd_fakes import FakeGripper, FakePhotographer
+from rgbd_fakes import FakeCamera, FakeGripper
 
-from finforce_eval.cli.twin import write_footage
+from finforce_eval.cli.twin import write_simulated_recording
 from finforce_eval.recordings.images import IMAGE
-from finforce_sim.footage import Footage
+from finforce_sim.simulated_recording import SimulatedRecording
 from lab.bench.chain import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC, OBJECT_TOPIC, stream_images, stream_keypoints
 
 
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory):
     """A recording of seven images."""
-    return write_footage(Footage(FakeGripper(count=7), FakePhotographer(), 0), tmp_path_factory.mktemp("bags") / "twin")
+    return write_simulated_recording(
+        SimulatedRecording(FakeGripper(count=7), FakeCamera(), 0), tmp_path_factory.mktemp("bags") / "twin"
+    )
 
 
 def test_images_of_a_recording_come_decoded_with_their_camera(bag):

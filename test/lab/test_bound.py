@@ -21,7 +21,7 @@ def hold(images=1, noise=NOISE, offset=0.0, friction=0.0, traction=0.0):
     return TrueImages(
         stamps=np.arange(images) / 30.0,
         depth=np.full(images, 3e-3),
-        mobilised=np.ones(images),
+        mobilization=np.ones(images),
         motions=motions,
         displacement=np.full((images, COUNT), 1e-3),
         places=np.zeros((images, COUNT, 2)),

@@ -11,7 +11,7 @@ import torch
 
 from finforce_eval.evaluation.scoring import ONSET_FORCE
 from finforce_keypoints.images import RgbdImage
-from finforce_sim.footage import parse_size
+from finforce_sim.simulated_recording import parse_size
 from lab.training.baseline import (
     JUDGED,
     PIECE,

@@ -12,10 +12,10 @@ from finforce.messages import NOTHING_SHARED, SharedStddev
 from finforce_contact.mesh.object_mesh import ObjectMesh
 from finforce_keypoints.errors import DetectionError
 from finforce_keypoints.images import ImageWatch
-from finforce_sim.footage import Footage
 from finforce_sim.gripper import JawState, TwinState
-from finforce_sim.photographer import Shot, TrueJaw
 from finforce_sim.scenarios import Scenario
+from finforce_sim.simulated_camera import Shot, TrueJaw
+from finforce_sim.simulated_recording import SimulatedRecording
 
 CAMERA = CameraIntrinsics(width=64, height=48, fx=43.0, fy=43.0, cx=31.5, cy=23.5, distortion=np.full(5, 0.01))
 KEYPOINTS = 4
@@ -63,7 +63,7 @@ class FakeGripper:
 
 
 @dataclass
-class FakePhotographer:
+class FakeCamera:
     """Noise for pictures; the last key point is hidden in every image."""
 
     black: tuple = ()
@@ -100,12 +100,12 @@ def true_jaw(state, side, T_gripper_camera=BENCH_CAMERA, hidden=1):
     )
 
 
-def make_footage(gripper=None, photographer=None, seed=0):
+def make_simulated(gripper=None, simulated_camera=None, seed=0):
     """Footage of 64 x 48 pixels."""
     gripper = gripper or FakeGripper()
-    photographer = photographer or FakePhotographer()
-    photographer.mesh = MESH if gripper.has_object else None
-    return Footage(gripper, photographer, seed)
+    simulated_camera = simulated_camera or FakeCamera()
+    simulated_camera.mesh = MESH if gripper.has_object else None
+    return SimulatedRecording(gripper, simulated_camera, seed)
 
 
 @dataclass(frozen=True)
@@ -161,7 +161,7 @@ CAMERA_POSE = ROBOT_CAMERA
 
 
 class FakeLens:
-    """Takes what `Photographer` takes, of 64 x 48 pixels; every key point is visible."""
+    """Takes what `SimulatedCamera` takes, of 64 x 48 pixels; every key point is visible."""
 
     camera, T_gripper_camera, depth_step = CAMERA, CAMERA_POSE, 1e-3
 

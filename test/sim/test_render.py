@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from finforce.camera import CameraIntrinsics, project
-from finforce_sim.photographer import _BOX, _BOX_TRIANGLES
 from finforce_sim.render import (
     FAR,
     PATTERNS,
@@ -20,6 +19,7 @@ from finforce_sim.render import (
     draw_look,
 )
 from finforce_sim.sensor import expose, measure_depth
+from finforce_sim.simulated_camera import _BOX, _BOX_TRIANGLES
 
 CAMERA = CameraIntrinsics(width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5)
 WHITE = Paint(color=np.full(3, 0.8), gloss=0.0, grain=0.0)

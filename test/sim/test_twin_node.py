@@ -10,17 +10,17 @@ from geometry_msgs.msg import PoseStamped, WrenchStamped
 from node_fakes import ros_domain
 from rclpy.executors import ExternalShutdownException
 from rclpy.parameter import Parameter
-from rgbd_fakes import FakeGripper, FakeLens, make_footage
+from rgbd_fakes import FakeGripper, FakeLens, make_simulated
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from std_msgs.msg import String
 
 from finforce.messages import decode_columns, stamp_of
 from finforce.ros import node as ros
 from finforce_sim import node as twin_node
-from finforce_sim.footage import encode_depth, parse_size
 from finforce_sim.gripper import PressedGrasp
 from finforce_sim.node import TwinCameraNode, TwinParameters
 from finforce_sim.scenarios import ScenarioError, build_scenario
+from finforce_sim.simulated_recording import encode_depth, parse_size
 from finforce_sim.stored_grasp import LiveScene
 
 COLOR = "/camera/camera/color/image_raw"
@@ -45,10 +45,10 @@ def probe():
         yield probe
 
 
-def start(probe, footage=None, **parameters):
+def start(probe, simulated=None, **parameters):
     overrides = [Parameter(name, value=value) for name, value in parameters.items()]
-    footage = footage or make_footage(FakeGripper(count=6))
-    node = TwinCameraNode(lambda *_, **__: footage, context=probe.context, parameter_overrides=overrides)
+    simulated = simulated or make_simulated(FakeGripper(count=6))
+    node = TwinCameraNode(lambda *_, **__: simulated, context=probe.context, parameter_overrides=overrides)
     probe.spinner.add_node(node)
     return node
 
@@ -64,7 +64,7 @@ def test_a_scene_is_published_once_as_it_was_rendered(probe):
     node = start(probe, loop=False)
     play(probe, node)
     probe.wait_for(lambda: len(probe.got[COLOR]) == 6 and node.is_over)
-    frames = list(make_footage(FakeGripper(count=6)))
+    frames = list(make_simulated(FakeGripper(count=6)))
     for frame, color, depth in zip(frames, probe.got[COLOR], probe.got[DEPTH], strict=True):
         np.testing.assert_array_equal(np.frombuffer(color.data, np.uint8).reshape(48, 64, 3), frame.color)
         np.testing.assert_array_equal(np.frombuffer(depth.data, "<u2").reshape(48, 64), encode_depth(frame.depth))

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from finforce.camera import project
-from finforce_sim.footage import Footage, parse_size
 from finforce_sim.gripper import TwinGripper
-from finforce_sim.photographer import BANDS, Photographer
 from finforce_sim.scenarios import build_scenario
 from finforce_sim.sensor import build_d405_vga
+from finforce_sim.simulated_camera import BANDS, SimulatedCamera
+from finforce_sim.simulated_recording import SimulatedRecording, parse_size
 
 CAMERA = build_d405_vga()
 
@@ -32,7 +32,7 @@ def pressed(states):
 
 @pytest.fixture(scope="module")
 def shot(gripper, pressed):
-    return Photographer(gripper, CAMERA, 3).shoot(pressed)
+    return SimulatedCamera(gripper, CAMERA, 3).shoot(pressed)
 
 
 def test_true_pixels_are_the_projected_key_points(shot):
@@ -50,9 +50,9 @@ def test_depth_at_visible_key_points_is_that_of_the_finger(shot):
 
 
 def test_what_the_object_covers_is_not_visible(shot, gripper, pressed):
-    photographer = Photographer(gripper, CAMERA, 3)
-    photographer.mesh = None
-    bare = photographer.shoot(pressed)
+    simulated_camera = SimulatedCamera(gripper, CAMERA, 3)
+    simulated_camera.mesh = None
+    bare = simulated_camera.shoot(pressed)
     for side, truth in bare.jaws.items():
         assert truth.visible.all()
         assert not shot.jaws[side].visible.all()
@@ -60,10 +60,10 @@ def test_what_the_object_covers_is_not_visible(shot, gripper, pressed):
 
 
 def test_the_same_seed_gives_the_same_image_and_another_one_another(shot, gripper, pressed):
-    again = Photographer(gripper, CAMERA, 3).shoot(pressed)
+    again = SimulatedCamera(gripper, CAMERA, 3).shoot(pressed)
     np.testing.assert_array_equal(again.color, shot.color)
     np.testing.assert_array_equal(again.depth, shot.depth)
-    assert (Photographer(gripper, CAMERA, 4).shoot(pressed).color != shot.color).mean() > 0.5
+    assert (SimulatedCamera(gripper, CAMERA, 4).shoot(pressed).color != shot.color).mean() > 0.5
 
 
 def test_the_dot_on_the_holder_is_where_the_reference_point_is(shot, gripper):
@@ -78,7 +78,7 @@ def test_the_dot_on_the_holder_is_where_the_reference_point_is(shot, gripper):
 
 def test_depth_comes_in_the_steps_that_were_asked_for(gripper, pressed):
     for step in (1e-3, 1e-4):
-        depth = Photographer(gripper, CAMERA, 3, step).shoot(pressed).depth
+        depth = SimulatedCamera(gripper, CAMERA, 3, step).shoot(pressed).depth
         depth = depth[np.isfinite(depth)].astype(float)
         np.testing.assert_allclose(depth / step, np.round(depth / step), atol=1e-3)  # float32 metres
         assert len(np.unique(np.round(depth / step))) > (50 if step == 1e-3 else 500)
@@ -88,7 +88,7 @@ def test_rows_of_a_rolling_shutter_are_of_their_own_time(gripper, states):
     before, state = next((a, b) for a, b in pairwise(states) if a.jaws["left"].origin_x < b.jaws["left"].origin_x)
     readout, height, rolling = 0.02, CAMERA.height, copy(gripper)
     rolling.scenario = replace(gripper.scenario, readout=readout)
-    rolled, flat = Photographer(rolling, CAMERA, 3).look(state, before), Photographer(gripper, CAMERA, 3)
+    rolled, flat = SimulatedCamera(rolling, CAMERA, 3).look(state, before), SimulatedCamera(gripper, CAMERA, 3)
     band = height // BANDS
     for number in (0, BANDS - 1):
         rows = slice(number * band, (number + 1) * band)
@@ -105,13 +105,13 @@ def test_rows_of_a_rolling_shutter_are_of_their_own_time(gripper, states):
 
 
 def test_a_gripper_that_stands_is_looked_at_once_and_has_the_images_that_it_had(gripper, states):
-    photographer, looks = Photographer(gripper, parse_size("64x48"), 3), []
-    watched = copy(photographer)
-    watched.look = lambda *states: looks.append(states) or photographer.look(*states)
+    simulated_camera, looks = SimulatedCamera(gripper, parse_size("64x48"), 3), []
+    watched = copy(simulated_camera)
+    watched.look = lambda *states: looks.append(states) or simulated_camera.look(*states)
     closing, states = copy(gripper), [*states[48:56], *states[70:]]  # it stands, closes, and stands again
     closing.states = lambda: iter(states)
-    for state, before, frame in zip(states, [None, *states], Footage(closing, watched, 3), strict=False):
-        alone = photographer.shoot(state, before)
+    for state, before, frame in zip(states, [None, *states], SimulatedRecording(closing, watched, 3), strict=False):
+        alone = simulated_camera.shoot(state, before)
         np.testing.assert_array_equal(frame.color, alone.color)
         np.testing.assert_array_equal(frame.depth, alone.depth)
         for side, true in alone.jaws.items():

@@ -60,7 +60,7 @@ class JawPosition:
     resting: bool
 
 
-class LoadWatch:
+class ForceMonitor:
     """Tells contact from offset, and jumps that motion does not explain from forces.
 
     Args:
@@ -183,9 +183,9 @@ class LoadWatch:
     def _surprise(self, force: float, opening: float) -> float:
         """Return by how much a force differs from what may be expected [N], signed."""
         if self.loaded:
-            surprise = self.model.surprise(opening, force)
+            innovation = self.model.innovation(opening, force)
             # jaws that open may let go of something stiffer than was learnt
-            return surprise if surprise > 0.0 or opening <= self.opening else 0.0
+            return innovation if innovation > 0.0 or opening <= self.opening else 0.0
         # where contact began between the two images is not known: any force up to the greatest stiffness may be
         reach = self._settings.largest_stiffness * max(0.0, self.opening - opening)
         return max(0.0, force - self.force - reach)
@@ -227,7 +227,7 @@ _SOONEST = 0.1  # of the median latency: a pipeline that others have left alone 
 _KNOWN = 8  # samples after which the latency is known
 
 
-class ForceFeed:
+class ForceInput:
     """Admits samples once, in order and with times that can be; measures latency and period.
 
     Args:
@@ -421,7 +421,7 @@ class ForceModel:
         """Return the force [N] at another opening [m], never below zero."""
         return max(0.0, self.force + self.stiffness * (self.opening - opening))
 
-    def surprise(self, opening: float, force: float) -> float:
+    def innovation(self, opening: float, force: float) -> float:
         """Return by how much a force [N] differs from the predicted one beyond four standard deviations [N], signed."""
         travel = self.opening - opening
         spread = self._force_variance + travel**2 * self._stiffness_variance + self._noise_variance

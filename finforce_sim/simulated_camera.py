@@ -113,7 +113,7 @@ class Shot:
     jaws: Mapping[str, TrueJaw]
 
 
-class Photographer:
+class SimulatedCamera:
     """Takes pictures of a gripper; materials, lights and background come from the seed and stay.
 
     Attributes:

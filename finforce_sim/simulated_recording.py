@@ -19,9 +19,9 @@ from finforce.camera_file import cut_camera
 from finforce.messages import NANOSECONDS
 from finforce.transforms import invert_pose
 from finforce_sim.gripper import FINGER, TwinGripper, TwinState
-from finforce_sim.photographer import Photographer, Shot, TrueJaw
 from finforce_sim.scenarios import Scenario, ScenarioError
 from finforce_sim.sensor import D405, LENSES, build_d405_vga
+from finforce_sim.simulated_camera import Shot, SimulatedCamera, TrueJaw
 
 START = 1_000 * NANOSECONDS  # [ns] stamp of the first image
 POSITION_STDDEV = 0.3e-3  # [m] of a tracked pose, along each axis
@@ -46,7 +46,7 @@ class TwinFrame(Shot):
     T_camera_object: NDArray | None
 
 
-class Footage:
+class SimulatedRecording:
     """The images of a gripper; every iteration takes them anew and the same.
 
     Attributes:
@@ -57,14 +57,14 @@ class Footage:
 
     Args:
         gripper: the gripper to render.
-        photographer: that renders it.
+        simulated_camera: that renders it.
         seed: of the object tracker's noise.
     """
 
-    def __init__(self, gripper: TwinGripper, photographer: Photographer, seed: int) -> None:
-        self._gripper, self._photographer, self._seed = gripper, photographer, seed
-        self.camera, self.T_gripper_camera = photographer.camera, photographer.T_gripper_camera
-        self.mesh, self.depth_step = photographer.mesh, photographer.depth_step
+    def __init__(self, gripper: TwinGripper, simulated_camera: SimulatedCamera, seed: int) -> None:
+        self._gripper, self._simulated_camera, self._seed = gripper, simulated_camera, seed
+        self.camera, self.T_gripper_camera = simulated_camera.camera, simulated_camera.T_gripper_camera
+        self.mesh, self.depth_step = simulated_camera.mesh, simulated_camera.depth_step
 
     def __len__(self) -> int:
         return len(self._gripper)
@@ -91,7 +91,7 @@ class Footage:
             for state in self._gripper.states():
                 stands = state.looks_like(before)
                 if not (stands and stood):  # the upper rows of a rolling shutter show the state before
-                    view = pool.submit(self._photographer.look, state, before)
+                    view = pool.submit(self._simulated_camera.look, state, before)
                 coming.append((state, pool.submit(self._shoot, state, before, view)))
                 before, stood = state, stands
                 if len(coming) > WORKERS:
@@ -103,18 +103,18 @@ class Footage:
             pool.shutdown(cancel_futures=True)
 
     def _shoot(self, state: TwinState, before: TwinState | None, view: Future[Shot]) -> Shot:
-        return self._photographer.shoot(state, before, view.result())
+        return self._simulated_camera.shoot(state, before, view.result())
 
 
-def build_footage(
+def build_simulated_recording(
     scenario: Scenario,
     seed: int,
     camera: CameraIntrinsics | None = None,
     *,
     finger: int = FINGER,
     depth_step: float = 1e-3,
-) -> Footage:
-    """Return the footage of a scenario.
+) -> SimulatedRecording:
+    """Return the recording of a scenario.
 
     Args:
         scenario: motion, light and camera.
@@ -127,7 +127,7 @@ def build_footage(
         FinforceError: the scenario's object or jaw cannot be used, or a library is missing.
     """
     gripper = TwinGripper(scenario, finger)
-    return Footage(gripper, Photographer(gripper, camera or build_d405_vga(), seed, depth_step), seed)
+    return SimulatedRecording(gripper, SimulatedCamera(gripper, camera or build_d405_vga(), seed, depth_step), seed)
 
 
 def parse_size(text: str, lens: str = D405) -> CameraIntrinsics:

@@ -95,12 +95,12 @@ LONGEST_OUTLOOK = 0.05  # [s] for which the jaws are assumed to keep their speed
 REACH_MARGIN = 1.5  # of the commanded speed
 
 
-class Knowledge:
+class StatusTracker:
     """Keeps what was believed.
 
     Attributes:
         reply: the last believed one; None before the first.
-        distrust: why the gripper's own flag of a calibration is not trusted, in a sentence; empty: it is.
+        calibration_invalid: why the gripper's own flag of a calibration is not trusted, in a sentence; empty: it is.
         asleep: the power stage sleeps since a fault, a calibration or a stop, whatever the reply echoes of orders.
         telemetry: temperature, supply, errors.
         filter: decides which replies are believed.
@@ -111,8 +111,8 @@ class Knowledge:
     """
 
     def __init__(self, settings: GripperSettings) -> None:
-        self.distrust = ""
-        self.asleep = False
+        self.calibration_invalid = ""
+        self.power_off = False
         self.telemetry = Telemetry(settings.telemetry_period)
         self.filter = ReplyFilter(settings.reply_timeout)
         self.history = History()
@@ -120,7 +120,7 @@ class Knowledge:
         self._contact_since = math.inf
 
     def forget(self) -> None:
-        """Know nothing any more; only such distrust and a sleeping power stage do not heal by themselves."""
+        """Know nothing any more; only such calibration_invalid and a sleeping power stage do not heal by themselves."""
         self.reply, self._contact_since = None, math.inf
         self.telemetry.forget()
         self.filter.forget()
@@ -140,7 +140,7 @@ class Knowledge:
     @property
     def calibrated(self) -> bool:
         """True if the position means something."""
-        return self.reply is not None and self.reply.calibrated and not self.distrust
+        return self.reply is not None and self.reply.calibrated and not self.calibration_invalid
 
     @property
     def error(self) -> bool:
@@ -150,7 +150,7 @@ class Knowledge:
     @property
     def driving(self) -> bool:
         """True if the gripper's power stage moves or holds the jaws."""
-        return self.reply is not None and self.reply.driving and not self.asleep
+        return self.reply is not None and self.reply.driving and not self.power_off
 
     @property
     def contact_time(self) -> float:
