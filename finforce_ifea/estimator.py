@@ -49,14 +49,14 @@ from finforce_ifea.tracking.influence import OffsetChange, UnloadedCheck, split_
 _LONGEST_GAP = 1.0
 _FEWEST_COMPARED = 3
 _TOLERANCE = 1e-3
-# A detector may repeat the key points of a jaw that stands still, and looks again every 4 s; longer is stale [s].
+# Age from which repeated key points are stale [s]: detectors look again every 4 s.
 _STALE = 5.0
 _UNTARED = "no tare: the jaw was loaded from the start; key point offsets are unknown"
-# Relative standard deviation of forces without a calibration, in magnitude and direction, beside that of the modulus.
+# Relative standard deviation of forces without a calibration, beside that of the modulus [-].
 _UNCALIBRATED = 0.1
-# Relative error of forces at the distance from stored shapes that those are good for.
+# Relative error of forces at the end of the range of the stored shapes [-].
 _EXTRAPOLATED = 0.015
-# Fingers and settings for which this process has compiled everything.
+# Fingers and settings that this process has compiled.
 _WARM: set[tuple[str, EstimatorSettings]] = set()
 
 
@@ -399,12 +399,8 @@ class ForceEstimator:
         extrapolated = _EXTRAPOLATED * state["extrapolation"]
         error = hypot(self._force_error, self._scale_error, state["location_error"], extrapolated)
         vectors, dt = np.empty((7, 3)), self._pass_time(state["force"])
-        relaxation, relaxation_stddev, errors = (
-            self._relaxation.packed,
-            self._relaxation_stddev.overstress,
-            (error, self._modulus_error),
-        )
-        magnitude, stddev = compute_force(state, relaxation, relaxation_stddev, dt, errors, vectors)
+        relaxation, errors = (self._relaxation.packed, self._relaxation_stddev.overstress), (error, self._modulus_error)
+        magnitude, stddev = compute_force(state, *relaxation, dt, errors, vectors)
         force, torque, force_stddev, torque_stddev, point, location, normal = vectors
         return Solution(
             stamp=self._stamp,
@@ -459,7 +455,7 @@ def warm_up(jaw: Jaw, tare_frames: int, update: Update, reset: Callable[[], None
     reset()
 
 
-# A key point farther than this from its place at rest is refused [m].
+# Distance from its position at rest beyond which a key point is rejected [m].
 _FARTHEST = 0.03
 
 

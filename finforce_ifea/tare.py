@@ -14,9 +14,11 @@ from finforce.compiled import njit
 from finforce_ifea.errors import NotEnoughDataError, UnderLoadError
 from finforce_ifea.settings import EstimatorSettings
 
-# Of a key point that no tare has seen: noise along one axis, and constant offset [m].
-_NOISE, OFFSET_STDDEV = 0.35e-3, 0.4e-3
-# Unloaded images over which offsets are averaged.
+# Standard deviation of a key point's noise along one axis without a tare [m].
+_NOISE = 0.35e-3
+# Standard deviation of its constant offset [m].
+OFFSET_STDDEV = 0.4e-3
+# Number of unloaded images over which offsets are averaged.
 _LONGEST_TARE = 300
 
 
@@ -242,28 +244,34 @@ def compute_tare(
 
 
 Significance = Callable[[Tare, float], float]
-# A tare looks loaded when the force that explains the offsets exceeds this many standard deviations.
+# Force that explains the offsets from which a tare seems loaded [sigma].
 _LOADED_SIGMA = 3.5
-# What the noise of an average may leave between the halves of a steady tare [m].
+# Standard deviation of the difference between the halves of a steady tare [m].
 _STEADY_STDDEV = 0.03e-3
 _DELAY_FRAMES = 15
 _FEWEST_FRAMES = 5
-# Time between images at which a tare takes all of its frames [s]; longest time that counts of a gap between two [s].
-_PERIOD, _LONGEST_PERIOD = 1.0 / 30.0, 0.25
-# Share of its frames that a tare takes at any rate [-].
+# Image period up to which a tare takes all of its images [s].
+_PERIOD = 1.0 / 30.0
+# Longest gap between images that counts in full [s].
+_LONGEST_PERIOD = 0.25
+# Fraction of its images that a tare takes at any rate [-].
 _LEAST_SHARE = 1.0 / 3.0
 _LEAST_SEEN = 0.5
 _LEAST_NEAR = 0.75
-# At rest the nearer three quarters of the key points are so near to their places [m]: in one frame, and on average.
+# Fraction of the key points, the nearest, that must be at their positions of rest [-].
 _NEARER = 0.75
 _REST_FRAMES = 10
-_REST_REACH, _REST_REACH_MEAN = 1e-3, 0.45e-3
-# An image shows a load if it is deeper by so many standard deviations than the least deep one but one, and by this [m].
+# Largest distance of these in one image [m].
+_REST_REACH = 1e-3
+# The same on average over `_REST_FRAMES` images [m].
+_REST_REACH_MEAN = 0.45e-3
+# Depth beyond the second smallest of a tare from which an image is loaded [sigma].
 _DEEPER_SIGMAS = 6.0
+# The same, at least [m].
 _LEAST_LOADED_DEPTH = 0.1e-3
-# Standard deviation over the median of absolute differences of two draws [-]: 1.4826 / sqrt(2).
+# Standard deviation over the median absolute difference of two samples [-]: 1.4826 / sqrt(2).
 _STDDEV_BY_DIFFERENCES = 1.05
-# Share of the images of a tare that must be without load [-]; the others are left out.
+# Fraction of a tare's images that must be unloaded [-]; the others are left out.
 _LEAST_UNLOADED = 1.0 / 3.0
 
 

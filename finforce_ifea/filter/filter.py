@@ -21,7 +21,7 @@ from finforce_ifea.filter.measurement import measure_distances, weigh
 from finforce_ifea.filter.state import SHARED, TRACTION
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
-# Log probability below which no hypothesis falls, so that it can come back.
+# Lower bound of a hypothesis' log probability, so that it can recover.
 _LEAST_WEIGHT = -9.0
 
 

@@ -17,36 +17,40 @@ from finforce_ifea.filter.slip_path import PathState, SlipPath, find_turn, turn_
 from finforce_ifea.filter.state import DEPTH, HEIGHT
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
-# Coefficients of friction that are weighed against each other, and the deviation of a coefficient up to which one is
-# enough: that is within what no friction explains.
+# Number of hypotheses of the coefficient of friction.
 NODES = 9
+# Standard deviation of the coefficient up to which one hypothesis is enough [-]: less than traction beyond friction.
 _WELL_KNOWN = 0.05
-# They cover the expected coefficient by so many standard deviations, up to the largest [-].
+# Half-width of the grid of coefficients [sigma].
 _SPAN = 2.5
+# Largest coefficient of the grid [-].
 _LARGEST = 1.2
-# Prior probability that only the jaws hold an object between two of them [-].
+# Prior probability that an object between two jaws is held by them alone [-].
 _HELD = 0.5
-# The least log odds that the gripper's moves give to that: what was grasped is still where it lay until it is lifted;
-# and the largest: it may hold a handle.
-_AT_REST, _PARTED = -4.0, 4.0
-# A motion back by less than this is noise [sigma] while the object moves, and where it has stopped; and one along the
-# finger by less than this [m].
+# Log odds of that before the object is lifted: it still lies where it lay.
+_AT_REST = -4.0
+# Largest log odds of that after a lift or a turn: the object may be a handle.
+_PARTED = 4.0
+# Reversals below this are noise [sigma], while the object moves.
 _REVERSAL = 2.5
+# The same where it has stopped [sigma].
 _REVERSAL_AT_REST = 4.0
+# Motion along the finger below this is noise of the object's pose [m].
 _HEIGHT_PLAY = 1e-3
-# Motion that is not worth a step [m].
+# Shortest step of the path [m].
 _SHORTEST = 0.01e-3
 # Probability of rest below which the object moves [-].
 _MOVES = 0.2
 _NO_PLACES = np.zeros((0, 2))
-# A stop is known better than the motion before it once its deviation is less by this factor.
+# A stop replaces the end of a motion once its standard deviation is smaller by this factor [-].
 _STOPPED = 0.7
-# 1 sigma of the depth of first touch [m].
+# Standard deviation of the depth of first touch [m].
 _TOUCH_STDDEV = 0.1e-3
-# Part of the path's deviation that is left while all of the contact slides, which it does where this much of the
-# probability is within so little of the cone [-].
+# Factor on the path's standard deviation while the whole contact slides [-].
 _SLIDING = 0.3
+# Probability of hypotheses at their cone from which the whole contact slides [-].
 _MOST = 0.5
+# Distance from the friction cone that counts as being at it [-].
 _AT_CONE = 1e-6
 _LEAST_PROBABILITY = 1e-6
 # Length of the path that can be taken back [m].

@@ -17,11 +17,11 @@ from finforce_ifea.contact_mechanics.indenter import HEIGHT, SHAPE, PressedObjec
 from finforce_ifea.contact_mechanics.pressed_jaw import ContactSurface
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
-# Heights next to the clamp, as shares of the lowest at which key points show a force [-].
+# Heights next to the clamp, relative to the lowest at which key points show a force [-].
 _NEXT_TO_CLAMP = np.array([0.2, 0.4, 0.6, 0.8, 1.0])
-# Objects farther off than this, or deeper in, are surely so [m].
+# Clearance, of either sign, beyond which the state of the contact is certain [m].
 _WELL_CLEAR = 3e-3
-# An object is apart from the jaw by so many standard deviations.
+# Clearance from which an object is apart from the jaw [sigma].
 APART_SIGMAS = 3.0
 _LEAST_VARIANCE = 1e-12
 

@@ -46,7 +46,7 @@ from finforce_ifea.filter.state import DEPTH, HEIGHT, SHAPE
 from finforce_ifea.tracking.contact_state import LEAST_DEPTH
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
-# What is expected of an object, and what the search for its contact is allowed.
+# Prior of an object's shape and height, and limits of the search for its contact.
 EXPECTATION = np.dtype(
     [
         ("mean", float, 2),  # of shape and height [m]
@@ -73,28 +73,33 @@ DEPTH_NOISE = MotionNoise(
     jump=(5e-3) ** 2,
     jump_probability=1e-3,
 )
-# Images from which the noise is learnt, the largest change that one of them shows, and the largest noise, as variances
-# over that in the tare; and the median of D^2 for three normal numbers, less what the contact takes up.
+# Time constant of the noise level [images].
 _LEVEL_IMAGES = 8.0
+# Largest noise variance that one image shows, relative to the tare's [-].
 _LARGEST_CHANGE = 9.0
+# Largest noise variance, relative to the tare's [-].
 _LARGEST_LEVEL = 25.0
+# Median of D^2 for three normal numbers, less what the contact explains [-].
 _MEDIAN_SQUARE = 2.05
-# Images from which the scatter of the depths is learnt.
+# Time constant of the scatter of the depths [images].
 _SCATTER_IMAGES = 15.0
-# Largest change of the height at once [m], and the changes that no longer matter [m].
+# Largest step of the height [m].
 _LARGEST_SHIFT = 0.3e-3
+# Tolerance of depth and height [m].
 _SETTLED = 0.1e-3
-# Of the model's reach.
+# Tolerance of the unknowns of the mechanics, relative to the model's reach [-].
 _SETTLED_CORRECTION = 0.05
-# Steps shortened to less than this factor are taken as they are: the key points cannot decide between two corners.
+# Step length below which the search ends [-]: the key points cannot decide between two corners.
 _UNDECIDED = 0.2
-# Weight at which a key point still agrees, and the share of them that has to.
+# Weight from which a key point agrees [-].
 _AGREES = 0.25
+# Fraction of key points that must agree [-].
 _MAJORITY = 0.5
-# The largest bump of a camera that is believed [sigma].
+# Largest bump of a camera [sigma].
 _LARGEST_BUMP = 5.0
-# Variances (4,) of the camera's motion where nobody touches it, and where it was bumped.
+# Variances (4,) of the camera's motion since the tare.
 _STILL = np.array([CAMERA_SHIFT, CAMERA_SHIFT, CAMERA_TURN_STDDEV, 0.0]) ** 2
+# The same after a bump.
 _BUMPED = np.array([BUMPED_SHIFT, BUMPED_SHIFT, BUMPED_TURN, 0.0]) ** 2
 _LEAST_VARIANCE = 1e-14
 

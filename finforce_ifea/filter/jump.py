@@ -45,23 +45,24 @@ class Jump(NamedTuple):
 
 
 _SHIFT = np.array([CAMERA_X, CAMERA_Z, CAMERA_TURN])
-# The camera was bumped, by a millimetre and half a degree.
+# A bumped camera: 1 mm and 10 mrad.
 BUMPED = Jump(_SHIFT, np.array([1e-3, 1e-3, 10e-3]), 1e-5)
-# The object touches elsewhere than stated, anywhere within 30 mm.
+# A contact elsewhere than stated, within 30 mm.
 MISPLACED = Jump(np.array([HEIGHT]), np.array([30e-3]), 1e-4)
-# The camera was bumped by less, and the object touches elsewhere, as they show over some images only.
+# A smaller bump, which only several images show.
 NUDGED = Jump(_SHIFT, np.array([0.4e-3, 0.4e-3, 4e-3]), 1e-4)
+# A contact elsewhere than stated, which only several images show.
 OFFSET = Jump(np.array([HEIGHT]), np.array([15e-3]), 1e-4)
-# Jumps that one image may show.
+# Jumps that one image can show.
 JUMPS = (BUMPED, MISPLACED)
-# Log odds against a jump since the first image, its prior left out, after which the test begins anew.
+# Log likelihood ratio of a jump below which the test starts anew.
 _UNLIKELY = -3.0
-# What an image shows beside the index of a jump: none, or not yet, as the object is too far from the linearisation.
+# Results beside the index of a jump: no jump, and no decision so far from the linearisation.
 NO_JUMP, UNDECIDED = -1, -2
-# Largest change of the depth at once, within which a linearisation holds [m].
+# Largest step of the depth [m]: the range of a linearisation.
 LARGEST_MOVE = 0.7e-3
-# Correlation between the errors by which a detector misplaces two key points of one shape [-]: that of the shipped
-# network in drawn scenes.
+# Correlation between a detector's errors at two key points of one shape [-]: that of the shipped network in random
+# scenes.
 ALIKE = 0.2
 
 

@@ -33,9 +33,9 @@ from finforce_ifea.tracking.contact_state import MIDDLE_STDDEV, ContactState
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
 _HEIGHTS = 13
-# The pair of forces that twists stands so far from the middle, as a share of half the width.
+# Lever of the pair of forces that twists, relative to half the width [-].
 _ARM = 0.8
-# Larger meshes are not worth the time: of theirs only the plane is known.
+# Largest mesh [nodes]: of larger ones, only the plane is computed.
 _MOST_NODES = 20_000
 
 
@@ -124,7 +124,7 @@ class _Answers(NamedTuple):
     roll: NDArray
 
 
-# Of the finger that was measured last, whose other jaw and later estimators need not wait for it.
+# Answers of the last finger, for its other jaw and later estimators.
 _LAST: dict[tuple, _Answers | None] = {}
 
 
@@ -154,44 +154,53 @@ def _answer_at_rest(jaw: Jaw, mesh: VolumeMesh) -> _Answers | None:
     return _Answers(model=model, steps=steps, heights=heights, half_width=half, roll=np.array(roll))
 
 
-# Pressure is spread evenly: its centre strays from the middle by this share of what touches, and by less where that is
-# the whole width of the finger: by what is left of a square, at least the share below.
+# Standard deviation of the pressure centre from the middle of what touches, relative to its width [-].
 _EVEN = 0.4
+# The same, at least, where the whole width of the finger touches [-].
 _WIDE = 0.15
-# One over the core of a rectangular section, as a share of half its width.
+# Inverse of the core of a rectangular section, relative to half its width [-].
 _CORE = 3.0
-# Time over which the pressure stays where it is [s].
+# Correlation time of the pressure centre [s].
 _LOCATION_TIME = 10.0
-# 1 sigma of the lateral traction ratio [-] and the time over which it stays the same [s].
+# Standard deviation of the lateral traction ratio [-].
 _TRACTION = 0.1
+# Correlation time of that ratio [s].
 _TRACTION_TIME = 60.0
-# The same of a weight that the jaws have lifted and turn.
+# Standard deviation of that ratio after a lift, by a weight that the jaws turn [-].
 _WEIGHT = 0.3
+# Correlation time of that ratio [s].
 _WEIGHT_TIME = 1.0
 _LIFTED_RATIO = _WEIGHT**2 + _TRACTION**2, _WEIGHT_TIME
-# 1 sigma of the share of the weight, over the normal force [-], and the time over which it stays the same [s].
-_SHARE, _SHARE_TIME = 0.3, 30.0
-# 1 sigma of what else than the known pull of the weight there is, as a ratio [-].
+# Standard deviation of this jaw's part of the weight, relative to the normal force [-].
+_SHARE = 0.3
+# Correlation time of that part [s].
+_SHARE_TIME = 30.0
+# Standard deviation of the lateral traction ratio beside a known weight [-].
 _REST = 0.05
-# Log prior odds of a lift in an image, the same where gravity tells its direction, and the log odds against one, prior
-# left out, after which the test begins anew.
-_LIFTED, _LIFTED_ALONG = np.log(1e-4), np.log(1e-2)
+# Log prior odds of a lift in an image.
+_LIFTED = np.log(1e-4)
+# The same where the direction of gravity is known.
+_LIFTED_ALONG = np.log(1e-2)
+# Log likelihood ratio of a lift below which the test starts anew.
 _UNLIKELY = -3.0
-# 1 sigma of what the linear jaw makes of the ratio [-].
+# Standard deviation of the ratio by the linear model of the jaw [-].
 _NONLINEAR = 0.04
-# A ratio of so many standard deviations is believed by half; less is next to nothing.
+# Ratio of which half is reported [sigma]: a soft threshold.
 _CLEAR = 3.0
-# Force below which nothing is learnt [N].
+# Least force from which the ratio is estimated [N].
 _LEAST_FORCE = 0.3
-# 1 sigma of an error of the mechanics along y [m], and the motion [m] and time [s] over which it stays the same.
+# Standard deviation of the mechanics' error along y [m].
 _FLOOR = 0.02e-3
+# Correlation length of that error [m].
 _OFFSET_LENGTH = 10e-3
+# Correlation time of that error [s].
 _OFFSET_TIME = 60.0
-# Error of what a turn moves a bent finger, as a share of it.
+# Relative error of the motion of a bent finger by a rotation [-].
 _TURN_ERROR = 0.5
-# A key point nearer to the middle plane does not show how its section turns, and one so little above another is of the
-# same section [m].
-_LEAST_ARM, _LEAST_RISE = 1e-3, 2e-3
+# Distance from the middle plane from which a key point shows the rotation of its section [m].
+_LEAST_ARM = 1e-3
+# Distance along the finger up to which two key points are of one section [m].
+_LEAST_RISE = 2e-3
 
 
 class _Estimate(NamedTuple):

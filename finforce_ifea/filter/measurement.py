@@ -36,12 +36,13 @@ _OPTIONS = {"cache": True, "error_model": "numpy"}
 
 # Degrees of freedom of a key point's noise [-].
 FREEDOM = 4.0
-# Weight up to which a key point is a gross error, and what is left of it: nothing that would matter.
+# Weight below which a key point is a gross error [-].
 _GROSS = 0.1
+# Weight of a gross error [-].
 NO_WEIGHT = 1e-9
 # Variance of a median over that of a mean [-]: pi / 2.
 _MEDIAN = 1.57
-# Error of the mechanics along y, one sigma [m].
+# Standard deviation of the mechanics' error along y [m].
 LATERAL_ERROR = 0.1e-3
 
 

@@ -20,43 +20,51 @@ from finforce_ifea.filter.state import APPARENT, CAMERA_STRETCH, CAMERA_X, DEPTH
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
 
-# 1 sigma of the depth in an image before it is seen [m]: wider than any motion between two images.
+# Prior standard deviation of the depth in each image [m]: larger than any motion between two images.
 FREE_DEPTH = 2e-3
-# Time over which the error of an object's pose stays the same [s]; trackers see an object from one side.
+# Correlation time of the error of an object's pose [s]: trackers see an object from one side.
 OBJECT_TIME = 10.0
-# Error of the mechanics at a key point, 1 sigma, relative to the displacement [-]: of a shape, and of all shapes. The
-# default mesh is within 1 % of an independent program.
+# Standard deviation of the mechanics' error at a key point in one shape, relative to the displacement [-].
 MODEL_SHAPE = 0.004
+# The same in all shapes [-]: the default mesh is within 1 % of an independent program.
 MODEL_RELATIVE = 0.01
-# Motion [m] and time [s] over which such an error stays the same.
+# Correlation length of the error in one shape [m].
 MODEL_LENGTH = 10e-3
+# Correlation time of that error [s].
 MODEL_TIME = 60.0
-# Motion over which what a detector errs by in the view of one shape stays the same [m]: half a pixel.
+# Correlation length of a detector's lasting error [m]: half a pixel.
 SIGHT_LENGTH = 0.1e-3
-# Time over which the relative error stays the same [s].
+# Correlation time of the error in all shapes [s].
 RELATIVE_TIME = 200.0
-# 1 sigma of the traction ratio beyond friction: at least [-], and relative to the coefficient of friction.
+# Standard deviation of the traction ratio beyond friction, at least [-].
 TRACTION_FLOOR = 0.04
+# The same relative to the coefficient of friction [-].
 TRACTION_SHARE = 0.15
-# Motion over which it stays the same [m].
+# Correlation length of that traction [m].
 TRACTION_LENGTH = 2e-3
-# 1 sigma of the traction ratio that errors of the mechanics look like [-], and that errors of a detector which last
-# while it sees the same look like, by their size [1/m], and the time over which it stays [s].
+# Standard deviation of the traction ratio that errors of the mechanics look like [-].
 APPARENT_TRACTION = 0.2
+# The same for a detector's lasting errors, relative to their standard deviation [1/m].
 APPARENT_SIGHT = 1e3
+# Correlation time of apparent traction [s].
 APPARENT_TIME = 10.0
-# 1 sigma of the shift [m] and turn [rad] of a camera that nobody touches, and the time over which they stay [s].
+# Standard deviation of the camera's shift since the tare [m].
 CAMERA_SHIFT = 0.02e-3
+# Standard deviation of its rotation [rad].
 CAMERA_TURN_STDDEV = 0.3e-3
+# Correlation time of both [s].
 CAMERA_TIME = 20.0
-# The same of a bumped camera.
+# Standard deviation of the shift of a bumped camera [m].
 BUMPED_SHIFT = 1e-3
+# Standard deviation of its rotation [rad].
 BUMPED_TURN = 10e-3
+# Correlation time of both [s]: it stays where it is.
 BUMPED_TIME = 1e4
-# 1 sigma of turn [rad] and stretch [-] of a jaw whose place in the picture is uncertain, and the time over which it is
-# off alike [s].
+# Standard deviation of the rotation of a jaw whose pose in the image is uncertain [rad].
 PLACE_TURN = 0.07
+# Standard deviation of its scale [-].
 PLACE_STRETCH = 0.02
+# Correlation time of both [s].
 PLACE_TIME = 1.0
 
 

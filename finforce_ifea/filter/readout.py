@@ -11,14 +11,14 @@ from finforce_ifea.filter.state import CAMERA_TURN, CAMERA_X, DEPTH, HEIGHT, TRA
 from finforce_ifea.tracking.contact_state import LEAST_DEPTH, LOADED_DEPTH, TOUCH_DEPTH
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
-# Error of the force's direction [-]: it is considered and never estimated.
+# Standard deviation of the force's direction [rad]: considered, not estimated.
 _MISDIRECTED = 0.03
 # Share of the variance of a detector's lasting errors that all key points of a jaw have in common [-]: 0.023 in drawn
 # grasps of the bench finger, whose key points err by half of what the shipped network states; twice that is considered.
 COMMON = 0.05
-# The largest force that is read out, over that of the linearisation [-].
+# Largest force, relative to that of the linearisation [-].
 _LARGEST_GROWTH = 10.0
-# The largest traction ratio that the mechanics is asked for [-].
+# Largest traction ratio of the mechanics [-].
 LARGEST_RATIO = 0.9
 
 

@@ -42,11 +42,11 @@ from finforce_ifea.filter.state import DEPTH, HEIGHT, SHAPE, TRACTION, state_siz
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tracking.contact_state import KEYPOINT, LOADED_DEPTH, blank_contact_state
 
-# Mean time of rest of an object that hardly presses: jaws that are open are about to close [s].
+# Mean time of rest of open jaws [s]: they are about to close.
 _FREE_TIME = 0.15
-# 1 sigma of the depth at the beginning [m].
+# Standard deviation of the depth in the first image [m].
 _FIRST_DEPTH = 0.1e-3
-# Least force at which the inclination of the faces is asked for [N].
+# Least force at which the inclination of the faces is read [N].
 _LEAST_FORCE = 0.1
 
 

@@ -25,15 +25,15 @@ from finforce_ifea.contact_mechanics.pressed_jaw import RigidContact
 from finforce_ifea.filter.state import DEPTH, HEIGHT
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
-# Coefficient of friction of a contact that does not slide [-].
+# Coefficient of friction of a sticking contact [-].
 _STICKS = 1e3
-# Motion after which the rates are measured again [m].
+# Motion after which the rates are computed again [m].
 _FRESH = 0.15e-3
-# Longest step of the path at once [m].
+# Longest step of the path [m].
 _STEP = 0.02e-3
-# Motion by which derivatives are measured [m].
+# Step of the finite differences [m].
 _SMALL = 1e-6
-# Gap between two parts of a contact [m].
+# Least gap between two parts of a contact [m].
 _GAP = 4e-3
 # Of `measure_rates`: a part sticks while the other does, too, or while it slides.
 _BOTH, _ALONE = 0, 1

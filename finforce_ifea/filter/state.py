@@ -12,7 +12,7 @@ the point's displacement [-].
 from __future__ import annotations
 
 DEPTH, SHAPE, HEIGHT, TRACTION, CAMERA_X, CAMERA_Z, CAMERA_TURN, CAMERA_STRETCH, APPARENT = range(9)
-# Entries that no single key point owns.
+# Number of entries that no single key point owns.
 SHARED = 9
 
 

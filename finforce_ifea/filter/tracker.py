@@ -26,23 +26,25 @@ from finforce_ifea.tare import PointNoise, Tare
 from finforce_ifea.tracking.contact_state import MIDDLE_STDDEV, TOUCH_DEPTH, UNSEEN_TRACTION, ContactState
 from finforce_ifea.tracking.influence import explain_offsets, measure_influence, press_lightly
 
-# Images without touch after which the next object may be any.
+# Images without touch after which another object is expected.
 _IMAGES_RELEASED = 15
-# 1 sigma by which the depth is less known after an image that told nothing [m].
+# Standard deviation that an image without information adds to the depth [m].
 _LOST_STDDEV = 1e-3
-# The height may leave what was given by this many of its standard deviations; beyond, the contact is another one.
+# Distance from the given height beyond which the contact is another one [sigma].
 _FARTHEST_HEIGHT = 8.0
-# Shapes so many times as far from the stored ones as these are good for are left to the full mechanics, until the
-# object has gone back to this share of its depth.
-_BEYOND_STORED, _BACK = 1.0, 0.8
-# Iterations of the full mechanics in one image, each as long as a hundred others: a shape that asks for more is wrong,
-# or settles over the next images.
+# Extrapolation from the stored shapes from which the full mechanics takes over [-].
+_BEYOND_STORED = 1.0
+# Fraction of the depth at that moment from which the stored shapes do again [-].
+_BACK = 0.8
+# Iterations of the full mechanics per image, each as long as a hundred others.
 _FULL_ITERATIONS = 3
-# Those that find the equilibrium of the full mechanics in the state at which they take over, and their last correction.
-_SETTLING, _SETTLED = 8, 2e-3
+# Iterations with which the full mechanics takes over.
+_SETTLING = 8
+# Tolerance of these, relative to the model's reach [-].
+_SETTLED = 2e-3
 # Steps of the depth in which the full mechanics is pressed anew [m].
 _PRESSING = 0.5e-3
-# Share of the expected deviation of a coefficient of friction below which something was learnt of it.
+# Standard deviation of a learnt coefficient of friction, relative to that of the prior [-].
 _LEARNT = 0.75
 
 

@@ -15,49 +15,48 @@ from finforce_ifea.relaxation import relax_force
 _OPTIONS = {"cache": True, "error_model": "numpy"}
 _V, _M = (np.float64, 3), (np.float64, (3, 3))
 
-# The contact that a tracker has found in an image. What was estimated is x where a contact is tracked, the force [N]
-# where its location is given.
+# Contact of a tracker in an image. The estimate is x where a contact is tracked, and the force [N] where its location
+# is given.
 CONTACT_STATE = np.dtype(
     [
         ("x", *_V),
         ("x_model", *_V),  # where the mechanics stands: never above the surface
-        ("covariance", *_M),  # of what was estimated
+        ("covariance", *_M),  # of the estimate
         ("force", *_V),  # elastic force on the jaw [N]
-        ("force_modes", *_M),  # its derivative by what was estimated
+        ("force_modes", *_M),  # its derivative by the estimate
         ("pressure_point", *_V),  # pressure centre on the deformed surface [m]
         ("pressure_location", *_V),  # the same on the undeformed surface [m]
         ("magnitude", float),  # of the force [N]
         ("stddev", float),  # of the force along itself [N]
-        ("unobserved_stddev", float),  # standard deviation of a force elsewhere, which key points hardly show [N]
+        ("unobserved_stddev", float),  # of a force next to the clamp [N]
         ("depth", float),  # below first touch [m]
         ("depth_variance", float),  # [m^2]
         ("height_stddev", float),  # of the pressure centre [m]
         ("used", int),  # key points with a weight
         ("residual", float),  # weighted root mean square [m]
-        ("kkt", float),  # what is left of the objective's gradient, relative to its parts
-        ("offset", float),  # contact location that the key points alone ask for, from the stated one [m]
+        ("kkt", float),  # gradient of the objective, relative to its parts
+        ("offset", float),  # contact location by the key points alone, from the stated one [m]
         ("mistaken", float),  # probability that the stated location is wrong
-        ("location_error", float),  # relative standard deviation of the force that the location leaves
-        ("extrapolation", float),  # distance of the shape from the stored ones, as a share of what these are good for
-        ("max_force", float),  # force beyond which no equilibrium is believed [N]
+        ("location_error", float),  # relative standard deviation of the force by the location
+        ("extrapolation", float),  # distance of the shape from the stored ones, relative to their range
+        ("max_force", float),  # largest plausible force [N]
         ("y", float),  # of the pressure along the width [m]
         ("y_stddev", float),  # [m]
         ("lateral_force", float),  # along y [N]; NaN where it is unknown
-        ("lateral_stddev", float),  # of the lateral force as a share of all force
+        ("lateral_stddev", float),  # of the lateral force, relative to the force
         ("traction_stddev", float),  # of the traction ratio along the finger
-        ("traction_leak", *_V),  # derivative of the force by that ratio where the key points stay as they are [N]
+        ("traction_leak", *_V),  # derivative of the force by that ratio at fixed key points [N]
         ("iterations", int),
-        ("converged", bool),  # whether the last iteration changed nothing that matters
-        ("sound", bool),  # whether the mesh is in order and the numbers are finite
-        ("quiet", bool),  # whether nothing seems to press
-        ("loaded", bool),  # whether something surely presses
+        ("converged", bool),  # the last step was below the tolerance
+        ("sound", bool),  # no element is inverted, all numbers are finite
+        ("quiet", bool),  # the jaw seems unloaded
+        ("loaded", bool),  # the jaw is surely loaded
     ],
     align=True,
 )
 ContactState = NDArray  # of this type and no dimension
 
-# One key point of an image: what was measured, and what is left of it at a state of the contact. In the plane means
-# along x and z, with y known.
+# One key point of an image. In the plane: along x and z, with y known.
 KEYPOINT = np.dtype(
     [
         ("measured", *_V),  # offsets and lateral motion removed, NaN where unused [m]
@@ -66,18 +65,19 @@ KEYPOINT = np.dtype(
         ("gain", float, 2),  # regression of the noise along x and z on that along y
         ("width_variance", float),  # along y in such an image [m^2]
         ("noise_ratio", float),  # variance in the tare over that in this image
-        ("offset_variance", float),  # of what is constant [m^2]
-        ("detector_variance", float),  # part of it that the detector errs by in the view of this shape [m^2]
+        ("offset_variance", float),  # of the constant offset [m^2]
+        ("detector_variance", float),  # part of it due to the detector, constant for one shape [m^2]
         ("weight", float),  # agreement times the noise ratio, 0 to 1
     ]
 )
 
-# The mechanics is evaluated at this depth [m] at least; below it shapes and forces are continued linearly.
+# Least depth at which the mechanics is evaluated [m]; shapes and forces below are extrapolated linearly.
 LEAST_DEPTH = 3e-5
-# Depths below which nothing seems to press, and above which something surely does [m].
+# Depth below which the jaw seems unloaded [m].
 TOUCH_DEPTH = 0.15e-3
+# Depth above which it is surely loaded [m].
 LOADED_DEPTH = 0.5e-3
-# Half of the friction cone is one standard deviation of an unseen traction ratio.
+# Standard deviation of an unobserved traction ratio, relative to the coefficient of friction [-].
 UNSEEN_TRACTION = 0.5
 # Standard deviation of an unknown lateral location [m].
 MIDDLE_STDDEV = 3e-3
@@ -93,18 +93,25 @@ _BLANK["max_force"] = np.inf
 _BLANK["used"] = 1
 _BLANK_BYTES = _BLANK.tobytes()
 
-# A force is rejected beyond this standard deviation, as a share of the force.
+# Standard deviation beyond which a force is rejected, relative to the force [-].
 _VAGUE_SHARE = 0.25
-# Shapes so many times as far from the stored ones as they are good for.
+# Extrapolation from the stored shapes beyond which a force is rejected [-].
 _FARTHEST_SHAPE = 2.0
-# A location that is so surely wrong, and by at least so much [m].
-_MISTAKEN, _LEAST_OFFSET = 0.99, 4e-3
-# What is left over of the key points' places [m], and its share of the finger's length: the mechanics explain a finger
-# within 0.6 mm or 1 %, even at a height that is not quite right; in a zoomed or empty picture 1.2 mm and more remain.
-# Key points that were noisy when the jaw was tared leave more, by so many standard deviations.
-LARGEST_RESIDUAL, _RESIDUAL_SHARE, _NOISY = 1e-3, 0.015, 3.0
-# An object would have to pull by so many standard deviations of the depth, from the least to the most [m].
-_PULLING, _LEAST_PULL, _MOST_PULL = 3.0, 0.5e-3, 0.9e-3
+# Probability of a wrong location from which a force is rejected [-].
+_MISTAKEN = 0.99
+# Least error of such a location [m].
+_LEAST_OFFSET = 4e-3
+# Residual of the key points beyond which a force is rejected, at least [m]: the mechanics explains a finger within
+# 0.6 mm, even at a slightly wrong height; a zoomed or empty picture leaves 1.2 mm and more.
+LARGEST_RESIDUAL = 1e-3
+# The same relative to the finger's length [-].
+_RESIDUAL_SHARE = 0.015
+# The same for key points that were noisy during the tare [sigma].
+_NOISY = 3.0
+# Negative depth that rejects the image [sigma].
+_PULLING = 3.0
+# Bounds of that depth [m].
+_LEAST_PULL, _MOST_PULL = 0.5e-3, 0.9e-3
 
 
 def bound_residual(rest: NDArray, noise: NDArray) -> float:
@@ -178,9 +185,9 @@ def measure_along(force: NDArray, modes: NDArray, covariance: NDArray) -> float:
     return np.sqrt(total)
 
 
-# Share of a force that nobody has seen along z.
+# Standard deviation along z of an unobserved force, relative to the force [-].
 UNSEEN_ALONG = 0.3
-# Root mean square error of a length by a variance across it, as a share of the variance over the length: sqrt(3) / 2.
+# Root mean square error of a length by a variance across it, relative to variance over length [-]: sqrt(3) / 2.
 _CURVED = 0.87
 
 

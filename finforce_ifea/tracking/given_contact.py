@@ -25,10 +25,10 @@ from finforce_ifea.tracking.influence import InfluenceCoefficients, explain_offs
 _NEIGHBOUR = 1e-3
 _KNOWN_LOADS = 32
 _QUIET_SIGMA = 3.0
-# Share of the model's reach in the last Newton step.
+# Tolerance of the Newton steps, relative to the model's reach [-].
 _SETTLED = 5e-3
 _FARTHEST_MOVE = 0.2
-# The median of |miss|^2 / variance is this for a normal distribution in three axes.
+# Median of the squared distance over its variance for a normal distribution in three axes [-].
 _MEDIAN_SQUARE = 2.4
 
 
@@ -218,10 +218,10 @@ class GivenContactTracker:
         return explain_offsets(modes, tare, stddev)
 
 
-# No averaging makes the place that key points ask for surer than this share of the heights that the face has: their
-# answers are those of the unloaded jaw.
+# Least standard deviation of an averaged location, relative to the heights of the face [-]: the model of it is that of
+# the unloaded jaw.
 _SUREST = 0.03
-# Images over which they are averaged.
+# Number of images over which locations are averaged.
 _LONGEST_AVERAGE = 45.0
 _ACROSS_CONTACT = np.linspace(-1.0, 1.0, 41)
 
@@ -315,8 +315,9 @@ class _LocationWatch:
         self._information = kept + information
 
 
-# A stated height is that of another contact once in so many times, and then anywhere within this [m].
+# Prior probability that the stated height is wrong [-].
 _MISTAKEN = 0.01
+# Standard deviation of the true height then [m].
 _ANYWHERE = 0.03
 
 

@@ -20,7 +20,7 @@ from finforce_ifea.tare import OFFSET_STDDEV, Tare
 
 _HEIGHTS = 13
 _TOUCH = 3e-5
-# Heights over which the face's turn is measured, to either side [m].
+# Distance to either side over which the rotation of the face is computed [m].
 _BESIDE = 2e-3
 
 
@@ -130,7 +130,7 @@ def press_lightly(contact: RigidContact, shape: float, height: float) -> tuple[N
     return q, contact.linearize(q, place)
 
 
-# Standard deviation of an offset that all key points share [m]: a depth scale wrong by 1 % at 0.15 m.
+# Standard deviation of an offset common to all key points [m]: a depth scale wrong by 1 % at 0.15 m.
 _COMMON_OFFSET = 1.5e-3
 
 
@@ -169,13 +169,19 @@ def split_change(modes: NDArray, change: NDArray) -> OffsetChange:
     return OffsetChange(*(float(np.sqrt(np.sum(part**2) / len(change))) for part in (bend, rest)))
 
 
-# The jaw is at rest while it seems pressed by less than this [m], in one frame or in so many standard deviations of
-# it, and on average over the last ones.
-LARGEST_DEPTH, LARGEST_MEAN_DEPTH = 0.3e-3, 0.15e-3
+# Largest apparent depth of an unloaded jaw in one image [m].
+LARGEST_DEPTH = 0.3e-3
+# The same on average over `_AVERAGED` images [m].
+LARGEST_MEAN_DEPTH = 0.15e-3
+# The same in one image [sigma].
 _CHANCE = 4.0
 _AVERAGED = 30
-# Key points farther from their place are no evidence [m]; too few of them, or a depth told no better than this, none.
-_FARTHEST, _FEWEST, _VAGUE = 3e-3, 4, 0.3e-3
+# Distance from its position at rest from which a key point is ignored [m].
+_FARTHEST = 3e-3
+# Least number of key points.
+_FEWEST = 4
+# Largest standard deviation of the depth [m].
+_VAGUE = 0.3e-3
 _NEARER, _REST_REACH = 0.75, 1e-3
 
 
