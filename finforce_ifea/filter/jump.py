@@ -64,6 +64,8 @@ LARGEST_MOVE = 0.7e-3
 # Correlation between a detector's errors at two key points of one shape [-]: that of the shipped network in random
 # scenes.
 ALIKE = 0.2
+# Error of the linearisation about the last state, relative to the object's motion since [-].
+_NONLINEAR = 0.2
 
 
 @njit(**_OPTIONS)
@@ -160,7 +162,7 @@ def _weigh_innovations(measured, nu, S, depth_variance, asked):
     `find_depth_jump`.
     """
     H, R, (deeper, variance) = measured.H, measured.R, asked
-    moved, spread = nu - H[:, DEPTH] * deeper, variance - depth_variance
+    moved, spread = nu - H[:, DEPTH] * deeper, variance + (_NONLINEAR * deeper) ** 2 - depth_variance
     blocks = np.empty_like(R)
     for i in range(len(R)):
         h = H[2 * i : 2 * i + 2, DEPTH]

@@ -367,14 +367,14 @@ class ContactTracker:
         state["max_force"] = self._fidelities[0].contact.max_force
 
     def _find_hidden(self, state: ContactState) -> float:
-        """Return the standard deviation of a force next to the clamp [N], see `HiddenForce`."""
+        """Return the standard deviation of a force [N] elsewhere than the key points have it, see `HiddenForce`."""
         force, centre = state["force"], float(state["pressure_location"][2])
         if self._is_apart:
             return 0.0
         if self._hidden.is_next_to_clamp(centre):
             return hypot(force[0], force[2])
         pressed, covariance = self._contact.indenter.pressed, self._search.contact_covariance()
-        return self._hidden.bound(pressed, state["x"], covariance, self._move_surface)
+        return self._hidden.bound(pressed, state["x"], covariance, centre, self._move_surface)
 
     def _move_surface(self) -> NDArray:
         """Return the motion along x of the inner face at its heights (h,) [m]."""
@@ -383,9 +383,13 @@ class ContactTracker:
 
     def _build_hidden(self, lowest: float) -> HiddenForce:
         """Return where key points hardly show a force, on a finger that shows one from a height [m] on."""
-        contact, heights = self._contact, list_clamped_heights(lowest)
-        pressed = (press_lightly(contact, self.settings.radius, height)[1] for height in heights)
-        return HiddenForce(heights, np.array([abs(each.force_modes[0, DEPTH]) for each in pressed]), contact.surface)
+        _, vague = self.response.fit_forces(np.ones(len(self._rest), bool))
+        contact, along = self._contact, zip(self.response.heights, self.response.stiffness, vague, strict=True)
+        clamped = [
+            (height, abs(float(press_lightly(contact, self.settings.radius, height)[1].force_modes[0, DEPTH])))
+            for height in list_clamped_heights(lowest)
+        ]
+        return HiddenForce(clamped, list(along), contact.surface)
 
 
 def _attach(contact: RigidContact, keypoints: NDArray) -> _Fidelity:

@@ -28,7 +28,7 @@ CONTACT_STATE = np.dtype(
         ("pressure_location", *_V),  # the same on the undeformed surface [m]
         ("magnitude", float),  # of the force [N]
         ("stddev", float),  # of the force along itself [N]
-        ("unobserved_stddev", float),  # of a force next to the clamp [N]
+        ("unobserved_stddev", float),  # of a force elsewhere, which key points hardly show [N]
         ("depth", float),  # below first touch [m]
         ("depth_variance", float),  # [m^2]
         ("height_stddev", float),  # of the pressure centre [m]
@@ -157,7 +157,7 @@ def _find_ambiguity(state: ContactState, vague: float) -> str:
         bent = f"the jaw is bent towards the object, as if that pulled by {1e3 * pulled:.1f} mm"
         return f"{bent}: open the jaw and tare, or the contact is elsewhere"
     if state["unobserved_stddev"] > vague:
-        return "the object may press where key points hardly show a force: next to the clamp"
+        return "the object may press where key points hardly show a force: next to the clamp, or along its face"
     if not state["stddev"] <= vague:
         return f"the visible key points tell the force only within {state['stddev']:.2g} N, expected {vague:.2g} N"
     return ""
