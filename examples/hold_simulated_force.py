@@ -4,7 +4,7 @@ from collections import deque
 from threading import Event, Thread
 
 from finforce_driver.can import build_bus
-from finforce_driver.grasp.load_watch import ForceSample
+from finforce_driver.grasp.force_monitor import ForceSample
 from finforce_driver.grasp.session import hold_force
 from finforce_driver.gripper import Gripper
 from finforce_driver.settings import GraspGoal

@@ -31,7 +31,7 @@ class Rule:
         implementation: its constants or functions.
         purpose: its purpose.
         off: values that switch it off, by the place where each is used.
-        scenes: that reach it.
+        scenes: that reach it; "stress NAME" is a family of the stress tests.
     """
 
     name: str
@@ -96,7 +96,7 @@ RULES = (
     _rule("initial weights", "`_weigh_innovations`", "weights before the first update, with the motion removed",
           {_FILTER + "jump:_weigh_innovations": _weigh_alike}, "gross", "cluster", "fast"),
     _rule("linearisation error", "`_NONLINEAR`", "larger tolerance of the initial weights after a motion",
-          {_FILTER + "jump:_NONLINEAR": 0.0}, "fast", "gross"),
+          {_FILTER + "jump:_NONLINEAR": 0.0}, "fast", "gross", "stress gross"),
     _rule("noise level", "`_LEVEL_IMAGES`", "noise above that of the tare",
           {_IMAGE + "_follow_level": _keep_level}, "noisy", "gross"),
     _rule("scatter of the depth", "`_follow_scatter`", "depths noisier than their key points tell",
@@ -172,7 +172,7 @@ RULES = (
     _rule("hidden force", "`_find_hidden`", "deviation due to contact where no key point shows it",
           {_TRACKER + "ContactTracker._find_hidden": lambda *_: 0.0}, "low box", "wide box", "box"),
     _rule("hidden force along the face", "`_ELSEWHERE`", "the same, away from the clamp",
-          {_FILTER + "hidden:_ELSEWHERE": _ALWAYS}, "wide box", "box", "low box"),
+          {_FILTER + "hidden:_ELSEWHERE": _ALWAYS}, "wide box", "box", "low box", "stress objects"),
     _rule("full model", "`_BEYOND_STORED`", "shapes beyond the stored ones",
           {_TRACKER + "ContactTracker._change_fidelity": _nothing}, "wide box", "low box"),
     _rule("reset after a release", "`_IMAGES_RELEASED`", "another object", {_TRACKER + "_IMAGES_RELEASED": 10**9},

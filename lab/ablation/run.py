@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from numba.core.dispatcher import Dispatcher
+from numpy.typing import NDArray
 
 from finforce_eval.errors import RecordingError
 from finforce_eval.tasks import progress_bar
@@ -32,12 +33,18 @@ from finforce_ifea.settings import EstimatorSettings
 from lab.ablation.rules import RULES, Rule
 from lab.ablation.scenes import Scene, build_scene
 from lab.harness import Figures, format_table
+from lab.stress import inputs, objects
 from lab.stress.session import FORCE_ERROR, Bench
-from lab.stress.stress import Plan
+from lab.stress.stress import Plan, run_family
 
 SIGMAS = 3.0
 # What counts as moved: forces [N], shares [%].
 MOVED_FORCE, MOVED_SHARE = 0.01, 1.0
+# Prefix of a scene that is a family of the stress tests.
+STRESS = "stress "
+FAMILIES = {family.name: family for family in (*inputs.FAMILIES, *objects.FAMILIES)}
+# Number of trials of such a scene.
+TRIALS = 12
 COLUMNS = ("magnitude/N", "vector/N", "in 3σ/%", "answered/%")
 
 
@@ -97,11 +104,23 @@ def play(scene: Scene) -> dict[str, float]:
     if not rows:
         return dict(zip(COLUMNS, (np.nan, np.nan, np.nan, 0.0), strict=True))
     found, true = np.array([answers[i].force for i in rows]), scene.forces[rows]
-    error, sigma = found - true, np.array([answers[i].force_stddev for i in rows])
     size = np.linalg.norm(found, axis=1) - np.linalg.norm(true, axis=1)
+    return _score(size, found - true, np.array([answers[i].force_stddev for i in rows]), len(rows) / due)
+
+
+def play_stress(family: str) -> dict[str, float]:
+    """Return the figures of a family of the stress tests, as `play` does."""
+    trials = run_family(FAMILIES[family], Plan(count=TRIALS))
+    sure = [trial for trial in trials if trial.sure and trial.errors]
+    errors, stated = (np.array([getattr(trial, name) for trial in sure]) for name in ("errors", "stated"))
+    return _score(errors[:, 3], errors[:, :3], stated[:, :3], len(sure) / len(trials))
+
+
+def _score(size: NDArray, error: NDArray, sigma: NDArray, answered: float) -> dict[str, float]:
+    """Return the figures for errors of magnitude (n,) and force (n, 3) [N] and its standard deviation (n, 3) [N]."""
     within = (np.abs(error) <= SIGMAS * sigma + 1e-3).mean(axis=0).min()
     rms = [float(np.sqrt(np.mean(each**2))) for each in (size, np.linalg.norm(error, axis=1))]
-    return dict(zip(COLUMNS, (*rms, 100.0 * float(within), 100.0 * len(rows) / due), strict=True))
+    return dict(zip(COLUMNS, (*rms, 100.0 * float(within), 100.0 * answered), strict=True))
 
 
 def play_recordings(bags: Iterable[str], options: Mapping[str, Any]) -> dict[str, dict[str, float]]:
@@ -159,8 +178,14 @@ def main() -> None:
             if asked["bags"]:
                 figures = play_recordings(asked["bags"], {"calibration": asked["calibration"]})
             else:
-                figures = {scene: play(pickle.loads((folder / scene).read_bytes())) for scene in scenes}
+                figures = {scene: _play_scene(folder, scene) for scene in scenes}
         print(json.dumps(figures), flush=True)
+
+
+def _play_scene(folder: Path, name: str) -> dict[str, float]:
+    """Return the figures of a scene in a folder, or of a family of the stress tests."""
+    family = name.removeprefix(STRESS)
+    return play_stress(family) if family != name else play(pickle.loads((folder / name).read_bytes()))
 
 
 def list_runs(rules: Iterable[Rule]) -> list[list[Rule]]:
@@ -182,10 +207,10 @@ def ablate(rules: Iterable[Rule], bags: Iterable[str] = (), calibration: str = "
     """
     rules, bags = list(rules), list(bags)
     names = [] if bags else list(dict.fromkeys(name for rule in rules for name in rule.scenes))
-    steps, rows = len(names) + len(rules) + 1, []
+    steps, rows = sum(not name.startswith(STRESS) for name in names) + len(rules) + 1, []
     with TemporaryDirectory(prefix="finforce_scenes_") as folder, progress_bar(steps, "step", "ablation") as bar:
         bench = Bench(Plan()) if names else None
-        for name in names:
+        for name in (name for name in names if not name.startswith(STRESS)):
             (Path(folder) / name).write_bytes(pickle.dumps(build_scene(bench, name)))
             bar.update(1)
         usual = next(run_child((), Path(folder), bags, calibration, names))

@@ -10,7 +10,7 @@ import pytest
 
 from finforce_ifea.observation import check_contact, check_observation
 from lab.ablation.rules import RULES
-from lab.ablation.run import find_compiled, list_runs, play, run_child, switch_off
+from lab.ablation.run import FAMILIES, STRESS, find_compiled, list_runs, play, run_child, switch_off
 from lab.ablation.scenes import SCENES, Press, build_scene, film, tell_height
 from lab.stress.session import Bench
 from lab.stress.stress import Plan
@@ -24,7 +24,7 @@ def test_everything_that_a_rule_replaces_is_there_and_a_scene_reaches_it(rule):
         name, _, path = place.partition(":")
         reduce(getattr, path.split("."), import_module(name))
     assert rule.scenes
-    assert set(rule.scenes) <= set(SCENES)
+    assert set(rule.scenes) <= {*SCENES, *(STRESS + family for family in FAMILIES)}
 
 
 def test_a_value_that_is_compiled_in_asks_for_another_compilation_of_what_holds_it_and_of_its_callers():
