@@ -61,21 +61,21 @@ class JawPosition:
 
 
 class ForceMonitor:
-    """Tells contact from offset, and jumps that motion does not explain from forces.
+    """Detects contact, and rejects jumps of the force that motion does not explain.
 
     Args:
         settings: limits and expectations.
-        onset_force: above what is seen without load, it says that something presses [N].
+        onset_force: force above the unloaded level from which something presses [N].
 
     Attributes:
         model: of force over opening, in use once loaded.
         loaded: True if something presses.
         suspect: True if the newest force was rejected as a possible jump.
-        force: the newest that was believed [N]; NaN before the first.
-        opening: that belongs to it [m].
+        force: the newest plausible one [N]; NaN before the first.
+        opening: of the jaws at that force [m].
         resting: True if the jaws rested then.
         peak: the largest while loaded [N].
-        stddev: of the force, as its source stated it for the newest that was believed [N].
+        stddev: of that force, as its source states it [N].
     """
 
     def __init__(self, settings: GraspSettings, onset_force: float) -> None:
@@ -228,7 +228,7 @@ _KNOWN = 8  # samples after which the latency is known
 
 
 class ForceInput:
-    """Admits samples once, in order and with times that can be; measures latency and period.
+    """Admits each sample once, in order and with plausible times; measures latency and period.
 
     Args:
         stale_after: age of an image after which it is not admitted [s].

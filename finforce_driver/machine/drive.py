@@ -1,4 +1,4 @@
-"""Knowledge and goals of the driver for one gripper, and the request that follows: the most urgent one first."""
+"""Status and goals of the driver for one gripper, and the request that follows: the most urgent one first."""
 
 from __future__ import annotations
 

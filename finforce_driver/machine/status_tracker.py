@@ -96,14 +96,14 @@ REACH_MARGIN = 1.5  # of the commanded speed
 
 
 class StatusTracker:
-    """Keeps what was believed.
+    """Tracks the status of one gripper by its plausible replies.
 
     Attributes:
-        reply: the last believed one; None before the first.
-        calibration_invalid: why the gripper's own flag of a calibration is not trusted, in a sentence; empty: it is.
-        asleep: the power stage sleeps since a fault, a calibration or a stop, whatever the reply echoes of orders.
+        reply: the last plausible reply; None before the first.
+        calibration_invalid: reason for which the gripper's calibration flag is not trusted; empty if it is.
+        power_off: True if a fault, a calibration or a stop has switched the power stage off, whatever the reply echoes.
         telemetry: temperature, supply, errors.
-        filter: decides which replies are believed.
+        filter: rejects implausible replies.
         history: positions over time [counts].
 
     Args:
@@ -120,7 +120,7 @@ class StatusTracker:
         self._contact_since = math.inf
 
     def forget(self) -> None:
-        """Know nothing any more; only such calibration_invalid and a sleeping power stage do not heal by themselves."""
+        """Forget everything but an invalid calibration and a power stage that is off."""
         self.reply, self._contact_since = None, math.inf
         self.telemetry.forget()
         self.filter.forget()
