@@ -26,7 +26,7 @@ _LEAST_WEIGHT = -9.0
 
 
 class Posterior(NamedTuple):
-    """The posterior after an image.
+    """Posterior of one image.
 
     Attributes:
         x: means of the hypotheses (N, n).
@@ -171,7 +171,7 @@ def update(measured, weight, ratios, x, log_weights, HP, S):
 
 @njit(**_OPTIONS)
 def widen(S, R, before):
-    """Return S (2 m, 2 m) with noise R in place of that before (m, 2, 2)."""
+    """Return S (2 m, 2 m) with the noise replaced by R (m, 2, 2)."""
     out = S.copy()
     for k in range(len(R)):
         for a in range(2):
@@ -182,7 +182,7 @@ def widen(S, R, before):
 
 @njit(**_OPTIONS)
 def normalize(log_weights):
-    """Return log weights (N,) whose weights add up to 1, none of them below the least."""
+    """Return normalised log weights (N,) with a lower bound."""
     out = log_weights - log_weights.max()
     out = np.maximum(out - np.log(np.exp(out).sum()), _LEAST_WEIGHT)
     return out - np.log(np.exp(out).sum())

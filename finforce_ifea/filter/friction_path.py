@@ -1,4 +1,4 @@
-"""Hypotheses of the traction of one object, and the path that tells how much of its friction each one uses."""
+"""Traction hypotheses of one object, and the path from which the mobilized friction of each one follows."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ _BRANCH = 1e-3
 
 
 class _Mark(NamedTuple):
-    """Where the path was: places (M, 2) [m], its state there, and the direction in which it came."""
+    """A point of the path: positions (M, 2) [m], state, and direction of motion."""
 
     places: NDArray
     path: PathState
@@ -66,9 +66,9 @@ class _Mark(NamedTuple):
 
 
 class TractionHypotheses:
-    """Coefficients of friction on a grid, and that only the jaws hold the object.
+    """Coefficients of friction on a grid, and an object that only the jaws hold.
 
-    What the jaws alone hold does not move along the finger: friction balances the inclination of their faces.
+    An object that only the jaws hold does not move along the finger: friction balances the inclination of their faces.
 
     Attributes:
         mu: coefficients of friction (M,) [-].
@@ -80,7 +80,7 @@ class TractionHypotheses:
     """
 
     def __init__(self, friction: Coefficient, held: str) -> None:
-        """Expect an object of a coefficient of friction; `held` as in `EstimatorSettings`."""
+        """Start with the prior of the coefficient of friction; `held` as in `EstimatorSettings`."""
         self._held = {"yes": 1.0, "either": _HELD}.get(held, 0.0)
         mean, stddev = friction
         self.unweighed = stddev if stddev <= _WELL_KNOWN else 0.0
@@ -96,13 +96,13 @@ class TractionHypotheses:
         self.reset()
 
     def reset(self) -> None:
-        """Expect an object that does not touch yet."""
+        """Reset to an object that does not touch yet."""
         self.upright, self._bears, self.motion = 0.0, 0.0, 0.0
         self.pull_stddev, self._parted, self._parting, self._is_at_rest = 0.0, 0.0, 0.0, False
         self.leave()
 
     def leave(self) -> None:
-        """Forget the path, as once nothing touches."""
+        """Reset the path, as after a release."""
         self._path.reset()
         self._anchor: NDArray | None = None
         self._anchor_stddev, self._direction, self.stddev = _TOUCH_STDDEV, 1.0, 0.0
@@ -114,11 +114,11 @@ class TractionHypotheses:
         return self._join(self._prior)
 
     def reweigh(self, log_weights: NDArray) -> NDArray:
-        """Return log probabilities (N,) in which that of "held" is the prior one again, and the coefficients' stay."""
+        """Return log probabilities (N,) with "held" at its prior and the coefficients as they are."""
         return self._join(self._share(np.exp(log_weights)) if self.follows_path else self._prior)
 
     def _join(self, shares: NDArray) -> NDArray:
-        """Return log probabilities (N,) for those of the coefficients (M,) where one of them holds."""
+        """Return log probabilities (N,) for those of the coefficients (M,), given that the object is not held."""
         parts = [np.log((shares + 1e-300) * (1.0 - self._held))] if self._held < 1.0 else []
         return np.concatenate([*parts, [np.log(self._held)]]) if self._held > 0.0 else parts[0]
 
@@ -129,7 +129,7 @@ class TractionHypotheses:
 
     @property
     def packed(self) -> tuple[tuple, tuple, tuple]:
-        """What `preview` has to know, as plain tuples."""
+        """Arguments of `preview` as plain tuples."""
         anchor = _NO_PLACES if self._anchor is None else self._anchor
         path = self.mu, self._path.parts, self._path.shares, self._path.rates, anchor
         return path, (self._direction, self._anchor_stddev, self.stddev), (self._held, self.upright)
@@ -140,7 +140,7 @@ class TractionHypotheses:
         return self._held < 1.0
 
     def estimate(self, weights: NDArray) -> Coefficient:
-        """Return the coefficient of friction for the weights of the hypotheses (N,)."""
+        """Return the estimated coefficient of friction for weights of the hypotheses (N,)."""
         if not self.follows_path:
             return Coefficient(0.0, np.inf)
         if len(self.mu) == 1:
@@ -152,12 +152,12 @@ class TractionHypotheses:
         return _share(weights, len(self.mu))
 
     def part(self, parting: float, *, shows_lifts: bool) -> None:
-        """Count a move of the gripper, which leaves behind whatever else held the object; see `WristMove`."""
+        """Update the odds of "held" by a motion of the gripper, see `WristMove`."""
         self._parted += parting
         self._is_at_rest = shows_lifts
 
     def bound_held(self, log_weights: NDArray) -> NDArray:
-        """Return the log weights (N,) with that of "held" by moves, and less what friction does not bear.
+        """Return the log weights (N,) with the odds of "held" by motion and by the friction it needs.
 
         It bears a ratio with P(mu > |kappa|).
         """
@@ -175,7 +175,7 @@ class TractionHypotheses:
         return motion
 
     def shift(self, change: float) -> None:
-        """Count the depth `change` [m] more."""
+        """Shift the depth by a change [m]."""
         if self._anchor is not None:
             self._anchor[:, 0] += change
             for mark in self._marks:
@@ -184,7 +184,7 @@ class TractionHypotheses:
     def follow(
         self, contact: RigidContact, q: NDArray, x: NDArray, places: NDArray, track: Track, weights: NDArray
     ) -> None:
-        """Follow the object to where it is now.
+        """Extend the path to the object's present state.
 
         A motion back counts once it is no chance. What stopped short of where it seemed to be is taken back to where
         it is known best, and its path with it.
@@ -222,7 +222,7 @@ class TractionHypotheses:
         self.stddev = _find_stddev(self._path.ratios, self.mu, own, self._path.rates, self._path.shares, stddev)
 
     def _take_back(self, contact: RigidContact, q: NDArray, x: NDArray, places: NDArray, own: NDArray) -> None:
-        """Follow the path anew from its last mark before the places (M, 2); see `follow` for the arguments."""
+        """Compute the path again from its last mark before the positions (M, 2); see `follow` for the arguments."""
         while self._marks:
             mark = self._marks.pop()
             motion = (places - mark.places) * [1.0, 0.0]
@@ -239,7 +239,7 @@ class TractionHypotheses:
 
 @njit(**_OPTIONS)
 def _bound(ratios, held, upright):
-    """Return the traction ratio of each hypothesis (N,), see `TractionHypotheses`, for ratios of the path (M,)."""
+    """Return the traction ratio of each hypothesis (N,) for ratios of the path (M,); see `TractionHypotheses`."""
     count = len(ratios) if held < 1.0 else 0
     out = np.full(count + 1 if held > 0.0 else count, upright)
     out[:count] = ratios[:count]
@@ -248,7 +248,7 @@ def _bound(ratios, held, upright):
 
 @njit(**_OPTIONS)
 def _share(weights, count):
-    """Return the probabilities (M,) of the first `count` hypotheses where one of them holds, for all weights (N,)."""
+    """Return the probabilities (M,) of the first `count` hypotheses, given one of them, for all weights (N,)."""
     own = weights[:count]
     return own / max(own.sum(), 1e-300)
 
@@ -280,7 +280,7 @@ def _find_motion(anchor, places, weights):
 
 @njit(**_OPTIONS)
 def _is_chance(deeper, direction, stddev, anchor_stddev, rests):
-    """Return whether a motion [m] may be one back by chance; `rests` is the probability of rest."""
+    """Return True if a reversal [m] is within the noise; `rests` is the probability of rest."""
     sigmas = _REVERSAL if rests < _MOVES else _REVERSAL_AT_REST
     return deeper * direction < 0.0 and abs(deeper) < sigmas * np.hypot(stddev, anchor_stddev)
 
@@ -323,7 +323,7 @@ def _bound_held(log_weights, mu, prior, step, upright, known):
 
 @njit(**_OPTIONS)
 def expect_coefficient(packed, weights):
-    """Return the expected coefficient of friction, see `preview`; 0 where only the jaws hold the object for sure."""
+    """Return the expected coefficient of friction, see `preview`; 0 if only the jaws hold the object."""
     mu, held = packed[0][0], packed[2][0]
     return (_share(weights, len(mu)) * mu).sum() if held < 1.0 else 0.0
 
@@ -336,7 +336,7 @@ def find_held(packed, weights):
 
 @njit(**_OPTIONS)
 def preview(packed, x, shift, weights, track):
-    """Return the traction ratio of each hypothesis (N,) with the object elsewhere, and the doubt.
+    """Return the traction ratio of each hypothesis (N,) at another state of the object, and its standard deviation.
 
     That is the change of the traction ratio if a motion back that may be chance is none; see `TractionHypotheses`.
 

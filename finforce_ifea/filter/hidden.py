@@ -1,4 +1,4 @@
-"""Force that an object may exert where key points hardly show it: next to the clamp, or along a flat face.
+"""Unobserved force of an object: next to the clamp, or along a flat face.
 
 An object whose clearance c from the deformed jaw has the standard deviation s at a height may press there, and one that
 seems to press there may be clear of it. With the stiffness k of the jaw, the force has the standard deviation
@@ -36,7 +36,7 @@ def list_clamped_heights(lowest: float) -> NDArray:
 
 
 class HiddenForce:
-    """Bounds the force elsewhere than the key points have it, within the uncertainty of the object's state."""
+    """Bounds the unobserved force within the uncertainty of the object's state."""
 
     def __init__(
         self,
@@ -44,7 +44,7 @@ class HiddenForce:
         along: Sequence[tuple[float, float, float]],
         surface: ContactSurface,
     ) -> None:
-        """Keep where such a force may act.
+        """Store the positions of such a force.
 
         Args:
             clamped: heights [m] next to the clamp, rising, and the stiffness of the jaw there [N/m].
@@ -57,7 +57,7 @@ class HiddenForce:
         self._rows = np.maximum(0, np.searchsorted(surface.heights, self._places[:, 0]) - 1)
 
     def is_next_to_clamp(self, centre: float) -> bool:
-        """Return whether key points tell nothing of a force about a height [m]."""
+        """Return True if key points show no force at a height [m]."""
         return centre < self._lowest
 
     def bound(
@@ -68,7 +68,7 @@ class HiddenForce:
         centre: float,
         move_surface: Callable[[], NDArray],
     ) -> float:
-        """Return the standard deviation of a hidden force [N].
+        """Return the standard deviation of the unobserved force [N].
 
         Args:
             pressed: the object.
@@ -90,7 +90,7 @@ class HiddenForce:
 
 @njit(**_OPTIONS)
 def _measure_clearances(pressed, x, covariance, places, clamped, centre):
-    """Return clearance and its deviation (m,) [m] at each place, infinite where the object is elsewhere or clear."""
+    """Return clearance and its standard deviation (m,) [m] at each position, infinite where no force is possible."""
     pressed, count, step = PressedObject(*pressed), len(places), np.zeros(3)
     heights, slope, variance = places[:, 0].copy(), np.full((3, count), -1.0), np.zeros(count)
     clearance = find_clearances(pressed, x, heights)

@@ -1,4 +1,4 @@
-"""What one image makes of the filter of a contact, compiled: prediction, iterations, and what is read out of it."""
+"""Compiled update of the contact filter by one image: prediction, iterations and read-out."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ _LEAST_VARIANCE = 1e-14
 
 @njit(**_OPTIONS)
 def find_place(touching, x):
-    """Return where the mechanics stands for a state x (3,), never above the surface, and the depth below [m].
+    """Return the state of the mechanics for a state x (3,), never above the surface, and the depth below [m].
 
     `touching` are object and surface, see `find_first_touch`.
     """
@@ -117,7 +117,7 @@ def find_place(touching, x):
 
 @njit(**_OPTIONS)
 def move_along(q, modes, x, before):
-    """Return unknowns (size,) moved along modes (size, 4) as the state of the mechanics (3,) has changed."""
+    """Return unknowns (size,) moved along modes (size, 4) by a change of the state of the mechanics (3,)."""
     out = q.copy()
     for i in range(3):
         out += modes[:, i] * (x[i] - before[i])
@@ -150,7 +150,7 @@ def find_expectation(expectation, told, detector_variance, friction):
 
 @njit(**_OPTIONS)
 def predict_image(image, expected, filtered, weights, friction, passed, watches, touching):
-    """Predict the state of an image in place, and where the contact is in it.
+    """Predict state and contact of an image; the state in place.
 
     Args:
         image: `points`, see `KEYPOINT`, and the positions of the key points in the model (K, 3) [m].
@@ -182,7 +182,7 @@ def predict_image(image, expected, filtered, weights, friction, passed, watches,
 
 @njit(**_OPTIONS)
 def _watch(watches, x, P, measured, posterior, detector, common, misplaced):
-    """Look for jumps that show over several images only; correct x (N, n) and P (n, n) for one, and return which."""
+    """Test for jumps that only several images show; correct x (N, n) and P (n, n) for one, and return its index."""
     found, alike = NO_JUMP, (common, np.zeros(1))
     unpacked = [JumpWatch(Jump(*each[0]), each[1], each[2], each[3]) for each in watches]
     for index in range(len(watches)):
@@ -198,7 +198,7 @@ def _watch(watches, x, P, measured, posterior, detector, common, misplaced):
 
 @njit(**_OPTIONS)
 def _smooth_depth(track, raw, z, own, scatter):
-    """Smooth a depth z [m] of some variance [m^2] by a `Track`.
+    """Smooth a depth z [m] with a `Track`.
 
     Args:
         track: state, which takes the depth.
@@ -218,7 +218,7 @@ def _smooth_depth(track, raw, z, own, scatter):
 
 @njit(**_OPTIONS)
 def finish(state, image, P, results, friction, filtered, made, where, place, watching):
-    """Return what the last linearisation of an image leaves, and fill in the contact state.
+    """Finish the update of an image after its last linearisation, and fill in the contact state.
 
     Args:
         state: see `CONTACT_STATE`.
@@ -266,7 +266,7 @@ def finish(state, image, P, results, friction, filtered, made, where, place, wat
 
 @njit(**_OPTIONS)
 def iterate(image, at, prior, weight, possible, known, x, last):
-    """Return what one image makes of one linearisation: the step that it asks for.
+    """Return the update of one linearisation and the next step.
 
     Args:
         image: `points`, `seen` and `level` of `observe`; see `EXPECTATION`.
@@ -300,7 +300,7 @@ def iterate(image, at, prior, weight, possible, known, x, last):
 
 @njit(**_OPTIONS)
 def _take_step(x, aim, last, share, expectation):
-    """Return x (3,) after a step (3,) within a share of where the linearisation holds, the step, and the next share.
+    """Return x (3,) after a step (3,) within a fraction of the linearisation's range, the step, and the next fraction.
 
     Between two corners of an object the linearisation changes its mind: meet in the middle.
     """
@@ -318,14 +318,14 @@ def _take_step(x, aim, last, share, expectation):
 
 @njit(**_OPTIONS)
 def _follow_level(level, distances):
-    """Return the variance of the noise over that in the tare, for what was expected and D^2 (m,) of the residuals."""
+    """Return the noise variance relative to the tare's, for the expected one and D^2 (m,) of the residuals."""
     seen = min(np.median(distances) / _MEDIAN_SQUARE, _LARGEST_CHANGE)
     return min(max(level * (1.0 + (seen - 1.0) / _LEVEL_IMAGES), 1.0), _LARGEST_LEVEL)
 
 
 @njit(**_OPTIONS)
 def _follow_scatter(scatter, before, z, R):
-    """Return the variance of the depths over that by the noise.
+    """Return the variance of the depths relative to that by the noise.
 
     Noise sends the depth back after each step: the product of two steps is less than zero by its variance, while
     steps of a motion have the same sign, or any. Those that are far larger are no noise.
@@ -345,7 +345,7 @@ def _follow_scatter(scatter, before, z, R):
 
 @njit(**_OPTIONS)
 def _is_settled(moved, missing, share, expectation):
-    """Return True if a step that moved the model by (3,), and left (3,) out, changed nothing that matters."""
+    """Return True if a step moved the model (3,), and left out (3,), by less than the tolerance."""
     tolerance = (_SETTLED, expectation[()].settled_change, _SETTLED)
     for i in range(3):
         if abs(moved[i]) >= tolerance[i] or (share > _UNDECIDED and abs(missing[i]) >= tolerance[i]):
@@ -355,7 +355,7 @@ def _is_settled(moved, missing, share, expectation):
 
 @njit(**_OPTIONS)
 def is_believed(mean, weight, V):
-    """Return True if most key points, by their weight (m,), agree, and the camera has moved as far as a bump may do.
+    """Return True if most key points agree by their weight (m,), and the camera's motion is that of a bump at most.
 
     Where V (n,) allows more, it may have moved farther by the mean of the state (n,).
     """

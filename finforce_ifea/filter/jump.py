@@ -31,7 +31,7 @@ _OPTIONS = {"cache": True, "error_model": "numpy"}
 
 
 class Jump(NamedTuple):
-    """Entries of the state that may jump together.
+    """A jump of some entries of the state.
 
     Attributes:
         entries: of x (j,).
@@ -96,7 +96,7 @@ def weigh_jump(jump, information, score):
 
 @njit(**_OPTIONS)
 def correct(measured, weight, ratios, x, log_weights, P, possible, depth):
-    """Return the posterior of one image, and which jump it shows, or `NO_JUMP`, or `UNDECIDED`.
+    """Return the posterior of one image, and the index of a jump, `NO_JUMP` or `UNDECIDED`.
 
     A bend that the linearisation does not reach looks like a jump: none is looked for until it is near.
 
@@ -131,7 +131,7 @@ def correct(measured, weight, ratios, x, log_weights, P, possible, depth):
 
 @njit(**_OPTIONS)
 def detect_jump(measured, weight, nu, S, possible):
-    """Return which part of the state has jumped, or `NO_JUMP`.
+    """Return the index of a jump, or `NO_JUMP`.
 
     Args:
         measured: see `update`.
@@ -156,7 +156,7 @@ def detect_jump(measured, weight, nu, S, possible):
 
 @njit(**_OPTIONS)
 def _weigh_innovations(measured, nu, S, depth_variance, asked):
-    """Return weights of the key points (m,) by their innovation (2 m,), the motion of the object taken out.
+    """Return weights of the key points (m,) by their innovations (2 m,) without the object's motion.
 
     That is no jump. S has a depth of which nothing is known; here the median of the key points tells it, `asked`, see
     `find_depth_jump`.
@@ -173,7 +173,7 @@ def _weigh_innovations(measured, nu, S, depth_variance, asked):
 
 
 class JumpWatch(NamedTuple):
-    """Tells small jumps from the innovations of several images: generalised likelihood ratio.
+    """Detects small jumps by a generalised likelihood ratio over the innovations of several images.
 
     With F the response of the state's mean so far to a unit jump at the first image, the innovations have the mean
     G b, G = H (E - F), where E selects the entries that jump (Willsky and Jones, 1976).
@@ -192,14 +192,14 @@ class JumpWatch(NamedTuple):
 
 
 def watch_for(jump: Jump, size: int) -> JumpWatch:
-    """Return the watch for a jump of a state that has n = size entries."""
+    """Return a detector of a jump for a state of n = size entries."""
     count = len(jump.entries)
     return JumpWatch(jump, np.zeros((size, count)), np.zeros((count, count)), np.zeros(count))
 
 
 @njit(**_OPTIONS)
 def forget(watched):
-    """Begin a watch with the next image."""
+    """Restart the test with the next image."""
     watched.F[:] = 0.0
     watched.information[:] = 0.0
     watched.score[:] = 0.0
@@ -207,7 +207,7 @@ def forget(watched):
 
 @njit(**_OPTIONS)
 def watch(watched, measured, posterior, detector_share, common):
-    """Take an image into a `JumpWatch`; return whether the state has jumped.
+    """Update a `JumpWatch` with an image; return True if the state has jumped.
 
     Args:
         watched: see above.
@@ -240,7 +240,7 @@ def watch(watched, measured, posterior, detector_share, common):
 
 @njit(**_OPTIONS)
 def jump_back(watched, x, P):
-    """Correct means (N, n) and covariance (n, n) for the jump that a `JumpWatch` has seen, in place."""
+    """Correct means (N, n) and covariance (n, n) for the jump of a `JumpWatch`, in place."""
     jump, F, information, score = watched
     V = np.linalg.inv(np.diag(jump.stddev**-2.0) + information)
     D = -F

@@ -1,4 +1,4 @@
-"""Location along the width at which a jaw is pressed, and the lateral force on it, by the key points' motion along y.
+"""Lateral position of the pressure on a jaw, and the lateral force, from the key points' motion along y.
 
 A normal force N off the middle twists the finger, a lateral force bends it sideways,
 
@@ -88,7 +88,7 @@ def _find_narrowest(jaw: Jaw, heights: NDArray, half: float) -> float:
 
 
 def measure_torsion(jaw: Jaw, mesh: VolumeMesh) -> Torsion | None:
-    """Return how a jaw twists and gives way sideways; None where it is no solid, or its mesh too large.
+    """Return the torsion and lateral bending of a jaw; None if it is no solid, or its mesh too large.
 
     Args:
         jaw: with its material and key points.
@@ -211,7 +211,7 @@ class _Estimate(NamedTuple):
 
 
 class LateralLoad:
-    """Follows what the key points show across one finger, by a Kalman filter.
+    """Kalman filter of the lateral load of one finger.
 
     Its state is the location of the pressure [m], the lateral traction ratio [-], an offset along y for each key point
     [m], and the jaw's share of the weight [N]. Two hypotheses differ in the ratio: it stays as it was, or the jaws have
@@ -234,14 +234,14 @@ class LateralLoad:
         self.reset()
 
     def reset(self) -> None:
-        """Forget what was seen; where the object is expected stays."""
+        """Reset the filter; the expected position of the object stays."""
         self._known: _Estimate | None = None
         self._depth, self._is_lifted, self._parted, self._largest = 0.0, False, 0.0, 0.0
         self.motions = np.zeros((self._count, 3))
         self.load = np.array([*self._expected, 0.0, self._traction])
 
     def expect(self, location: float, stddev: float) -> None:
-        """Take where along y the object is nearest [m], and how wide it is there."""
+        """Set the lateral position of the object's nearest part [m], and its width."""
         half = self._torsion.half_width if self._torsion else abs(location)
         narrow = max(_WIDE, 1.0 - 3.0 * (stddev / half) ** 2) if half > 0.0 else 1.0
         # beyond a third of the half width, the core of a section, an eccentric pressure leaves the other edge
@@ -249,7 +249,7 @@ class LateralLoad:
         self._expected = min(max(float(location), -half), half), uneven * narrow * float(stddev)
 
     def weigh(self, force: float) -> tuple[float, float]:
-        """Return this jaw's share of the weight, and its standard deviation [N], for the force on the jaw [N]."""
+        """Return this jaw's part of the weight, and its standard deviation [N], for the force on the jaw [N]."""
         if self._known is None or self._largest == 0.0:
             return 0.0, _SHARE * force
         return float(self._known.x[-1]), sqrt(max(self._known.P[-1, -1], 0.0))
@@ -257,7 +257,7 @@ class LateralLoad:
     def update(
         self, motions: NDArray, bend: NDArray, points: NDArray, state: ContactState, dt: float, move: WristMove | None
     ) -> None:
-        """Take the motions of the key points along y in an image.
+        """Update with the motions of the key points along y in an image.
 
         Args:
             motions: measured along y (K,) [m], NaN where unused.
@@ -292,7 +292,7 @@ class LateralLoad:
         move: WristMove | None,
         normal: float,
     ) -> None:
-        """Take an image into both hypotheses, and decide between them.
+        """Update both hypotheses with an image, and decide between them.
 
         Args:
             measured: see `_observe`.
@@ -426,7 +426,7 @@ def _step(estimate, expected, offsets, passed, measured, weight):
 
 @njit(**_OPTIONS)
 def turn_bent(along_x, rest, bend):
-    """Return what a turn of the sections moves a bent finger along y (K,), see the module.
+    """Return the motion of a bent finger along y by a rotation of its sections (K,), see the module.
 
     Args:
         along_x: motions of the key points by the turn (K,).

@@ -80,7 +80,7 @@ def find_seen(points):
 
 
 class DetectorErrors(NamedTuple):
-    """Errors of a detector that last while it sees the same.
+    """Lasting errors of a detector.
 
     Attributes:
         share: of the variance of the key points' offsets [-].
@@ -164,7 +164,7 @@ def weigh(distances):
 
 @njit(**_OPTIONS)
 def find_depth_jump(H, R, nu):
-    """Return the median [m] of the depths that the key points ask for one by one, and its variance [m^2].
+    """Return the median [m] of the depths by each key point alone, and its variance [m^2].
 
     Args:
         H: see `Measurement`.

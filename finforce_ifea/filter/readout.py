@@ -24,7 +24,7 @@ LARGEST_RATIO = 0.9
 
 @njit(**_OPTIONS)
 def spread_common(H, A, L, variances):
-    """Return the covariance of the first four entries by what all key points of an image err by alike (4, 4).
+    """Return the covariance of the first four entries due to errors common to all key points (4, 4).
 
     It is considered and never estimated: nothing tells it from a motion of the object.
 
@@ -118,7 +118,7 @@ def find_held_ratio(force, ratio, pull):
 
 @njit(**_OPTIONS)
 def judge_points(state, points, seen, left, weight, offset):
-    """Fill in how well the key points agree.
+    """Fill in weights and residual of the key points.
 
     Args:
         state: see `CONTACT_STATE`.

@@ -51,7 +51,7 @@ _LEAST_FORCE = 0.1
 
 
 class _Place(NamedTuple):
-    """State of the contact (3,), where the mechanics stands for it (3,), and depth below first touch [m]."""
+    """State of the contact (3,), state of the mechanics (3,), and depth below first touch [m]."""
 
     x: NDArray
     x_model: NDArray
@@ -186,11 +186,11 @@ class ContactSearch:
 
     @property
     def _told(self) -> tuple[bool, bool, float, float]:
-        """What `find_expectation` has to know."""
+        """Argument `told` of `find_expectation`."""
         return self._misplaced, self._bumped, self.hypotheses.stddev, self.hypotheses.unweighed
 
     def _expect(self) -> Expectation:
-        """Return what the state returns to."""
+        """Return the prior that the state returns to."""
         return find_expectation(self.expectation, self._told, self._detector_errors.variance, self.friction.mean)
 
     def _start(self) -> None:
@@ -201,7 +201,7 @@ class ContactSearch:
         self.track = Track(DEPTH_NOISE, float(m[DEPTH]), _FIRST_DEPTH**2)
 
     def find(self, contact: RigidContact, probe: Any, dt: float, *, iterations: int) -> bool:
-        """Find the contact in the image of `points`; False, all as it was, where too few key points agree.
+        """Find the contact in the image of `points`; False, with nothing changed, if too few key points agree.
 
         Args:
             contact: of the jaw with the object.
@@ -268,7 +268,7 @@ class ContactSearch:
         return seen, ratios, _Place(*place)
 
     def _take(self, image, P, results, friction, pressed, at, ratio, place, *, settled: bool) -> None:
-        """Take what an image has shown; see `finish` for the arguments."""
+        """Store the update of an image; see `finish` for the arguments."""
         hypotheses, s = self.hypotheses, blank_contact_state()
         s["mistaken"] = self._misplaced
         made = pressed.force, np.ascontiguousarray(pressed.force_modes), at, ratio
@@ -294,7 +294,7 @@ class ContactSearch:
             self._misplaced |= JUMPS[index] is MISPLACED
 
     def follow_path(self, contact: RigidContact) -> None:
-        """Follow how the object uses its friction, which the force of the image did not wait for."""
+        """Extend the friction path after the force of the image has been reported."""
         if self.x is None or not self.hypotheses.follows_path:
             return
         if self.state["depth"] <= 0.0:

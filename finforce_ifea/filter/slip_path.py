@@ -73,7 +73,7 @@ class SlipPath:
         return self.parts @ self.shares
 
     def move(self, contact: RigidContact, q: NDArray, x: NDArray, motion: NDArray) -> None:
-        """Take the motion of the object.
+        """Move the object.
 
         Args:
             contact: of the jaw.
@@ -85,7 +85,7 @@ class SlipPath:
         self.parts = turn_path(self.parts, self.coefficients, self.rates, motion)
 
     def measure(self, contact: RigidContact, q: NDArray, x: NDArray) -> None:
-        """Measure the rates anew where an object that may stick has moved; see `move` for the arguments."""
+        """Compute the rates again where an object that may stick has moved; see `move` for the arguments."""
         if max(abs(x[0] - self._at[0]), abs(x[2] - self._at[1])) > _FRESH and self.coefficients.any():
             before = self.state
             self.rates, self.shares, self._heights = measure_rates(contact, q, x)
@@ -94,11 +94,11 @@ class SlipPath:
 
     @property
     def state(self) -> PathState:
-        """What `resume` goes on from."""
+        """State for `resume`."""
         return PathState(self.parts, self._heights)
 
     def resume(self, state: PathState) -> None:
-        """Go on from another state; a part of the contact that is new begins where it gives way while all sticks."""
+        """Continue from another state; a new part of the contact starts at its ratio while everything sticks."""
         along, ahead, turned = self.rates[_BOTH, :, :, 0].T
         stuck = np.divide(along - turned, ahead, out=np.zeros(2), where=ahead != 0.0)
         self.parts = np.clip(stuck, -self.coefficients[:, None], self.coefficients[:, None])

@@ -49,7 +49,7 @@ _LEARNT = 0.75
 
 
 class _Fidelity(NamedTuple):
-    """One of the mechanics of a jaw: its contact, the probe of the key points, and these at rest (K, 3) [m]."""
+    """One model of a jaw: contact, probe of the key points, and these at rest (K, 3) [m]."""
 
     contact: RigidContact
     probe: Any
@@ -106,7 +106,7 @@ class ContactTracker:
         self.reset()
 
     def reset(self, height: float | None = None) -> None:
-        """Start anew, unloaded, with an unknown object that will first touch at `height` [m], the middle if None."""
+        """Restart unloaded, with an unknown object that first touches at `height` [m], the middle if None."""
         settings = self.settings
         self._given = height
         self._use(0)
@@ -119,14 +119,14 @@ class ContactTracker:
         self._begin()
 
     def _use(self, fidelity: int) -> None:
-        """Take one of the mechanics for the next images, with the object that was pressed into the one before."""
+        """Use another model for the next images, with the object of the one before."""
         indenter = self._fidelities[self._fidelity].contact.indenter
         self._fidelity = fidelity
         self._contact, self._probe, self._rest = self._fidelities[fidelity]
         self._contact.set_indenter(indenter)
 
     def _press(self, indenter: RoundIndenter | OutlineIndenter) -> None:
-        """Take another object, and what the search is allowed with it."""
+        """Set the object and the limits of the search."""
         self._contact.set_indenter(indenter)
         for name in ("lowest", "highest", "largest_change", "settled_change", "has_corners"):
             self._search.expectation[name] = getattr(indenter, name)
@@ -141,7 +141,7 @@ class ContactTracker:
         return self._search.expectation["mean"]
 
     def _change_fidelity(self, state: ContactState) -> None:
-        """Go on with the full mechanics where the shape is too far from those stored, and back where it bends less."""
+        """Switch to the full mechanics beyond the stored shapes, and back."""
         pressed = float(state["x"][DEPTH])
         is_beyond = state["extrapolation"] > _BEYOND_STORED and state["depth"] > TOUCH_DEPTH
         if self._fidelity == 0 and is_beyond and len(self._fidelities) > 1:
@@ -166,7 +166,7 @@ class ContactTracker:
         return q, False
 
     def _restore_shape(self) -> None:
-        """Find the equilibrium of the full mechanics anew where an image has led it astray, from the unloaded jaw."""
+        """Restore the equilibrium of the full mechanics from the unloaded jaw, after a failed image."""
         x = self._search.state["x_model"]
         if self._settle(self.q, x)[1]:
             return
@@ -190,7 +190,7 @@ class ContactTracker:
         return self._search.points["weight"] > 0
 
     def give_shape(self) -> NDArray:
-        """Return the shape (size,) for another tracker to begin with."""
+        """Return the shape (size,) with which another tracker starts."""
         return self.q if self._fidelity == 0 else self._left[0]
 
     def _begin(self) -> None:
@@ -203,7 +203,7 @@ class ContactTracker:
         self._postures.reset()
 
     def _forget_contact(self) -> None:
-        """Expect any object again, as the next one may be."""
+        """Forget the contact: the next object may be any."""
         self._led = self._mean.copy()
         self._search.forget(self._mean)
 
@@ -247,7 +247,7 @@ class ContactTracker:
         return state
 
     def _follow_posture(self, posture: WristPosture | None) -> WristMove | None:
-        """Return how the jaw has moved since the last image, which tells whether only the jaws hold the object."""
+        """Return the motion of the jaw since the last image."""
         move, search = self._postures.update(posture if self.settings.may_be_held else None), self._search
         search.pull = 0.0, 0.0
         if move is not None:
@@ -269,18 +269,18 @@ class ContactTracker:
         return explain_offsets(self.rest_modes(), tare, stddev)
 
     def rest_modes(self) -> NDArray:
-        """Return how the key points of the undeformed jaw move in x and z by the depth (K, 2) [m/m]."""
+        """Return the derivative of the undeformed jaw's key points in x and z by the depth (K, 2) [m/m]."""
         q = np.zeros(self._contact.model.size)
         pressed = self._contact.linearize(q, find_place(self._contact.packed_object, np.r_[-1.0, self._mean])[0])
         return self._contact.model.project(self._probe, q, pressed.modes)[:, [0, 2], DEPTH]
 
     def forget(self) -> None:
-        """Forget what was learnt of the object."""
+        """Forget the object's coefficient of friction."""
         self._search.expect_friction(self._friction)
         self.reset()
 
     def expect_friction(self, friction: Coefficient | None) -> None:
-        """Expect an object of a stated coefficient of friction; None for one of which the settings say all."""
+        """Set the object's stated coefficient of friction; None for that of the settings."""
         settings, self._is_unstated = self.settings, friction is None
         self._friction = Coefficient(settings.friction, settings.friction_stddev) if friction is None else friction
         self._search.expect_friction(self._friction)
@@ -303,18 +303,18 @@ class ContactTracker:
         return self._outline is self._contact.indenter
 
     def learn(self) -> None:
-        """Follow the path of the object, which the force of the last image did not wait for."""
+        """Extend the friction path after the force of the last image has been reported."""
         if self._has_moved:
             self._has_moved = False
             self._search.follow_path(self._contact)
 
     def resume(self, q: NDArray) -> None:
-        """Start anew from the shape (size,) that another tracker has found."""
+        """Restart from the shape (size,) of another tracker."""
         self.reset()
         self._search.resume(q.copy())
 
     def follow(self, contact: Contact) -> None:
-        """Take over where a contact's object is: its outline, or its height as that of first touch."""
+        """Set the contact's object: its outline, or its height of first touch."""
         if contact.outline is not None:
             self._follow_outline(contact)
             return
@@ -327,7 +327,7 @@ class ContactTracker:
         self._given = self._mean[1] = height
 
     def _follow_outline(self, contact: Contact) -> None:
-        """Take the outline's tilt and height as what is to be expected; an outline cut anew keeps the contact."""
+        """Set the prior to the outline's tilt and height; a new section of the same object keeps the contact."""
         before = self._contact.indenter
         if contact.outline.across is not None:
             self._lateral.expect(*contact.outline.across)
@@ -351,7 +351,7 @@ class ContactTracker:
             self._search.shift(after.pressed.front - before.pressed.front)
 
     def _lead(self, chance: NDArray) -> None:
-        """Take the contact along where the object slides or tilts, beyond what its pose may be off by chance."""
+        """Move the contact with an object that slides or tilts, beyond the noise of its pose."""
         moved = self._mean - self._led
         change = moved - np.minimum(np.maximum(moved, -chance), chance)
         if change.any():
@@ -359,7 +359,7 @@ class ContactTracker:
             self._search.lead(change)
 
     def _complete(self, state: ContactState) -> None:
-        """Fill in what is known of the force across a contact, and what the jaw bears."""
+        """Fill in lateral force, unobserved force and largest force."""
         traction = UNSEEN_TRACTION * self.settings.friction
         load = self._lateral.load if self._is_known else (0.0, MIDDLE_STDDEV, nan, traction)
         state["y"], state["y_stddev"], state["lateral_force"], state["lateral_stddev"] = load
@@ -367,7 +367,7 @@ class ContactTracker:
         state["max_force"] = self._fidelities[0].contact.max_force
 
     def _find_hidden(self, state: ContactState) -> float:
-        """Return the standard deviation of a force [N] elsewhere than the key points have it, see `HiddenForce`."""
+        """Return the standard deviation of the unobserved force [N], see `HiddenForce`."""
         force, centre = state["force"], float(state["pressure_location"][2])
         if self._is_apart:
             return 0.0

@@ -115,7 +115,7 @@ _LEAST_PULL, _MOST_PULL = 0.5e-3, 0.9e-3
 
 
 def bound_residual(rest: NDArray, noise: NDArray) -> float:
-    """Return the largest residual [m] that key points of a jaw leave.
+    """Return the largest residual [m] of a jaw's key points.
 
     Args:
         rest: key points of the jaw file (K, 3) [m].
@@ -126,7 +126,7 @@ def bound_residual(rest: NDArray, noise: NDArray) -> float:
 
 
 def find_rejection_reason(state: ContactState, *, largest_residual: float, largest_stddev: float) -> str:
-    """Return why the force of a contact state must be rejected, empty where it can be trusted.
+    """Return the reason for rejecting the force of a contact state; empty if it can be trusted.
 
     Args:
         state: of one image.
@@ -151,7 +151,7 @@ def find_rejection_reason(state: ContactState, *, largest_residual: float, large
 
 
 def _find_ambiguity(state: ContactState, vague: float) -> str:
-    """Return why the force of a contact that fits the key points may still be another one, by `vague` [N] or more."""
+    """Return the reason for which a fitting contact leaves the force uncertain by `vague` [N] or more; else empty."""
     pulled = -float(state["depth"])
     if pulled > min(max(_PULLING * sqrt(state["depth_variance"]), _LEAST_PULL), _MOST_PULL):
         bent = f"the jaw is bent towards the object, as if that pulled by {1e3 * pulled:.1f} mm"
@@ -193,7 +193,7 @@ _CURVED = 0.87
 
 @njit(**_OPTIONS)
 def compute_force(state, relaxation, relaxation_stddev, dt, errors, out):
-    """Write the force that the material gives now, and what belongs to it, to out (7, 3).
+    """Compute force, torque, standard deviations and contact into out (7, 3).
 
     The rows are force [N], torque about the jaw frame's origin [N m], their standard deviations, contact point [m],
     contact location [m] and direction; the last three are NaN without a force.

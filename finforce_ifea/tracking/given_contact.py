@@ -1,4 +1,4 @@
-"""Force at a given contact from key points, image after image, and whether they contradict its location."""
+"""Force at a given contact from key points, and a test of its location."""
 
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
@@ -68,7 +68,7 @@ class GivenContactTracker:
         return self.mechanics.model.positions(self.probe, np.zeros(self.mechanics.model.size))
 
     def reset(self) -> None:
-        """Start anew, unloaded, with the middle candidate."""
+        """Restart unloaded, with the middle candidate."""
         self.q = np.zeros(self.mechanics.model.size)
         self._watch.reset()
         self._candidate = len(self.jaw.candidates) // 2
@@ -76,7 +76,7 @@ class GivenContactTracker:
         self._weights: NDArray | None = np.ones(1)
 
     def resume(self, q: NDArray) -> None:
-        """Start anew from the shape (size,) that another tracker has found."""
+        """Restart from the shape (size,) of another tracker."""
         self.reset()
         self.q = q.copy()
 
@@ -85,11 +85,11 @@ class GivenContactTracker:
         return self.mechanics.model.vertices(self.q)
 
     def give_shape(self) -> NDArray:
-        """Return the shape (size,) for another tracker to begin with."""
+        """Return the shape (size,) with which another tracker starts."""
         return self.q
 
     def follow(self, contact: Contact) -> None:
-        """Take a contact over: its heights and weights."""
+        """Set the contact's heights and weights."""
         heights = contact.points[:, 2]
         if self.paper:
             middle = np.average(heights, weights=contact.weights)
@@ -227,7 +227,7 @@ _ACROSS_CONTACT = np.linspace(-1.0, 1.0, 41)
 
 
 class _LocationWatch:
-    """Averages where the key points would have the load, and says how far the given place can be believed.
+    """Averages the location by the key points, and tests the given one.
 
     A load F at the height z moves the key points by F U(z). What is left of their residuals r once F has been fitted,
     and P takes U out,
@@ -250,7 +250,7 @@ class _LocationWatch:
         self.reset()
 
     def reset(self) -> None:
-        """Forget where the key points had the load."""
+        """Reset the average."""
         self._offset, self._information = 0.0, 0.0
 
     def follow(self, heights: NDArray, weights: NDArray) -> None:
@@ -265,7 +265,7 @@ class _LocationWatch:
         self._spread = float(np.average((heights - height) ** 2, weights=weights))
 
     def judge(self, residuals: NDArray, precision: NDArray, state: ContactState) -> None:
-        """Fill in what one image and those before tell of the location.
+        """Fill in the location by this image and those before.
 
         Args:
             residuals: of the key points in the plane (K, 2) [m], measured minus modelled.

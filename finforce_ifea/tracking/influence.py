@@ -1,4 +1,4 @@
-"""Influence coefficients of an unloaded jaw, and whether the known object is out of its reach.
+"""Influence coefficients of an unloaded jaw, and a test for an object out of its reach.
 
 Key points say of an unloaded jaw how deep d [m] something would press it. With the modes m_k [m/m] by which a depth
 moves the points, their deviations e_k [m] from the tared jaw and the covariance N of one of them,
@@ -186,7 +186,7 @@ _NEARER, _REST_REACH = 0.75, 1e-3
 
 
 class UnloadedCheck:
-    """Watches an unloaded jaw while its object is away.
+    """Checks that a jaw is unloaded while its object is out of reach.
 
     Args:
         keypoints: drawn (K, 3) [m].
