@@ -364,7 +364,7 @@ class ForceEstimator:
             self._tracker.reset()
             self._contact = None
             return self._fail("diverged", "the shape cannot be reached by the jaw", used, iterations)
-        # the bound is no less; linear tetrahedra, as of the paper's solver, lock, and follow no bent jaw so far
+        # no bound is below `LARGEST_RESIDUAL`; the paper's linear tetrahedra lock and leave more than that
         is_far = self.settings.solver != "paper" and state["residual"] > LARGEST_RESIDUAL
         most = bound_residual(self.jaw.keypoints, self._taring.tare.noise) if is_far else np.inf
         reason = find_rejection_reason(state, largest_residual=most, largest_stddev=self.settings.largest_stddev)
@@ -399,8 +399,8 @@ class ForceEstimator:
         extrapolated = _EXTRAPOLATED * state["extrapolation"]
         error = hypot(self._force_error, self._scale_error, state["location_error"], extrapolated)
         vectors, dt = np.empty((7, 3)), self._pass_time(state["force"])
-        relaxation, errors = (self._relaxation.packed, self._relaxation_stddev.overstress), (error, self._modulus_error)
-        magnitude, stddev = compute_force(state, *relaxation, dt, errors, vectors)
+        spread, errors = self._relaxation_stddev.overstress, (error, self._modulus_error)
+        magnitude, stddev = compute_force(state, self._relaxation.packed, spread, dt, errors, vectors)
         force, torque, force_stddev, torque_stddev, point, location, normal = vectors
         return Solution(
             stamp=self._stamp,
@@ -455,7 +455,7 @@ def warm_up(jaw: Jaw, tare_frames: int, update: Update, reset: Callable[[], None
     reset()
 
 
-# Distance from its position at rest beyond which a key point is rejected [m].
+# Distance from its position at rest, along any axis, beyond which a key point is rejected [m].
 _FARTHEST = 0.03
 
 

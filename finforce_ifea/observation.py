@@ -30,8 +30,10 @@ _UNITS = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}  # [s
 _FARTHEST = 1.0
 # Maximum capture time [s] since 1970: the year 5138. Milliseconds since 1970 are ten times as many.
 _LATEST = 1e11
-# An object is away that stands in front of the undeformed surface by more than this and what its place may err [m].
-OUT_OF_REACH, _SIGMAS = 10e-3, 3.0
+# Distance in front of the undeformed face from which an object is out of reach [m].
+OUT_OF_REACH = 10e-3
+# Allowance for the uncertainty of its position [sigma].
+_SIGMAS = 3.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -97,7 +99,7 @@ class Contact:
 
 
 def is_out_of_reach(contact: Contact, face_x: float) -> bool:
-    """Return True if a contact's outline is farther from a face x = face_x [m] than `OUT_OF_REACH`, surely."""
+    """Return True if a contact's outline is in front of a face x = face_x [m] by over `OUT_OF_REACH` and 3 sigma."""
     outline = contact.outline
     if outline is None or contact.touching is not False:
         return False

@@ -87,7 +87,7 @@ def match_stated(scatter: NDArray, stddev: NDArray, floor: float) -> StatedNoise
 def compute_point_noise(usual: StatedNoise, stddev: NDArray | None) -> PointNoise:
     """Return the noise of one image's key points: N_k, enlarged for what states more than it did in the tare.
 
-        N_ki = R N_k R,    R = diag(max(1, s_ki / s_k)),    trust_ki = tr N_k / tr N_ki (in the plane).
+        N_ki = R N_k R,    R = diag(max(1, s_ki / s_k)),    noise_ratio_ki = tr N_k / tr N_ki (in the plane).
 
     A key point that states less than in the tare counts as it did there: nothing has shown that it is better.
 
@@ -244,7 +244,7 @@ def compute_tare(
 
 
 Significance = Callable[[Tare, float], float]
-# Force that explains the offsets from which a tare seems loaded [sigma].
+# Significance of a force in the offsets from which a tare seems loaded [sigma].
 _LOADED_SIGMA = 3.5
 # Standard deviation of the difference between the halves of a steady tare [m].
 _STEADY_STDDEV = 0.03e-3
@@ -258,10 +258,10 @@ _LONGEST_PERIOD = 0.25
 _LEAST_SHARE = 1.0 / 3.0
 _LEAST_SEEN = 0.5
 _LEAST_NEAR = 0.75
-# Fraction of the key points, the nearest, that must be at their positions of rest [-].
+# Fraction of the key points, the nearest ones, that must be at rest [-].
 _NEARER = 0.75
 _REST_FRAMES = 10
-# Largest distance of these in one image [m].
+# Largest root mean square distance of these in one image [m].
 _REST_REACH = 1e-3
 # The same on average over `_REST_FRAMES` images [m].
 _REST_REACH_MEAN = 0.45e-3

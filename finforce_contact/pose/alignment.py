@@ -69,9 +69,9 @@ class Comparison:
     residuals: NDArray
     visibility: NDArray
 
-    def count(self, sight: Visibility) -> int:
-        """Return how many samples have this sight."""
-        return int(np.count_nonzero(self.visibility == sight))
+    def count(self, kind: Visibility) -> int:
+        """Return the number of samples of a kind."""
+        return int(np.count_nonzero(self.visibility == kind))
 
 
 class DepthImage:

@@ -161,7 +161,7 @@ class ForceMonitor:
         """
         if math.isnan(self.force):
             return False
-        beyond = self._surprise(force, opening)
+        beyond = self._excess(force, opening)
         if abs(beyond) <= _JUMP:
             self._jumps = 0
             return False
@@ -180,12 +180,12 @@ class ForceMonitor:
             )
         return True
 
-    def _surprise(self, force: float, opening: float) -> float:
+    def _excess(self, force: float, opening: float) -> float:
         """Return by how much a force differs from what may be expected [N], signed."""
         if self.loaded:
-            innovation = self.model.innovation(opening, force)
+            excess = self.model.excess(opening, force)
             # jaws that open may let go of something stiffer than was learnt
-            return innovation if innovation > 0.0 or opening <= self.opening else 0.0
+            return excess if excess > 0.0 or opening <= self.opening else 0.0
         # where contact began between the two images is not known: any force up to the greatest stiffness may be
         reach = self._settings.largest_stiffness * max(0.0, self.opening - opening)
         return max(0.0, force - self.force - reach)
@@ -421,7 +421,7 @@ class ForceModel:
         """Return the force [N] at another opening [m], never below zero."""
         return max(0.0, self.force + self.stiffness * (self.opening - opening))
 
-    def innovation(self, opening: float, force: float) -> float:
+    def excess(self, opening: float, force: float) -> float:
         """Return by how much a force [N] differs from the predicted one beyond four standard deviations [N], signed."""
         travel = self.opening - opening
         spread = self._force_variance + travel**2 * self._stiffness_variance + self._noise_variance

@@ -1,4 +1,4 @@
-"""Status and goals of the driver for one gripper, and the request that follows: the most urgent one first."""
+"""Status of one gripper, goals of the driver, and the request that follows: the most urgent one first."""
 
 from __future__ import annotations
 
@@ -230,7 +230,7 @@ class Drive:
         if self.calibration is not None:
             return Phase.CALIBRATING
         if not self.known.calibrated:
-            return Phase.LOST if self.known.calibration_invalid not in ("", HALF_CALIBRATED) else Phase.UNCALIBRATED
+            return Phase.LOST if self.known.calibration_problem not in ("", HALF_CALIBRATED) else Phase.UNCALIBRATED
         if self.arrival is not None and not self.moving:
             return Phase.MOVING if self.arrival.moving else Phase.PROBING
         return Phase.MOVING if self.moving else Phase.READY
@@ -358,8 +358,8 @@ class Drive:
             return STOP_PENDING
         if self.note and phase is not Phase.FAULT:
             return self.note
-        if phase in (Phase.UNCALIBRATED, Phase.LOST) and self.known.calibration_invalid:
-            return self.known.calibration_invalid
+        if phase in (Phase.UNCALIBRATED, Phase.LOST) and self.known.calibration_problem:
+            return self.known.calibration_problem
         return describe(phase, self.outcome, faults)
 
     # What is sent next

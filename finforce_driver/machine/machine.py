@@ -159,7 +159,7 @@ class GripperMachine(Drive):
         self._watch.forget()
         self.note, self._enabled = "", True
         self.calibration = CalibrationRun(
-            self.settings, calibrated=self.known.calibrated, reset=bool(self.known.calibration_invalid)
+            self.settings, calibrated=self.known.calibrated, reset=bool(self.known.calibration_problem)
         )
 
     @_command
@@ -256,7 +256,7 @@ class GripperMachine(Drive):
         """Forget what can have changed by the time the link is back, and want nothing."""
         if self.calibration is not None:
             # without an earlier calibration the gripper's flag will say whether it was completed
-            self.known.calibration_invalid = self.known.calibration_invalid or (
+            self.known.calibration_problem = self.known.calibration_problem or (
                 HALF_CALIBRATED if self.known.calibrated else ""
             )
             self.calibration = None
@@ -385,7 +385,7 @@ class GripperMachine(Drive):
     def _break_calibration(self) -> None:
         """Note that a calibration under way is cut short."""
         if self.calibration is not None:
-            self.calibration, self.known.calibration_invalid = None, HALF_CALIBRATED
+            self.calibration, self.known.calibration_problem = None, HALF_CALIBRATED
             self.known.power_off = True
 
     def _postpone_hold(self) -> None:
@@ -435,8 +435,8 @@ class GripperMachine(Drive):
             self._follow_calibration(reply)
         elif before is not None and before.calibrated and not reply.calibrated:
             self._abort(REBOOTED)
-            self.known.calibration_invalid = ""
-        elif before is not None and reply.calibrated and not before.calibrated and not self.known.calibration_invalid:
+            self.known.calibration_problem = ""
+        elif before is not None and reply.calibrated and not before.calibrated and not self.known.calibration_problem:
             self._invalidate_calibration("the gripper was calibrated, but not by this driver", False)
         elif not reply.error:
             self._follow_orders(reply)
@@ -489,7 +489,7 @@ class GripperMachine(Drive):
         run.take(reply)
         if run.step.over:
             self.calibration = None
-            self.known.calibration_invalid = HALF_CALIBRATED if run.step is Step.FAILED else ""
+            self.known.calibration_problem = HALF_CALIBRATED if run.step is Step.FAILED else ""
             self.known.power_off = True
             self.known.restart_history()
             self._abort(run.reason)
@@ -557,6 +557,6 @@ class GripperMachine(Drive):
         stop = self.order(position=position, flags=flags)
         self._break_calibration()
         self._abort()
-        self.known.calibration_invalid = LOST.format(what=what)
+        self.known.calibration_problem = LOST.format(what=what)
         self.orders.want(stop, urgent=True)
         self.refresh()

@@ -341,18 +341,18 @@ class OrderWatch:
         self._order, self._odd = None, 0
         self._low = self._high = math.nan
 
-    def judge(self, reply: Reply, asleep: bool) -> str:
+    def judge(self, reply: Reply, power_off: bool) -> str:
         """Judge a believed reply; return what is wrong, empty where nothing is.
 
         Args:
             reply: as it came.
-            asleep: the power stage sleeps.
+            power_off: True if the power stage is off.
         """
         order = self._order
         stands, self._position = reply.position == self._position, reply.position
         if order is None:
             self._low, self._high = (reply.position if math.isnan(end) else end for end in (self._low, self._high))
-            runs = asleep and abs(reply.current_mA) >= CLEAR_CURRENT and self.strays(reply)
+            runs = power_off and abs(reply.current_mA) >= CLEAR_CURRENT and self.strays(reply)
             return "the motor runs without an order" if runs else ""
         if reply.time - self._sent < GRACE:
             self._low, self._high = min(self._low, reply.position), max(self._high, reply.position)

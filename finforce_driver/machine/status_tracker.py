@@ -100,7 +100,7 @@ class StatusTracker:
 
     Attributes:
         reply: the last plausible reply; None before the first.
-        calibration_invalid: reason for which the gripper's calibration flag is not trusted; empty if it is.
+        calibration_problem: reason for which the gripper's calibration flag is not trusted; empty if it is.
         power_off: True if a fault, a calibration or a stop has switched the power stage off, whatever the reply echoes.
         telemetry: temperature, supply, errors.
         filter: rejects implausible replies.
@@ -111,7 +111,7 @@ class StatusTracker:
     """
 
     def __init__(self, settings: GripperSettings) -> None:
-        self.calibration_invalid = ""
+        self.calibration_problem = ""
         self.power_off = False
         self.telemetry = Telemetry(settings.telemetry_period)
         self.filter = ReplyFilter(settings.reply_timeout)
@@ -140,7 +140,7 @@ class StatusTracker:
     @property
     def calibrated(self) -> bool:
         """True if the position means something."""
-        return self.reply is not None and self.reply.calibrated and not self.calibration_invalid
+        return self.reply is not None and self.reply.calibrated and not self.calibration_problem
 
     @property
     def error(self) -> bool:

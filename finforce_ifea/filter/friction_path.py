@@ -19,7 +19,7 @@ from finforce_ifea.filter.state import DEPTH, HEIGHT
 _OPTIONS = {"cache": True, "error_model": "numpy"}
 # Number of hypotheses of the coefficient of friction.
 NODES = 9
-# Standard deviation of the coefficient up to which one hypothesis is enough [-]: less than traction beyond friction.
+# Standard deviation of the coefficient up to which one hypothesis is enough [-].
 _WELL_KNOWN = 0.05
 # Half-width of the grid of coefficients [sigma].
 _SPAN = 2.5

@@ -19,7 +19,7 @@ from finforce_ifea.contact_mechanics.pressed_jaw import ContactSurface
 _OPTIONS = {"cache": True, "error_model": "numpy"}
 # Heights next to the clamp, relative to the lowest at which key points show a force [-].
 _NEXT_TO_CLAMP = np.array([0.2, 0.4, 0.6, 0.8, 1.0])
-# Step between the heights along the finger.
+# Every n-th of the heights along the finger is used.
 _EVERY = 3
 # Distance along the finger from the pressure centre from which a force is elsewhere [m].
 _ELSEWHERE = 5e-3

@@ -89,7 +89,7 @@ _LARGEST_SHIFT = 0.3e-3
 _SETTLED = 0.1e-3
 # Tolerance of the unknowns of the mechanics, relative to the model's reach [-].
 _SETTLED_CORRECTION = 0.05
-# Step length below which the search ends [-]: the key points cannot decide between two corners.
+# Fraction of a full step below which its remainder is ignored [-]: the key points cannot decide between two corners.
 _UNDECIDED = 0.2
 # Weight from which a key point agrees [-].
 _AGREES = 0.25
@@ -97,7 +97,7 @@ _AGREES = 0.25
 _MAJORITY = 0.5
 # Largest bump of a camera [sigma].
 _LARGEST_BUMP = 5.0
-# Variances (4,) of the camera's motion since the tare.
+# Variances (4,) of the camera's motion since the tare [m^2, m^2, rad^2, -].
 _STILL = np.array([CAMERA_SHIFT, CAMERA_SHIFT, CAMERA_TURN_STDDEV, 0.0]) ** 2
 # The same after a bump.
 _BUMPED = np.array([BUMPED_SHIFT, BUMPED_SHIFT, BUMPED_TURN, 0.0]) ** 2
@@ -345,7 +345,7 @@ def _follow_scatter(scatter, before, z, R):
 
 @njit(**_OPTIONS)
 def _is_settled(moved, missing, share, expectation):
-    """Return True if a step moved the model (3,), and left out (3,), by less than the tolerance."""
+    """Return True if the model's step (3,) and its remainder (3,) are below the tolerance."""
     tolerance = (_SETTLED, expectation[()].settled_change, _SETTLED)
     for i in range(3):
         if abs(moved[i]) >= tolerance[i] or (share > _UNDECIDED and abs(missing[i]) >= tolerance[i]):
@@ -355,7 +355,7 @@ def _is_settled(moved, missing, share, expectation):
 
 @njit(**_OPTIONS)
 def is_believed(mean, weight, V):
-    """Return True if most key points agree by their weight (m,), and the camera's motion is that of a bump at most.
+    """Return True if most key points agree by their weight (m,), and the camera has moved no farther than a bump.
 
     Where V (n,) allows more, it may have moved farther by the mean of the state (n,).
     """

@@ -45,19 +45,19 @@ class Jump(NamedTuple):
 
 
 _SHIFT = np.array([CAMERA_X, CAMERA_Z, CAMERA_TURN])
-# A bumped camera: 1 mm and 10 mrad.
+# Bump of the camera: 1 mm and 10 mrad (1 sigma).
 BUMPED = Jump(_SHIFT, np.array([1e-3, 1e-3, 10e-3]), 1e-5)
-# A contact elsewhere than stated, within 30 mm.
+# Contact elsewhere than stated: 30 mm (1 sigma).
 MISPLACED = Jump(np.array([HEIGHT]), np.array([30e-3]), 1e-4)
-# A smaller bump, which only several images show.
+# Smaller bump, which only several images show: 0.4 mm and 4 mrad (1 sigma).
 NUDGED = Jump(_SHIFT, np.array([0.4e-3, 0.4e-3, 4e-3]), 1e-4)
-# A contact elsewhere than stated, which only several images show.
+# Contact elsewhere than stated, which only several images show: 15 mm (1 sigma).
 OFFSET = Jump(np.array([HEIGHT]), np.array([15e-3]), 1e-4)
 # Jumps that one image can show.
 JUMPS = (BUMPED, MISPLACED)
 # Log likelihood ratio of a jump below which the test starts anew.
 _UNLIKELY = -3.0
-# Results beside the index of a jump: no jump, and no decision so far from the linearisation.
+# Results other than the index of a jump: none, or undecided, too far from the linearisation.
 NO_JUMP, UNDECIDED = -1, -2
 # Largest step of the depth [m]: the range of a linearisation.
 LARGEST_MOVE = 0.7e-3
@@ -158,7 +158,7 @@ def detect_jump(measured, weight, nu, S, possible):
 def _weigh_innovations(measured, nu, S, depth_variance, asked):
     """Return weights of the key points (m,) by their innovations (2 m,) without the object's motion.
 
-    That is no jump. S has a depth of which nothing is known; here the median of the key points tells it, `asked`, see
+    The object's motion is no jump. S has an unknown depth; here it is the median of the key points, `asked`, see
     `find_depth_jump`.
     """
     H, R, (deeper, variance) = measured.H, measured.R, asked

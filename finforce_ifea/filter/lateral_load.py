@@ -33,7 +33,7 @@ from finforce_ifea.tracking.contact_state import MIDDLE_STDDEV, ContactState
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
 _HEIGHTS = 13
-# Lever of the pair of forces that twists, relative to half the width [-].
+# Distance of each force of the twisting pair from the middle, relative to half the width [-].
 _ARM = 0.8
 # Largest mesh [nodes]: of larger ones, only the plane is computed.
 _MOST_NODES = 20_000
@@ -154,9 +154,9 @@ def _answer_at_rest(jaw: Jaw, mesh: VolumeMesh) -> _Answers | None:
     return _Answers(model=model, steps=steps, heights=heights, half_width=half, roll=np.array(roll))
 
 
-# Standard deviation of the pressure centre from the middle of what touches, relative to its width [-].
+# Standard deviation of the pressure centre, relative to that of an even pressure over what touches [-].
 _EVEN = 0.4
-# The same, at least, where the whole width of the finger touches [-].
+# Least further factor on it where the whole width of the finger touches [-].
 _WIDE = 0.15
 # Inverse of the core of a rectangular section, relative to half its width [-].
 _CORE = 3.0
@@ -187,9 +187,9 @@ _UNLIKELY = -3.0
 _NONLINEAR = 0.04
 # Ratio of which half is reported [sigma]: a soft threshold.
 _CLEAR = 3.0
-# Least force from which the ratio is estimated [N].
+# Force below which the filter starts anew [N].
 _LEAST_FORCE = 0.3
-# Standard deviation of the mechanics' error along y [m].
+# Standard deviation of the mechanics' part of a key point's offset along y [m].
 _FLOOR = 0.02e-3
 # Correlation length of that error [m].
 _OFFSET_LENGTH = 10e-3
@@ -241,7 +241,7 @@ class LateralLoad:
         self.load = np.array([*self._expected, 0.0, self._traction])
 
     def expect(self, location: float, stddev: float) -> None:
-        """Set the lateral position of the object's nearest part [m], and its width."""
+        """Set the lateral position of the object's nearest part [m], and the standard deviation of its width."""
         half = self._torsion.half_width if self._torsion else abs(location)
         narrow = max(_WIDE, 1.0 - 3.0 * (stddev / half) ** 2) if half > 0.0 else 1.0
         # beyond a third of the half width, the core of a section, an eccentric pressure leaves the other edge

@@ -28,9 +28,9 @@ OBJECT_TIME = 10.0
 MODEL_SHAPE = 0.004
 # The same in all shapes [-]: the default mesh is within 1 % of an independent program.
 MODEL_RELATIVE = 0.01
-# Correlation length of the error in one shape [m].
+# Correlation length of a key point's offset [m].
 MODEL_LENGTH = 10e-3
-# Correlation time of that error [s].
+# Correlation time of that offset, and of traction beyond friction [s].
 MODEL_TIME = 60.0
 # Correlation length of a detector's lasting error [m]: half a pixel.
 SIGHT_LENGTH = 0.1e-3

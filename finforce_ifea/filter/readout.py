@@ -11,12 +11,12 @@ from finforce_ifea.filter.state import CAMERA_TURN, CAMERA_X, DEPTH, HEIGHT, TRA
 from finforce_ifea.tracking.contact_state import LEAST_DEPTH, LOADED_DEPTH, TOUCH_DEPTH
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
-# Standard deviation of the force's direction [rad]: considered, not estimated.
+# Standard deviation of the traction ratio by errors of the force's direction [-]: considered, not estimated.
 _MISDIRECTED = 0.03
 # Share of the variance of a detector's lasting errors that all key points of a jaw have in common [-]: 0.023 in drawn
 # grasps of the bench finger, whose key points err by half of what the shipped network states; twice that is considered.
 COMMON = 0.05
-# Largest force, relative to that of the linearisation [-].
+# Largest factor by which the force may grow beyond the linearisation [-].
 _LARGEST_GROWTH = 10.0
 # Largest traction ratio of the mechanics [-].
 LARGEST_RATIO = 0.9

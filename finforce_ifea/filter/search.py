@@ -42,7 +42,7 @@ from finforce_ifea.filter.state import DEPTH, HEIGHT, SHAPE, TRACTION, state_siz
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tracking.contact_state import KEYPOINT, LOADED_DEPTH, blank_contact_state
 
-# Mean time of rest of open jaws [s]: they are about to close.
+# Mean time of rest of jaws that are open or hardly pressed [s]: they are about to close.
 _FREE_TIME = 0.15
 # Standard deviation of the depth in the first image [m].
 _FIRST_DEPTH = 0.1e-3
@@ -201,7 +201,7 @@ class ContactSearch:
         self.track = Track(DEPTH_NOISE, float(m[DEPTH]), _FIRST_DEPTH**2)
 
     def find(self, contact: RigidContact, probe: Any, dt: float, *, iterations: int) -> bool:
-        """Find the contact in the image of `points`; False, with nothing changed, if too few key points agree.
+        """Find the contact in the image of `points`; False, with the contact as it was, if too few key points agree.
 
         Args:
             contact: of the jaw with the object.

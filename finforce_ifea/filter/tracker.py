@@ -32,13 +32,13 @@ _IMAGES_RELEASED = 15
 _LOST_STDDEV = 1e-3
 # Distance from the given height beyond which the contact is another one [sigma].
 _FARTHEST_HEIGHT = 8.0
-# Extrapolation from the stored shapes from which the full mechanics takes over [-].
+# Extrapolation from the stored shapes beyond which the full mechanics takes over [-].
 _BEYOND_STORED = 1.0
-# Fraction of the depth at that moment from which the stored shapes do again [-].
+# Fraction of the depth at that moment below which the stored shapes take over again [-].
 _BACK = 0.8
 # Iterations of the full mechanics per image, each as long as a hundred others.
 _FULL_ITERATIONS = 3
-# Iterations with which the full mechanics takes over.
+# Largest number of iterations in which the full mechanics settles.
 _SETTLING = 8
 # Tolerance of these, relative to the model's reach [-].
 _SETTLED = 2e-3
@@ -269,13 +269,13 @@ class ContactTracker:
         return explain_offsets(self.rest_modes(), tare, stddev)
 
     def rest_modes(self) -> NDArray:
-        """Return the derivative of the undeformed jaw's key points in x and z by the depth (K, 2) [m/m]."""
+        """Return the derivative of the undeformed jaw's key point positions in x and z by the depth (K, 2) [m/m]."""
         q = np.zeros(self._contact.model.size)
         pressed = self._contact.linearize(q, find_place(self._contact.packed_object, np.r_[-1.0, self._mean])[0])
         return self._contact.model.project(self._probe, q, pressed.modes)[:, [0, 2], DEPTH]
 
     def forget(self) -> None:
-        """Forget the object's coefficient of friction."""
+        """Forget the object and its coefficient of friction."""
         self._search.expect_friction(self._friction)
         self.reset()
 

@@ -35,7 +35,7 @@ CONTACT_STATE = np.dtype(
         ("used", int),  # key points with a weight
         ("residual", float),  # weighted root mean square [m]
         ("kkt", float),  # gradient of the objective, relative to its parts
-        ("offset", float),  # contact location by the key points alone, from the stated one [m]
+        ("offset", float),  # contact location by the key points, from the stated one [m]
         ("mistaken", float),  # probability that the stated location is wrong
         ("location_error", float),  # relative standard deviation of the force by the location
         ("extrapolation", float),  # distance of the shape from the stored ones, relative to their range
@@ -67,7 +67,7 @@ KEYPOINT = np.dtype(
         ("noise_ratio", float),  # variance in the tare over that in this image
         ("offset_variance", float),  # of the constant offset [m^2]
         ("detector_variance", float),  # part of it due to the detector, constant for one shape [m^2]
-        ("weight", float),  # agreement times the noise ratio, 0 to 1
+        ("weight", float),  # by agreement with the others, 0 to 1
     ]
 )
 
@@ -158,6 +158,8 @@ def _find_ambiguity(state: ContactState, vague: float) -> str:
         return f"{bent}: open the jaw and tare, or the contact is elsewhere"
     if state["unobserved_stddev"] > vague:
         return "the object may press where key points hardly show a force: next to the clamp, or along its face"
+    if state["stddev"] == np.inf:
+        return f"the shape has not settled within {state['iterations']} iterations; is the contact location right?"
     if not state["stddev"] <= vague:
         return f"the visible key points tell the force only within {state['stddev']:.2g} N, expected {vague:.2g} N"
     return ""

@@ -194,6 +194,8 @@ class GivenContactTracker:
         state["pressure_location"] = share @ load.points
         for name in ("residual", "kkt", "iterations", "converged"):
             state[name] = getattr(result, name)
+        if not (result.converged or self.paper):
+            state["stddev"] = np.inf  # the next image goes on from here
         if result.converged and not self.paper:
             self._watch.judge((targets - positions)[:, ::2], weights / variance, state)
         traction = UNSEEN_TRACTION * self.settings.friction
@@ -218,10 +220,10 @@ class GivenContactTracker:
         return explain_offsets(modes, tare, stddev)
 
 
-# Least standard deviation of an averaged location, relative to the heights of the face [-]: the model of it is that of
+# Least standard deviation of an averaged location, relative to the length of the face [-]: the model is linear about
 # the unloaded jaw.
 _SUREST = 0.03
-# Number of images over which locations are averaged.
+# Time constant of the average location [images].
 _LONGEST_AVERAGE = 45.0
 _ACROSS_CONTACT = np.linspace(-1.0, 1.0, 41)
 

@@ -173,7 +173,7 @@ def split_change(modes: NDArray, change: NDArray) -> OffsetChange:
 LARGEST_DEPTH = 0.3e-3
 # The same on average over `_AVERAGED` images [m].
 LARGEST_MEAN_DEPTH = 0.15e-3
-# The same in one image [sigma].
+# The same in one image, and on average [sigma].
 _CHANCE = 4.0
 _AVERAGED = 30
 # Distance from its position at rest from which a key point is ignored [m].

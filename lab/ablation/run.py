@@ -43,7 +43,7 @@ MOVED_FORCE, MOVED_SHARE = 0.01, 1.0
 # Prefix of a scene that is a family of the stress tests.
 STRESS = "stress "
 FAMILIES = {family.name: family for family in (*inputs.FAMILIES, *objects.FAMILIES)}
-# Number of trials of such a scene.
+# `--count` of such a family.
 TRIALS = 12
 COLUMNS = ("magnitude/N", "vector/N", "in 3σ/%", "answered/%")
 
@@ -112,6 +112,8 @@ def play_stress(family: str) -> dict[str, float]:
     """Return the figures of a family of the stress tests, as `play` does."""
     trials = run_family(FAMILIES[family], Plan(count=TRIALS))
     sure = [trial for trial in trials if trial.sure and trial.errors]
+    if not sure:
+        return dict(zip(COLUMNS, (np.nan, np.nan, np.nan, 0.0), strict=True))
     errors, stated = (np.array([getattr(trial, name) for trial in sure]) for name in ("errors", "stated"))
     return _score(errors[:, 3], errors[:, :3], stated[:, :3], len(sure) / len(trials))
 

@@ -336,10 +336,7 @@ def build_other_finger(bench: Bench, random: np.random.Generator) -> Scene:
 
 
 def build_sight(bench: Bench, random: np.random.Generator) -> Scene:
-    """Rub, with a detector that errs by half of the 0.3 mm that it states, a third of that alike at all key points.
-
-    The errors last while it sees the same, with little scatter.
-    """
+    """Rub an object, seen by a detector with lasting errors: half of the stated 0.3 mm, a third of that in common."""
     pressed = press(bench, ramp(4, 3, 5, hold=20), friction=0.4)
     told = tell_height(bench, pressed, 0.3e-3)
     scene = film(bench, pressed, told, random, 0.3, friction=0.45, friction_stddev=0.25)

@@ -72,12 +72,12 @@ def test_noise_is_learnt():
     assert loud.noise > 0.08
 
 
-def test_surprise_is_what_neither_noise_nor_motion_explains():
+def test_the_excess_is_what_neither_noise_nor_motion_explains():
     model, force, opening = load(1300.0)
-    assert model.innovation(opening, force + 0.1) == 0.0
-    assert model.innovation(opening, force + 2.0) > 1.2
-    assert model.innovation(opening, force - 2.0) < -1.2
-    assert model.innovation(opening - 0.001, force + 1.3) == 0.0
+    assert model.excess(opening, force + 0.1) == 0.0
+    assert model.excess(opening, force + 2.0) > 1.2
+    assert model.excess(opening, force - 2.0) < -1.2
+    assert model.excess(opening - 0.001, force + 1.3) == 0.0
 
 
 @settings(max_examples=200)

@@ -19,7 +19,7 @@ MM = 1e-3
 )
 def test_an_object_cannot_pull(depth, stddev, rejected):
     state = blank_contact_state()
-    state["depth"], state["depth_variance"], state["converged"] = depth, stddev**2, True
+    state["depth"], state["depth_variance"] = depth, stddev**2
     reason = find_rejection_reason(state, largest_residual=1e-3, largest_stddev=1.0)
     assert ("as if that pulled" in reason) == rejected == bool(reason)
 
@@ -36,7 +36,7 @@ def test_an_object_cannot_pull(depth, stddev, rejected):
 )
 def test_a_force_is_told_with_the_deviation_that_the_user_can_do_with(magnitude, stddev, largest, rejected):
     state = blank_contact_state()
-    state["magnitude"], state["stddev"], state["converged"] = magnitude, stddev, True
+    state["magnitude"], state["stddev"] = magnitude, stddev
     reason = find_rejection_reason(state, largest_residual=1e-3, largest_stddev=largest)
     assert bool(reason) == rejected
     assert not reason or f"only within {stddev:.2g} N, expected {max(largest, 0.25 * magnitude):.2g} N" in reason

@@ -233,6 +233,14 @@ def test_convergence_is_reported():
     assert np.mean([solution.converged for solution in hasty[REST:]]) < np.mean([s.converged for s in solved()[REST:]])
 
 
+def test_a_given_contact_whose_shape_has_not_settled_gives_no_force():
+    recording = pressed()
+    given = Contact(points=recording.contact.points, weights=np.ones(1), free=False)
+    found = run(recording, make_estimator(solver="frame", iterations=1), given)[REST:]
+    assert any("has not settled" in solution.message for solution in found)
+    assert all(solution.converged for solution in found if solution.trusted and solution.magnitude_stddev > 0.0)
+
+
 @pytest.mark.parametrize("solver", MODELS)
 def test_deformed_surface_and_key_points_follow_the_finger(solver):
     recording, estimator = record(ramp(5)), make_estimator(solver=solver)
