@@ -109,7 +109,7 @@ class ForceEstimator:
             lambda *chance: self._tracker.significance(*chance),
             self._tracked.rest_modes,
         )
-        self._reach = UnloadedCheck(self.jaw.keypoints, self.jaw.inner_face_x, self._tracked.rest_modes)
+        self._unloaded_check = UnloadedCheck(self.jaw.keypoints, self.jaw.inner_face_x, self._tracked.rest_modes)
         self.reset()
 
     def reset(self) -> None:
@@ -123,7 +123,7 @@ class ForceEstimator:
         self._scale_error = 0.0  # relative standard deviation of the displacements that all key points share [-]
         self._relaxed: float | None = None
         self._taring.reset()
-        self._reach.reset()
+        self._unloaded_check.reset()
         self._relaxation.reset()
         self._relaxation_stddev.reset()
         self._tracked.reset()
@@ -254,7 +254,7 @@ class ForceEstimator:
             return self._fail("waiting", waiting, used)
         if contact is None or not len(contact.points):
             return self._without_contact(points, used)
-        self.is_idle = self.tared and self._reach.is_idle(contact, points, self._taring.tare)
+        self.is_idle = self.tared and self._unloaded_check.is_idle(contact, points, self._taring.tare)
         if self.is_idle:
             return self._rest("the object is out of reach, the jaw is at rest", points)
         beyond = self._find_beyond(contact)

@@ -8,7 +8,7 @@ import pytest
 from eval_fakes import PERIOD, START, FakeContactEstimator, FakeJaw, make_recording
 from keypoint_node_fakes import CameraBench
 from node_fakes import KEYPOINTS, FakeEstimator, keypoint_cloud, start_solver
-from rgbd_fakes import FakeDetector, make_simulated
+from rgbd_fakes import FakeDetector, make_fake_recording
 
 from finforce.health import IDLE, Idling
 from finforce.messages import stamp_of
@@ -71,7 +71,7 @@ def test_images_that_the_solver_passes_over_have_no_row(probe):
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
-    return read_recording(write_simulated_recording(make_simulated(), tmp_path_factory.mktemp("bags") / "twin"))
+    return read_recording(write_simulated_recording(make_fake_recording(), tmp_path_factory.mktemp("bags") / "twin"))
 
 
 class StillAt(FakeDetector):

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from eval_fakes import FakeEstimator, FakeJaw, evaluate_recording
-from rgbd_fakes import FakeDetector, FakeGripper, make_simulated
+from rgbd_fakes import FakeDetector, FakeGripper, make_fake_recording
 
 from finforce_contact.loop import GivenContact
 from finforce_eval.cli import demo, replay
@@ -30,7 +30,7 @@ def rendered(monkeypatch):
 
     def build(scenario, seed, camera):
         calls.append((scenario.name, seed))
-        return make_simulated(seed=seed)
+        return make_fake_recording(seed=seed)
 
     monkeypatch.setattr("finforce_eval.cli.demo.build_simulated_recording", build)
     return calls
@@ -79,7 +79,7 @@ def test_what_the_demo_has_not_made_is_left_alone(rendered, tmp_path, name):
 def played(tmp_path_factory):
     """A recording from images; the force rises by 0.1 N an image from image 20 on."""
     path = write_simulated_recording(
-        make_simulated(FakeGripper(count=40, onset=20)), tmp_path_factory.mktemp("bags") / "twin"
+        make_fake_recording(FakeGripper(count=40, onset=20)), tmp_path_factory.mktemp("bags") / "twin"
     )
     recording = read_recording(path)
     return detect_keypoints(recording, FakeDetector(recording))

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rgbd_fakes import FakeCamera, FakeDetector, FakeGripper, make_simulated
+from rgbd_fakes import FakeCamera, FakeDetector, FakeGripper, make_fake_recording
 
 from finforce.errors import PoseError
 from finforce_eval.cli.main import main
@@ -23,7 +23,7 @@ from finforce_keypoints.parameters import DetectorParameters
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
-    return read_recording(write_simulated_recording(make_simulated(), tmp_path_factory.mktemp("bags") / "twin"))
+    return read_recording(write_simulated_recording(make_fake_recording(), tmp_path_factory.mktemp("bags") / "twin"))
 
 
 def is_found(track):
@@ -93,7 +93,7 @@ def test_images_without_depth_are_a_note(recording):
 
 
 def test_a_black_picture_gives_no_key_points(tmp_path):
-    folder = write_simulated_recording(make_simulated(simulated_camera=FakeCamera(black=(5,))), tmp_path / "twin")
+    folder = write_simulated_recording(make_fake_recording(simulated_camera=FakeCamera(black=(5,))), tmp_path / "twin")
     found, detector = detect(read_recording(folder))
     assert not is_found(found.jaws["left"])[5] and len(detector.stamps) == 11
     assert any("black" in note for note in found.notes)
@@ -193,7 +193,7 @@ def test_extrinsics_are_a_name_or_seven_numbers():
 
 
 def test_key_points_of_two_jaws_come_in_one_pass(tmp_path):
-    folder = write_simulated_recording(make_simulated(FakeGripper(sides=("left", "right"))), tmp_path / "both")
+    folder = write_simulated_recording(make_fake_recording(FakeGripper(sides=("left", "right"))), tmp_path / "both")
     recording = read_recording(folder)
     found, detector = detect(recording)
     assert len(detector.stamps) == 12 and found.jaws.keys() == {"left", "right"}
@@ -223,7 +223,7 @@ def detect_with(recording, monkeypatch, *changes):
 def test_a_camera_is_frozen_offline_when_it_is_in_the_node(tmp_path, monkeypatch):
     simulated_camera = FakeCamera(frozen=(3, 4, 5, 6, 7))
     recording = read_recording(
-        write_simulated_recording(make_simulated(simulated_camera=simulated_camera), tmp_path / "twin")
+        write_simulated_recording(make_fake_recording(simulated_camera=simulated_camera), tmp_path / "twin")
     )
     found, detector = detect_with(recording, monkeypatch)
     assert len(detector.stamps) == 12 - 3

@@ -12,7 +12,7 @@ import pyarrow
 import pytest
 from eval_fakes import cut
 from pyarrow import parquet
-from rgbd_fakes import make_simulated
+from rgbd_fakes import make_fake_recording
 
 import finforce as ff
 from finforce_eval.cli.main import main
@@ -64,7 +64,7 @@ def test_a_folder_of_recordings_gives_all_of_them(folder, tmp_path):
 
 
 def test_forces_come_from_images(folder, tmp_path, monkeypatch):
-    path, looked = write_simulated_recording(make_simulated(), tmp_path / "twin"), []
+    path, looked = write_simulated_recording(make_fake_recording(), tmp_path / "twin"), []
     keypoints = ff.read_recording(folder / "first").jaws
 
     def detect(source, recording):
@@ -107,7 +107,7 @@ def test_the_example_prints_the_largest_force_of_each_recording(folder, tmp_path
 
 
 def test_the_example_prints_a_line_per_image(tmp_path, monkeypatch, capsys):
-    path, sensor = write_simulated_recording(make_simulated(), tmp_path / "twin"), ff.ForceSensor
+    path, sensor = write_simulated_recording(make_fake_recording(), tmp_path / "twin"), ff.ForceSensor
     monkeypatch.setattr(ff, "ForceSensor", lambda *given, **more: sensor(*given, **more | {"calibration": "bench"}))
     monkeypatch.setattr(sys, "argv", ["images_to_forces.py", str(path)])
     runpy.run_path(str(EXAMPLES / "images_to_forces.py"))

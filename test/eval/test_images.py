@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from packet_fakes import KEY_EVERY, draw_pictures, encode_packets
 from rclpy.serialization import deserialize_message
-from rgbd_fakes import CAMERA, FakeGripper, make_simulated
+from rgbd_fakes import CAMERA, FakeGripper, make_fake_recording
 from rosbags.typesys import get_types_from_msg
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Image
@@ -39,20 +39,20 @@ class Message:
 def written(request, tmp_path_factory):
     folder = tmp_path_factory.mktemp("bags") / "twin"
     return request.param, write_simulated_recording(
-        make_simulated(), folder, compressed=FORMS[request.param], case={"scene": "fake"}
+        make_fake_recording(), folder, compressed=FORMS[request.param], case={"scene": "fake"}
     )
 
 
 def write_without(folder, *topics, simulated=None, edit=lambda entry: entry):
     """Write a plain recording without some topics, each message after an edit."""
-    entries = simulated_entries(simulated or make_simulated(), FORMS["raw"])
+    entries = simulated_entries(simulated or make_fake_recording(), FORMS["raw"])
     kept = [edit(entry) for entry in entries if entry.topic not in topics]
     return write_entries([entry for entry in kept if entry is not None], folder)
 
 
 def test_images_come_back_as_they_were_taken(written):
     form, folder = written
-    frames = list(make_simulated())
+    frames = list(make_fake_recording())
     images = read_recording(folder).images
     assert len(images) == len(frames) and len(images.unpaired) == 0
     for frame, (stamp, image) in zip(frames, images, strict=True):
@@ -71,7 +71,7 @@ def test_images_come_back_as_they_were_taken(written):
 def test_truth_comes_back_exactly(written):
     _, folder = written
     recording = read_recording(folder)
-    track, frames = recording.jaws["left"], list(make_simulated())
+    track, frames = recording.jaws["left"], list(make_fake_recording())
     assert track.is_awaited and track.pose is None and track.keypoints.stamps_ns.size == 0
     np.testing.assert_array_equal(track.sight.stamps_ns, [frame.stamp for frame in frames])
     truths = [frame.jaws["left"] for frame in frames]
@@ -84,7 +84,7 @@ def test_truth_comes_back_exactly(written):
 
 
 def test_the_object_is_tracked_at_a_third_of_the_images_with_the_noise_of_the_bench():
-    frames = list(make_simulated(FakeGripper(count=3000)))
+    frames = list(make_fake_recording(FakeGripper(count=3000)))
     tracked = [frame for frame in frames if frame.T_camera_object is not None]
     assert [frame.stamp for frame in tracked] == [frame.stamp for frame in frames[::3]]
     positions = np.array([frame.T_camera_object[:3, 3] for frame in tracked])
@@ -92,11 +92,11 @@ def test_the_object_is_tracked_at_a_third_of_the_images_with_the_noise_of_the_be
     turns = Rotation.from_matrix([frame.T_camera_object[:3, :3] for frame in tracked])
     angles = np.degrees((turns * turns.mean().inv()).as_rotvec())
     np.testing.assert_allclose(angles.std(axis=0), 0.3, rtol=0.12)
-    assert list(make_simulated(FakeGripper(has_object=False)))[0].T_camera_object is None
+    assert list(make_fake_recording(FakeGripper(has_object=False)))[0].T_camera_object is None
 
 
-def test_footage_is_the_same_twice_and_another_with_another_seed():
-    first, second, other = make_simulated(), make_simulated(), make_simulated(seed=1)
+def test_a_recording_is_the_same_twice_and_another_with_another_seed():
+    first, second, other = make_fake_recording(), make_fake_recording(), make_fake_recording(seed=1)
     for one, two in zip(first, second, strict=True):
         np.testing.assert_array_equal(one.color, two.color)
         np.testing.assert_array_equal(one.T_camera_object is None, two.T_camera_object is None)
@@ -105,7 +105,7 @@ def test_footage_is_the_same_twice_and_another_with_another_seed():
 
 
 def test_the_mesh_is_found_and_found_again_when_the_folder_was_renamed(tmp_path):
-    folder = write_simulated_recording(make_simulated(), tmp_path / "twin")
+    folder = write_simulated_recording(make_fake_recording(), tmp_path / "twin")
     assert find_mesh(read_recording(folder)) == folder / "object.stl"
     moved = folder.rename(tmp_path / "another")
     assert find_mesh(read_recording(moved)) == moved / "object.stl"
@@ -113,7 +113,7 @@ def test_the_mesh_is_found_and_found_again_when_the_folder_was_renamed(tmp_path)
 
 def test_reading_holds_few_images_at_a_time(tmp_path):
     folder = write_simulated_recording(
-        make_simulated(FakeGripper(count=900)), tmp_path / "long", compressed=FORMS["raw"]
+        make_fake_recording(FakeGripper(count=900)), tmp_path / "long", compressed=FORMS["raw"]
     )
     whole = 900 * (64 * 48 * 5)
     images = read_recording(folder).images
@@ -132,7 +132,7 @@ def test_images_without_camera_info_are_refused(tmp_path):
 
 def test_images_without_depth_are_read_as_colours_alone(tmp_path):
     images = read_recording(write_without(tmp_path / "bag", DEPTH_TOPIC)).images
-    frames = list(make_simulated())
+    frames = list(make_fake_recording())
     assert not images.has_depth and images.stamps_ns.tolist() == [frame.stamp for frame in frames]
     for frame, (_, image) in zip(frames, images, strict=True):
         assert image.depth is None
@@ -146,7 +146,7 @@ def test_depth_is_the_nearest_and_some_lost_depth_leaves_its_images_out(tmp_path
         return entry
 
     def lost(entry):
-        is_fifth = entry.topic == DEPTH_TOPIC and entry.stamp == list(make_simulated())[5].stamp
+        is_fifth = entry.topic == DEPTH_TOPIC and entry.stamp == list(make_fake_recording())[5].stamp
         return None if is_fifth else entry
 
     folder = write_without(tmp_path / "late", edit=separate_headers(late))
@@ -158,7 +158,7 @@ def test_depth_is_the_nearest_and_some_lost_depth_leaves_its_images_out(tmp_path
     everything = [image.depth is not None for _, image in images.all_colors()]
     assert everything == [number != 5 for number in range(12)]
     alone = images.colors_alone()
-    assert [stamp for stamp, image in alone if image.depth is None] == [frame.stamp for frame in make_simulated()]
+    assert [stamp for stamp, image in alone if image.depth is None] == [frame.stamp for frame in make_fake_recording()]
 
 
 def test_both_jaws_are_looked_for_in_images_of_which_no_topic_tells_the_jaws(tmp_path):
@@ -242,11 +242,11 @@ def test_compressed_images_are_played_as_plain_ones_under_the_names_the_nodes_li
     from rclpy.serialization import deserialize_message
     from sensor_msgs.msg import Image
 
-    folder = write_simulated_recording(make_simulated(), tmp_path / "twin")
+    folder = write_simulated_recording(make_fake_recording(), tmp_path / "twin")
     played = list(Playback(folder))
     color = [deserialize_message(message.data, Image) for message in played if message.topic == COLOR_TOPIC]
     depth = [deserialize_message(message.data, Image) for message in played if message.topic == DEPTH_TOPIC]
-    frames = list(make_simulated())
+    frames = list(make_fake_recording())
     assert len(color) == len(depth) == len(frames)
     assert {(image.encoding, image.width, image.height, image.step) for image in depth} == {("16UC1", 64, 48, 128)}
     assert {(image.encoding, image.step) for image in color} == {("rgb8", 192)}
@@ -256,18 +256,18 @@ def test_compressed_images_are_played_as_plain_ones_under_the_names_the_nodes_li
     }
 
 
-def test_footage_that_breaks_off_leaves_no_recording(tmp_path):
+def test_a_recording_that_breaks_off_leaves_no_recording(tmp_path):
     class Breaking(FakeGripper):
         def states(self):
             yield from list(super().states())[:3]
             raise RuntimeError("buckled")
 
     with pytest.raises(RuntimeError, match="buckled"):
-        write_simulated_recording(make_simulated(Breaking()), tmp_path / "half")
+        write_simulated_recording(make_fake_recording(Breaking()), tmp_path / "half")
     assert not (tmp_path / "half").exists()
-    folder = write_simulated_recording(make_simulated(), tmp_path / "whole")
+    folder = write_simulated_recording(make_fake_recording(), tmp_path / "whole")
     with pytest.raises(RecordingError, match="exists already"):
-        write_simulated_recording(make_simulated(), folder)
+        write_simulated_recording(make_fake_recording(), folder)
     assert folder.exists()
 
 
@@ -278,7 +278,7 @@ def test_key_points_that_were_recorded_do_not_need_whole_images(tmp_path):
 
     recording = replace(make_recording(frames=6), case={})
     entries = sorted(recording_entries(recording), key=lambda entry: entry.stamp)
-    simulated = simulated_entries(make_simulated(), FORMS["raw"])
+    simulated = simulated_entries(make_fake_recording(), FORMS["raw"])
     colors = [entry for entry in simulated if entry.topic == COLOR_TOPIC]
     read = read_recording(write_entries([*entries, *colors], tmp_path / "bag"))
     assert read.images is None and any("camera_info" in note for note in read.notes)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from eval_fakes import FakeEstimator, FakeJaw, change_info, evaluate_recording, make_recording
 from rclpy.serialization import deserialize_message
-from rgbd_fakes import CAMERA, FakeDetector, FakeGripper, make_simulated
+from rgbd_fakes import CAMERA, FakeDetector, FakeGripper, make_fake_recording
 from rosbags.rosbag2 import StoragePlugin, Writer
 from sensor_msgs.msg import CameraInfo
 
@@ -45,7 +45,7 @@ class LeftOnly(FakeDetector):
 
 
 def test_a_jaw_that_is_never_seen_has_no_force_and_the_other_keeps_its_own(tmp_path):
-    simulated = make_simulated(FakeGripper(sides=("left", "right")))
+    simulated = make_fake_recording(FakeGripper(sides=("left", "right")))
     recording = read_recording(write_simulated_recording(simulated, tmp_path / "bag"))
     blind = {side: replace(track, sight=None, truth=None) for side, track in recording.jaws.items()}
     found = detect_keypoints(replace(recording, jaws=blind), LeftOnly(recording))
@@ -81,8 +81,8 @@ def test_pictures_too_few_for_a_tare_are_told_to_be_taken_as_stills(estimator, h
 
 
 def write_renamed(folder, names, **options):
-    """Footage whose camera topics have other names, and no topic of a jaw."""
-    entries = simulated_entries(make_simulated(), False)
+    """A recording whose camera topics have other names, and no topic of a jaw."""
+    entries = simulated_entries(make_fake_recording(), False)
     kept = [each._replace(topic=names[each.topic]) for each in entries if each.topic in names]
     return write_entries(kept, folder, **options)
 
@@ -99,7 +99,7 @@ def test_the_only_camera_of_a_bag_is_found_whatever_its_topics_are_called(names,
 
 
 def two_cameras(folder):
-    entries = simulated_entries(make_simulated(), False)
+    entries = simulated_entries(make_fake_recording(), False)
     kept = [each for each in entries if each.topic in ZED]
     right = {name: topic.replace("left", "right") for name, topic in ZED.items() if name != DEPTH_TOPIC}
     both = [each._replace(topic=names[each.topic]) for names in (ZED, right) for each in kept if each.topic in names]
@@ -112,7 +112,7 @@ def test_rectified_images_have_the_projection_matrix_and_no_lens(names, is_recti
     projection = np.array([40.0, 0.0, 30.0, 0.0, 0.0, 41.0, 22.0, 0.0, 0.0, 0.0, 1.0, 0.0])
     entries = [
         each._replace(topic=names[each.topic], message=replace(each.message, p=projection) if is_info else each.message)
-        for each in simulated_entries(make_simulated(), False)
+        for each in simulated_entries(make_fake_recording(), False)
         if each.topic in names
         for is_info in [each.topic == INFO_TOPIC]
     ]
@@ -147,7 +147,7 @@ def test_depth_in_another_frame_is_not_taken_for_aligned_depth(tmp_path):
             return entry._replace(message=replace(entry.message, header=header))
         return entry
 
-    entries = [elsewhere(each) for each in simulated_entries(make_simulated(), False)]
+    entries = [elsewhere(each) for each in simulated_entries(make_fake_recording(), False)]
     kept = [each._replace(topic=ZED[each.topic]) for each in entries if each.topic in ZED]
     bag = write_entries(kept, tmp_path / "bag")
     recording = read_recording(bag)
@@ -194,7 +194,7 @@ def test_intrinsics_that_were_given_are_played_beside_every_image(names, tmp_pat
 def test_an_episode_after_the_end_of_its_video_is_named(tmp_path, capsys):
     from lerobot_fakes import CAMERA, FPS, write_dataset
 
-    pictures = [frame.color for frame in make_simulated(FakeGripper(count=6))]
+    pictures = [frame.color for frame in make_fake_recording(FakeGripper(count=6))]
     write_dataset(tmp_path / "merged", [pictures[:3], pictures[:3]], "v3.0")
     path = next((tmp_path / "merged/meta/episodes").rglob("*.parquet"))
     table, name = parquet.read_table(path), f"videos/{CAMERA}/from_timestamp"
@@ -278,7 +278,7 @@ def dataset(tmp_path):
     """Two episodes of noise in both layouts."""
     from lerobot_fakes import write_dataset
 
-    pictures = [frame.color for frame in make_simulated(FakeGripper(count=8))]
+    pictures = [frame.color for frame in make_fake_recording(FakeGripper(count=8))]
     write_dataset(tmp_path / "noise", [pictures[:3], pictures], "v2.1")
     return tmp_path / "noise"
 
@@ -298,7 +298,7 @@ def test_a_dataset_in_which_no_jaw_is_seen_is_not_annotated(dataset, capsys):
 def lengthen_video(folder):
     from lerobot_fakes import write_video
 
-    pictures = [frame.color for frame in make_simulated(FakeGripper(count=8))]
+    pictures = [frame.color for frame in make_fake_recording(FakeGripper(count=8))]
     write_video(next((folder / "videos").rglob("episode_000000.mp4")), pictures)
 
 
@@ -318,7 +318,7 @@ def slow_rows(folder):
 def slow_video(folder):
     from lerobot_fakes import write_video
 
-    pictures = [frame.color for frame in make_simulated(FakeGripper(count=3))]
+    pictures = [frame.color for frame in make_fake_recording(FakeGripper(count=3))]
     write_video(next((folder / "videos").rglob("episode_000000.mp4")), pictures, rate=10)
 
 
@@ -361,7 +361,7 @@ def test_rows_pictures_and_numbers_that_disagree_are_refused_in_one_line(damage,
 def test_an_episode_that_begins_between_two_frames_of_its_video_is_refused(share, tmp_path, capsys):
     from lerobot_fakes import CAMERA, FPS, write_dataset
 
-    pictures = [frame.color for frame in make_simulated(FakeGripper(count=6))]
+    pictures = [frame.color for frame in make_fake_recording(FakeGripper(count=6))]
     write_dataset(tmp_path / "noise", [pictures[:3], pictures[:3]], "v3.0")
     path = next((tmp_path / "noise/meta/episodes").rglob("*.parquet"))
     table, name = parquet.read_table(path), f"videos/{CAMERA}/from_timestamp"

@@ -6,7 +6,7 @@ from importlib import resources
 import numpy as np
 import pytest
 from eval_fakes import FakeEstimator, FakeJaw, evaluate_recording
-from rgbd_fakes import FakeDetector, FakeGripper, make_simulated
+from rgbd_fakes import FakeDetector, FakeGripper, make_fake_recording
 
 from finforce_contact.loop import GivenContact
 from finforce_eval.cli.main import main, parse
@@ -26,7 +26,7 @@ def asked(monkeypatch):
 
     def build(scenario, seed, camera, *, finger, depth_step):
         calls.append((scenario, seed, camera, finger, depth_step))
-        return make_simulated(seed=seed)
+        return make_fake_recording(seed=seed)
 
     monkeypatch.setattr("finforce_eval.cli.twin.build_simulated_recording", build)
     return calls
@@ -143,7 +143,7 @@ def evaluation(tmp_path_factory):
     """A run from images whose estimate follows the truth one image late."""
     gripper = FakeGripper(count=40, onset=20)
     recording = read_recording(
-        write_simulated_recording(make_simulated(gripper), tmp_path_factory.mktemp("bags") / "twin")
+        write_simulated_recording(make_fake_recording(gripper), tmp_path_factory.mktemp("bags") / "twin")
     )
     found = detect_keypoints(recording, FakeDetector(recording))
     late = np.vstack((np.zeros((1, 3)), recording.truth("left").force[:-1]))
@@ -173,7 +173,7 @@ def test_the_table_shows_them_and_says_what_they_are(evaluation):
 
 def test_the_detector_of_two_jaws_is_timed_once(tmp_path):
     gripper = FakeGripper(sides=("left", "right"))
-    recording = read_recording(write_simulated_recording(make_simulated(gripper), tmp_path / "both"))
+    recording = read_recording(write_simulated_recording(make_fake_recording(gripper), tmp_path / "both"))
     found = detect_keypoints(recording, FakeDetector(recording))
     results = [
         evaluate_recording(

@@ -75,7 +75,7 @@ IMAGES = 8
 
 
 @dataclass(frozen=True)
-class StillFootage:
+class StillRecording:
     """The first images of a scene, and no word of a jaw but what they show."""
 
     simulated: SimulatedRecording
@@ -95,7 +95,7 @@ def still(tmp_path_factory):
     """A recording of open jaws at rest."""
     folder = tmp_path_factory.mktemp("still") / "still"
     return write_simulated_recording(
-        StillFootage(build_simulated_recording(build_scenario("grasp_cylinder"), 3)), folder
+        StillRecording(build_simulated_recording(build_scenario("grasp_cylinder"), 3)), folder
     )
 
 

@@ -100,8 +100,8 @@ def true_jaw(state, side, T_gripper_camera=BENCH_CAMERA, hidden=1):
     )
 
 
-def make_simulated(gripper=None, simulated_camera=None, seed=0):
-    """Footage of 64 x 48 pixels."""
+def make_fake_recording(gripper=None, simulated_camera=None, seed=0):
+    """A simulated recording of 64 x 48 pixels."""
     gripper = gripper or FakeGripper()
     simulated_camera = simulated_camera or FakeCamera()
     simulated_camera.mesh = MESH if gripper.has_object else None

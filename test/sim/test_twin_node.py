@@ -10,7 +10,7 @@ from geometry_msgs.msg import PoseStamped, WrenchStamped
 from node_fakes import ros_domain
 from rclpy.executors import ExternalShutdownException
 from rclpy.parameter import Parameter
-from rgbd_fakes import FakeGripper, FakeLens, make_simulated
+from rgbd_fakes import FakeGripper, FakeLens, make_fake_recording
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from std_msgs.msg import String
 
@@ -47,7 +47,7 @@ def probe():
 
 def start(probe, simulated=None, **parameters):
     overrides = [Parameter(name, value=value) for name, value in parameters.items()]
-    simulated = simulated or make_simulated(FakeGripper(count=6))
+    simulated = simulated or make_fake_recording(FakeGripper(count=6))
     node = TwinCameraNode(lambda *_, **__: simulated, context=probe.context, parameter_overrides=overrides)
     probe.spinner.add_node(node)
     return node
@@ -64,7 +64,7 @@ def test_a_scene_is_published_once_as_it_was_rendered(probe):
     node = start(probe, loop=False)
     play(probe, node)
     probe.wait_for(lambda: len(probe.got[COLOR]) == 6 and node.is_over)
-    frames = list(make_simulated(FakeGripper(count=6)))
+    frames = list(make_fake_recording(FakeGripper(count=6)))
     for frame, color, depth in zip(frames, probe.got[COLOR], probe.got[DEPTH], strict=True):
         np.testing.assert_array_equal(np.frombuffer(color.data, np.uint8).reshape(48, 64, 3), frame.color)
         np.testing.assert_array_equal(np.frombuffer(depth.data, "<u2").reshape(48, 64), encode_depth(frame.depth))
