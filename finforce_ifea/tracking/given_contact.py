@@ -28,6 +28,10 @@ _QUIET_SIGMA = 3.0
 # Tolerance of the Newton steps, relative to the model's reach [-].
 _SETTLED = 5e-3
 _FARTHEST_MOVE = 0.2
+# Weight of an image in the fraction of the last images in which a key point was seen [-].
+_PRESENCE_GAIN = 0.1
+# Fraction below which a key point is not used [-]: hidden points are detected now and then, on what hides them.
+_LEAST_PRESENCE = 0.5
 # Median of the squared distance over its variance for a normal distribution in three axes [-].
 _MEDIAN_SQUARE = 2.4
 
@@ -71,6 +75,7 @@ class GivenContactTracker:
         """Restart unloaded, with the middle candidate."""
         self.q = np.zeros(self.mechanics.model.size)
         self._watch.reset()
+        self._presence: NDArray | None = None
         self._candidate = len(self.jaw.candidates) // 2
         self._heights = (float(self.jaw.candidates[self._candidate, 2]),)
         self._weights: NDArray | None = np.ones(1)
@@ -143,6 +148,7 @@ class GivenContactTracker:
             UnobservableError: They do not tell the force.
         """
         targets = points - tare.offsets
+        targets[self._follow_presence(np.isfinite(points[:, 0])) < _LEAST_PRESENCE] = np.nan
         known = np.isfinite(targets[:, 0])
         noise = tare.point_noise(observation.stddev)
         scatter = np.trace(noise.plane, axis1=1, axis2=2) / 2.0 / noise.noise_ratio
@@ -162,6 +168,12 @@ class GivenContactTracker:
             return None
         self.q = result.q
         return self._report(result, targets, weights, variance)
+
+    def _follow_presence(self, seen: NDArray) -> NDArray:
+        """Return the fraction of the last images in which each key point was seen (K,)."""
+        before = seen.astype(float) if self._presence is None else self._presence
+        self._presence = before + _PRESENCE_GAIN * (seen - before)
+        return self._presence
 
     def _solve(self, targets: NDArray, precision: NDArray | None) -> InverseResult:
         steps = 1 if self.paper else self.settings.iterations

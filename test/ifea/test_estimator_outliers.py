@@ -85,16 +85,26 @@ def test_points_of_low_likelihood_may_be_anywhere():
     assert not any(solution.keypoints_used[[3, 4, 10]].any() for solution in second[80:])
 
 
-def test_points_that_appear_once_in_twenty_frames_count_for_little():
+def show_now_and_then():
+    """A recording whose points 3, 4 and 10 are hidden, and the same where they appear once in twenty images."""
     hidden = pressed().changed(range(70, len(STEPS)), lambda _, likelihood: likelihood.put([3, 4, 10], 0.1))
 
     def show(points, likelihood):
         points[[3, 4, 10]] = BENCH.keypoints[[3, 4, 10]] + [0.002, 0.003, 0.0]
         likelihood[[3, 4, 10]] = 0.95
 
-    flickering = hidden.changed(range(85, len(STEPS), 20), show)
-    usual, found = (np.array([each.force for each in run(steps, solver="frame")]) for steps in (hidden, flickering))
+    return hidden, hidden.changed(range(85, len(STEPS), 20), show)
+
+
+def test_points_that_appear_once_in_twenty_frames_count_for_little():
+    usual, found = (np.array([each.force for each in run(steps, solver="frame")]) for steps in show_now_and_then())
     assert np.nanmax(np.abs(found - usual)) < 0.01
+
+
+def test_points_that_appear_once_in_twenty_frames_are_not_believed_at_a_given_contact():
+    given = Contact(points=pressed().contact.points, weights=np.ones(1), free=False)
+    hidden, flickering = (run(steps, contact=given, solver="frame") for steps in show_now_and_then())
+    assert_identical(hidden, flickering)
 
 
 def test_holes_in_the_depth_image_are_bridged():
