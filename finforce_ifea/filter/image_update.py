@@ -7,7 +7,7 @@ import numpy as np
 from finforce.compiled import njit
 from finforce.kalman import MotionNoise, expect_position, find_mean, find_variance, predict
 from finforce.kalman import correct as correct_track
-from finforce_ifea.contact_mechanics.indenter import find_first_touch
+from finforce_ifea.contact_mechanics.indenter import CELL, find_first_touch
 from finforce_ifea.filter.filter import Posterior, reduce_covariance
 from finforce_ifea.filter.friction_path import expect_coefficient, find_held, preview
 from finforce_ifea.filter.jump import (
@@ -91,6 +91,10 @@ _SETTLED = 0.1e-3
 _SETTLED_CORRECTION = 0.05
 # Fraction of a full step below which its remainder is ignored [-]: the key points cannot decide between two corners.
 _UNDECIDED = 0.2
+# Standard deviation of the traction ratio by the inclination of an edge that hardly touches [-].
+_INCLINED = 0.5
+# Depth up to which an edge is rounded [m]: half a cell of its field.
+_EDGE = 0.5 * CELL
 # Weight from which a key point agrees [-].
 _AGREES = 0.25
 # Fraction of key points that must agree [-].
@@ -255,7 +259,9 @@ def finish(state, image, P, results, friction, filtered, made, where, place, wat
         s.x[i], s.x_model[i] = at_place[i], x_model[i]
         s.pressure_point[i], s.pressure_location[i] = point[i], location[i]
     s.depth, s.extrapolation, s.sound = depth, extrapolation, smallest_det > 0.0
-    spread = doubt**2 + find_held(packed, weights) * pull_stddev**2
+    # an edge is rounded by more than it sinks in at first
+    inclined = _INCLINED * max(1.0 - depth / _EDGE, 0.0) if expectation[()].has_corners else 0.0
+    spread = doubt**2 + inclined**2 + find_held(packed, weights) * pull_stddev**2
     shift = smooth + x_model[0] - at_place[0]
     smoothing = posterior.own, lessened, spread_common(measured.H, posterior.A, posterior.L, COMMON * shared)
     read_out(state, force, modes, x, log_weights, P, shift, smoothing, at, ratios, ratio, spread)

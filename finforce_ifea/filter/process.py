@@ -24,7 +24,9 @@ _OPTIONS = {"cache": True, "error_model": "numpy"}
 FREE_DEPTH = 2e-3
 # Correlation time of the error of an object's pose [s]: trackers see an object from one side.
 OBJECT_TIME = 10.0
-# Standard deviation of the mechanics' error at a key point in one shape, relative to the displacement [-].
+# Standard deviation of the mechanics' error at a key point, at least [m].
+MODEL_FLOOR = 0.02e-3
+# The same in one shape, relative to the displacement [-].
 MODEL_SHAPE = 0.004
 # The same in all shapes [-]: the default mesh is within 1 % of an independent program.
 MODEL_RELATIVE = 0.01
@@ -104,7 +106,7 @@ def expect_state(expected, offset_variance, displacement):
     V[TRACTION], V[APPARENT] = expected.traction_variance, expected.apparent_variance
     V[CAMERA_X : CAMERA_STRETCH + 1] = expected.camera_variance
     for k in range(count):
-        own = offset_variance[k] + (MODEL_SHAPE * displacement[k]) ** 2
+        own = offset_variance[k] + MODEL_FLOOR**2 + (MODEL_SHAPE * displacement[k]) ** 2
         V[SHARED + 2 * k] = V[SHARED + 2 * k + 1] = own
     V[SHARED + 2 * count :] = MODEL_RELATIVE**2
     return m, V

@@ -53,7 +53,7 @@ class FakeDetector:
         self.name, self.sha256 = "fake", "ab12"
         self.watch = ImageWatch()
 
-    def look(self, image):
+    def detect_color(self, image):
         self.looks.append(image)
 
     def detect(self, image):
