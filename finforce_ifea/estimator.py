@@ -399,8 +399,14 @@ class ForceEstimator:
         extrapolated = _EXTRAPOLATED * state["extrapolation"]
         error = hypot(self._force_error, self._scale_error, state["location_error"], extrapolated)
         vectors, dt = np.empty((7, 3)), self._pass_time(state["force"])
-        spread, errors = self._relaxation_stddev.overstress, (error, self._modulus_error)
-        magnitude, stddev = compute_force(state, self._relaxation.packed, spread, dt, errors, vectors)
+        magnitude, stddev = compute_force(
+            state,
+            self._relaxation.packed,
+            self._relaxation_stddev.overstress,
+            dt,
+            (error, self._modulus_error),
+            vectors,
+        )
         force, torque, force_stddev, torque_stddev, point, location, normal = vectors
         return Solution(
             stamp=self._stamp,

@@ -9,7 +9,7 @@ from dataclasses import replace
 from statistics import median
 
 from finforce_driver.errors import BackOffError, GraspError, UnseenForceError
-from finforce_driver.grasp.force_monitor import NOISE, ForceInput, ForceMonitor, ForceSample, JawPosition, TouchSample
+from finforce_driver.grasp.force_monitor import NOISE, ForceFilter, ForceMonitor, ForceSample, JawPosition, TouchSample
 from finforce_driver.grasp.plan import DEVIATIONS, FRICTION, MOTOR_MARGIN, GraspPlan
 from finforce_driver.grasp.probe import FrictionProbe
 from finforce_driver.settings import GraspGoal, GraspSettings, GripperSettings
@@ -60,7 +60,7 @@ class ForceGrasp:
         self._excess = 0.0  # of the camera's force above the motor's [N], more than friction explains
         self.goal, self.settings = goal, settings or GraspSettings()
         self.set_force = self.settings.check_force(goal.force)
-        self._feed = ForceInput(self.settings.stale_after)
+        self._feed = ForceFilter(self.settings.stale_after)
         self._load = ForceMonitor(self.settings, min(_ONSET_FORCE, 0.5 * goal.force))
         self._position = JawPosition(opening=math.nan, resting=False)
         self._plan = GraspPlan(goal, self.settings, self._load, self._feed, self._jaws, resolution)

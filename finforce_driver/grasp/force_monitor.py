@@ -227,7 +227,7 @@ _SOONEST = 0.1  # of the median latency: a pipeline that others have left alone 
 _KNOWN = 8  # samples after which the latency is known
 
 
-class ForceInput:
+class ForceFilter:
     """Admits each sample once, in order and with plausible times; measures latency and period.
 
     Args:

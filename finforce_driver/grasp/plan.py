@@ -15,7 +15,7 @@ import math
 from collections.abc import Callable
 
 from finforce_driver.errors import GraspError
-from finforce_driver.grasp.force_monitor import ForceInput, ForceMonitor, JawPosition
+from finforce_driver.grasp.force_monitor import ForceFilter, ForceMonitor, JawPosition
 from finforce_driver.settings import GraspGoal, GraspSettings, GripperSettings
 from finforce_driver.state import GripperState
 
@@ -70,7 +70,7 @@ class GraspPlan:
         goal: GraspGoal,
         settings: GraspSettings,
         load: ForceMonitor,
-        feed: ForceInput,
+        feed: ForceFilter,
         jaws: GripperSettings,
         step: float | None = None,
     ) -> None:

@@ -123,11 +123,8 @@ def observe(points, seen, positions, motions, at, ratio, level):
         k = seen[i]
         point, p = points[k], positions[k]
         lateral = point.measured[1] - p[1]
-        square[i] = (
-            lateral
-            * lateral
-            / (level * point.width_variance / point.noise_ratio + point.offset_variance + LATERAL_ERROR**2)
-        )
+        noise = level * point.width_variance / point.noise_ratio
+        square[i] = lateral * lateral / (noise + point.offset_variance + LATERAL_ERROR**2)
         size = np.hypot(p[0] - point.rest[0], p[2] - point.rest[2])
         for a in range(2):
             row, motion = 2 * i + a, motions[k, 2 * a]

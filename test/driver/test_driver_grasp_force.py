@@ -13,7 +13,7 @@ from finforce_driver.errors import BackOffError, GraspError, TargetError
 from finforce_driver.grasp.controller import ForceGrasp, check_force_value
 from finforce_driver.grasp.force_monitor import (
     LEAST_STIFFNESS,
-    ForceInput,
+    ForceFilter,
     ForceModel,
     ForceMonitor,
     ForceSample,
@@ -106,7 +106,7 @@ def sample(stamp, *, latency=0.06, force=1.0):
 
 
 def fed(count=20, latency=0.06):
-    feed = ForceInput(0.25)
+    feed = ForceFilter(0.25)
     for index in range(count):
         assert feed.admit(sample(index / 30.0, latency=latency))
     return feed
@@ -135,11 +135,11 @@ def test_latency_and_period_are_medians():
     assert feed.latency == pytest.approx(0.06)
     assert feed.period == pytest.approx(1 / 30)
     assert feed.age(1.0) == pytest.approx(1.0 - 20 / 30)
-    assert ForceInput(0.25).age(1.0) == math.inf
+    assert ForceFilter(0.25).age(1.0) == math.inf
 
 
 def test_touch_is_believed_while_it_is_fresh():
-    feed = ForceInput(0.25)
+    feed = ForceFilter(0.25)
     assert feed.admit_touch(TouchSample(stamp=1.0, touching=True), 1.1)
     assert feed.touching(1.2)
     assert feed.touching(1.3) is None
@@ -202,7 +202,7 @@ def test_a_force_that_noise_makes_negative_is_none():
 def plan(closed_opening=0.0):
     """A plan for jaws that have had no command yet."""
     limits = GraspSettings()
-    watch, feed = ForceMonitor(limits, 0.25), ForceInput(limits.stale_after)
+    watch, feed = ForceMonitor(limits, 0.25), ForceFilter(limits.stale_after)
     return GraspPlan(GraspGoal(force=1.0), limits, watch, feed, GripperSettings(closed_opening=closed_opening), STEP)
 
 
