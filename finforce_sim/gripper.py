@@ -112,12 +112,12 @@ class TwinGripper(Assembly):
             posture, weight = planned, weights[index]
             if held is not None and not is_same:
                 shapes = held.follow(self.setting_of(posture, weight))
-            x = held.x if held is not None else 0.0
+            x, carried = (held.x, held.carried) if held is not None else (0.0, 0.0)
             yield TwinState(
                 stamp=float(stamp),
                 phase=script.phases[index],
                 jaws={side: self._jaw_state(side, posture, shapes[side], wrenches[side]) for side in self.jaws},
-                T_gripper_object=self.object_pose(posture, x),
+                T_gripper_object=self.object_pose(posture, x, carried),
                 gravity=script.gravity[index],
             )
 
@@ -165,7 +165,7 @@ class PressedGrasp(Assembly):
 
     def _solve(self, step: float) -> None:
         """Solve grasps from first touch on, at most `step` [m] of closing apart; without an object the jaws at rest."""
-        held, solved, centres = self.hold_object(), [], []
+        held, solved, places = self.hold_object(), [], []
         closings = np.linspace(0.0, self._reach, int(np.ceil(self._reach / step)) + 1) if held else np.zeros(1)
         for closing in closings:
             try:
@@ -175,8 +175,8 @@ class PressedGrasp(Assembly):
                 if len(solved) < 2:
                     raise
                 break
-            centres.append(held.x if held else 0.0)
-        self._closings, self._centres = closings[: len(solved)], np.array(centres)
+            places.append((held.x, held.carried) if held else (0.0, 0.0))
+        self._closings, self._places = closings[: len(solved)], np.array(places)
         self._tables = {side: _stack_shapes([shapes[side] for shapes in solved]) for side in self.jaws}
 
     def relaxation(self) -> dict[str, RelaxedWrench]:
@@ -231,7 +231,7 @@ class PressedGrasp(Assembly):
     def pose_at(self, opening: float) -> NDArray | None:
         """Return T_gripper_object (4, 4) at an opening [m]; None without an object."""
         closing = self.closing_at(opening)
-        return self.object_pose(Posture(closing=closing), self._place_object(closing))
+        return self.object_pose(Posture(closing=closing), *self._place_object(closing))
 
     def _find_growth(self, opening: float) -> float:
         """Return by which factor forces exceed the table's last ones; 0 without contact, for that has no force."""
@@ -239,12 +239,13 @@ class PressedGrasp(Assembly):
             return 0.0
         return 1.0 + JAMMED * max(self.least_opening - opening, 0.0) / max(self._forces[-1], 1e-9)
 
-    def _place_object(self, closing: float) -> float:
-        """Return the object's x [m]: solved in contact; before, where it lay unless a jaw has pushed it."""
+    def _place_object(self, closing: float) -> tuple[float, float]:
+        """Return x and `carried` [m]: solved in contact; before, where the object lay unless a jaw has pushed it."""
         if closing >= 0.0:
-            return float(np.interp(closing, self._closings, self._centres))
-        pushed = self._centres[0]
-        return float(np.clip(self.scenario.offset, pushed + closing, pushed - closing))
+            x, carried = (float(np.interp(closing, self._closings, places)) for places in self._places.T)
+            return x, carried
+        pushed = self._places[0, 0]
+        return float(np.clip(self.scenario.offset, pushed + closing, pushed - closing)), 0.0
 
     def _read(self, rows: NDArray, opening: float) -> NDArray:
         """Return what lies between two rows of a table (m, ...) at an opening [m]."""

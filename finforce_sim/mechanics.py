@@ -148,6 +148,12 @@ class PressedJaw:
         """Return the force of the pressure alone (3,) [N] at unknowns q (size,)."""
         return self._press(q, load).forces.sum(0)
 
+    def find_carry(self, before: NDArray, q: NDArray, load: Load) -> NDArray:
+        """Return the pressure times the surface's motion along z [N m] since unknowns (size,), and the pressure [N]."""
+        size = np.linalg.norm(self._press(q, load).forces, axis=1)
+        before, now = (self.model.positions(self.surface.probe, unknowns)[:, 2] for unknowns in (before, q))
+        return np.array([size @ (now - before), size.sum()])
+
     def linearize(self, q: NDArray, load: Load) -> JawStep:
         """Return the Newton step of f_int(q) = J^T (p(J q, origin) + pull shares) at unknowns q (size,).
 
@@ -264,9 +270,11 @@ class HeldObject:
     """An object between the jaws, free along x, or before a single jaw at x = 0; height and tilt are given.
 
     The pressure follows from the shapes and has no friction. What it and the weight leave along y and z is taken up by
-    the jaws' surfaces as a pull, each in proportion to its pressure, unless a hand guides the object.
+    the jaws' surfaces as a pull, each in proportion to its pressure, unless a hand guides the object. The surfaces that
+    hold it carry it along the fingers as these bend.
 
     Attributes:
+        carried: distance along z by which the jaws have carried the object [m].
         creep: speed at which the object slides along z [m/s]: what the pulls have beyond the friction, over the drag.
     """
 
@@ -281,7 +289,7 @@ class HeldObject:
             drag: of a sliding object [N s/m]; 0: it would fall, which is an error.
         """
         self._jaws, self._guided, self._is_free = jaws, guided, len(jaws) > 1
-        self._friction, self._drag, self.creep = friction, drag, 0.0
+        self._friction, self._drag, self.creep, self.carried = friction, drag, 0.0, 0.0
         rest = {side: np.zeros(jaw.model.size) for side, jaw in jaws.items()}
         for side, jaw in jaws.items():
             jaw.keep(rest[side], None)
@@ -303,10 +311,10 @@ class HeldObject:
         start, reached, step = self._setting or setting, 0.0, 1.0
         while reached < 1.0:
             share = min(reached + step, 1.0)
-            balance = self._solve(start.between(setting, share))
+            balance, carried = self._carry(start.between(setting, share))
             if balance is not None:
                 self._before = self._balance if step == 1.0 else None
-                self._balance, reached = balance, share
+                self._balance, self.carried, reached = balance, carried, share
                 for side, jaw in self._jaws.items():
                     jaw.keep(balance.q[side], balance.loads[side])
                 continue
@@ -320,12 +328,37 @@ class HeldObject:
         q, loads = self._balance.q, self._balance.loads
         return {side: jaw.describe(q[side], loads[side]) for side, jaw in self._jaws.items()}
 
-    def _solve(self, setting: GraspSetting) -> _Balance | None:
-        """Return the balance at a setting, None when Newton's method does not find it."""
+    def _carry(self, setting: GraspSetting) -> tuple[_Balance | None, float]:
+        """Return the balance at a setting, None where none is found, and how far the object is carried [m]."""
+        balance = self._solve(setting, self.carried)
+        carried = self._find_carry(balance)
+        if carried != self.carried:
+            balance = self._solve(setting, carried, balance)
+            carried = self._find_carry(balance)
+        return balance, carried
+
+    def _find_carry(self, balance: _Balance | None) -> float:
+        """Return how far the object is carried [m] where the jaws go on to another balance."""
+        loads = [] if balance is None else [*self._balance.loads.values(), *balance.loads.values()]
+        if self._guided or not self._is_free or not loads or None in loads:
+            return self.carried
+        found = [jaw.find_carry(self._balance.q[s], balance.q[s], balance.loads[s]) for s, jaw in self._jaws.items()]
+        moved, pressure = np.sum(found, axis=0)
+        return self.carried + (float(moved / pressure) if pressure > 0.0 else 0.0)
+
+    def _solve(self, setting: GraspSetting, carried: float, near: _Balance | None = None) -> _Balance | None:
+        """Return the balance of an object that is carried [m]; None when Newton's method does not find it.
+
+        Args:
+            setting: of the jaws, and where the object would lie without being carried.
+            carried: along z [m].
+            near: where the search begins; None: on as the jaws went.
+        """
+        setting = replace(setting, height=setting.height + carried)
         gaps = {side: self._gap(side, setting) for side in self._jaws}
         if sum(gaps.values()) >= 0.0:
             return self._release(setting, gaps)
-        q, x = self._predict(gaps)
+        q, x = self._predict(gaps) if near is None else (dict(near.q), near.x)
         for iteration in range(_ITERATIONS):
             loads = self._find_loads(q, x, setting)
             steps = {side: jaw.linearize(q[side], loads[side]) for side, jaw in self._jaws.items()}
@@ -501,13 +534,13 @@ class Assembly:
         origin = self.touch_origin - posture.closing
         return -origin if side == "left" else origin
 
-    def object_pose(self, posture: Posture, x: float) -> NDArray | None:
-        """Return T_gripper_object (4, 4) of an object at x [m] between two jaws; None without an object."""
+    def object_pose(self, posture: Posture, x: float, carried: float) -> NDArray | None:
+        """Return T_gripper_object (4, 4) of an object at x [m] between two jaws, see `HeldObject`; None without one."""
         if self._object is None:
             return None
         if self.scenario.camera == "bench":
             x = BENCH_ORIGIN_X + self.touch_origin - posture.closing
-        position = np.array([x, self.scenario.shift, self.scenario.height + posture.slide])
+        position = np.array([x, self.scenario.shift, self.scenario.height + posture.slide + carried])
         return self._object.pose_at(position, posture.rock)
 
     def _meet_object(self) -> float:

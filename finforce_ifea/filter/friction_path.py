@@ -12,6 +12,7 @@ from finforce.compiled import njit
 from finforce.kalman import Track, find_variance
 from finforce_ifea.contact_mechanics.friction import Coefficient
 from finforce_ifea.contact_mechanics.pressed_jaw import RigidContact
+from finforce_ifea.filter.carried_object import CarriedObject
 from finforce_ifea.filter.readout import LARGEST_RATIO
 from finforce_ifea.filter.slip_path import PathState, SlipPath, find_turn, turn_path
 from finforce_ifea.filter.state import DEPTH, HEIGHT
@@ -68,7 +69,7 @@ class _Mark(NamedTuple):
 class TractionHypotheses:
     """Coefficients of friction on a grid, and an object that only the jaws hold.
 
-    An object that only the jaws hold does not move along the finger: friction balances the inclination of their faces.
+    An object that only the jaws hold does not slide along the finger: friction balances the inclination of their faces.
 
     Attributes:
         mu: coefficients of friction (M,) [-].
@@ -77,6 +78,7 @@ class TractionHypotheses:
         motion: of the object along the path since it was last asked for [m].
         stddev: of the traction ratio by errors of the path [-].
         unweighed: standard deviation of the coefficient of friction that no hypothesis stands for [-].
+        carried: motion of an object that only the jaws hold.
     """
 
     def __init__(self, friction: Coefficient, held: str) -> None:
@@ -92,7 +94,7 @@ class TractionHypotheses:
             self._cell = float(self.mu[1] - self.mu[0])
             prior = np.exp(-0.5 * ((self.mu - mean) / stddev) ** 2) + 1e-300
         self._prior = prior / prior.sum()
-        self._path = SlipPath(self.mu)
+        self._path, self.carried = SlipPath(self.mu), CarriedObject()
         self.reset()
 
     def reset(self) -> None:
@@ -104,6 +106,7 @@ class TractionHypotheses:
     def leave(self) -> None:
         """Reset the path, as after a release."""
         self._path.reset()
+        self.carried.leave()
         self._anchor: NDArray | None = None
         self._anchor_stddev, self._direction, self.stddev = _TOUCH_STDDEV, 1.0, 0.0
         self._marks: list[_Mark] = []
@@ -152,18 +155,19 @@ class TractionHypotheses:
         return _share(weights, len(self.mu))
 
     def part(self, parting: float, *, shows_lifts: bool) -> None:
-        """Update the odds of "held" by a motion of the gripper, see `WristMove`."""
+        """Update the odds of "held" by a motion of the gripper, see `WristMove`; those by the object's end with it."""
         self._parted += parting
         self._is_at_rest = shows_lifts
 
     def bound_held(self, log_weights: NDArray) -> NDArray:
-        """Return the log weights (N,) with the odds of "held" by motion and by the friction it needs.
+        """Return the log weights (N,) with the odds of "held" by motions and by the friction it needs.
 
         It bears a ratio with P(mu > |kappa|).
         """
         if not 0.0 < self._held < 1.0:
             return log_weights
         parting = min(self._parted + (_AT_REST if self._is_at_rest else 0.0), _PARTED)
+        parting += 0.0 if self._parted else self.carried.log_odds
         step, known = max(self._cell, 2.0 * self.unweighed), (self._bears, parting - self._parting)
         weighed, self._bears = _bound_held(log_weights, self.mu, self._prior, step, self.upright, known)
         self._parting = parting
@@ -177,6 +181,7 @@ class TractionHypotheses:
     def shift(self, change: float) -> None:
         """Shift the depth by a change [m]."""
         if self._anchor is not None:
+            self.carried.shift(change)
             self._anchor[:, 0] += change
             for mark in self._marks:
                 mark.places[:, 0] += change
@@ -206,6 +211,7 @@ class TractionHypotheses:
             if _is_chance(deeper, self._direction, stddev, self._anchor_stddev, track.rests):
                 if stddev < _STOPPED * self._anchor_stddev:
                     self._take_back(contact, q, x, places[: len(self.mu)], own)
+                    self._carry(own)
                     self._anchor_stddev = stddev
                 return
             if abs(deeper) < _SHORTEST:
@@ -219,7 +225,12 @@ class TractionHypotheses:
         self._anchor = self._anchor + motion
         self.motion += abs(deeper)
         self._path.move(contact, q, x, motion)
+        self._carry(own)
         self.stddev = _find_stddev(self._path.ratios, self.mu, own, self._path.rates, self._path.shares, stddev)
+
+    def _carry(self, own: NDArray) -> None:
+        """Carry the object to the end of the path, for weights of the coefficients (M,)."""
+        self.carried.follow(float(own @ self._anchor[:, 0]), self.upright, self._path.rates, self._path.shares)
 
     def _take_back(self, contact: RigidContact, q: NDArray, x: NDArray, places: NDArray, own: NDArray) -> None:
         """Compute the path again from its last mark before the positions (M, 2); see `follow` for the arguments."""

@@ -111,10 +111,16 @@ class SlipPath:
 @njit(**_OPTIONS)
 def find_turn(rates, shares, ratio):
     """Return the size of the change of a traction ratio by depth [1/m] while all of the contact sticks."""
+    return abs(find_rate(rates, shares, ratio, 1.0, 0.0))
+
+
+@njit(**_OPTIONS)
+def find_rate(rates, shares, ratio, depth, height):
+    """Return the change of a traction ratio by a motion in depth and height [m] while all of the contact sticks."""
     turn = 0.0
     for h in range(2):
-        turn += shares[h] * _find_rate(rates[_BOTH, h], ratio, 1.0, 0.0)
-    return abs(turn)
+        turn += shares[h] * _find_rate(rates[_BOTH, h], ratio, depth, height)
+    return turn
 
 
 @njit(**_OPTIONS)

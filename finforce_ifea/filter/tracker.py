@@ -341,6 +341,7 @@ class ContactTracker:
         self._is_apart = bool(pressed_by_pose < -APART_SIGMAS * contact.outline.stddev[0])
         height = float(expected.mean[1])
         self._given = None
+        self._search.hypotheses.carried.see(height, float(contact.outline.stddev[1]))
         is_off = abs(self._search.state["x"][HEIGHT] - height) > _FARTHEST_HEIGHT * self.settings.height_stddev
         is_same = isinstance(before, OutlineIndenter) and after.resembles(before)
         if isinstance(before, OutlineIndenter) and not is_same:

@@ -170,6 +170,8 @@ RULES = (
           "handed", "lifted", "rubbed"),
     _rule("held by the jaws", "`_HELD`", "objects that only the jaws hold", {_PATH + "_HELD": 0.0},
           "held", "lifted", "handed"),
+    _rule("object carried along", "`CarriedObject`", "objects that the bending jaws move show that only they hold them",
+          {_FILTER + "carried_object:_MOVED": 1e6}, "moved", "held"),
     _rule("friction limit", "`bound_held`", "objects that friction cannot hold",
           {_PATH + "TractionHypotheses.bound_held": lambda self, weights: weights}, "fixed", "held"),
     _rule("step halving at corners", "`has_corners`", "objects that rock",

@@ -66,12 +66,14 @@ class Press:
         states: of the contact: depth below first touch [m], shape, height [m] (n, 3).
         points: key points (n, K, 3) [m].
         forces: on the jaw (n, 3) [N].
+        carried: motion along the finger of the surface that touches (n,) [m].
         indenter: the object.
     """
 
     states: NDArray
     points: NDArray
     forces: NDArray
+    carried: NDArray
     indenter: Indenter = field(default_factory=RoundIndenter)
 
 
@@ -110,7 +112,7 @@ def press(
     contact.set_indenter(indenter)
     states = np.stack([depths, np.full(len(depths), shape), np.broadcast_to(height, depths.shape)], axis=1)
     probe, rest = contact.model.attach(bench.jaw.keypoints, KEYPOINT_DISTANCE), np.zeros(contact.model.size)
-    q, before, traction, found = rest, states[0], FRICTIONLESS, []
+    q, before, traction, found, carried = rest, states[0], FRICTIONLESS, [], 0.0
     for i, state in enumerate(states):
         count = max(1, int(np.ceil(np.abs(state - before)[[0, 2]].max() / _STEP - 1e-9)))
         for x in np.linspace(before, state, count + 1)[1:] if found else [state]:
@@ -119,13 +121,16 @@ def press(
             if x[0] <= 0.0:
                 q, force, traction = rest, np.zeros(3), FRICTIONLESS
                 continue
-            traction = traction._replace(moved=moved)
+            traction, last = traction._replace(moved=moved), contact.place_points(q)
             q, force, traction = settle(contact, q, at, traction, None if along is None else float(along[i]))
+            points = contact.place_points(q)
+            pressure = np.linalg.norm(contact.press(points, at, traction).forces, axis=1)
+            carried += float(pressure @ (points - last)[:, 2] / pressure.sum())
             if along is None and friction > 0.0:
                 traction = keep_shear(contact, q, at, traction, friction)
-        found.append((contact.model.positions(probe, q), force))
-    points, forces = (np.stack(each) for each in zip(*found, strict=True))
-    return Press(states=states, points=points, forces=forces, indenter=indenter)
+        found.append((contact.model.positions(probe, q), force, carried))
+    points, forces, motions = (np.stack(each) for each in zip(*found, strict=True))
+    return Press(states=states, points=points, forces=forces, carried=motions, indenter=indenter)
 
 
 class Settled(NamedTuple):
@@ -387,6 +392,15 @@ def build_held(bench: Bench, random: np.random.Generator) -> Scene:
     return film(bench, pressed, told, random, friction=0.45, friction_stddev=0.25, **_HELD)
 
 
+def build_moved(bench: Bench, random: np.random.Generator) -> Scene:
+    """Hold an object between two jaws alone, which carry it along the finger as they bend; its pose shows that."""
+    depths, polygon = ramp(8, hold=60), circle(_RADIUS)
+    told = {"indenter": OutlineIndenter((polygon,)), "shape": 0.0, "along": np.zeros(len(depths))}
+    pressed = press(bench, depths, height=0.03 + press(bench, depths, height=0.03, **told).carried, **told)
+    contacts = tell_outline(bench, pressed, random, polygon)
+    return film(bench, pressed, contacts, random, friction=0.45, friction_stddev=0.25, **_HELD)
+
+
 def build_fixed(bench: Bench, random: np.random.Generator) -> Scene:
     """Press an object of no friction by two jaws, low down, that something else holds."""
     pressed = press(bench, ramp(5, 3, hold=60), height=0.025)
@@ -435,7 +449,7 @@ def build_next(bench: Bench, random: np.random.Generator) -> Scene:
     first = press(bench, ramp(5, 0, hold=30), shape=22e-3, height=0.022)
     then = press(bench, ramp(5, hold=60)[_TARE + _REST :], shape=5e-3, height=0.027)
     joined = {name: np.concatenate([getattr(each, name) for each in (first, then)])
-              for name in ("states", "points", "forces")}  # fmt: skip
+              for name in ("states", "points", "forces", "carried")}  # fmt: skip
     pressed = Press(**joined)
     return film(bench, pressed, tell_height(bench, pressed, -2.5e-3), random, height_stddev=2.5e-3)
 

@@ -215,14 +215,15 @@ def test_too_heavy_an_object_with_drag_slides_towards_the_tips_and_rests_where_i
     _, states = play("slipping")
     height = np.array([state.T_gripper_object[2, 3] for state in states])
     speed = RATE * np.diff(height)
-    assert speed.min() > -1e-9
+    assert speed[[net_of(state)[2] > 0.5 for state in states[1:]]].min() > -1e-4
     assert 3e-3 < speed.max() < 0.03
     slides = np.flatnonzero(speed > 1e-4)
     # the weight is more than the friction of both jaws bears, and the drag the rest
     fastest = states[int(speed.argmax())]
     held = 0.3 * sum(np.linalg.norm(jaw.force[[0, 1]]) for jaw in fastest.jaws.values())
     assert 0.3 < net_of(fastest)[2] - held < 1.0
-    assert height[slides[-1] + 1 :].max() == height[-1] > height[0] + 3e-3
+    assert height[slides[-1] + 1 :].max() == pytest.approx(height[-1], abs=1e-5)
+    assert height[-1] > height[0] + 3e-3
 
 
 def test_object_on_the_clamped_base_is_refused():
@@ -322,6 +323,26 @@ def test_images_come_at_the_rate_that_was_asked_for_of_the_same_course():
     assert [posture.closing for posture in fast.postures[::3]] == pytest.approx([p.closing for p in slow.postures])
     with pytest.raises(ScenarioError, match="readout of 0.02 s at 90 Hz"):
         build_scenario("grasp_cylinder", rate=90.0, readout=0.02)
+
+
+def test_bending_jaws_carry_a_free_object_towards_their_base_and_back_and_a_guided_one_stays():
+    free, guided = (TwinGripper(build_scenario("grasp_cylinder", roughness=r), 3, "coarse") for r in (0.0, 0.5))
+    way = np.linspace(0.0, 8e-3, 41)
+    held, kept, carried = free.hold_object(), guided.hold_object(), []
+    for closing in np.concatenate([way, way[::-1]]):
+        held.follow(free.setting_of(Posture(closing=float(closing))))
+        carried.append(held.carried)
+    for closing in way:
+        kept.follow(guided.setting_of(Posture(closing=float(closing))))
+    assert -1.2e-3 < carried[40] < -0.5e-3
+    assert carried[20] == pytest.approx(0.2 * carried[40], rel=0.3)  # it grows as the square of the closing
+    assert abs(carried[-1]) < 0.02e-3
+    assert kept.carried == 0.0
+
+
+def test_the_pose_of_a_free_object_moves_with_it(cylinder):
+    heights = np.array([state.T_gripper_object[2, 3] for state in cylinder[1]])
+    assert -0.7e-3 < heights.min() - heights[0] < -0.2e-3
 
 
 def press_along(roughness, closings):
