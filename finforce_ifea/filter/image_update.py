@@ -25,7 +25,7 @@ from finforce_ifea.filter.jump import (
 )
 from finforce_ifea.filter.measurement import Measurement, find_seen, observe, summarize_detector_errors
 from finforce_ifea.filter.process import (
-    APPARENT_SIGHT,
+    APPARENT_DETECTOR,
     APPARENT_TRACTION,
     BUMPED_SHIFT,
     BUMPED_TIME,
@@ -148,7 +148,7 @@ def find_expectation(expectation, told, detector_variance, friction):
         time = PLACE_TIME
     for i, place in enumerate((shared, shared, PLACE_TURN, PLACE_STRETCH)):
         camera[i] = (_BUMPED[i] if bumped else _STILL[i]) + (place**2 if shared > 0.0 else 0.0)
-    apparent = APPARENT_TRACTION**2 + APPARENT_SIGHT**2 * detector_variance
+    apparent = APPARENT_TRACTION**2 + APPARENT_DETECTOR**2 * detector_variance
     return Expectation(mean, variance, traction, apparent, camera, time)
 
 

@@ -35,7 +35,7 @@ MODEL_LENGTH = 10e-3
 # Correlation time of that offset, and of traction beyond friction [s].
 MODEL_TIME = 60.0
 # Correlation length of a detector's lasting error [m]: half a pixel.
-SIGHT_LENGTH = 0.1e-3
+DETECTOR_LENGTH = 0.1e-3
 # Correlation time of the error in all shapes [s].
 RELATIVE_TIME = 200.0
 # Standard deviation of the traction ratio beyond friction, at least [-].
@@ -47,7 +47,7 @@ TRACTION_LENGTH = 2e-3
 # Standard deviation of the traction ratio that errors of the mechanics look like [-].
 APPARENT_TRACTION = 0.2
 # The same for a detector's lasting errors, relative to their standard deviation [1/m].
-APPARENT_SIGHT = 1e3
+APPARENT_DETECTOR = 1e3
 # Correlation time of apparent traction [s].
 APPARENT_TIME = 10.0
 # Standard deviation of the camera's shift since the tare [m].
@@ -128,7 +128,7 @@ def find_decay(detector_share, dt, motion, camera_time):
     a[TRACTION] = np.exp(-motion / TRACTION_LENGTH - dt / MODEL_TIME)
     a[APPARENT] = np.exp(-dt / APPARENT_TIME)
     a[CAMERA_X : CAMERA_STRETCH + 1] = np.exp(-dt / camera_time)
-    lasts, seen = np.exp(-motion / MODEL_LENGTH - dt / MODEL_TIME), np.exp(-motion / SIGHT_LENGTH)
+    lasts, seen = np.exp(-motion / MODEL_LENGTH - dt / MODEL_TIME), np.exp(-motion / DETECTOR_LENGTH)
     for k in range(keypoints):
         a[SHARED + 2 * k : SHARED + 2 * k + 2] = lasts * (1.0 - detector_share[k] + detector_share[k] * seen)
     a[SHARED + 2 * keypoints :] = np.exp(-dt / RELATIVE_TIME)

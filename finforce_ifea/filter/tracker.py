@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from finforce_ifea.contact_mechanics.friction import Coefficient, constant_traction
 from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, OutlineIndenter, RoundIndenter, expect_object
 from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics, RigidContact, limit_step
-from finforce_ifea.filter.hidden import APART_SIGMAS, HiddenForce, list_clamped_heights
 from finforce_ifea.filter.image_update import find_place
 from finforce_ifea.filter.lateral_load import LateralLoad, Torsion
 from finforce_ifea.filter.search import ContactSearch
+from finforce_ifea.filter.unobserved_force import APART_SIGMAS, UnobservedForce, list_clamped_heights
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE
 from finforce_ifea.observation import Contact, Observation
 from finforce_ifea.posture import PostureTrack, WristMove, WristPosture
@@ -96,7 +96,7 @@ class ContactTracker:
         self.response = measure_influence(self._contact, self._probe, len(keypoints))
         self._outline: OutlineIndenter | None = None
         self._is_apart = False
-        self._hidden = self._build_hidden(contact_range[0])
+        self._unobserved = self._build_unobserved(contact_range[0])
         self._lateral = LateralLoad(
             torsion, len(keypoints), UNSEEN_TRACTION * settings.friction, may_be_held=settings.may_be_held
         )
@@ -364,25 +364,25 @@ class ContactTracker:
         traction = UNSEEN_TRACTION * self.settings.friction
         load = self._lateral.load if self._is_known else (0.0, MIDDLE_STDDEV, nan, traction)
         state["y"], state["y_stddev"], state["lateral_force"], state["lateral_stddev"] = load
-        state["unobserved_stddev"] = self._find_hidden(state)
+        state["unobserved_stddev"] = self._find_unobserved_stddev(state)
         state["max_force"] = self._fidelities[0].contact.max_force
 
-    def _find_hidden(self, state: ContactState) -> float:
-        """Return the standard deviation of the unobserved force [N], see `HiddenForce`."""
+    def _find_unobserved_stddev(self, state: ContactState) -> float:
+        """Return the standard deviation of the unobserved force [N], see `UnobservedForce`."""
         force, centre = state["force"], float(state["pressure_location"][2])
         if self._is_apart:
             return 0.0
-        if self._hidden.is_next_to_clamp(centre):
+        if self._unobserved.is_next_to_clamp(centre):
             return hypot(force[0], force[2])
         pressed, covariance = self._contact.indenter.pressed, self._search.contact_covariance()
-        return self._hidden.bound(pressed, state["x"], covariance, centre, self._move_surface)
+        return self._unobserved.bound(pressed, state["x"], covariance, centre, self._move_surface)
 
     def _move_surface(self) -> NDArray:
         """Return the motion along x of the inner face at its heights (h,) [m]."""
         surface = self._contact.surface
         return (self._contact.place_points(self.q)[:, 0] - surface.points[:, 0])[:: surface.across]
 
-    def _build_hidden(self, lowest: float) -> HiddenForce:
+    def _build_unobserved(self, lowest: float) -> UnobservedForce:
         """Return where key points hardly show a force, on a finger that shows one from a height [m] on."""
         _, vague = self.response.fit_forces(np.ones(len(self._rest), bool))
         contact, along = self._contact, zip(self.response.heights, self.response.stiffness, vague, strict=True)
@@ -390,7 +390,7 @@ class ContactTracker:
             (height, abs(float(press_lightly(contact, self.settings.radius, height)[1].force_modes[0, DEPTH])))
             for height in list_clamped_heights(lowest)
         ]
-        return HiddenForce(clamped, list(along), contact.surface)
+        return UnobservedForce(clamped, list(along), contact.surface)
 
 
 def _attach(contact: RigidContact, keypoints: NDArray) -> _Fidelity:

@@ -35,7 +35,7 @@ def list_clamped_heights(lowest: float) -> NDArray:
     return lowest * _NEXT_TO_CLAMP
 
 
-class HiddenForce:
+class UnobservedForce:
     """Bounds the unobserved force within the uncertainty of the object's state."""
 
     def __init__(
