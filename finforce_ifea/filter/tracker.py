@@ -5,7 +5,7 @@ The shape of an unknown object is its radius, that of a known outline its tilt.
 
 from __future__ import annotations
 
-from math import hypot, nan
+from math import hypot, nan, sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -44,6 +44,8 @@ _SETTLING = 8
 _SETTLED = 2e-3
 # Steps of the depth in which the full mechanics is pressed anew [m].
 _PRESSING = 0.5e-3
+# Root mean square of the part of a weight along the finger where the direction of gravity is not known [-].
+_ANY_DIRECTION = 1.0 / sqrt(3.0)
 # Standard deviation of a learnt coefficient of friction, relative to that of the prior [-].
 _LEARNT = 0.75
 
@@ -249,9 +251,9 @@ class ContactTracker:
     def _follow_posture(self, posture: WristPosture | None) -> WristMove | None:
         """Return the motion of the jaw since the last image."""
         move, search = self._postures.update(posture if self.settings.may_be_held else None), self._search
-        search.pull = 0.0, 0.0
+        weight, stddev = self._lateral.weigh(float(search.state["magnitude"]))
+        search.pull = 0.0, _ANY_DIRECTION * stddev
         if move is not None:
-            weight, stddev = self._lateral.weigh(float(search.state["magnitude"]))
             search.pull = weight * float(move.now[2]), stddev * abs(float(move.now[2]))
             search.hypotheses.part(move.parting if search.state["loaded"] else 0.0, shows_lifts=move.shows_lifts)
         return move

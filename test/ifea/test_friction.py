@@ -190,4 +190,7 @@ class TestHeld:
         settled = [number for number in pressed if np.linalg.norm(held[number].force) > 2.0]
         along = np.array([held[number].force[2] for number in settled])
         assert np.sqrt(np.mean(along**2)) < 0.15
+        # of a weight, of which nothing is known, a part of the normal force in any direction
+        share = np.array([held[number].force_stddev[2] / np.linalg.norm(held[number].force) for number in settled])
+        assert 0.15 < share.min() and share.max() < 0.4
         assert estimator.friction.stddev == np.inf  # it tells nothing
