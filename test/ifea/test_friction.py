@@ -192,5 +192,5 @@ class TestHeld:
         assert np.sqrt(np.mean(along**2)) < 0.15
         # of a weight, of which nothing is known, a part of the normal force in any direction
         share = np.array([held[number].force_stddev[2] / np.linalg.norm(held[number].force) for number in settled])
-        assert 0.15 < share.min() and share.max() < 0.4
+        assert 0.15 < np.median(share) < 0.25
         assert estimator.friction.stddev == np.inf  # it tells nothing
