@@ -45,7 +45,8 @@ def test_the_estimator_takes_every_image_of_a_scene(name, bench, monkeypatch):
     def press(bench, depths, *, indenter=None, shape=0.0125, height=0.040, **_):
         states = np.stack(np.broadcast_arrays(depths, shape, height), axis=1)
         points = np.tile(bench.jaw.keypoints, (len(depths), 1, 1))
-        rest = Press(states=states, points=points, forces=np.zeros((len(depths), 3)))
+        still = np.zeros(len(depths))
+        rest = Press(states=states, points=points, forces=np.zeros((len(depths), 3)), carried=still)
         return rest if indenter is None else replace(rest, indenter=indenter)
 
     monkeypatch.setattr("lab.ablation.scenes.press", press)
@@ -75,7 +76,8 @@ def scenes(bench, tmp_path_factory):
     random, folder = np.random.default_rng(0), tmp_path_factory.mktemp("scenes")
     count = 120
     rest = np.tile(bench.jaw.keypoints, (count, 1, 1))
-    pressed = Press(states=np.tile([0.0, 0.0125, 0.040], (count, 1)), points=rest, forces=np.zeros((count, 3)))
+    still = {"states": np.tile([0.0, 0.0125, 0.040], (count, 1)), "carried": np.zeros(count)}
+    pressed = Press(points=rest, forces=np.zeros((count, 3)), **still)
     scale = np.where(np.arange(count) < 60, 1.0, 4.0)
     scene = film(bench, pressed, tell_height(bench, pressed), random, scale)
     for image in scene.images[50:]:
