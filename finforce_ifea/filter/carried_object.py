@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from math import isnan, log, nan
 
-import numpy as np
 from numpy.typing import NDArray
 
 from finforce_ifea.filter.slip_path import find_rate
@@ -63,7 +62,8 @@ class CarriedObject:
             rates: see `SlipPath`.
             shares: see `SlipPath`.
         """
-        by_depth, by_height = (find_rate(rates, shares, upright, *motion) for motion in np.eye(2))
+        by_depth = find_rate(rates, shares, upright, 1.0, 0.0)
+        by_height = find_rate(rates, shares, upright, 0.0, 1.0)
         if by_height != 0.0 and not isnan(self._depth):
             self.carried += (upright - self._upright - by_depth * (depth - self._depth)) / by_height
         self._depth, self._upright, self._touches = depth, upright, depth > TOUCH_DEPTH

@@ -229,8 +229,9 @@ class TractionHypotheses:
         self.stddev = _find_stddev(self._path.ratios, self.mu, own, self._path.rates, self._path.shares, stddev)
 
     def _carry(self, own: NDArray) -> None:
-        """Carry the object to the end of the path, for weights of the coefficients (M,)."""
-        self.carried.follow(float(own @ self._anchor[:, 0]), self.upright, self._path.rates, self._path.shares)
+        """Carry an object that only the jaws may hold to the end of the path, for weights of the coefficients (M,)."""
+        if self._held > 0.0:
+            self.carried.follow(float(own @ self._anchor[:, 0]), self.upright, self._path.rates, self._path.shares)
 
     def _take_back(self, contact: RigidContact, q: NDArray, x: NDArray, places: NDArray, own: NDArray) -> None:
         """Compute the path again from its last mark before the positions (M, 2); see `follow` for the arguments."""
