@@ -70,15 +70,18 @@ class SharedStddev(NamedTuple):
             few degrees.
         height: of the jaw along its z where poses of an object are compared with it [m].
         scale: relative error of all displacements [-].
+        closing: of a shift along the closing axis alone [m]: of a jaw whose reference mark is not seen.
     """
 
     shift: float = 0.0
     height: float = 0.0
     scale: float = 0.0
+    closing: float = 0.0
 
 
 NOTHING_SHARED = SharedStddev()
-_SHARED = dict(zip(SharedStddev._fields, ("shared", "shared_height", "shared_scale"), strict=True))  # columns
+# columns
+_SHARED = dict(zip(SharedStddev._fields, ("shared", "shared_height", "shared_scale", "shared_closing"), strict=True))
 
 
 def shared_columns(shared: SharedStddev, count: int) -> dict[str, NDArray[np.float32]]:

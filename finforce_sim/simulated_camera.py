@@ -55,7 +55,8 @@ class Wardrobe:
         holder = draw_paint(rng, ("plain", "noise"))
         holder = replace(holder, color=draw_color(rng, 0.02, 0.7), gloss=0.3)
         # a dot of the holder's brightness would be no mark
-        bright = float(np.maximum(holder.color, holder.second).mean()) < 0.2
+        seen = holder.color if holder.pattern == "plain" else np.maximum(holder.color, holder.second)
+        bright = float(seen.mean()) < 0.2
         dot = draw_color(rng, 0.7, 0.95) ** 0.3 if bright else draw_color(rng, 0.01, 0.02)
         # a draw more than is used: with it the pictures of a seed stay what they were
         jaw, palm, thing, _ = draw_jaw_paint(rng), draw_paint(rng, ("plain", "noise")), draw_paint(rng), draw_paint(rng)

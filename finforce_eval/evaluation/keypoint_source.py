@@ -18,7 +18,7 @@ from finforce.camera import ImageError
 from finforce.errors import FinforceError, PoseError, suggest
 from finforce.gripper_frames import SIDES, read_extrinsics
 from finforce.health import Idling
-from finforce.messages import NANOSECONDS
+from finforce.messages import NANOSECONDS, NOTHING_SHARED
 from finforce.rig import read_rig
 from finforce.transforms import pose_from_quaternion, pose_numbers, quaternion_from_pose
 from finforce_eval.errors import OptionError, RecordingError, UnseenError
@@ -455,7 +455,7 @@ def _with_detection(
         points=passed,
         likelihood=np.nan_to_num(_rows(seen, "likelihood", (count,))),
         stddev=np.where(np.isfinite(passed), stddev, np.nan),
-        shared=np.nan_to_num(_rows(seen, "shared", (3,))),
+        shared=np.nan_to_num(_rows(seen, "shared", (len(NOTHING_SHARED),))),
     )
     unfound = np.full(count, "")
     reasons = [unfound if each is None else each.reasons for each in seen]

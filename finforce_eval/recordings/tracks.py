@@ -44,7 +44,7 @@ class KeypointTrack(Timed):
         points: (n, K, 3) [m], jaw frame; NaN = none.
         likelihood: (n, K) in [0, 1].
         stddev: (n, K, 3) one standard deviation [m], jaw frame, NaN = not known; None when nothing says.
-        shared: (n, 3) standard deviations of what the points of an image share, see `SharedStddev`; None: 0.
+        shared: (n, 4) standard deviations of what the points of an image share, see `SharedStddev`; None: 0.
     """
 
     stamps_ns: NDArray[np.int64]

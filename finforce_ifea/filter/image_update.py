@@ -57,6 +57,7 @@ EXPECTATION = np.dtype(
         ("settled_change", float),  # of the shape that no longer matters
         ("has_corners", bool),  # whether the object may rock
         ("shared", float),  # standard deviation of a shift that all key points of an image share [m]
+        ("closing", float),  # that of a shift along the closing axis alone [m]
         ("mount", float),  # standard deviation of the height at which the jaw is mounted [m]
     ],
     align=True,
@@ -144,11 +145,12 @@ def find_expectation(expectation, told, detector_variance, friction):
     variance[1] += (MISPLACED.stddev[0] ** 2 if misplaced else 0.0) + expectation.mount**2
     traction = TRACTION_FLOOR**2 + (TRACTION_SHARE * friction) ** 2 + min(path_stddev, friction) ** 2 + unweighed**2
     shared, time = expectation.shared, BUMPED_TIME if bumped else CAMERA_TIME
-    if shared > 0.0:
+    if max(shared, expectation.closing) > 0.0:
         time = PLACE_TIME
     for i, place in enumerate((shared, shared, PLACE_TURN, PLACE_STRETCH)):
         camera[i] = (_BUMPED[i] if bumped else _STILL[i]) + (place**2 if shared > 0.0 else 0.0)
     apparent = APPARENT_TRACTION**2 + APPARENT_DETECTOR**2 * detector_variance
+    camera[0] += expectation.closing**2
     return Expectation(mean, variance, traction, apparent, camera, time)
 
 

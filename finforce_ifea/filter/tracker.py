@@ -223,6 +223,7 @@ class ContactTracker:
             self._tare = tare
             search.restart()
         search.expectation["shared"] = observation.shared.shift
+        search.expectation["closing"] = observation.shared.closing
         search.expectation["mount"] = observation.shared.height if self._is_known else 0.0
         planar = measured - self._lateral.motions if self._is_known else measured
         self._fill(planar, tare, tare.point_noise(observation.stddev))

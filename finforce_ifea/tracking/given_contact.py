@@ -153,7 +153,7 @@ class GivenContactTracker:
         noise = tare.point_noise(observation.stddev)
         scatter = np.trace(noise.plane, axis1=1, axis2=2) / 2.0 / noise.noise_ratio
         # the points are taken to err independently, and would average away what they share
-        scatter += np.count_nonzero(known) * observation.shared.shift**2
+        scatter += np.count_nonzero(known) * (observation.shared.shift**2 + observation.shared.closing**2)
         variance = scatter + noise.bias + tare.offset_variance()
         try:
             if self.paper:

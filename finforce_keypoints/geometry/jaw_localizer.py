@@ -160,7 +160,7 @@ class JawLocalizer:
     @property
     def is_settled(self) -> bool:
         """True if the jaw's place is no longer learnt, so that images in a row tell the same."""
-        return self._patch.is_learnt
+        return self._patch.is_settled
 
     def rest(self, stamp: float) -> None:
         """Take it that the jaw has not moved from the last image to one of `stamp` [s]."""
@@ -255,7 +255,8 @@ class JawLocalizer:
         if abs(measured.slip) > MOST_SLIP:
             return None
         if seen.likely[-1] and not self._mount.is_held:
-            return self._patch.refine(seen.image.color, seen.image.camera, measured, self._origin.place)
+            image, forecast = seen.image, self._track.forecast(seen.image.stamp)
+            return self._patch.refine(image.color, image.camera, measured, self._origin.place, forecast)
         return measured
 
     def _describe(self, seen: _Seen, scale: DepthScale, origin: Origin) -> JawKeypoints:
@@ -275,7 +276,8 @@ class JawLocalizer:
         shared = COVERED_STDDEV if seen.tag is None else float(np.hypot(origin.stddev, TAGGED_STDDEV))
         y_stddev = np.where(is_held, self._model.relief, fit.stddev)
         stddev = compute_stddev(sight, depths, y_stddev, seen.ray_stddev)
-        stddev[:, 0] = np.hypot(stddev[:, 0], 0.0 if is_held else origin.stddev)
+        own = np.sqrt(max(origin.stddev**2 - origin.shared**2, 0.0))
+        stddev[:, 0] = np.hypot(stddev[:, 0], 0.0 if is_held else own)
         reasons = self._judge(seen.image, seen.detection, has_depth, points)
         valid = reasons == ""
         count = len(valid)
@@ -289,7 +291,9 @@ class JawLocalizer:
             T_camera_jaw=self._origin.place(replace(origin, x=origin.x - self._track.speed * late[-1])),
             reasons=reasons,
             scale=fit.scale,
-            shared=SharedStddev(shared if is_held else 0.0, *self._mount.stddev),
+            shared=SharedStddev(
+                shared if is_held else 0.0, *self._mount.stddev, closing=0.0 if is_held else origin.shared
+            ),
         )
 
     def _find_delays(self, seen: _Seen, T_camera_jaw: NDArray) -> NDArray:

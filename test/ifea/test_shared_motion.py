@@ -70,6 +70,26 @@ def test_what_is_shared_makes_no_force_surer(slipping):
     assert 0.0 < stated[0] < stated[1]
 
 
+def test_a_jaw_whose_place_on_the_closing_axis_is_unsure_tells_the_force_within_what_is_stated():
+    """The reference mark is not seen: the place is off by a fraction of a millimetre, another one in every half second.
+
+    A jaw of which nothing is unsure takes the same for bending.
+    """
+    pressed, rng, beyond = record(ramp(4, hold=2.0), seed=3), np.random.default_rng(5), []
+    off = np.repeat(rng.normal(0.0, 0.2e-3, len(pressed.depths)), 15)[: len(pressed.depths)]
+    off *= np.minimum(pressed.depths / 1e-3, 1.0)  # tared where it stood at first
+    held = slice(-50, None)
+    for shared in (SharedStddev(closing=0.2e-3), NOTHING_SHARED):
+        seen = [
+            slip(replace(o, shared=shared), shift=s, turn=0.0) for o, s in zip(pressed.observations, off, strict=True)
+        ]
+        shifted = replace(pressed, observations=seen)
+        solutions = run(shifted, solver="frame")
+        stated = np.array([s.magnitude_stddev for s in solutions[held]])
+        beyond.append((np.abs(errors(shifted, solutions)[held]) > 3.0 * stated).mean())
+    assert beyond[0] <= 0.02 < 0.2 < beyond[1]
+
+
 def test_a_scale_that_is_unsure_makes_the_force_as_unsure():
     pressed, stated = record(ramp(3, hold=0.3), seed=3), []
     for scale in (0.0, 0.1):

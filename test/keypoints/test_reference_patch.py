@@ -5,7 +5,7 @@ from scipy.ndimage import gaussian_filter
 from finforce.gripper_frames import ROBOT_CAMERA, jaw_in_camera
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints.geometry import jaw_pose as reference_patch
-from finforce_keypoints.geometry.jaw_pose import TEMPLATE_IMAGES, Origin, PatchMatcher, ReferencePatch
+from finforce_keypoints.geometry.jaw_pose import STDDEV, TEMPLATE_IMAGES, Origin, PatchMatcher, ReferencePatch
 from finforce_keypoints.geometry.side_picture import find_side, intersect_plane
 from finforce_sim.sensor import build_d405_vga
 
@@ -21,7 +21,7 @@ def place_of(side):
     return lambda origin: jaw_in_camera(ROBOT_CAMERA, side, origin.x)
 
 
-def image_of(side, x, *, gain=1.0, offset=0.0, seed=0, covered=False):
+def image_of(side, x, *, gain=1.0, offset=0.0, seed=0, covered=False, contrast=1.0):
     """The textured plane of a jaw's side at an origin [m], as the camera sees it, with noise."""
     jaw = load_jaw("bench", side)
     places = intersect_plane(PIXELS, find_side(jaw), place_of(side)(Origin(x=x, stddev=0.0)), CAMERA)
@@ -30,7 +30,8 @@ def image_of(side, x, *, gain=1.0, offset=0.0, seed=0, covered=False):
     if covered:
         grey = np.random.default_rng(9).permutation(grey.ravel()).reshape(grey.shape)
     noise = np.random.default_rng(seed).normal(0.0, 4.0, grey.shape)
-    grey = np.clip(gain * gaussian_filter(grey, 0.7) + offset + noise, 0, 255)
+    grey = 120.0 + contrast * (gaussian_filter(grey, 0.7) - 120.0)
+    grey = np.clip(gain * grey + offset + noise, 0, 255)
     return np.repeat(grey[..., None], 3, axis=2).astype(np.uint8)
 
 
@@ -64,6 +65,42 @@ def test_something_else_in_its_place_leaves_what_was_measured():
     assert patch.refine(image_of("left", -0.04, covered=True), CAMERA, measured, place_of("left")) == measured
 
 
+def test_a_holder_without_a_mark_leaves_what_was_measured_and_is_not_waited_for():
+    patch = ReferencePatch(load_jaw("bench"))
+    for seed in range(TEMPLATE_IMAGES + 5):
+        measured = Origin(x=-0.04 + 1e-5 * seed, stddev=3e-4)
+        bare = image_of("left", -0.04, contrast=0.01, seed=seed)
+        assert patch.refine(bare, CAMERA, measured, place_of("left")) == measured
+    assert patch.is_settled
+
+
+@pytest.mark.parametrize("contrast", [0.06, 0.1])
+def test_a_faint_mark_tells_a_slide_within_what_is_stated(contrast, monkeypatch):
+    monkeypatch.setattr(reference_patch, "TEMPLATE_IMAGES", 1)
+    patch = ReferencePatch(load_jaw("bench"))
+    start, measured = Origin(x=-0.04, stddev=6e-4), Origin(x=-0.0398, stddev=6e-4)
+    patch.refine(image_of("left", -0.04, contrast=contrast), CAMERA, start, place_of("left"))
+    found = [
+        patch.refine(image_of("left", -0.04, contrast=contrast, seed=seed), CAMERA, measured, place_of("left"))
+        for seed in range(1, 21)
+    ]
+    told = [each for each in found if each != measured]
+    errors, stated = np.array([each.x + 0.04 for each in told]), np.array([each.stddev for each in told])
+    assert len(told) > 10 and (stated > 1.3 * STDDEV).all()
+    assert 0.3 < np.sqrt(np.mean((errors / stated) ** 2)) < 2.0
+
+
+def test_a_jaw_is_found_where_it_should_be_though_the_network_is_far_off(monkeypatch):
+    monkeypatch.setattr(reference_patch, "TEMPLATE_IMAGES", 1)
+    patch = ReferencePatch(load_jaw("bench"))
+    patch.refine(image_of("left", -0.04), CAMERA, Origin(x=-0.04, stddev=3e-4), place_of("left"))
+    image, forecast = image_of("left", -0.039, seed=1), Origin(x=-0.0392, stddev=1e-4)
+    unsure = Origin(x=-0.0363, stddev=6e-4)
+    assert patch.refine(image, CAMERA, unsure, place_of("left"), forecast).x == pytest.approx(-0.039, abs=0.03e-3)
+    sure = Origin(x=-0.0363, stddev=1e-4)  # of another place, which a forecast does not overrule
+    assert patch.refine(image, CAMERA, sure, place_of("left"), forecast) == sure
+
+
 def test_the_place_of_the_first_images_is_the_mean_of_what_was_measured():
     patch, errors = ReferencePatch(load_jaw("bench")), np.random.default_rng(0).normal(0.0, 0.2e-3, TEMPLATE_IMAGES)
     errors -= errors.mean()
@@ -89,6 +126,6 @@ def test_a_slide_by_half_a_pixel_is_read_off_to_a_hundredth():
     def spot(x):
         return 200.0 * np.exp(-((columns - 20.0 - x) ** 2 + (rows - 20.0) ** 2) / 50.0)
 
-    assert PatchMatcher(spot(0.0)).match(spot(0.5))[0] == pytest.approx(0.5, abs=0.01)
-    assert PatchMatcher(spot(0.0)).match(spot(-0.5))[0] == pytest.approx(-0.5, abs=0.01)
-    assert PatchMatcher(spot(0.0)).match(200.0 - spot(0.0))[1] == 0.0
+    assert PatchMatcher(spot(0.0)).match(spot(0.5)).x == pytest.approx(0.5, abs=0.01)
+    assert PatchMatcher(spot(0.0)).match(spot(-0.5)).x == pytest.approx(-0.5, abs=0.01)
+    assert PatchMatcher(spot(0.0)).match(200.0 - spot(0.0)).likeness == 0.0
