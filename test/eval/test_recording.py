@@ -69,7 +69,9 @@ def test_what_the_points_of_an_image_share_is_read_as_it_was_written(tmp_path):
     written = make_recording("held")
     jaws = dict(written.jaws)
     for side, jaw in jaws.items():
-        shared = np.linspace((1e-3, 0.0, 0.01), (3e-3, 2e-3, 0.02), len(jaw.keypoints.stamps_ns)).astype(np.float32)
+        shared = np.linspace((1e-3, 0.0, 0.01, 0.0), (3e-3, 2e-3, 0.02, 1e-3), len(jaw.keypoints.stamps_ns)).astype(
+            np.float32
+        )
         jaws[side] = replace(jaw, keypoints=replace(jaw.keypoints, shared=shared.astype(np.float64)))
     written = replace(written, jaws=jaws)
     read = read_recording(write_recording(written, tmp_path / "held"))

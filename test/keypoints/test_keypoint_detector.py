@@ -107,12 +107,16 @@ def test_unlikely_points_say_nothing_about_the_plane_of_the_others():
 
 
 def test_an_unsure_reference_point_makes_all_points_unsure_along_x():
-    stated = []
+    stated, shared = [], []
     for stddev in (0.4, 2.0):
         _, depth, pixel_detector, detector = build()
         pixel_detector.stddev = np.append(np.full(15, 0.4), stddev)
-        stated.append(detector.detect(bare_image(0.0, depth.astype(np.float32)))["left"].stddev)
-    assert (stated[1][:, 0] > 2.0 * stated[0][:, 0]).all()  # five times the share of the reference point
+        found = detector.detect(bare_image(0.0, depth.astype(np.float32)))["left"]
+        stated.append(found.stddev)
+        shared.append(found.shared.closing)
+    # five times the share of the reference point
+    assert (np.hypot(stated[1][:, 0], shared[1]) > 2.0 * np.hypot(stated[0][:, 0], shared[0])).all()
+    assert shared[1] == pytest.approx(5.0 * shared[0], rel=0.01)
     np.testing.assert_allclose(stated[1][:, 1:], stated[0][:, 1:], rtol=0.05)
 
 

@@ -41,7 +41,7 @@ from finforce_keypoints.node import KeypointDetectorNode
 
 COLUMNS = (
     *("x", "y", "z", "likelihood", "u", "v", "valid", "reason", "stddev_x", "stddev_y", "stddev_z"),
-    *("shared", "shared_height", "shared_scale"),
+    *("shared", "shared_height", "shared_scale", "shared_closing"),
 )
 
 

@@ -318,7 +318,7 @@ def test_the_place_of_a_jaw_in_a_holder_is_stated_apart_from_its_points():
         found.append(localizer.locate(image, localizer.predict_pixels(CAMERA), DepthScale(error=0.0, stddev=0.015)))
     straight, held = found
     used = held.valid & straight.valid
-    assert held.shared[1:] == (1e-3, 0.02) and straight.shared[1:] == (0.0, 0.0)
+    assert held.shared[1:] == (1e-3, 0.02, 0.0) and straight.shared[1:3] == (0.0, 0.0)
     assert straight.shared.shift == 0.0 and held.shared.shift == COVERED_STDDEV and used.sum() >= 5
     # what the camera is off the side, and the place along the closing axis, move all points together
     assert (held.stddev[used][:, [0, 2]] < straight.stddev[used][:, [0, 2]]).all()
