@@ -20,7 +20,7 @@ from geometry_msgs.msg import PoseStamped, TwistStamped, WrenchStamped  # noqa: 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.callback_groups import CallbackGroup, MutuallyExclusiveCallbackGroup
 from rclpy.exceptions import NameValidationException, ParameterException
-from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import Executor, ExternalShutdownException
 from rclpy.expand_topic_name import expand_topic_name
 from rclpy.logging import get_logger
 from rclpy.node import Node
@@ -38,6 +38,7 @@ from finforce.errors import FinforceError
 from finforce.health import Health, Level, Outcome, Report
 from finforce.messages import NANOSECONDS
 from finforce.processors import free_caller
+from finforce.ros.executor import TolerantExecutor
 from finforce.ros.frames import Frames  # noqa: F401 - for those with frames
 from finforce.ros.messages import (  # noqa: F401 - for those who publish
     cloud_message,
@@ -309,18 +310,6 @@ async def run_aside(node: Node, action: Callable[[], Any]) -> Any:
 
     Thread(target=run, daemon=True).start()
     return await done
-
-
-class TolerantExecutor(SingleThreadedExecutor):
-    """Drops bytes that are no message of their topic's type; rclpy's own executor would end with the node."""
-
-    def _take_subscription(self, sub: Any) -> Any:
-        """Return what calls back with a message; nothing for one that the middleware cannot read."""
-        try:
-            return super()._take_subscription(sub)
-        except RuntimeError as error:
-            get_logger("finforce").warning(f"dropped a message on {sub.topic_name}: {error}", throttle_duration_sec=2.0)
-            return None
 
 
 def run_node(name: str, build: Callable[[], Node], work: Callable[..., None] = rclpy.spin) -> int:

@@ -47,7 +47,6 @@ _OVERRIDABLE = QoSOverridingOptions.with_default_policies()  # by the parameters
 BUDGET = 5e-3  # [s] that a stage may take before those that could go on without it do
 WATCHED = 15  # messages over which that is judged
 _LOOKED_FOR, _AT_REST = 0.2, 1.0  # [s] between looks at who publishes, and at whether images are wanted
-_EVENTS = 0.02  # [s] after a look, in which events are waited for
 _MOST_WAITING = 1000  # messages, more than any queue keeps
 
 
@@ -65,7 +64,6 @@ class Pipeline:
     Attributes:
         stages: of its nodes.
         spare: time between the callback before and the one at work, for which the process had nothing to do [s].
-        looked: time of the last look, infinite before the first [s of monotonic].
     """
 
     def __init__(self, is_shared: bool = True) -> None:
@@ -79,7 +77,6 @@ class Pipeline:
         self._timers: list[Timer] = []
         self._delayed: list[Callable[[], None]] = []
         self._depth, self._ended, self.spare = 0, perf_counter(), 0.0
-        self.looked = inf
 
     def publishes(self, topic: str) -> bool:
         """Say whether a stage publishes a topic."""
@@ -105,7 +102,6 @@ class Pipeline:
 
     def look_again(self) -> None:
         """Find out which stages are needed, and do what depends on it."""
-        self.looked = monotonic()
         self._find_needed()
         for look in self._looks:
             look()
@@ -292,19 +288,6 @@ class Outlet:
         return self.pipeline.count_ports(self.topic_name) + self.publisher.get_subscription_count()
 
 
-class _EventGroup(MutuallyExclusiveCallbackGroup):
-    """The events of a stage's publishers, waited for at rest, else after every look: with every message it is dear."""
-
-    def __init__(self, stage: Stage) -> None:
-        super().__init__()
-        self._stage = stage
-
-    def can_execute(self, entity: Any) -> bool:
-        """Say whether an event is waited for now."""
-        is_due = not self._stage.is_needed or monotonic() - self._stage.pipeline.looked < _EVENTS
-        return is_due and super().can_execute(entity)
-
-
 class Stage:
     """One node's ends of topics: says which do not meet because the two ends ask for different service.
 
@@ -325,7 +308,7 @@ class Stage:
         self.is_needed, self.turned = True, lambda: None
         self.needs_images: Callable[[], bool] = lambda: True
         self._answers: list[Outlet] = []
-        self._events = _EventGroup(self)
+        self._events = MutuallyExclusiveCallbackGroup()
         self._awake_until = -inf
         self.pipeline.stages.append(self)
         self._suspects: dict[str, tuple[bool, QoSProfile]] = {}

@@ -195,26 +195,6 @@ def test_a_stage_that_rests_hears_nothing_from_outside_until_somebody_hears_it(p
     node.destroy_node()
 
 
-def test_events_of_publishers_are_waited_for_at_rest_else_after_a_look_alone(probe):
-    node = Relay(None, "alone", "outside", "said", context=probe.context)
-    node.stage.rest_unheard(Skips(), lambda: None)
-    pipeline, events = node.stage.pipeline, node.out.publisher.event_handlers
-
-    def are_waited_for():
-        return {event.callback_group.can_execute(event) for event in events}
-
-    pipeline.look_again()
-    sleep(2.0 * topics._EVENTS)
-    assert not node.stage.is_needed and are_waited_for() == {True}
-    node.stage.keep_awake(60.0)
-    assert node.stage.is_needed and are_waited_for() == {True}
-    sleep(2.0 * topics._EVENTS)
-    assert are_waited_for() == {False}
-    pipeline.look_again()
-    assert are_waited_for() == {True}
-    node.destroy_node()
-
-
 def test_stages_that_hear_each_other_rest_all_the_same(probe):
     pipeline = Pipeline()
     pair = [Relay(pipeline, *words, context=probe.context) for words in (("a", "one", "two"), ("b", "two", "one"))]
