@@ -16,7 +16,7 @@ from rclpy.node import Node
 from rclpy.task import Task
 
 _KINDS = ("timer", "subscription", "guard_condition", "client", "service")
-_LOOK_PERIOD = 0.25  # [s] between two looks of rclpy's own executor while messages come
+_LOOK_PERIOD = 1.0  # [s] between two looks of rclpy's own executor while messages come
 
 
 class _Watched(NamedTuple):
@@ -35,7 +35,7 @@ class TolerantExecutor(SingleThreadedExecutor):
 
     rclpy gathers the entities and builds a wait set with every message, for a fifth of a pipeline's time. While
     messages come, those and timers are waited for here, in a set that lasts until an entity comes or goes. All else is
-    left to rclpy as soon as it is ready, events every quarter of a second. Without messages, rclpy works alone.
+    left to rclpy as soon as it is ready, events once in a second. Without messages, rclpy works alone.
 
     Bytes that are no message of their topic's type are dropped; rclpy's own executor would end with the node.
     """
@@ -156,7 +156,7 @@ class TolerantExecutor(SingleThreadedExecutor):
             kind: {each.handle.pointer: each for each in entities if not iscoroutinefunction(each.callback)}
             for kind, entities in (("timers", timers), ("subscriptions", subscriptions))
         }
-        has_actions = not all(isinstance(each, EventHandler) for each in gather("waitables"))
+        has_actions = not all(isinstance(each, EventHandler) for node in nodes for each in node.waitables)
         return _Watched(has_actions, rcl.WaitSet(*counts, self._context.handle), handles, guards, **plain)
 
 
