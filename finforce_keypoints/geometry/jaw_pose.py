@@ -56,7 +56,7 @@ ITERATIONS = 5
 SETTLED = 0.02  # [px] that a last iteration may move
 FARTHEST = 2.0e-3  # [m] between the network's place and the registered one, and in its standard deviations beside
 _FARTHEST_SIGMA = 4.0
-_CLEAR = 0.5  # deviation of a registered place by that of the network's, up to which the patch tells more
+_CLEAR = 0.5  # noise of a registered place by the deviation of the network's, up to which the patch tells more
 LEAST_LIKENESS = 0.75  # correlation with the template, below which something else is seen
 STDDEV = 0.04e-3  # [m] of a registered slide
 _INNER = (slice(3, -3), slice(3, -3))  # the border's gradients are one-sided
@@ -317,9 +317,9 @@ class ReferencePatch:
             if not abs(x + self._anchor - measured.x) <= farthest:
                 return None
             if abs(slide.x) < SETTLED:
-                origin = Origin(x=x, stddev=hypot(STDDEV, SCALE * slide.stddev))
-                is_clear = slide.likeness >= LEAST_LIKENESS and origin.stddev < _CLEAR * measured.stddev
-                return origin if is_clear else None
+                noise = SCALE * slide.stddev
+                is_clear = slide.likeness >= LEAST_LIKENESS and noise < _CLEAR * measured.stddev
+                return Origin(x=x, stddev=hypot(STDDEV, noise)) if is_clear else None
         return None
 
     def _take(self, color: NDArray, camera: CameraIntrinsics, T_camera_jaw: NDArray) -> NDArray:

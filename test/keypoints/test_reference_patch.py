@@ -90,6 +90,15 @@ def test_a_faint_mark_tells_a_slide_within_what_is_stated(contrast, monkeypatch)
     assert 0.3 < np.sqrt(np.mean((errors / stated) ** 2)) < 2.0
 
 
+def test_a_clear_mark_is_followed_however_sure_the_network_is(monkeypatch):
+    monkeypatch.setattr(reference_patch, "TEMPLATE_IMAGES", 1)
+    patch = ReferencePatch(load_jaw("bench"))
+    patch.refine(image_of("left", -0.04), CAMERA, Origin(x=-0.04, stddev=3e-5), place_of("left"))
+    measured = Origin(x=-0.0389, stddev=3e-5)
+    found = patch.refine(image_of("left", -0.039, seed=1), CAMERA, measured, place_of("left"))
+    assert found.x == pytest.approx(-0.039, abs=0.03e-3) and found != measured
+
+
 def test_a_jaw_is_found_where_it_should_be_though_the_network_is_far_off(monkeypatch):
     monkeypatch.setattr(reference_patch, "TEMPLATE_IMAGES", 1)
     patch = ReferencePatch(load_jaw("bench"))
