@@ -80,7 +80,7 @@ class SharedStddev(NamedTuple):
 
 
 NOTHING_SHARED = SharedStddev()
-# columns
+# Columns of a key point cloud.
 _SHARED = dict(zip(SharedStddev._fields, ("shared", "shared_height", "shared_scale", "shared_closing"), strict=True))
 
 

@@ -113,7 +113,7 @@ class TolerantExecutor(SingleThreadedExecutor):
         for guard in watched.guards:
             guard._executor_triggered |= guard.handle.pointer in ready["guard_condition"]
         left = {address for addresses in ready.values() for address in addresses}
-        left.discard(self._guard.handle.pointer)  # rclpy works itself up by it; who wakes this executor says so
+        left.discard(self._guard.handle.pointer)  # rclpy's own callbacks trigger it, too; `wake` says so itself
         for address, timer in watched.timers.items():
             if address in left and timer.handle.is_timer_ready():
                 _call(self._take_timer(timer))
@@ -161,7 +161,7 @@ class TolerantExecutor(SingleThreadedExecutor):
 
 
 def _call(callback: Any) -> None:
-    """Call back, with what an entity was taken as."""
+    """Run the coroutine function of an entity that was taken, which awaits nothing; None: nothing was there."""
     if callback is not None:
         with suppress(StopIteration):
             callback().send(None)

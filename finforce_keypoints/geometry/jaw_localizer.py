@@ -291,9 +291,7 @@ class JawLocalizer:
             T_camera_jaw=self._origin.place(replace(origin, x=origin.x - self._track.speed * late[-1])),
             reasons=reasons,
             scale=fit.scale,
-            shared=SharedStddev(
-                shared if is_held else 0.0, *self._mount.stddev, closing=0.0 if is_held else origin.shared
-            ),
+            shared=SharedStddev(shared if is_held else 0.0, *self._mount.stddev, closing=origin.shared),
         )
 
     def _find_delays(self, seen: _Seen, T_camera_jaw: NDArray) -> NDArray:
