@@ -579,6 +579,7 @@ class CameraStream:
     def __init__(self, frame: str = "", depth_scale: float = MILLIMETRE, topic: str = "") -> None:
         self.frame, self._is_sure, self._depth_scale, self._topic = frame, bool(frame), depth_scale, topic
         self.camera: CameraIntrinsics | None = None
+        self._numbers: tuple[Any, ...] = ()
         self.video = PacketDecoder()
 
     def frame_of(self, message: Any, *, is_sure: bool = True) -> str:
@@ -594,10 +595,16 @@ class CameraStream:
             ObservationError: the frame is another one.
             IntrinsicsError: the numbers are no camera's.
         """
-        camera = camera_from_info(info, self.frame_of(info), self._topic)
+        frame, arrays = self.frame_of(info), (np.asarray(numbers).tobytes() for numbers in (info.d, info.k, info.p))
+        numbers = (info.width, info.height, info.distortion_model, *arrays)
+        if numbers == self._numbers:  # most come with every image
+            check_frame(info, frame, "the camera info")
+            return False
+        camera = camera_from_info(info, frame, self._topic)
         is_new = not same_camera(self.camera, camera)
         if is_new:
             self.camera = camera
+        self._numbers = numbers
         return is_new
 
     def known_camera(self, topic: str) -> CameraIntrinsics:

@@ -2,6 +2,7 @@
 
 import os
 import sys
+from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -62,9 +63,28 @@ def import_manifold3d() -> ModuleType:
     return import_library("manifold3d", "contact of meshes")
 
 
+class _Deferred(ModuleType):
+    """A module that is imported when one of its functions is called."""
+
+    def __getattr__(self, name: str) -> Callable:
+        """Return what calls the function of a name."""
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return lambda *args, **options: getattr(import_module(self.__name__), name)(*args, **options)
+
+
+_PLOTS = "open3d.visualization.draw_plotly"  # imports Dash, Plotly and IPython: 44 MB, 0.3 s
+
+
 def import_open3d() -> ModuleType:
     """Return open3d, repair and registration; raises MissingDependencyError where it is not installed."""
-    return import_library("open3d", "the simulator, or registration or decimation of a mesh,", "'finforce[mesh]'")
+    if "open3d" not in sys.modules:
+        sys.modules[_PLOTS] = _Deferred(_PLOTS)
+    try:
+        return import_library("open3d", "the simulator, or registration or decimation of a mesh,", "'finforce[mesh]'")
+    finally:
+        if isinstance(sys.modules.get(_PLOTS), _Deferred):
+            del sys.modules[_PLOTS]
 
 
 def import_trimesh() -> ModuleType:

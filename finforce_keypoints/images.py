@@ -407,6 +407,9 @@ class RgbdFeed:
         waiting, lost = self._images.entries(COLOR), []
         while (first := waiting.popleft()) is not color:
             lost.append(first)
+        depths = self._images.entries(DEPTH)
+        while depths[0] is not depth:  # its own one may belong to the next image, too
+            depths.popleft()
         # more of them, and images come faster than they are looked at
         alone = lost[-1:] if self._parameters.depth == AUTO else []
         self.passed += len(lost) - len(alone)

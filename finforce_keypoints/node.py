@@ -298,8 +298,9 @@ class KeypointDetectorNode(ros.ImageNode):
         """Publish the key points of an image, (h, w, 3), while they are fresh."""
         found = self.found
         self.gate.check_age(stamp, self.now())
+        warnings = self.detector.warnings
         for side in self.health:
-            outcome = outcome_of_keypoints(found.get(side), side, self.detector.warnings.get(side, ""))
+            outcome = outcome_of_keypoints(found.get(side), side, warnings.get(side, ""))
             if side not in found:
                 self.reject(outcome, side)
                 continue

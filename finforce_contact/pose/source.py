@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from math import inf
 from threading import Condition, RLock
 from types import SimpleNamespace
@@ -20,6 +21,7 @@ from finforce.messages import (
     pose_from_message,
     stamp_of,
 )
+from finforce.optional import import_open3d
 from finforce_contact.mesh.object_mesh import ObjectMesh
 from finforce_contact.parameters import ORIGINS, ContactParameters, TrackerSettings
 from finforce_contact.pose.alignment import DepthImage
@@ -127,6 +129,9 @@ class MeshFeed:
 
     def set_object(self, mesh: ObjectMesh | None) -> None:
         """Compare another object from now on."""
+        if mesh is not None:
+            with suppress(MissingDependencyError):  # which the comparison tells
+                import_open3d()  # now: later, images would wait for a third of a second
         with self._arrival:
             self._mesh = mesh
             self.reset()

@@ -7,6 +7,7 @@ rigid object it is the same as `RigidContact`, at the price of a look-up.
 
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
+from weakref import WeakValueDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -112,6 +113,7 @@ class ReducedModel:
         self.size = self.rows + 2
         self.loads, self.compliance = self.manifold.loads, self.manifold.compliance
         self.shape_compliance = self.manifold.shape_compliance
+        self._probes: WeakValueDictionary[bytes, _Probe] = WeakValueDictionary()  # by their points; ten megabytes each
         stiffness = LARGEST_MOVE / np.abs(np.diagonal(self.compliance[0, 0]))
         self.reach = np.r_[stiffness, LARGEST_GRID_STEP, manifold.loads.shape[1]]
 
@@ -144,14 +146,18 @@ class ReducedModel:
         on_face = self._face.holds(points, _ON_FACE) & (points[:, 2] >= low) & (points[:, 2] <= high)
         if on_face.all():
             return _FacePoints(points=points, rows=_share_rows(self.manifold.heights, points[:, 2]))
+        if (known := self._probes.get(points.tobytes())) is not None:
+            return known
         full, basis, zero = self._full, self.manifold.basis, np.zeros(self._full.size)
         motion = full.project(full.attach(points, max_distance), zero, basis).reshape(3 * len(points), -1)
-        return _Probe(
+        probe = _Probe(
             points=points,
             shapes=self.manifold.shapes @ motion.T,
             compliance=np.ascontiguousarray(motion.astype(np.float32) @ self.shape_compliance),
             rows=_share_rows(self.manifold.heights, points[:, 2]),
         )
+        self._probes[points.tobytes()] = probe
+        return probe
 
     def positions(self, probe: _Probe | _FacePoints, q: NDArray) -> NDArray:
         """Return the deformed positions (p, 3) [m] of a probe."""

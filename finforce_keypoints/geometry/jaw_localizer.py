@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, replace
+from statistics import median
 
 import numpy as np
 from numpy.typing import NDArray
@@ -133,8 +134,8 @@ class JawLocalizer:
                 f"the jaw lies {1e3 * self._astray:+.0f} mm along its z from where the rig has it: is the image zoomed "
                 "or stabilised, or of another rig?"
             )
-        if abs(self.depth_ratio - 1.0) > DEPTH_OFF:
-            return describe_depth(self.depth_ratio)
+        if abs((ratio := self.depth_ratio) - 1.0) > DEPTH_OFF:
+            return describe_depth(ratio)
         distance = self._rest_check.distance
         if not distance > self._settings.rest_tolerance:
             return ""
@@ -145,7 +146,7 @@ class JawLocalizer:
     @property
     def depth_ratio(self) -> float:
         """Measured depth over that of the jaw's place by its colours [-], over some images; NaN before."""
-        return float(np.median(self._ratios)) if len(self._ratios) == DEPTH_IMAGES else float("nan")
+        return median(self._ratios) if len(self._ratios) == DEPTH_IMAGES else float("nan")
 
     @property
     def is_lost(self) -> bool:

@@ -29,6 +29,19 @@ def test_the_door_itself_loads_no_library():
     assert not {name.split(".")[0] for name in loaded} - {"finforce", *sys.stdlib_module_names}
 
 
+def test_open3d_comes_without_its_plots_which_come_when_they_are_called():
+    code = """
+import sys
+from finforce.optional import import_open3d
+plots = import_open3d().visualization.get_plotly_fig
+print("dash" in sys.modules, callable(plots))
+plots([import_open3d().geometry.TriangleMesh.create_box()])
+print("dash" in sys.modules)
+"""
+    found = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout
+    assert found.split() == ["False", "True", "True"]
+
+
 def test_an_unknown_name_is_refused_with_the_known_ones():
     with pytest.raises(AttributeError, match=r"no attribute 'load_jaws'; it has .*load_jaw,"):
         finforce.load_jaws  # noqa: B018 - the look-up is the claim

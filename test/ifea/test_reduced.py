@@ -243,3 +243,10 @@ def test_a_step_that_leads_away_from_the_stored_equilibria_is_left_out_and_told(
     m, step = np.array([2.0, 2.0]), np.array([0.5 * direction, 0.0, 3e-6 * np.sqrt(2.0)])
     assert approach_grid(tables, np.full(count, 1e-6), m, step) == left
     assert step[0] == (0.0 if left else -0.5)
+
+
+def test_the_tables_of_the_same_points_are_there_once():
+    model = reduced().model
+    probe = model.attach(BENCH.keypoints, 1e-3)
+    assert model.attach(BENCH.keypoints.copy(), 1e-3) is probe
+    assert model.attach(BENCH.keypoints[:3], 1e-3) is not probe

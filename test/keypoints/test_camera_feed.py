@@ -14,6 +14,7 @@ from finforce.errors import ObservationError
 from finforce.video_packets import MissingFrameError
 from finforce_keypoints.errors import SyncError
 from finforce_keypoints.images import COLOR as COLORS
+from finforce_keypoints.images import DEPTH as DEPTHS
 from finforce_keypoints.images import SILENCE, RgbdFeed, check_image
 from finforce_keypoints.parameters import DetectorParameters
 
@@ -69,6 +70,25 @@ def depth_of(number, value=120):
     plane = np.full((HEIGHT, WIDTH), value, dtype=np.uint16)
     plane[0] += number
     return image_of(round(1e9 * PERIOD * number), plane, "16UC1")
+
+
+def test_of_depth_that_was_used_none_but_the_last_is_kept():
+    camera = Camera()
+    for _ in range(20):
+        assert camera.shoot(COLOR)
+    assert len(camera.feed._images.entries(DEPTHS)) == 1
+
+
+def test_intrinsics_are_read_again_only_when_their_numbers_change():
+    camera, info = Camera(), camera_info()
+    stream = camera.feed.stream
+    first = stream.camera
+    assert not stream.take_info(info) and stream.camera is first
+    info.k = [1.01 * number if index < 6 else number for index, number in enumerate(info.k)]
+    assert stream.take_info(info) and stream.camera.fx == pytest.approx(1.01 * first.fx)
+    info.header.frame_id = "elsewhere"
+    with pytest.raises(ObservationError, match="elsewhere"):
+        stream.take_info(info)
 
 
 def test_without_depth_every_colour_image_is_whole():
