@@ -103,7 +103,7 @@ class JawLocalizer:
         self._mount = mount or JawMount()
         self._visible = self._mount.seen_points(jaw)
         self._origin = OriginEstimator(jaw, T_gripper_camera, settings, self._mount)
-        self._track = OriginTrack(settings, self._origin.largest_stddev)
+        self._track = OriginTrack(settings)
         self._patch, self._rest_check = ReferencePatch(jaw), _RestCheck(jaw.keypoints)
         self._unconfirmed, self._slip, self._astray, self._is_tag_elsewhere = 0, 0.0, 0.0, False
         self._ratios: deque[float] = deque(maxlen=DEPTH_IMAGES)

@@ -21,7 +21,7 @@ from finforce.kalman import MotionNoise, Track
 from finforce.optional import import_cv2
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_keypoints.geometry.side_picture import PlaneGrid, SidePlane, map_picture, take_picture
-from finforce_keypoints.geometry.template import BENDS, SHARE, find_motions
+from finforce_keypoints.geometry.template import BENDS, PAIRS, SHARE, find_motions
 from finforce_keypoints.parameters import DetectorSettings, JawMount
 
 # Errors of a network in the reference point, by what it states: of images in a row alike, and of a single one; measured
@@ -32,11 +32,9 @@ _HIGHEST_RIGID = 3.5e-3  # key points that bend more than this say nothing about
 _LEAST_AGREEMENT = 0.6  # share of the points near the base that stand where the jaw is said to be: of a jaw, all do
 _SET_ASIDE = 3  # consecutive places off the trajectory that are believed when they agree
 _RIGID_STDDEV = 0.3e-3  # [m] bending of the jaw at that height; more with the square of the height
-_ORIGIN_STDDEV = 0.6e-3  # [m] a jaw whose place is less well known is not found
-COVERED_STDDEV = 3e-3  # [m] the same of a jaw whose rigid part is covered: how sure its place is goes into the force
+COVERED_STDDEV = 3e-3  # [m] a jaw whose place is less well known is not found: how well it is known goes into the force
 SLIP = 1.5e-3  # [m] standard deviation of how far holder and camera give under load, along the jaw
 _ROUNDS = 6  # of reweighting
-_LEAST_NOISE = 0.05e-3  # [m] of a place by points near the base, from image to image
 _LEAST_BENT = 5  # points that tell the place of a jaw that may be bent
 _ORIGIN_GATE = 3.0  # standard deviations of an origin off the forecast, which mean that the speed has changed
 # Process noise of a jaw that stands, or closes at some centimetres per second.
@@ -107,14 +105,11 @@ class OriginEstimator:
         self._bent = np.append(np.where(bent < _HIGHEST_RIGID, bent, np.inf), 0.0)
         sign = -1.0 if jaw.side == "left" else 1.0
         self._low, self._high = sorted((sign * settings.opening_min, sign * settings.opening_max))
-        self._motions: NDArray | None = None
-        self.largest_stddev = _ORIGIN_STDDEV
-        if mount.is_held:
-            bends = np.insert(find_motions(jaw)[:BENDS], 1, 0.0, axis=2) @ self._T_camera_middle[:3, :3].T
-            slip = np.broadcast_to(SLIP * self._T_camera_middle[:3, 2], (1, *points.shape))
-            rigid = np.zeros((BENDS, 1 + len(corners), 3))
-            self._motions = np.concatenate((slip, np.append(bends, rigid, axis=1)))
-            self.largest_stddev = COVERED_STDDEV
+        self._is_held = mount.is_held
+        bends = np.insert(find_motions(jaw), 1, 0.0, axis=2) @ self._T_camera_middle[:3, :3].T
+        slip = np.broadcast_to(SLIP * self._is_held * self._T_camera_middle[:3, 2], (1, *points.shape))
+        rigid = np.zeros((len(bends), 1 + len(corners), 3))
+        self._motions = np.concatenate((slip, np.append(bends, rigid, axis=1)))
 
     @property
     def middle(self) -> Origin:
@@ -138,9 +133,8 @@ class OriginEstimator:
     ) -> Origin | None:
         """Return the origin that rays show, None when they show none within the opening range.
 
-        The reference point decides; without it, the key points near the clamped base do, less exactly as they bend.
-        What most of them contradict is no jaw. Where the holder covers the reference point, all points decide, bent in
-        whatever way the jaw's mechanics allow.
+        The reference point decides, unless the points near the clamped base contradict it. Where it is not seen, all
+        points decide, bent in whatever way the jaw's mechanics allow.
 
         Args:
             rays: (K + 1, 3) through the jaw's points, camera frame, z = 1; NaN: not seen.
@@ -148,27 +142,15 @@ class OriginEstimator:
             tag: rays (4, 3) to the corners of the jaw's tag; None where it is not seen.
             tag_stddev: of these rays' x and y [-].
         """
-        if self._motions is not None:
-            corners = len(self._starts) - self._count
-            tag = np.full((corners, 3), np.nan) if tag is None else tag
-            return self._measure_bent(np.vstack((rays, tag)), np.append(stddev, np.full(corners, tag_stddev)))
-        x, error, off = self._solve(rays, stddev)
-        with np.errstate(invalid="ignore"):
-            fits = (off <= self._tolerance) & (x >= self._low) & (x <= self._high) & np.isfinite(self._bent)
-        if fits[-1]:
-            stddev = float(error[-1])
-            shared, noise = _LASTING * stddev, _NETWORK_NOISE * stddev
-            origin = Origin(x=float(x[-1]), stddev=stddev, shared=shared, noise=noise)
-            return origin if self._agrees(origin, x, off) else None
-        if fits.sum() < 2:
-            return None
-        x, error, bent = x[fits], error[fits], self._bent[fits]
-        weights = 1.0 / (error**2 + bent**2 + (x - np.median(x)) ** 2)
-        # bent points do not err independently: what they share is no smaller than the least bending
-        spread = np.sqrt(1.0 / weights.sum() + bent.min() ** 2)
-        noise = max(1.0 / np.sqrt((1.0 / error**2).sum()), _LEAST_NOISE)
-        place = float(weights @ x / weights.sum())
-        return Origin(x=place, stddev=float(spread), shared=float(bent.min()), noise=float(noise), is_bent=True)
+        if not self._is_held:
+            x, error, off = self._solve(rays, stddev)
+            if off[-1] <= self._tolerance and self._low <= x[-1] <= self._high:
+                known = float(error[-1])
+                origin = Origin(x=float(x[-1]), stddev=known, shared=_LASTING * known, noise=_NETWORK_NOISE * known)
+                return origin if self._agrees(origin, x, off) else None
+        corners = len(self._starts) - self._count
+        tag = np.full((corners, 3), np.nan) if tag is None else tag
+        return self._measure_bent(np.vstack((rays, tag)), np.append(stddev, np.full(corners, tag_stddev)))
 
     def _measure_bent(self, rays: NDArray, stddev: NDArray) -> Origin | None:
         """Return the origin by all points that are seen; None where they are too few or no jaw within the range.
@@ -192,9 +174,12 @@ class OriginEstimator:
         slopes /= points[:, 2, None, None]
         along = np.broadcast_to(self._axis, (1, *points.shape))
         columns = np.einsum("kab,ikb->kai", slopes, np.concatenate((along, self._motions[:, seen])))
-        away = rays[seen, :2] - points[:, :2] / points[:, 2:]
+        columns, products = np.split(columns, [2 + BENDS], axis=2)
+        straight = rays[seen, :2] - points[:, :2] / points[:, 2:]
         prior, variance, weights = np.diag([0.0, *np.ones(1 + BENDS)]), stddev[seen] ** 2, np.ones(len(points))
+        found = np.zeros(2 + BENDS)
         for _ in range(_ROUNDS):
+            away = straight - products @ [found[2 + i] * found[2 + j] for i, j in PAIRS]
             weighted = columns * (weights / variance)[:, None, None]
             covariance = np.linalg.inv(np.einsum("kai,kaj->ij", weighted, columns) + prior)
             found = covariance @ np.einsum("kai,ka->i", weighted, away)
@@ -204,6 +189,8 @@ class OriginEstimator:
         place, spread = middle + float(found[0]), float(np.sqrt(covariance[0, 0]))
         # what a finger differs from its shapes by is the same from image to image
         origin = Origin(x=place, stddev=spread, shared=spread, slip=SLIP * float(found[1]))
+        if not self._is_held:
+            origin = replace(origin, noise=_NETWORK_NOISE * spread, is_bent=True, slip=0.0)
         return origin if self._low <= place <= self._high else None
 
     def _agrees(self, origin: Origin, x: NDArray, off: NDArray) -> bool:
@@ -385,9 +372,9 @@ class OriginTrack:
     from one image to the next is in the noise of this one, or in that of the forecast where the last one was worse.
     """
 
-    def __init__(self, settings: DetectorSettings, largest_stddev: float = _ORIGIN_STDDEV) -> None:
-        """Keep noise and gates; a jaw whose place is less well known than `largest_stddev` [m] is not found."""
-        self._settings, self._largest_stddev = settings, largest_stddev
+    def __init__(self, settings: DetectorSettings) -> None:
+        """Keep the gates."""
+        self._settings = settings
         self.reset()
 
     def reset(self) -> None:
@@ -450,7 +437,7 @@ class OriginTrack:
             # a finger stays bent from image to image: no average of its points knows better where its base is
             track.widen(max(min(before, origin.shared**2) - track.variance, 0.0))
         found = self._tell(track)
-        return found if found.stddev <= self._largest_stddev else None
+        return found if found.stddev <= COVERED_STDDEV else None
 
     def _take_bias(self, origin: Origin, forecast: Origin) -> Origin:
         """Return an origin by points that may be bent less what it was off when the reference point was last seen."""
@@ -472,7 +459,7 @@ class OriginTrack:
         """Start the trajectory at an origin."""
         self._stamp, self._track = stamp, Track(_NOISE, origin.x, (origin.noise or origin.stddev) ** 2, speed)
         self._aside, self._missed, self._last = [], 0, origin
-        return self._tell(self._track) if origin.stddev <= self._largest_stddev else None
+        return self._tell(self._track) if origin.stddev <= COVERED_STDDEV else None
 
     def _miss(self, stamp: float, track: Track | None) -> Origin | None:
         """Go on as predicted, without an origin, for a few images."""
@@ -482,7 +469,7 @@ class OriginTrack:
             return None
         self._stamp, self._track = stamp, track
         found = self._tell(track)
-        return found if found.stddev <= self._largest_stddev else None
+        return found if found.stddev <= COVERED_STDDEV else None
 
     def _set_aside(self, stamp: float, origin: Origin, track: Track) -> Origin | None:
         """Keep an origin that no jaw can reach; believe it once some in a row agree."""
