@@ -94,10 +94,12 @@ def compute_point_noise(usual: StatedNoise, stddev: NDArray | None) -> PointNois
     A detector errs in the same way while it sees the same: what is stated and does not scatter in the tare stands still
     there, is taken off with the offsets, and comes back with another shape. No averaging removes it,
 
-        b_k = max(0, (s_kx^2 + s_kz^2) / 2 - tr N_k),    bias_k = sqrt(b_k median(b)), zero when nothing is stated;
+        b_k = max(s_kx^2 + s_kz^2 - n_k, n_k),    n_k = N_kxx + N_kzz,    bias_k = sqrt(b_k median(b)),
 
-    up to twice the variance of the scatter is taken for chance. What a detector sees badly, it states badly, too: in
-    drawn scenes the errors follow the geometric mean of what is stated of a point and of most of its jaw.
+    zero when nothing is stated. In drawn scenes the lasting errors are 0.4 to 2 times the scatter along an axis, 1.4 in
+    the root mean square, where ribs are bright and where they hardly show; what is stated less the scatter is far more
+    than they are in the first, and nothing in the second. What a detector sees badly, it states badly, too: the errors
+    follow the geometric mean of what is stated of a point and of most of its jaw.
 
     Args:
         usual: of each key point in the tare.
@@ -134,7 +136,8 @@ def _enlarge_noise(covariance, usual, stddev):
             now += plane[k, a, a] * growth[i] ** 2
             stated += (usual[k, i] * growth[i]) ** 2
         along[k], noise_ratio[k] = noise[1, 1] * growth[1] ** 2, own / now
-        bias[k] = max(0.0, stated - noise[0, 0] - noise[2, 2])
+        scatter = noise[0, 0] + noise[2, 2]
+        bias[k] = max(stated - scatter, scatter)
     return plane, gain, along, noise_ratio, bias
 
 
