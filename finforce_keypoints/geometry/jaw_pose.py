@@ -148,6 +148,7 @@ class OriginEstimator:
                 known = float(error[-1])
                 origin = Origin(x=float(x[-1]), stddev=known, shared=_LASTING * known, noise=_NETWORK_NOISE * known)
                 return origin if self._agrees(origin, x, off) else None
+            rays = np.vstack((rays[:-1], np.full(3, np.nan)))  # what is off the mark's line is not the mark
         corners = len(self._starts) - self._count
         tag = np.full((corners, 3), np.nan) if tag is None else tag
         return self._measure_bent(np.vstack((rays, tag)), np.append(stddev, np.full(corners, tag_stddev)))
