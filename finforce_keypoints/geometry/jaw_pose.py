@@ -36,6 +36,7 @@ COVERED_STDDEV = 3e-3  # [m] a jaw whose place is less well known is not found: 
 SLIP = 1.5e-3  # [m] standard deviation of how far holder and camera give under load, along the jaw
 _ROUNDS = 6  # of reweighting
 _LEAST_BENT = 5  # points that tell the place of a jaw that may be bent
+_LEAST_WEIGHT = 0.4  # mean over these: 0.5 and more on jaws in images of the twin, up to 0.3 where there is none
 _ORIGIN_GATE = 3.0  # standard deviations of an origin off the forecast, which mean that the speed has changed
 # Process noise of a jaw that stands, or closes at some centimetres per second.
 _NOISE = MotionNoise(
@@ -190,9 +191,11 @@ class OriginEstimator:
         place, spread = middle + float(found[0]), float(np.sqrt(covariance[0, 0]))
         # what a finger differs from its shapes by is the same from image to image
         origin = Origin(x=place, stddev=spread, shared=spread, slip=SLIP * float(found[1]))
+        is_jaw = self._low <= place <= self._high
         if not self._is_held:
             origin = replace(origin, noise=_NETWORK_NOISE * spread, is_bent=True, slip=0.0)
-        return origin if self._low <= place <= self._high else None
+            is_jaw &= bool(weights.mean() >= _LEAST_WEIGHT)
+        return origin if is_jaw else None
 
     def _agrees(self, origin: Origin, x: NDArray, off: NDArray) -> bool:
         """Say whether the points near the base, by origins (K + 1,) and distances (K + 1,), are of a jaw there."""

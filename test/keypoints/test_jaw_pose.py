@@ -66,6 +66,14 @@ def test_without_the_reference_point_all_points_say_less_exactly_where_the_jaw_i
     assert 0.5 < np.std(off) < 1.5 and abs(np.mean(off)) < 0.6 and np.abs(off).max() < 4.0
 
 
+def test_points_without_the_shape_of_a_jaw_say_nothing(seen):
+    estimator, look, sign = seen
+    rng, found = np.random.default_rng(0), []
+    for _ in range(50):
+        found.append(measure(estimator, only(range(15), look(sign * 0.04) + 8.0 * rng.standard_normal((16, 2)))))
+    assert sum(origin is not None for origin in found) <= 5
+
+
 def test_the_tip_alone_says_nothing(seen):
     estimator, look, sign = seen
     assert measure(estimator, only([6, 13, 14], look(sign * 0.04))) is None
