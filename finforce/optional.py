@@ -78,13 +78,12 @@ _PLOTS = "open3d.visualization.draw_plotly"  # imports Dash, Plotly and IPython:
 
 def import_open3d() -> ModuleType:
     """Return open3d, repair and registration; raises MissingDependencyError where it is not installed."""
-    if "open3d" not in sys.modules:
-        sys.modules[_PLOTS] = _Deferred(_PLOTS)
+    sys.modules.setdefault(_PLOTS, _Deferred(_PLOTS))
     try:
         return import_library("open3d", "the simulator, or registration or decimation of a mesh,", "'finforce[mesh]'")
     finally:
         if isinstance(sys.modules.get(_PLOTS), _Deferred):
-            del sys.modules[_PLOTS]
+            sys.modules.pop(_PLOTS, None)
 
 
 def import_trimesh() -> ModuleType:

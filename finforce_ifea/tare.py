@@ -42,7 +42,7 @@ class PointNoise(NamedTuple):
         gain: regression of x and z on y in this image (K, 2).
         width_variance: along y in this image (K,) [m^2].
         noise_ratio: variance in the tare over that in this image (K,), at most 1.
-        bias: variance of an error of this image less one of the tare, as far as these do not scatter (K,) [m^2].
+        bias: variance of an error of this image less one of the tare, which lasts while the view does (K,) [m^2].
     """
 
     plane: NDArray

@@ -113,7 +113,7 @@ class ReducedModel:
         self.size = self.rows + 2
         self.loads, self.compliance = self.manifold.loads, self.manifold.compliance
         self.shape_compliance = self.manifold.shape_compliance
-        self._probes: WeakValueDictionary[bytes, _Probe] = WeakValueDictionary()  # by their points; ten megabytes each
+        self._probes: WeakValueDictionary[tuple[bytes, float], _Probe] = WeakValueDictionary()  # ten megabytes each
         stiffness = LARGEST_MOVE / np.abs(np.diagonal(self.compliance[0, 0]))
         self.reach = np.r_[stiffness, LARGEST_GRID_STEP, manifold.loads.shape[1]]
 
@@ -146,7 +146,8 @@ class ReducedModel:
         on_face = self._face.holds(points, _ON_FACE) & (points[:, 2] >= low) & (points[:, 2] <= high)
         if on_face.all():
             return _FacePoints(points=points, rows=_share_rows(self.manifold.heights, points[:, 2]))
-        if (known := self._probes.get(points.tobytes())) is not None:
+        key = points.tobytes(), max_distance
+        if (known := self._probes.get(key)) is not None:
             return known
         full, basis, zero = self._full, self.manifold.basis, np.zeros(self._full.size)
         motion = full.project(full.attach(points, max_distance), zero, basis).reshape(3 * len(points), -1)
@@ -156,7 +157,7 @@ class ReducedModel:
             compliance=np.ascontiguousarray(motion.astype(np.float32) @ self.shape_compliance),
             rows=_share_rows(self.manifold.heights, points[:, 2]),
         )
-        self._probes[points.tobytes()] = probe
+        self._probes[key] = probe
         return probe
 
     def positions(self, probe: _Probe | _FacePoints, q: NDArray) -> NDArray:

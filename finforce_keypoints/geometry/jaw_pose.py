@@ -32,11 +32,11 @@ _HIGHEST_RIGID = 3.5e-3  # key points that bend more than this say nothing about
 _LEAST_AGREEMENT = 0.6  # share of the points near the base that stand where the jaw is said to be: of a jaw, all do
 _SET_ASIDE = 3  # consecutive places off the trajectory that are believed when they agree
 _RIGID_STDDEV = 0.3e-3  # [m] bending of the jaw at that height; more with the square of the height
-COVERED_STDDEV = 3e-3  # [m] a jaw whose place is less well known is not found: how well it is known goes into the force
+COVERED_STDDEV = 3e-3  # [m] of a jaw whose rigid part is covered; one whose place is less well known is not found
 SLIP = 1.5e-3  # [m] standard deviation of how far holder and camera give under load, along the jaw
 _ROUNDS = 6  # of reweighting
 _LEAST_BENT = 5  # points that tell the place of a jaw that may be bent
-_LEAST_WEIGHT = 0.4  # mean over these: 0.5 and more on jaws in images of the twin, up to 0.3 where there is none
+_LEAST_WEIGHT = 0.4  # mean over these: 0.5 and more in 99 of 100 images of jaws, up to 0.3 where there is none
 _ORIGIN_GATE = 3.0  # standard deviations of an origin off the forecast, which mean that the speed has changed
 # Process noise of a jaw that stands, or closes at some centimetres per second.
 _NOISE = MotionNoise(
@@ -159,9 +159,10 @@ class OriginEstimator:
 
         Least squares with less weight for what is far off, to first order around the median of the points' own places:
 
-            r_k - p_k / p_kz = D_k (a x + sum_i c_i m_ki) + e_k,   D_k = dr / dp,   c_i of the motions m_i ~ N(0, 1)
+            r_k - p_k / p_kz = D_k (a x + sum_i c_i m_ki + sum_ij c_i c_j m_kij) + e_k,   D_k = dr / dp,
 
-        The first of the motions is the slip of the jaw in its holder, or of the holder before the camera.
+        c_i of the motions m_i ~ N(0, 1), m_ij of the products in `PAIRS`, those of the round before. The first of the
+        motions is the slip of a held jaw in its holder, or of the holder before the camera.
         """
         with np.errstate(invalid="ignore"):
             x, _, off = self._solve(rays, stddev)
@@ -193,7 +194,7 @@ class OriginEstimator:
         origin = Origin(x=place, stddev=spread, shared=spread, slip=SLIP * float(found[1]))
         is_jaw = self._low <= place <= self._high
         if not self._is_held:
-            origin = replace(origin, noise=_NETWORK_NOISE * spread, is_bent=True, slip=0.0)
+            origin = replace(origin, noise=_NETWORK_NOISE * spread, is_bent=True)
             is_jaw &= bool(weights.mean() >= _LEAST_WEIGHT)
         return origin if is_jaw else None
 

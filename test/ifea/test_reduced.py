@@ -10,7 +10,7 @@ from mechanics_fakes import BENCH, bench_mechanics, press, rounded_box, settle
 from finforce_ifea.contact_mechanics.friction import constant_traction
 from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, SHAPE, OutlineIndenter, RoundIndenter
 from finforce_ifea.contact_mechanics.pressed_jaw import RigidContact, limit_step
-from finforce_ifea.errors import ContactError, JawFileError
+from finforce_ifea.errors import ContactError, JawFileError, MeshError
 from finforce_ifea.fem.solid import SolidModel
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.mechanics import build_chosen, build_mechanics
@@ -250,3 +250,8 @@ def test_the_tables_of_the_same_points_are_there_once():
     probe = model.attach(BENCH.keypoints, 1e-3)
     assert model.attach(BENCH.keypoints.copy(), 1e-3) is probe
     assert model.attach(BENCH.keypoints[:3], 1e-3) is not probe
+    # what is on the jaw within one distance may be off it within another
+    aside = BENCH.keypoints + [0.0, 2e-3, 0.0]
+    far = model.attach(aside, 20e-3)
+    with pytest.raises(MeshError):
+        model.attach(far.points, 1e-6)
