@@ -27,12 +27,14 @@ class TwinScene:
         seed: of textures, lights, background and noise.
         changes: numbers of the scenario that differ.
         size: of the images, WIDTHxHEIGHT.
+        lens: of the camera.
     """
 
     scenario: str
     seed: int
     changes: Mapping[str, Any] = field(default_factory=dict)
     size: str = SIZE
+    lens: str = "d405"
 
     def build(self) -> Scenario:
         """Return the scenario.
@@ -89,5 +91,5 @@ def _render(scene: TwinScene, path: Path) -> None:
 
     scenario = scene.build()
     record_simulation(
-        build_simulated_recording(scenario, scene.seed, parse_size(scene.size)), scenario, scene.seed, path
+        build_simulated_recording(scenario, scene.seed, parse_size(scene.size, scene.lens)), scenario, scene.seed, path
     )

@@ -87,10 +87,11 @@ def project_columns(H, rows, u, A):
 
 
 @njit(**_OPTIONS)
-def innovate(H, rows, u, P, R):
-    """Return H P (2 m, n) and S = H P H^T + R (2 m, 2 m); see `Measurement` for the arguments."""
+def innovate(measured, P):
+    """Return H P (2 m, n) and S = H P H^T + R (2 m, 2 m) for a `Measurement`."""
+    H, rows, u, R = measured.H, measured.rows, measured.u, measured.R
     HP = multiply_rows(H, rows, u, P)
-    S = project_columns(H, rows, u, HP)
+    S = project_columns(H, rows, u, HP) + measured.cross
     for k in range(len(R)):
         for a in range(2):
             for b in range(2):
@@ -162,7 +163,7 @@ def update(measured, weight, ratios, x, log_weights, HP, S):
         A,
         L,
         np.dot(white, before),
-        _spread_noise(A, L, R),
+        _spread_noise(A, L, R, measured.cross),
         left,
         distances,
         weigh(distances),
@@ -204,7 +205,7 @@ def reduce_covariance(P, A):
 
 
 @njit(**_OPTIONS)
-def _spread_noise(A, L, R):
+def _spread_noise(A, L, R, cross):
     """Return the covariance of the first four entries by the noise of this image alone, K R K^T (4, 4)."""
     m, gains = len(L), A[:, :4].copy()
     for i in range(m - 1, -1, -1):
@@ -213,7 +214,7 @@ def _spread_noise(A, L, R):
         for j in range(i):
             for c in range(4):
                 gains[j, c] -= L[i, j] * gains[i, c]
-    out = np.zeros((4, 4))
+    out = np.dot(np.ascontiguousarray(gains.T), np.dot(cross, gains))
     for k in range(len(R)):
         for a in range(2):
             for b in range(2):

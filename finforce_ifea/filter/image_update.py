@@ -243,7 +243,7 @@ def finish(state, image, P, results, friction, filtered, made, where, place, wat
         Means, covariance, log weights and weights of the hypotheses; noise level, scatter of the depth, and what
         smoothing adds to it [m]; the ratio at which only the jaws hold the object, and its slope; the jump.
     """
-    (points, seen, level, expectation), (packed, weights, (pull, pull_stddev)) = image, friction
+    ((points, seen, level, _), expectation), (packed, weights, (pull, pull_stddev)) = image, friction
     (track, scatter, raw), (force, modes, at, ratio), (detector, watches, settled) = filtered, made, watching
     measured, posterior, (at_place, x_model, depth) = Measurement(*results[0]), Posterior(*results[1]), place
     weight, offset = posterior.weight, posterior.mean[HEIGHT] - expectation[()].mean[1]
@@ -277,7 +277,7 @@ def iterate(image, at, prior, weight, possible, known, x, last):
     """Return the update of one linearisation and the next step.
 
     Args:
-        image: `points`, `seen` and `level` of `observe`; see `EXPECTATION`.
+        image: see `observe`; see `EXPECTATION`.
         at: `positions`, `motions`, `at` and `ratio` of `observe`; modes (size, 4) and size of the `PressedState`.
         prior: `ratios`, `x`, `log_weights` and `P` of `correct`.
         weight: see `correct`.
@@ -291,9 +291,9 @@ def iterate(image, at, prior, weight, possible, known, x, last):
         Measurement, posterior and jump; the next `_Place`; the motion of the unknowns of the mechanics
         (size,); this step, and the next share; whether it changes nothing that matters.
     """
-    (points, seen, level, expectation), (positions, motions, x_model, ratio, modes, size) = image, at
+    (observed, expectation), (positions, motions, x_model, ratio, modes, size) = image, at
     (touching, reach, track, scatter), (before, share) = known, last
-    measured = observe(points, seen, positions, motions, x_model, ratio, level)
+    measured = observe(observed, positions, motions, x_model, ratio)
     posterior, found = correct(measured, weight, *prior, possible, x_model[DEPTH])
     aim, variance = posterior.mean[: HEIGHT + 1] - x, max(posterior.own[0, 0], _LEAST_VARIANCE) * scatter
     aim[0] = expect_position(track, posterior.mean[DEPTH], variance, DEPTH_NOISE) - x[0]

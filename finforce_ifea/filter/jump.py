@@ -110,7 +110,7 @@ def correct(measured, weight, ratios, x, log_weights, P, possible, depth):
         possible: mask of those of `JUMPS` that are possible now (J,).
         depth: of the linearisation [m].
     """
-    HP, S = innovate(measured.H, measured.rows, measured.u, P, measured.R)
+    HP, S = innovate(measured, P)
     found = NO_JUMP
     if len(weight) == 0:
         before = np.exp(log_weights)
@@ -125,7 +125,7 @@ def correct(measured, weight, ratios, x, log_weights, P, possible, depth):
                 if index == found:
                     for i in range(len(jump.entries)):
                         P[jump.entries[i], jump.entries[i]] += jump.stddev[i] ** 2
-            HP, S = innovate(measured.H, measured.rows, measured.u, P, measured.R)
+            HP, S = innovate(measured, P)
     return update(measured, weight, ratios, x, log_weights, HP, S), found
 
 

@@ -4,11 +4,13 @@ In the plane of the jaw's motion, with what the noise along y tells of that alon
 
     z_k = p_k(d, s, h, kappa) + camera_k + o_k + r_k |u_k| + n_k,
 
-with p_k the mechanics' position and u_k its displacement. n_k is Student's t, whose weights
+with p_k the mechanics' position and u_k its displacement. The noise n_k of neighbours is correlated, see
+`finforce_ifea.tare.measure_correlation`. It is Student's t, whose weights
 
     w_k = (nu + 3) / (nu + D_k^2)
 
-divide the covariance of a point whose squared normalised residual is D_k^2 (see Lange, Little and Taylor, 1989).
+divide the covariance of a point whose squared normalised residual is D_k^2 (see Lange, Little and Taylor, 1989); what
+they add to it is of the point alone.
 """
 
 from __future__ import annotations
@@ -56,6 +58,7 @@ class Measurement(NamedTuple):
         z: measured positions less the part of the linearised ones that does not depend on x (2 m,) [m].
         R: noise (m, 2, 2) [m^2].
         square: squared normalised residuals along y (m,).
+        cross: covariances of the noise of different key points (2 m, 2 m) [m^2], zero within each.
     """
 
     H: NDArray
@@ -64,6 +67,7 @@ class Measurement(NamedTuple):
     z: NDArray
     R: NDArray
     square: NDArray
+    cross: NDArray
 
 
 @njit(**_OPTIONS)
@@ -104,18 +108,18 @@ def summarize_detector_errors(points):
 
 
 @njit(**_OPTIONS)
-def observe(points, seen, positions, motions, at, ratio, level):
+def observe(image, positions, motions, at, ratio):
     """Return the measurement by key points.
 
     Args:
-        points: all key points of the image (K,), see `KEYPOINT`.
-        seen: those that are used (m,).
+        image: all key points (K,), see `KEYPOINT`; those that are used (m,); variance of the noise over that in the
+            tare; its correlation (K, K).
         positions: of the mechanics (K, 3) [m].
         motions: their derivatives by depth, shape, height and traction ratio (K, 3, 4).
         at: depth, shape and height at which the mechanics stands (3,).
         ratio: traction ratio at which it stands.
-        level: variance of the noise over that in the tare.
     """
+    points, seen, level, correlation = image
     m = len(seen)
     H, rows, u, z = np.zeros((2 * m, SHARED)), np.empty(2 * m, np.int64), np.empty(2 * m), np.empty(2 * m)
     R, square = np.empty((m, 2, 2)), np.empty(m)
@@ -138,7 +142,27 @@ def observe(points, seen, positions, motions, at, ratio, level):
         H[2 * i, CAMERA_X], H[2 * i + 1, CAMERA_Z] = 1.0, 1.0
         H[2 * i, CAMERA_TURN], H[2 * i + 1, CAMERA_TURN] = p[2], -p[0]
         H[2 * i + 1, CAMERA_STRETCH] = p[2]
-    return Measurement(H, rows, u, z, R, square)
+    return Measurement(H, rows, u, z, R, square, _correlate(R, correlation, seen))
+
+
+@njit(**_OPTIONS)
+def _correlate(R, correlation, seen):
+    """Return `cross` of a `Measurement`: rho_kl C_k C_l^T, with C_k C_k^T the noise R_k of each key point."""
+    m = len(R)
+    C, cross = np.zeros((m, 2, 2)), np.zeros((2 * m, 2 * m))
+    for k in range(m):
+        C[k, 0, 0] = np.sqrt(R[k, 0, 0])
+        C[k, 1, 0] = R[k, 1, 0] / C[k, 0, 0]
+        C[k, 1, 1] = np.sqrt(max(R[k, 1, 1] - C[k, 1, 0] ** 2, 0.0))
+    for k in range(m):
+        for j in range(k):
+            rho = correlation[seen[k], seen[j]]
+            if rho > 0.0:
+                for a in range(2):
+                    for b in range(2):
+                        value = rho * (C[k, a, 0] * C[j, b, 0] + C[k, a, 1] * C[j, b, 1])
+                        cross[2 * k + a, 2 * j + b] = cross[2 * j + b, 2 * k + a] = value
+    return cross
 
 
 @njit(**_OPTIONS)

@@ -13,8 +13,8 @@ from finforce_ifea.tracking.contact_state import LEAST_DEPTH, LOADED_DEPTH, TOUC
 _OPTIONS = {"cache": True, "error_model": "numpy"}
 # Standard deviation of the traction ratio by errors of the force's direction [-]: considered, not estimated.
 _MISDIRECTED = 0.03
-# Share of the variance of a detector's lasting errors that all key points of a jaw have in common [-]: 0.023 in drawn
-# grasps of the bench finger, whose key points err by half of what the shipped network states; twice that is considered.
+# Share of the variance of a detector's lasting errors that all key points of a jaw have in common [-]: 0.02 in the
+# median of scenes drawn at random, several times as much in a few of them.
 COMMON = 0.05
 # Largest factor by which the force may grow beyond the linearisation [-].
 _LARGEST_GROWTH = 10.0

@@ -63,6 +63,7 @@ class ContactSearch:
 
     Attributes:
         points: key points of the last image (K,), see `KEYPOINT`.
+        correlation: of their noise (K, K), see `measure_correlation`.
         state: of the contact in the last image in which it was found, see `CONTACT_STATE`.
         expectation: of the object, see `EXPECTATION`.
         q: unknowns of the jaw (size,).
@@ -80,6 +81,7 @@ class ContactSearch:
         self.settings, self.pull = settings, (0.0, 0.0)
         self.points, self.positions = np.zeros(count, KEYPOINT), np.zeros((count, 3))
         self.state, self.expectation = blank_contact_state(), np.zeros((), EXPECTATION)
+        self.correlation = np.eye(count)
         self._count, self._detector_errors = count, DetectorErrors(0.0, 0.0, 1.0)
         self._watches = tuple(watch_for(jump, state_size(count)) for jump in (NUDGED, OFFSET))
         self._packed_watches = tuple((tuple(each.jump), *each[1:]) for each in self._watches)
@@ -217,7 +219,7 @@ class ContactSearch:
         settled, iteration, last = False, 0, (np.zeros(3), 1.0)
         posterior, found, jump, P = None, UNDECIDED, NO_JUMP, self.P.copy()
         possible = True, bool(self.state["depth"] > LOADED_DEPTH) and not self._misplaced
-        image = self.points, seen, self._level, self.expectation
+        image = (self.points, seen, self._level, self.correlation), self.expectation
         known = touching, contact.reach, self.track.state, self._scatter
         prior = ratios, self.x, self.log_weights, P
         while iteration < iterations and not settled:

@@ -220,7 +220,7 @@ class ContactTracker:
         """
         search, measured, move = self._search, points - tare.offsets, self._follow_posture(observation.posture)
         if tare is not self._tare:
-            self._tare = tare
+            self._tare, search.correlation = tare, tare.correlation
             search.restart()
         search.expectation["shared"] = observation.shared.shift
         search.expectation["closing"] = observation.shared.closing

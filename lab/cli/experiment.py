@@ -22,6 +22,7 @@ EXPERIMENTS = {
     "manipulation": ("a held weight of 100 g that is turned, in two lights", "manipulation"),
     "friction": ("the 27 grasps with a friction of 0.5, and nine of them with a probe", "friction"),
     "network": ("nine grasps in two lights against the paper's baseline network", "network"),
+    "drawn": ("24 scenes over all that the twin can vary, drawn from the seed", "drawn"),
     "chip": ("an object that breaks at 5.43 N, grasped to 5 N by force, position and current", "chip"),
 }
 

@@ -125,10 +125,11 @@ class RunOptions:
         if is_own:
             bag = Path(settings["bag"])
         else:
-            about = {name: settings[name] for name in ("changes", "seed", "size")}
+            about = {name: settings[name] for name in ("changes", "seed", "size", "lens") if name in settings}
             scene = TwinScene(scenario=settings["scene"], **about)
             bag, source = find_scene(scene, folder / RECORDINGS), source or "images"
-        yield KeypointSource(source=source, jaw_file=settings["jaw"]).apply(read_recording(bag))
+        detector = settings.get("detector", {})
+        yield KeypointSource(source=source, jaw_file=settings["jaw"], parameters=detector).apply(read_recording(bag))
         if not is_own:
             rmtree(bag, ignore_errors=True)
 

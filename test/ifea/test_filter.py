@@ -6,6 +6,7 @@ and back with a coefficient of friction of 0.3.
 
 import itertools
 from functools import cache
+from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -28,6 +29,7 @@ from finforce_ifea.filter.measurement import (
     DetectorErrors,
     Measurement,
     measure_distances,
+    observe,
     summarize_detector_errors,
     weigh,
 )
@@ -39,6 +41,7 @@ from finforce_ifea.jaw.calibration import Calibration, load_calibration
 from finforce_ifea.mechanics import build_chosen
 from finforce_ifea.observation import Observation
 from finforce_ifea.settings import EstimatorSettings
+from finforce_ifea.tracking.contact_state import KEYPOINT
 from lab.presses import rub_jaw
 
 RUBBED = np.load(Path(__file__).parents[1] / "data" / "rubbed_bench.npz")
@@ -52,8 +55,11 @@ def mechanics():
     return build_chosen(load_calibration("bench").apply(BENCH), EstimatorSettings())
 
 
-def draw(seed=0):
-    """A random measurement of three of four key points, H in full, P, and means of two hypotheses."""
+def draw(seed=0, rho=0.0):
+    """A random measurement of three of four key points, H in full, P, and means of two hypotheses.
+
+    The noise of the first two correlates by rho.
+    """
     random, rows = np.random.default_rng(seed), np.array([0, 1, 2, 3, 6, 7])
     H, u = random.standard_normal((6, SHARED)), np.repeat(random.uniform(0.0, 1.0, 3), 2)
     full = np.zeros((6, SIZE))
@@ -63,7 +69,9 @@ def draw(seed=0):
         full[row, SHARED + 2 * COUNT + entry] = u[row]
     root = random.standard_normal((SIZE, SIZE))
     R = np.stack([each @ each.T + 0.1 * np.eye(2) for each in random.standard_normal((3, 2, 2))])
-    measured = Measurement(H, rows, u, random.standard_normal(6), R, np.zeros(3))
+    cross, roots = np.zeros((6, 6)), np.linalg.cholesky(R)
+    cross[:2, 2:4] = rho * roots[0] @ roots[1].T
+    measured = Measurement(H, rows, u, random.standard_normal(6), R, np.zeros(3), cross + cross.T)
     return measured, full, root @ root.T, random.standard_normal((2, SIZE))
 
 
@@ -76,27 +84,45 @@ def block(R):
 
 
 class TestUpdate:
-    def test_it_is_the_textbooks(self):
-        measured, full, P, x = draw()
-        S, ratios = full @ P @ full.T + block(measured.R), np.array([-0.2, 0.3])
+    @pytest.mark.parametrize("rho", [0.0, 0.8])
+    def test_it_is_the_textbooks(self, rho):
+        measured, full, P, x = draw(rho=rho)
+        R = block(measured.R) + measured.cross
+        S, ratios = full @ P @ full.T + R, np.array([-0.2, 0.3])
         K = P @ full.T @ np.linalg.inv(S)
         nu = measured.z - x @ full.T - np.outer(ratios, measured.H[:, TRACTION])
         np.testing.assert_allclose(expect_innovations(measured, ratios, x), nu, rtol=1e-9)
-        prior = innovate(measured.H, measured.rows, measured.u, P, measured.R)
+        prior = innovate(measured, P)
         post = update(measured, np.ones(3), ratios, x, np.log([0.3, 0.7]), *prior)
         np.testing.assert_allclose(post.x, x + nu @ K.T, rtol=1e-8)
         np.testing.assert_allclose(reduce_covariance(P, post.A), P - K @ S @ K.T, rtol=1e-7, atol=1e-7)
         np.testing.assert_allclose(post.L @ post.L.T, S, rtol=1e-9)
-        np.testing.assert_allclose(post.own, (K @ block(measured.R) @ K.T)[:4, :4], rtol=1e-7, atol=1e-10)
+        np.testing.assert_allclose(post.own, (K @ R @ K.T)[:4, :4], rtol=1e-7, atol=1e-10)
         likelihoods = np.array([0.3, 0.7]) * np.exp(-0.5 * np.einsum("ia,ab,ib->i", nu, np.linalg.inv(S), nu))
         likelihoods = np.maximum(likelihoods / likelihoods.sum(), np.exp(-9.0))
         np.testing.assert_allclose(np.exp(post.log_weights), likelihoods / likelihoods.sum(), rtol=1e-6)
 
     def test_the_innovation_has_the_covariance_of_prediction_and_noise(self):
         measured, full, P, _ = draw(1)
-        HP, S = innovate(measured.H, measured.rows, measured.u, P, measured.R)
+        HP, S = innovate(measured, P)
         np.testing.assert_allclose(HP, full @ P, rtol=1e-10)
         np.testing.assert_allclose(S, full @ P @ full.T + block(measured.R), rtol=1e-10)
+
+
+def test_neighbours_share_their_noise_as_far_as_the_tare_has_seen():
+    points = np.zeros(COUNT, KEYPOINT)
+    random, correlation = np.random.default_rng(0), 0.5 ** np.abs(np.subtract.outer(np.arange(COUNT), np.arange(COUNT)))
+    points["tare_noise"] = [each @ each.T + 0.1 * np.eye(2) for each in random.standard_normal((COUNT, 2, 2))]
+    points["noise_ratio"], points["width_variance"], seen = [1.0, 1.0, 0.5, 1.0], 1.0, np.array([0, 2, 3])
+    motions = np.zeros((COUNT, 3, 4))
+    measured = observe((points, seen, 2.0, correlation), np.zeros((COUNT, 3)), motions, np.zeros(3), 0.0)
+    roots = np.linalg.cholesky(2.0 * points["tare_noise"] / points["noise_ratio"][:, None, None])[seen]
+    for k, j in product(range(3), repeat=2):
+        expected = correlation[seen[k], seen[j]] * roots[k] @ roots[j].T
+        found = measured.cross[2 * k : 2 * k + 2, 2 * j : 2 * j + 2]
+        np.testing.assert_allclose(measured.R[k] if k == j else found, expected, atol=1e-12)
+        assert k != j or not found.any()
+    assert np.linalg.eigvalsh(block(measured.R) + measured.cross).min() > 0.0
 
 
 EXPECTED = Expectation(np.ones(2), np.full(2, 4.0), 0.01, 0.04, np.ones(4), CAMERA_TIME)
@@ -104,7 +130,7 @@ EXPECTED = Expectation(np.ones(2), np.full(2, 4.0), 0.01, 0.04, np.ones(4), CAME
 
 def test_what_all_key_points_err_by_alike_is_told_as_far_as_it_moves_the_state():
     measured, full, P, x = draw()
-    prior, variances = innovate(measured.H, measured.rows, measured.u, P, measured.R), np.array([0.1, 0.2, 0.3])
+    prior, variances = innovate(measured, P), np.array([0.1, 0.2, 0.3])
     before = update(measured, np.ones(3), np.zeros(2), x, np.log([0.5, 0.5]), *prior)
     expected = np.zeros((4, 4))
     for variance, entry in zip(variances, (CAMERA_X, CAMERA_Z, CAMERA_TURN), strict=True):
@@ -153,7 +179,7 @@ class TestJump:
     def test_errors_that_are_alike_tell_less_of_one(self):
         """Three key points whose errors correlate by 0.2 tell of what moves all of them as 3 / 1.4 do."""
         measured, _, P, x = draw()
-        HP, S = innovate(measured.H, measured.rows, measured.u, P, measured.R)
+        HP, S = innovate(measured, P)
         posterior = update(measured, np.ones(3), np.zeros(2), x, np.log([0.5, 0.5]), HP, S)
         told = {}
         for sight in (0.0, 1.0):
@@ -165,7 +191,7 @@ class TestJump:
 
     def test_what_a_detector_errs_by_in_all_key_points_is_no_bump_however_long_it_lasts(self):
         measured, _, P, x = draw()
-        HP, S = innovate(measured.H, measured.rows, measured.u, P, measured.R)
+        HP, S = innovate(measured, P)
         posterior, seen = update(measured, np.ones(3), np.zeros(2), x, np.log([0.5, 0.5]), HP, S), {}
         for share in (0.0, 0.2):
             watched = watch_for(NUDGED, SIZE)

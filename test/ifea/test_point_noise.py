@@ -152,8 +152,8 @@ def measure_noise(stated, *, given=False, late=1.0, ignored=""):
 
 @pytest.mark.parametrize("given", [False, True], ids=["rolling", "given"])
 def test_stated_deviations_lower_the_error_when_half_of_the_points_are_coarse(given):
-    # measured 0.62 and 0.63 of the error without; the 2.7 times smaller noise of one frame is averaged over time
-    assert measure_noise(True, given=given) < 0.7 * measure_noise(False, given=given)
+    # measured 0.73 and 0.71 of the error without, for a detector that states is taken to err by more than it scatters
+    assert measure_noise(True, given=given) < 0.8 * measure_noise(False, given=given)
 
 
 def test_stated_deviations_are_as_good_as_to_know_which_points_are_coarse():
@@ -176,32 +176,33 @@ def test_a_common_factor_within_the_scatter_changes_nothing():
 
 
 def test_what_is_stated_far_beyond_the_scatter_stands_still():
-    usual = match_stated(scatter_of(STATED), stated_by(4.0 * STATED, 4000), FLOOR)
-    bias = compute_point_noise(usual, 4.0 * STATED).bias
-    # twice 16 - 1 times the variance in plane, of which the tare's 4000 images tell the scatter within a few per cent
+    usual = match_stated(scatter_of(STATED), stated_by(8.0 * STATED, 4000), FLOOR)
+    bias = compute_point_noise(usual, 8.0 * STATED).bias
+    # a detector errs by half of what it states: twice 16 - 1 times the variance in plane, of which the tare's 4000
+    # images tell the scatter within a few per cent
     own = 30.0 * STATED[:, 0] ** 2
     np.testing.assert_allclose(bias, np.sqrt(own * np.median(own)), rtol=0.05)
     assert not compute_point_noise(usual, None).bias.any()
-    later = STATED * np.where(np.arange(len(STATED)) == 2, 5.0, 4.0)[:, None]
+    later = STATED * np.where(np.arange(len(STATED)) == 2, 10.0, 8.0)[:, None]
     doubtful = compute_point_noise(usual, later).bias
     own[2] *= 48.0 / 30.0
     np.testing.assert_allclose(doubtful, np.sqrt(own * np.median(own)), rtol=0.05)
 
 
-@pytest.mark.parametrize("share", [0.3, 1.0, 1.4])
-def test_what_stands_still_is_at_least_what_scatters_whatever_is_stated(share):
+@pytest.mark.parametrize("share", [0.3, 1.0, 3.0])
+def test_what_stands_still_is_at_least_twice_what_scatters_whatever_is_stated(share):
     usual = match_stated(scatter_of(STATED), stated_by(share * STATED, 4000), FLOOR)
-    own = 2.0 * (STATED[:, 0] ** 2 + FLOOR**2)
+    own = 4.0 * (STATED[:, 0] ** 2 + FLOOR**2)
     np.testing.assert_allclose(compute_point_noise(usual, share * STATED).bias, np.sqrt(own * np.median(own)), rtol=0.1)
 
 
-def test_a_detector_that_errs_anew_in_every_shape_is_believed_as_far_as_it_says():
+def test_a_detector_that_errs_anew_in_every_shape_by_half_of_what_it_says_is_believed():
     # jitter of 0.02 mm at rest, and an error of 0.3 mm that each point keeps while the jaw keeps its shape
     depths = ramp(2, 5)
     random, (clean, forces) = np.random.default_rng(4), true_course(depths, 25, 40)
     steps = {depth: 0.3e-3 * random.normal(size=(K, 3)) * [1.0, 0.0, 1.0] for depth in sorted(set(depths))}
     points = clean + [steps[depth] for depth in depths] + 0.02e-3 * random.normal(size=clean.shape)
-    stated = np.full((K, 3), 0.3e-3)
+    stated = np.full((K, 3), 0.6e-3)
     found = {}
     for name, stddev in (("stated", stated), ("silent", None)):
         observations = [

@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 from mechanics_fakes import BENCH
 
-from finforce_ifea.tare import StatedNoise, blank_tare, compute_point_noise, compute_tare, find_unloaded
+from finforce_ifea.tare import (
+    StatedNoise,
+    blank_tare,
+    compute_point_noise,
+    compute_tare,
+    find_unloaded,
+    measure_correlation,
+)
 from finforce_ifea.tracking.influence import explain_offsets
 
 REST = BENCH.keypoints
@@ -34,6 +41,38 @@ def test_noise_is_measured_with_its_directions():
     expected = 0.1e-3**2 * np.eye(3) + 0.5e-3**2 * np.outer(sight, sight)
     # 6 %: 3000 samples; the floor of 0.02 mm adds 0.2 %; constant offsets are no noise
     np.testing.assert_allclose(compute_tare(seen, REST).noise, expected, atol=0.06 * expected.max())
+
+
+DISTANCES = np.linalg.norm(REST[:, None] - REST, axis=2)
+
+
+def draw_near(correlation, count, seed):
+    """Noise (n, K, 3) [m] with a correlation (K, K) between key points."""
+    root = np.linalg.cholesky(correlation)
+    return NOISE * np.einsum("kj,njc->nkc", root, np.random.default_rng(seed).normal(size=(count, *REST.shape)))
+
+
+@pytest.mark.parametrize("length", [5e-3, 12e-3, 30e-3])
+def test_noise_that_neighbours_share_is_found_at_all_distances(length):
+    expected = np.exp(-DISTANCES / length)
+    found = np.mean([measure_correlation(draw_near(expected, 45, seed), REST) for seed in range(20)], axis=0)
+    np.testing.assert_allclose(found, expected, atol=0.08)
+
+
+def test_noise_of_each_point_alone_is_not_shared():
+    found = [measure_correlation(draw_near(np.eye(len(REST)), 45, seed), REST) for seed in range(100)]
+    assert sum(not np.array_equal(each, np.eye(len(REST))) for each in found) <= 2
+
+
+def test_points_that_are_seen_now_and_then_share_their_noise_with_the_others():
+    expected = np.exp(-DISTANCES / 12e-3)
+    scatter = draw_near(expected, 300, 0)
+    scatter[::2, 4], scatter[:, 9] = np.nan, np.nan
+    np.testing.assert_allclose(measure_correlation(scatter, REST), expected, atol=0.08)
+
+
+def test_no_noise_is_not_shared():
+    np.testing.assert_array_equal(measure_correlation(np.zeros((5, *REST.shape)), REST), np.eye(len(REST)))
 
 
 def test_noise_has_a_floor():
