@@ -101,6 +101,8 @@ RULES = (
           {_IMAGE + "_follow_level": _keep_level}, "noisy", "gross"),
     _rule("scatter of the depth", "`_follow_scatter`", "depths noisier than their key points tell",
           {_IMAGE + "_follow_scatter": _keep_scatter}, "swaying", "noisy", "paused"),
+    _rule("correlated noise", "`measure_correlation`", "noise that neighbouring key points share",
+          {"finforce_ifea.tare:measure_correlation": lambda scatter, keypoints: np.eye(len(keypoints))}, "alike"),
     _rule("depth smoothing", "`DEPTH_NOISE`", "averages the depth over images",
           _with_noise(drift=1.0), "press", "noisy", "rubbed"),
     _rule("two motion models", "`rest_time`", "a model of rest beside that of motion",

@@ -37,6 +37,7 @@ _RADIUS, _HEIGHT = 12.5e-3, 0.040
 _RELAXING = (RelaxationTerm(share=0.5, time_constant=5.0),)
 _HELD = {"held": "either"}
 _LIFTED = 100  # images after a lift
+_ALIKE_LENGTH = 12e-3  # [m], over which a network's noise is alike
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -362,6 +363,14 @@ def build_rubbed_box(bench: Bench, random: np.random.Generator) -> Scene:
     pressed = press(bench, ramp(3, 2, 4, 2), indenter=outline, shape=0.0, height=0.055, friction=0.6)
     told = tell_outline(bench, pressed, random, BOX)
     return film(bench, pressed, told, random, 0.3, friction=0.45, friction_stddev=0.25)
+
+
+def build_alike(bench: Bench, random: np.random.Generator) -> Scene:
+    """Rub, seen by a detector whose noise of 0.1 mm neighbours share, as an image's pixels make them."""
+    scene, rest = build_rubbed(bench, random), bench.jaw.keypoints
+    distance = np.linalg.norm(rest[:, None] - rest, axis=2)
+    root = np.linalg.cholesky(np.exp(-distance / _ALIKE_LENGTH))
+    return shift(scene, 0.1e-3 * np.einsum("kj,njc->nkc", root, random.normal(size=(len(scene.images), *rest.shape))))
 
 
 def build_swaying(bench: Bench, random: np.random.Generator) -> Scene:

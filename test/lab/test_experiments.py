@@ -2,7 +2,7 @@
 
 import json
 import subprocess
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,13 +14,18 @@ from eval_fakes import cut, make_recording
 
 from finforce.errors import FinforceError
 from finforce_eval.cli.main import main
+from finforce_eval.evaluation.scoring import Stats
 from finforce_eval.machine import describe_sources
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.writer import write_recording
 from finforce_eval.table import ForceSeries
 from finforce_eval.tasks import Manifest
+from finforce_ifea.jaw.jaw import load_jaw
+from finforce_sim.objects import place_object
+from finforce_sim.scenarios import build_scenario
 from lab.experiments import grasp_world
 from lab.experiments.chip import CHIP
+from lab.experiments.drawn import DRAWN, draw_scene
 from lab.experiments.experiment import (
     Case,
     Experiment,
@@ -351,6 +356,52 @@ def test_grasps_of_the_paper_are_repeated_with_friction_a_probe_and_in_each_ligh
     }
 
 
+@pytest.mark.parametrize("jaw", ["bench", "ssg48_fin_ray_1"])
+def test_drawn_scenes_are_the_same_for_a_seed_and_fit_the_jaw(jaw):
+    candidates = load_jaw(jaw).candidates[:, 2]
+    drawn = [draw_scene(seed, jaw) for seed in range(40)]
+    assert drawn[7] == draw_scene(7, jaw)
+    assert len({each["scene"] for each in drawn}) > 5 and len({each["size"] for each in drawn}) == 4
+    for each in drawn:
+        scenario = build_scenario(each["scene"], **each["changes"])  # refuses numbers out of their bounds
+        assert candidates.min() < scenario.height < candidates.max()
+        width = np.ptp(place_object(scenario).centred.vertices[:, 0])
+        assert 0.0119 < width < 0.0451
+        assert (each["lens"] == "d405") == (not each["detector"])
+
+
+def test_drawn_scenes_are_judged_together_by_their_images():
+    row = {"scene": "hold", "object": "cube", "camera": "", "light": "dim", "rate/Hz": 30.0, "friction": 0.0}
+    row |= {"press/mm": 3.0, "images": 100, "answered": 90, "rmse_N": 0.1, "within_3_sigma_pct": 100.0}
+    row |= {axis: {"rmse_N": 0.1} for axis in "xyz"} | {"sharpness": dict.fromkeys("xyz", 2.0)}
+    worse = row | {"answered": 30, "rmse_N": 0.3, "within_3_sigma_pct": 60.0, "x": {"rmse_N": 0.5}}
+    silent = row | {"answered": 0, "rmse_N": None, "within_3_sigma_pct": np.nan, "x": {"rmse_N": np.nan}}
+    rows = {"100": row, "101": worse, "102": silent}
+    tables = DRAWN.find(RunOptions(), rows, Path()).tables
+    total = tables["all"].iloc[0]
+    assert total["images"] == 300 and total["answered/%"] == pytest.approx(40.0)
+    assert total["x/N"] == pytest.approx(np.sqrt(0.75 * 0.1**2 + 0.25 * 0.5**2))
+    assert total["within 3σ/%"] == pytest.approx(90.0)
+    assert list(tables["scenes"].seed) == list(rows)
+
+
+def test_a_drawn_scene_is_rendered_and_scored_with_its_lens(tmp_path, monkeypatch):
+    case = DRAWN.list_cases(RunOptions(seed=3, quick=True))[0]
+    made = []
+
+    @contextmanager
+    def opened(options, case, folder):
+        made.append(case.settings)
+        yield "recording"
+
+    evaluation = SimpleNamespace(total=SimpleNamespace(all=Stats(n=0), record_frames=5))
+    monkeypatch.setattr(RunOptions, "open_case", opened)
+    monkeypatch.setattr("lab.experiments.drawn.evaluate_all", lambda recordings, setup: evaluation)
+    found = DRAWN.run(RunOptions(), case, tmp_path)
+    assert made[0]["lens"] == draw_scene(3)["lens"] and made[0]["size"] == draw_scene(3)["size"]
+    assert found["images"] == 5 and found["answered"] == 0 and np.isnan(found["x"]["rmse_N"])
+
+
 def test_errors_of_both_methods_are_over_the_images_for_which_both_have_a_force(tmp_path):
     row = {"images": 10, "object": "cube", "light": "bright"}
     rows = {
@@ -370,6 +421,7 @@ def test_errors_of_both_methods_are_over_the_images_for_which_both_have_a_force(
     [
         (["network"], "--network RUN/checkpoint.pt"),
         (["friction", "--on", "some_bag"], "expected twin"),
+        (["drawn", "--on", "some_bag"], "expected twin"),
         (["nothing"], "got 'nothing', expected one of"),
         (["chip", "--on", "some_bag"], "expected twin"),
         (["grasp", "--on", "twin", "a_bag"], "not both"),
