@@ -70,10 +70,7 @@ PARTS = {
     "chain": "bench --parts chain --json {json}",
     "ablation": "ablation --json {json}",
     "stress": "stress --count 12 --json {json}",
-    **{
-        name: f"experiment {name} --report {{report}}"
-        for name in ("grasp", "friction", "manipulation", "drawn", "chip")
-    },
+    **{name: f"experiment {name} --report {{report}}" for name in ("grasp", "friction", "manipulation", "chip")},
     "places": "experiment places --on {small} --calibration bench --report {report}",
     "network": "experiment network --network {network} --report {report}",
     "bound": "bound {bounded} --calibration bench --json {json}",

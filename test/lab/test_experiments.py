@@ -370,7 +370,7 @@ def test_drawn_scenes_are_the_same_for_a_seed_and_fit_the_jaw(jaw):
         assert (each["lens"] == "d405") == (not each["detector"])
 
 
-def test_drawn_scenes_are_judged_together_by_their_images():
+def test_the_median_and_the_worst_of_drawn_scenes_are_told():
     row = {"scene": "hold", "object": "cube", "camera": "", "light": "dim", "rate/Hz": 30.0, "friction": 0.0}
     row |= {"press/mm": 3.0, "images": 100, "answered": 90, "rmse_N": 0.1, "within_3_sigma_pct": 100.0}
     row |= {axis: {"rmse_N": 0.1} for axis in "xyz"} | {"sharpness": dict.fromkeys("xyz", 2.0)}
@@ -378,10 +378,10 @@ def test_drawn_scenes_are_judged_together_by_their_images():
     silent = row | {"answered": 0, "rmse_N": None, "within_3_sigma_pct": np.nan, "x": {"rmse_N": np.nan}}
     rows = {"100": row, "101": worse, "102": silent}
     tables = DRAWN.find(RunOptions(), rows, Path()).tables
-    total = tables["all"].iloc[0]
-    assert total["images"] == 300 and total["answered/%"] == pytest.approx(40.0)
-    assert total["x/N"] == pytest.approx(np.sqrt(0.75 * 0.1**2 + 0.25 * 0.5**2))
-    assert total["within 3σ/%"] == pytest.approx(90.0)
+    median, worst = (tables["all"].set_index("scene").loc[name] for name in ("median", "worst"))
+    assert median["x/N"] == pytest.approx(0.3) and worst["x/N"] == 0.5
+    assert median["answered/%"] == pytest.approx(30.0) and worst["answered/%"] == 0.0
+    assert worst["within 3σ/%"] == 60.0 and worst["sharp x"] == 2.0
     assert list(tables["scenes"].seed) == list(rows)
 
 
