@@ -19,6 +19,7 @@ from lab.harness import Figures
 
 COUNT = 24
 QUICK_COUNT = 2
+QUICK = {"rate": 15.0, "levels": 1, "cycles": 1}
 SCENES = ("grasp_cylinder", "hold", "weight_turn", "shifting", "slipping", "rocking", "fast_close")
 # turned about x by a right angle or not at all, and about y by any angle: the twin presses along the middle plane of
 # its jaws, which a leaning object would not touch first
@@ -91,13 +92,14 @@ def list_cases(options: RunOptions) -> Sequence[Case]:
     cases = []
     for number in range(QUICK_COUNT if options.quick else COUNT):
         drawn = draw_scene(options.seed + number, options.jaw)
-        changes = drawn["changes"]
+        changes, size = drawn["changes"], options.size if options.quick else drawn["size"]
+        changes |= QUICK if options.quick else {}
         words = {"scene": drawn["scene"], "object": changes["object"], "light": changes["light"]}
-        words |= {"camera": f"{changes['camera']} {drawn['lens']} {drawn['size']}", "rate/Hz": changes["rate"]}
+        words |= {"camera": f"{changes['camera']} {drawn['lens']} {size}", "rate/Hz": changes["rate"]}
         words |= {"friction": changes.get("roughness", 0.0), "press/mm": 1e3 * changes["displacement"]}
         more = {name: drawn[name] for name in ("lens", "detector")}
         case = options.scene_case(str(options.seed + number), drawn["scene"], changes, number, words=words, **more)
-        cases.append(Case(name=case.name, settings=case.settings | {"size": drawn["size"]}))
+        cases.append(Case(name=case.name, settings=case.settings | {"size": size}))
     return cases
 
 
@@ -139,7 +141,7 @@ def find(options: RunOptions, figures: Mapping[str, Mapping[str, Any]], folder: 
 
 NOTE = (
     "Root mean square errors over both jaws' images of the record phases; worst: of each column. Within 3σ: along the "
-    "axis that has the fewest. Sharp: see `grasp`. A scene that the twin cannot play, as where a jaw buckles, has failed."
+    "axis that has the fewest. Sharp: see `grasp`. A scene that the twin cannot play, as where a jaw buckles, failed."
 )
 DRAWN = Experiment(
     name="drawn",

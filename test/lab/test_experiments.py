@@ -386,7 +386,7 @@ def test_the_median_and_the_worst_of_drawn_scenes_are_told():
 
 
 def test_a_drawn_scene_is_rendered_and_scored_with_its_lens(tmp_path, monkeypatch):
-    case = DRAWN.list_cases(RunOptions(seed=3, quick=True))[0]
+    case = DRAWN.list_cases(RunOptions(seed=3))[0]
     made = []
 
     @contextmanager
@@ -400,6 +400,8 @@ def test_a_drawn_scene_is_rendered_and_scored_with_its_lens(tmp_path, monkeypatc
     found = DRAWN.run(RunOptions(), case, tmp_path)
     assert made[0]["lens"] == draw_scene(3)["lens"] and made[0]["size"] == draw_scene(3)["size"]
     assert found["images"] == 5 and found["answered"] == 0 and np.isnan(found["x"]["rmse_N"])
+    quick = DRAWN.list_cases(RunOptions(seed=3, quick=True, size="320x240"))[0].settings
+    assert quick["size"] == "320x240" and quick["changes"]["rate"] == 15.0 and quick["lens"] == made[0]["lens"]
 
 
 def test_errors_of_both_methods_are_over_the_images_for_which_both_have_a_force(tmp_path):
