@@ -37,7 +37,7 @@ _RADIUS, _HEIGHT = 12.5e-3, 0.040
 _RELAXING = (RelaxationTerm(share=0.5, time_constant=5.0),)
 _HELD = {"held": "either"}
 _LIFTED = 100  # images after a lift
-_ALIKE_LENGTH = 12e-3  # [m], over which a network's noise is alike
+_ALIKE_LENGTH = 30e-3  # [m], over which a detector's noise is alike
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -366,11 +366,10 @@ def build_rubbed_box(bench: Bench, random: np.random.Generator) -> Scene:
 
 
 def build_alike(bench: Bench, random: np.random.Generator) -> Scene:
-    """Rub, seen by a detector whose noise of 0.1 mm neighbours share, as an image's pixels make them."""
-    scene, rest = build_rubbed(bench, random), bench.jaw.keypoints
-    distance = np.linalg.norm(rest[:, None] - rest, axis=2)
-    root = np.linalg.cholesky(np.exp(-distance / _ALIKE_LENGTH))
-    return shift(scene, 0.1e-3 * np.einsum("kj,njc->nkc", root, random.normal(size=(len(scene.images), *rest.shape))))
+    """Press, seen by a detector whose noise of 0.3 mm neighbours share, as pixels of a small image make them."""
+    scene, rest = build_press(bench, random), bench.jaw.keypoints
+    root = np.linalg.cholesky(np.exp(-np.linalg.norm(rest[:, None] - rest, axis=2) / _ALIKE_LENGTH))
+    return shift(scene, 0.3e-3 * np.einsum("kj,njc->nkc", root, random.normal(size=(len(scene.images), *rest.shape))))
 
 
 def build_swaying(bench: Bench, random: np.random.Generator) -> Scene:
