@@ -196,6 +196,12 @@ def test_what_stands_still_is_at_least_twice_what_scatters_whatever_is_stated(sh
     np.testing.assert_allclose(compute_point_noise(usual, share * STATED).bias, np.sqrt(own * np.median(own)), rtol=0.1)
 
 
+def test_all_that_is_stated_lasts_where_nothing_scatters():
+    usual = match_stated(np.zeros((5, K, 3)), stated_by(STATED, 5), FLOOR)
+    own = 2.0 * (STATED[:, 0] ** 2 - FLOOR**2)
+    np.testing.assert_allclose(compute_point_noise(usual, STATED).bias, np.sqrt(own * np.median(own)), rtol=1e-9)
+
+
 def test_a_detector_that_errs_anew_in_every_shape_by_half_of_what_it_says_is_believed():
     # jitter of 0.02 mm at rest, and an error of 0.3 mm that each point keeps while the jaw keeps its shape
     depths = ramp(2, 5)
