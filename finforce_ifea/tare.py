@@ -123,7 +123,7 @@ def measure_correlation(scatter: NDArray, keypoints: NDArray) -> NDArray:
     return min(r, _LARGEST_CORRELATION) ** (distance / distance[seen, nearest[seen]].mean())
 
 
-def compute_point_noise(usual: StatedNoise, stddev: NDArray | None) -> PointNoise:
+def compute_point_noise(usual: StatedNoise, stddev: NDArray | None, *, is_measured: bool = True) -> PointNoise:
     """Return the noise of one image's key points: N_k, enlarged for what states more than it did in the tare.
 
         N_ki = R N_k R,    R = diag(max(1, s_ki / s_k)),    noise_ratio_ki = tr N_k / tr N_ki (in the plane).
@@ -135,21 +135,22 @@ def compute_point_noise(usual: StatedNoise, stddev: NDArray | None) -> PointNois
 
         b_k = max((s_kx^2 + s_kz^2) / 4 - n_k, 2 n_k),    n_k = N_kxx + N_kzz,    bias_k = sqrt(b_k median(b)),
 
-    zero when nothing is stated; all that is stated where nothing scatters, as in one photograph seen again. The shipped
-    network errs by half of what it states. In scenes of the twin drawn at
-    random, bright and dark, by three lenses, the lasting errors of a jaw are 1.4 times its scatter in the median, and
-    up to four times. What a detector sees badly, it states badly, too: the errors follow the geometric mean of what is
-    stated of a point and of most of its jaw.
+    zero when nothing is stated. Without a tare, or where nothing scatters, as in one photograph seen again, all that is
+    stated lasts. The shipped network errs by half of what it states. In scenes of the twin drawn at random, bright and
+    dark, by three lenses, the lasting errors of a jaw are 1.4 times its scatter in the median, and up to four times.
+    What a detector sees badly, it states badly, too: the errors follow the geometric mean of what is stated of a point
+    and of most of its jaw.
 
     Args:
         usual: of each key point in the tare.
         stddev: stated in this image (K, 3) [m], NaN where there is no key point; None when nothing is stated.
+        is_measured: whether the usual noise was measured by a tare.
     """
     before, now = usual.stddev, stddev
     if now is None:
         before = now = np.sqrt(np.diagonal(usual.covariance, axis1=1, axis2=2))
     before, now = (np.ascontiguousarray(each, float) for each in (before, now))
-    noise = PointNoise(*_enlarge_noise(np.ascontiguousarray(usual.covariance), before, now))
+    noise = PointNoise(*_enlarge_noise(np.ascontiguousarray(usual.covariance), before, now, is_measured))
     seen = np.isfinite(now[:, 0])
     if stddev is None or not seen.any():
         return noise._replace(bias=np.zeros(len(before)))
@@ -157,7 +158,7 @@ def compute_point_noise(usual: StatedNoise, stddev: NDArray | None) -> PointNois
 
 
 @njit(cache=True)
-def _enlarge_noise(covariance, usual, stddev):
+def _enlarge_noise(covariance, usual, stddev, is_measured):
     """Return what `PointNoise` holds, where an image states `stddev` (K, 3) [m] and usual ones are (K, 3)."""
     count = len(covariance)
     plane, gain = np.empty((count, 2, 2)), np.empty((count, 2))
@@ -177,10 +178,10 @@ def _enlarge_noise(covariance, usual, stddev):
             stated += (usual[k, i] * growth[i]) ** 2
         along[k], noise_ratio[k] = noise[1, 1] * growth[1] ** 2, own / now
         scatter = noise[0, 0] + noise[2, 2]
-        if scatter > _UNSEEN:
+        if is_measured and scatter > _UNSEEN:
             bias[k] = max(_ERRS_BY**2 * stated - scatter, _LASTS * scatter)
         else:
-            bias[k] = stated - scatter
+            bias[k] = max(stated - scatter, scatter)
     return plane, gain, along, noise_ratio, bias
 
 
@@ -232,7 +233,9 @@ class Tare:
 
         A tare without stated deviations stands for key points that all state its pooled noise.
         """
-        return self._silent_noise if stddev is None else compute_point_noise(self._usual, stddev)
+        if stddev is None:
+            return self._silent_noise
+        return compute_point_noise(self._usual, stddev, is_measured=self.is_taken)
 
     @cached_property
     def _usual(self) -> StatedNoise:

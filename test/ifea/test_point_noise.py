@@ -25,7 +25,7 @@ from mechanics_fakes import BENCH
 from finforce.errors import ObservationError
 from finforce_ifea.observation import Contact, Observation
 from finforce_ifea.settings import EstimatorSettings
-from finforce_ifea.tare import compute_point_noise, compute_tare, match_stated
+from finforce_ifea.tare import blank_tare, compute_point_noise, compute_tare, match_stated
 
 FLOOR = 0.02e-3
 K = len(BENCH.keypoints)
@@ -194,6 +194,11 @@ def test_what_stands_still_is_at_least_twice_what_scatters_whatever_is_stated(sh
     usual = match_stated(scatter_of(STATED), stated_by(share * STATED, 4000), FLOOR)
     own = 4.0 * (STATED[:, 0] ** 2 + FLOOR**2)
     np.testing.assert_allclose(compute_point_noise(usual, share * STATED).bias, np.sqrt(own * np.median(own)), rtol=0.1)
+
+
+def test_all_that_is_stated_lasts_without_a_tare():
+    blank, own = blank_tare(K, 0.1e-3), 2.0 * (STATED[:, 0] ** 2 - 0.1e-3**2)
+    np.testing.assert_allclose(blank.point_noise(STATED).bias, np.sqrt(own * np.median(own)), rtol=1e-9)
 
 
 def test_all_that_is_stated_lasts_where_nothing_scatters():
