@@ -28,7 +28,7 @@ _UNSEEN = 2.0 * (1.01 * _NOISE_FLOOR) ** 2
 _CHANCE = 3.0
 # Largest correlation [-].
 _LARGEST_CORRELATION = 0.9
-# Errors of the shipped network relative to what it states [-]: root mean square in scenes drawn at random.
+# Errors of the shipped network along x relative to what it states [-]: median of scenes drawn at random.
 _ERRS_BY = 0.5
 # Variance of lasting errors over that of the scatter, at least [-].
 _LASTS = 2.0
@@ -136,8 +136,8 @@ def compute_point_noise(usual: StatedNoise, stddev: NDArray | None, *, is_measur
         b_k = max((s_kx^2 + s_kz^2) / 4 - n_k, 2 n_k),    n_k = N_kxx + N_kzz,    bias_k = sqrt(b_k median(b)),
 
     zero when nothing is stated. Without a tare, or where nothing scatters, as in one photograph seen again, all that is
-    stated lasts. The shipped network errs by half of what it states. In scenes of the twin drawn at random, bright and
-    dark, by three lenses, the lasting errors of a jaw are 1.4 times its scatter in the median, and up to four times.
+    stated lasts. In scenes of the twin drawn at random, bright and dark, by three lenses, the lasting errors of a jaw
+    along x are half of what the shipped network states and 1.4 times its scatter in the median, and up to four times.
     What a detector sees badly, it states badly, too: the errors follow the geometric mean of what is stated of a point
     and of most of its jaw.
 

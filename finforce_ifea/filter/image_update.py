@@ -277,7 +277,7 @@ def iterate(image, at, prior, weight, possible, known, x, last):
     """Return the update of one linearisation and the next step.
 
     Args:
-        image: see `observe`; see `EXPECTATION`.
+        image: `image` of `observe`; the object's `EXPECTATION`.
         at: `positions`, `motions`, `at` and `ratio` of `observe`; modes (size, 4) and size of the `PressedState`.
         prior: `ratios`, `x`, `log_weights` and `P` of `correct`.
         weight: see `correct`.

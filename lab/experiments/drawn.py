@@ -97,9 +97,8 @@ def list_cases(options: RunOptions) -> Sequence[Case]:
         words = {"scene": drawn["scene"], "object": changes["object"], "light": changes["light"]}
         words |= {"camera": f"{changes['camera']} {drawn['lens']} {size}", "rate/Hz": changes["rate"]}
         words |= {"friction": changes.get("roughness", 0.0), "press/mm": 1e3 * changes["displacement"]}
-        more = {name: drawn[name] for name in ("lens", "detector")}
-        case = options.scene_case(str(options.seed + number), drawn["scene"], changes, number, words=words, **more)
-        cases.append(Case(name=case.name, settings=case.settings | {"size": size}))
+        more = {"words": words, "size": size, "lens": drawn["lens"], "detector": drawn["detector"]}
+        cases.append(options.scene_case(str(options.seed + number), drawn["scene"], changes, number, **more))
     return cases
 
 
