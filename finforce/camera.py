@@ -143,9 +143,9 @@ def compute_rays(camera: CameraIntrinsics) -> NDArray:
     Returns:
         (h, w, 3) directions in the camera frame with z = 1, so that a ray times its depth is a point.
     """
-    columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-    rays = rays_from_pixels(np.stack((columns, rows), axis=-1).reshape(-1, 2), camera)
-    rays = rays.reshape(camera.height, camera.width, 3)
+    pixels = np.empty((camera.height, camera.width, 2))
+    pixels[..., 0], pixels[..., 1] = np.arange(camera.width), np.arange(camera.height)[:, None]
+    rays = rays_from_pixels(pixels.reshape(-1, 2), camera).reshape(camera.height, camera.width, 3)
     rays.flags.writeable = False
     return rays
 

@@ -11,8 +11,9 @@ from finforce.caches import COMPILED, ROOT, keep_compiled, name_sources
 
 try:
     from numba.core.caching import CacheImpl, UserProvidedCacheLocator
+    from numba.core.codegen import JITCodeLibrary, JITCPUCodegen, ll
 except ImportError:  # another Numba, whose own locators go by path and time
-    CacheImpl = UserProvidedCacheLocator = object
+    CacheImpl = UserProvidedCacheLocator = JITCodeLibrary = JITCPUCodegen = ll = object
 
 __all__ = ["njit"]
 
@@ -47,5 +48,31 @@ class SourceLocator(UserProvidedCacheLocator):
         return stamp
 
 
+class LeanLibrary(JITCodeLibrary):
+    """Machine code of a function, whose intermediate code is parsed when something is compiled against it.
+
+    Numba parses that of every function that it loads: 1 MB each, which nobody needs where all is compiled.
+    """
+
+    _bitcode = b""
+
+    @classmethod
+    def _unserialize(cls, codegen: Any, state: tuple[str, str, Any]) -> Any:
+        """Return a function's library that was kept."""
+        library = super()._unserialize(codegen, state)
+        if state[1] == "object":
+            _, library._bitcode = state[2]
+            library._shared_module = None
+        return library
+
+    def _get_module_for_linking(self) -> Any:
+        """Return the intermediate code."""
+        if self._bitcode and self._shared_module is None:
+            self._shared_module = ll.parse_bitcode(self._bitcode)
+        return super()._get_module_for_linking()
+
+
 keep_compiled()
 getattr(CacheImpl, "_locator_classes", []).insert(0, SourceLocator)
+if getattr(JITCPUCodegen, "_library_class", None) is JITCodeLibrary:
+    JITCPUCodegen._library_class = LeanLibrary

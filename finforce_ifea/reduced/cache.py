@@ -31,16 +31,18 @@ from finforce_ifea.jaw.jaw import Jaw
 from finforce_ifea.reduced import build as manifold_build
 from finforce_ifea.reduced.build import Share, build_manifold, build_rest
 from finforce_ifea.reduced.equilibria import Manifold
-from finforce_ifea.reduced.model import ReducedContact, ReducedModel, scale_manifold
+from finforce_ifea.reduced.model import ReducedContact, ReducedModel
 
 # To be raised when what is stored, or how it is found, changes.
-VERSION = 8
+VERSION = 9
 # What reading a damaged archive raises, one or the other by where the damage is.
 _UNREADABLE = (OSError, ValueError, KeyError, EOFError, RuntimeError, BadZipFile, struct.error, zlib.error)
 # Share by which loads and motions of the first equilibria may differ by their compliances: right ones reach 0.001.
 LARGEST_MISS = 0.05
-# By name and modulus [Pa]; two jaws of a gripper are each other's mirror image, for which the equilibria are the same.
-_SHARED: WeakValueDictionary[tuple[str, float], Manifold] = WeakValueDictionary()
+# By name; two jaws of a gripper are each other's mirror image, for which the equilibria are the same.
+_SHARED: WeakValueDictionary[str, Manifold] = WeakValueDictionary()
+# Fields that stand in a file of their own, of which a process holds no more in memory than it uses.
+_MAPPED, _BLOCK = ("compliance", "shape_compliance"), 1 << 20
 _LOG = logging.getLogger(__name__)
 
 
@@ -82,7 +84,8 @@ def _read(path: Path) -> Manifold | None:
         if path.exists():
             check_plain(path)
         with np.load(path, allow_pickle=False) as stored:
-            values = {field.name: stored[field.name] for field in fields(Manifold)}
+            values = {field.name: stored[field.name] for field in fields(Manifold) if field.name not in _MAPPED}
+            values |= _map_tables(path.with_suffix(".npy"), stored)
             _check(values, str(stored["key"]), path.stem)
     except FileNotFoundError:
         return None
@@ -91,6 +94,27 @@ def _read(path: Path) -> Manifold | None:
         return None
     values["young_modulus"] = float(values["young_modulus"])
     return Manifold(**values)
+
+
+def _map_tables(path: Path, stored: Mapping[str, NDArray]) -> dict[str, NDArray]:
+    """Return the tables of a file as they lie there; raises ValueError where its content is not the one stored."""
+    if _sum_up(path) != int(stored["checksum"]):
+        raise ValueError(f"{path.name} has another content")
+    flat, tables = np.load(path, mmap_mode="c", allow_pickle=False), {}
+    for name in _MAPPED:
+        shape = tuple(stored[f"{name}_shape"])
+        size = int(np.prod(shape))
+        tables[name], flat = np.asarray(flat[:size]).reshape(shape), flat[size:]
+    return tables
+
+
+def _sum_up(path: Path) -> int:
+    """Return the checksum of a file."""
+    total = 0
+    with path.open("rb") as file:
+        while block := file.read(_BLOCK):
+            total = zlib.crc32(block, total)
+    return total
 
 
 def _check(values: Mapping[str, NDArray], key: str, expected: str) -> None:
@@ -105,17 +129,24 @@ def _check(values: Mapping[str, NDArray], key: str, expected: str) -> None:
 
 def _write(path: Path, manifold: Manifold) -> None:
     """Store a manifold, whole or not at all; what a killed process has left of it is removed."""
-    part = path.with_suffix(f".{os.getpid()}.part")
+    part, tables = (path.with_suffix(f".{os.getpid()}{ending}.part") for ending in ("", ".npy"))
+    values = {field.name: getattr(manifold, field.name) for field in fields(Manifold)}
+    large = [values.pop(name) for name in _MAPPED]
+    shapes = {f"{name}_shape": table.shape for name, table in zip(_MAPPED, large, strict=True)}
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         for left in path.parent.glob(f"{path.stem}.*.part"):
             left.unlink(missing_ok=True)
+        with tables.open("wb") as file:
+            np.save(file, np.concatenate([table.ravel() for table in large]))
         with part.open("wb") as file:
-            np.savez(file, key=path.stem, **{field.name: getattr(manifold, field.name) for field in fields(Manifold)})
+            np.savez(file, key=path.stem, checksum=_sum_up(tables), **shapes, **values)
+        os.replace(tables, path.with_suffix(".npy"))
         os.replace(part, path)
     except OSError as error:
-        with suppress(OSError):
-            part.unlink(missing_ok=True)
+        for left in (part, tables):
+            with suppress(OSError):
+                left.unlink(missing_ok=True)
         _LOG.warning("the equilibria cannot be stored in %s (%s); the next start rebuilds them", path.parent, error)
 
 
@@ -132,7 +163,7 @@ def reduce_mechanics(full: Mechanics, jaw: Jaw, *, linear: bool = False) -> Mech
     """
     modulus = jaw.material.young_modulus
     manifold = build_rest(full, modulus) if linear else _share_manifold(full, jaw)
-    model = ReducedModel(manifold, full.model, full.contact.face)
+    model = ReducedModel(manifold, full.model, full.contact.face, modulus)
     surface = full.contact.surface
     middle = surface.points[:: surface.across].copy()
     middle[:, 1] = 0.0
@@ -147,13 +178,11 @@ def reduce_mechanics(full: Mechanics, jaw: Jaw, *, linear: bool = False) -> Mech
 
 
 def _share_manifold(full: Mechanics, jaw: Jaw) -> Manifold:
-    """Return the manifold of a jaw with its modulus, the same one for all jaws of this process that are alike."""
-    modulus = jaw.material.young_modulus
-    key = (name_manifold(full, jaw), modulus)
+    """Return the manifold of a jaw, the same one for all jaws of this process that are alike but for their modulus."""
+    key = name_manifold(full, jaw)
     found = _SHARED.get(key)
     if found is None:
-        found = scale_manifold(fetch_manifold(key[0], lambda: _build_watched(full, jaw)), modulus)
-        _SHARED[key] = found
+        found = _SHARED[key] = fetch_manifold(key, lambda: _build_watched(full, jaw))
     return found
 
 

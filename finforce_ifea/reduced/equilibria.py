@@ -210,7 +210,10 @@ def bound_grid_step(step, m, moves):
 
 @njit(**_EXACT)
 def _measure_miss(tables, loads, m):
-    """Return the root mean square distance [m] of a jaw under loads (2 n,) [N] from the equilibrium stored at m."""
+    """Return the root mean square distance [m] of a jaw under loads (2 n,) [N] from the equilibrium stored at m.
+
+    Loads are of a jaw with the modulus of the stored ones.
+    """
     count = len(loads)
     extra, miss = np.empty(count), np.zeros(count)
     interpolate(tables[2], m, extra)

@@ -5,9 +5,8 @@ the grid coordinates of the stored equilibrium that is nearest in shape. See `fi
 rigid object it is the same as `RigidContact`, at the price of a look-up.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
-from weakref import WeakValueDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,14 +56,12 @@ class _Probe:
 
     Attributes:
         points: undeformed positions (p, 3) [m].
-        shapes: their motions at the stored equilibria (T, Z, 3 p) [m].
-        compliance: motion of points by loads on the rows (T, Z, 3 p, 2 n) [m/N], in single precision.
+        basis: motion of the points per shape of the jaw (3 p, r).
         rows: weight of each row in a point (p, n), for loads.
     """
 
     points: NDArray
-    shapes: NDArray
-    compliance: NDArray
+    basis: NDArray
     rows: NDArray
 
 
@@ -101,20 +98,26 @@ class ReducedModel:
     Attributes:
         size: number of unknowns.
         reach: largest change of each unknown at once (size,).
+        softness: modulus of the stored equilibria over that of the jaw, whose loads are smaller by that factor.
+
+    Args:
+        manifold: equilibria of such a jaw of any modulus.
+        full: model of the jaw.
+        face: its inner face.
+        young_modulus: of the jaw [Pa].
     """
 
     rotations = None
     across: Across = "middle"
 
-    def __init__(self, manifold: Manifold, full: JawModel, face: FaceLine) -> None:
-        """Keep the manifold of the jaw that `full` describes, with its inner face."""
+    def __init__(self, manifold: Manifold, full: JawModel, face: FaceLine, young_modulus: float) -> None:
         self.manifold, self._full, self._face = manifold, full, face
+        self.softness = manifold.young_modulus / young_modulus
         self.rows = manifold.loads.shape[2]
         self.size = self.rows + 2
-        self.loads, self.compliance = self.manifold.loads, self.manifold.compliance
-        self.shape_compliance = self.manifold.shape_compliance
-        self._probes: WeakValueDictionary[tuple[bytes, float], _Probe] = WeakValueDictionary()  # ten megabytes each
-        stiffness = LARGEST_MOVE / np.abs(np.diagonal(self.compliance[0, 0]))
+        self._rows = manifold.moves, manifold.compliance, manifold.loads, self.softness
+        self.shapes = manifold.shapes, manifold.shape_compliance, manifold.loads, self.softness
+        stiffness = LARGEST_MOVE / (self.softness * np.abs(np.diagonal(manifold.compliance[0, 0])))
         self.reach = np.r_[stiffness, LARGEST_GRID_STEP, manifold.loads.shape[1]]
 
     def linearize(self, q: NDArray) -> Linearization:
@@ -137,7 +140,7 @@ class ReducedModel:
 
     def moves(self, q: NDArray) -> NDArray:
         """Return the motions of the rows (2 n,) [m], x and z interleaved."""
-        return _follow(self.manifold.moves, self.compliance, self.loads, q)
+        return _follow(self._rows, q)
 
     def attach(self, points: NDArray, max_distance: float = 1e-3) -> _Probe | _FacePoints:
         """Return a probe of material points (p, 3) [m, undeformed]; raises MeshError when one is off the jaw."""
@@ -146,32 +149,26 @@ class ReducedModel:
         on_face = self._face.holds(points, _ON_FACE) & (points[:, 2] >= low) & (points[:, 2] <= high)
         if on_face.all():
             return _FacePoints(points=points, rows=_share_rows(self.manifold.heights, points[:, 2]))
-        key = points.tobytes(), max_distance
-        if (known := self._probes.get(key)) is not None:
-            return known
-        full, basis, zero = self._full, self.manifold.basis, np.zeros(self._full.size)
-        motion = full.project(full.attach(points, max_distance), zero, basis).reshape(3 * len(points), -1)
-        probe = _Probe(
+        full, zero = self._full, np.zeros(self._full.size)
+        basis = full.project(full.attach(points, max_distance), zero, self.manifold.basis)
+        return _Probe(
             points=points,
-            shapes=self.manifold.shapes @ motion.T,
-            compliance=np.ascontiguousarray(motion.astype(np.float32) @ self.shape_compliance),
+            basis=basis.reshape(3 * len(points), -1),
             rows=_share_rows(self.manifold.heights, points[:, 2]),
         )
-        self._probes[key] = probe
-        return probe
 
     def positions(self, probe: _Probe | _FacePoints, q: NDArray) -> NDArray:
         """Return the deformed positions (p, 3) [m] of a probe."""
         if isinstance(probe, _FacePoints):
             return probe.points + probe.spread(self.moves(q))
-        return _move_tables(probe.points, probe.shapes, probe.compliance, self.loads, q)
+        return _place_probe(probe.points, probe.basis, self.shapes, q)
 
     def project(self, probe: _Probe | _FacePoints, q: NDArray, modes: NDArray) -> NDArray:
         """Return the motions (p, 3, k) [m] of a probe for changes modes (size, k) of the loads alone."""
         if isinstance(probe, _FacePoints):
             now = self.moves(q)
             return np.stack([probe.spread(self.moves(q + mode) - now) for mode in modes.T], axis=2)
-        return _move_points(probe.compliance, q, np.ascontiguousarray(modes))
+        return _move_probe(probe.basis, self.shapes, q, np.ascontiguousarray(modes))
 
     def load(self, probe: _Probe | _FacePoints, q: NDArray, forces: NDArray) -> NDArray:
         """Return the loads (size,) [N] at the rows of forces (p, 3) [N] at points of the inner face."""
@@ -187,24 +184,7 @@ class ReducedModel:
 
     def expand(self, q: NDArray) -> NDArray:
         """Return the unknowns of the full model (m,) at this one's (size,), as far as its basis goes."""
-        still = np.zeros((self.manifold.basis.shape[1], 1))
-        shape = _move_tables(still, self.manifold.shapes, self.shape_compliance, self.loads, q)
-        return self.manifold.basis @ shape.ravel()
-
-
-def scale_manifold(manifold: Manifold, young_modulus: float) -> Manifold:
-    """Return the manifold of a jaw with another modulus [Pa]."""
-    if young_modulus == manifold.young_modulus:
-        return manifold
-    factor = young_modulus / manifold.young_modulus
-    soft = np.float32(1.0 / factor)
-    return replace(
-        manifold,
-        young_modulus=young_modulus,
-        loads=manifold.loads * factor,
-        compliance=manifold.compliance * soft,
-        shape_compliance=manifold.shape_compliance * soft,
-    )
+        return self.manifold.basis @ _follow(self.shapes, q)
 
 
 def _share_rows(heights: NDArray, places: NDArray) -> NDArray:
@@ -247,12 +227,13 @@ class ReducedContact(RigidContact):
         length = surface.heights[-1] - surface.heights[0]
         # the rest alone is stored on purpose where no rod was pressed in
         farthest = _FARTHEST_SHAPE * length if model.manifold.depths.any() else np.inf
-        x, z = (model.loads[:, :, axis::2].sum(axis=2) for axis in (0, 1))
+        x, z = (model.manifold.loads[:, :, axis::2].sum(axis=2) / model.softness for axis in (0, 1))
         self.max_force = _MAX_FORCE_RATIO * float(np.hypot(x, z).max()) if np.isfinite(farthest) else np.inf
         self._jaw = _Jaw(
             moves=model.manifold.moves,
-            compliance=model.compliance,
-            loads=model.loads,
+            compliance=model.manifold.compliance,
+            loads=model.manifold.loads,
+            softness=model.softness,
             points=surface.points,
             low=upper - 1,
             share=share,
@@ -262,8 +243,7 @@ class ReducedContact(RigidContact):
             farthest=farthest,
         )
         self.packed = tuple(self._jaw)
-        shapes, compliance = model.manifold.shapes[:, :, :0], model.shape_compliance[:, :, :0]
-        self._no_points = np.zeros((0, 3)), shapes.copy(), compliance.copy()
+        self._no_points = np.zeros((0, 3)), np.zeros((0, len(model.manifold.basis.T))), model.shapes
 
     def place_points(self, q: NDArray) -> NDArray:
         """See `RigidContact`."""
@@ -286,7 +266,7 @@ class ReducedContact(RigidContact):
         """See `RigidContact`."""
         if isinstance(probe, _FacePoints):
             return super().linearize_points(probe, q, x, traction)
-        pressed, points = tuple(self.indenter.pressed), (probe.points, probe.shapes, probe.compliance)
+        pressed, points = tuple(self.indenter.pressed), (probe.points, probe.basis, self.model.shapes)
         return linearize_reduced(self.packed, pressed, tuple(traction), q, x, points)
 
     def approach(self, q: NDArray, step: NDArray, x: NDArray) -> NDArray:
@@ -311,6 +291,7 @@ class _Jaw(NamedTuple):
         moves: of the rows at the stored equilibria (T, Z, 2 n) [m].
         compliance: of the rows (T, Z, 2 n, 2 n) [m/N].
         loads: stored (T, Z, 2 n) [N].
+        softness: see `ReducedModel`.
         points: contact points, undeformed (p, 3) [m].
         low: the row below each point (p,), -1 for the clamp.
         share: of the row above in each point (p,).
@@ -323,6 +304,7 @@ class _Jaw(NamedTuple):
     moves: NDArray
     compliance: NDArray
     loads: NDArray
+    softness: float
     points: NDArray
     low: NDArray
     share: NDArray
@@ -363,47 +345,63 @@ class _PlacedObject(NamedTuple):
 
 
 @njit(**_OPTIONS)
-def _follow(moves, compliance, loads, q):
-    """Return motions (k,) [m] of a table moves (T, Z, k) with its compliance (T, Z, k, 2 n) for unknowns q."""
+def _follow(tables, q):
+    """Return motions (k,) [m] for unknowns q (2 n + 2,).
+
+    Args:
+        tables: stored motions (T, Z, k) [m], their compliance (T, Z, k, 2 n) [m/N], the loads (T, Z, 2 n) [N], and
+            `ReducedModel.softness`.
+        q: unknowns.
+    """
+    moves, compliance, loads, softness = tables
     count = loads.shape[2]
     m, extra, out = q[count:], np.empty(count), np.empty(moves.shape[2])
     interpolate(loads, m, extra)
     for k in range(count):
-        extra[k] = q[k] - extra[k]
+        extra[k] = softness * q[k] - extra[k]
     interpolate(moves, m, out)
     add_product(compliance, m, extra, 1, out)
     return out
 
 
 @njit(**_OPTIONS)
-def _move_tables(points, shapes, compliance, loads, q):
-    """Return points (p, c) [m] moved as the table shapes (T, Z, p c) [m] and its compliance say."""
-    placed = _follow(shapes, compliance, loads, q).reshape(points.shape)
-    for k in range(len(points)):
-        for a in range(points.shape[1]):
-            placed[k, a] += points[k, a]
-    return placed
+def _place_probe(points, basis, tables, q):
+    """Return material points (p, 3) [m], moved as a jaw with unknowns q is bent.
+
+    Args:
+        points: undeformed (p, 3) [m].
+        basis: their motion per shape (3 p, r).
+        tables: of the shapes, see `_follow`.
+        q: unknowns (2 n + 2,).
+    """
+    if len(points) == 0:
+        return points
+    return points + (basis @ _follow(tables, q)).reshape(points.shape)
 
 
 @njit(**_OPTIONS)
-def _move_points(compliance, q, modes):
-    """Return the motions (p, 3, k) [m] of points whose compliance is (T, Z, 3 p, 2 n), for modes (2 n + 2, k)."""
-    count, k = compliance.shape[3], modes.shape[1]
+def _move_probe(basis, tables, q, modes):
+    """Return the motions (p, 3, k) [m] of points for modes (2 n + 2, k) of the loads.
+
+    Args:
+        basis: motion of the points per shape (3 p, r).
+        tables: of the shapes, see `_follow`.
+        q: unknowns (2 n + 2,).
+        modes: changes of the loads [N].
+    """
+    _, compliance, _, softness = tables
+    (rank, count), k = compliance.shape[2:], modes.shape[1]
+    if len(basis) == 0:
+        return np.zeros((0, 3, k))
     first, last = count, 0
     for c in range(k):
         begin, end = find_ends(modes[:count, c])
         if end > 0:
             first, last = min(first, begin), max(last, end)
     first = min(first, last)
-    size = compliance.shape[2]
-    part = np.empty((size, last - first))
-    blend(compliance, q[count:], (0, size), (first, last), part)
-    out = np.zeros((size, k))
-    for i in range(size):
-        for j in range(last - first):
-            for c in range(k):
-                out[i, c] += part[i, j] * modes[first + j, c]
-    return out.reshape(size // 3, 3, k)
+    part = np.empty((rank, last - first))
+    blend(compliance, q[count:], (0, rank), (first, last), part)
+    return (basis @ (softness * (part @ modes[first:last]))).reshape(len(basis) // 3, 3, k)
 
 
 @njit(**_OPTIONS)
@@ -481,7 +479,7 @@ def _gather(jaw, placed, points):
 
 
 @njit(**_OPTIONS)
-def _solve_rows(q, compliance, loads, stiffness):
+def _solve_rows(jaw, q, loads, stiffness):
     """Return (2 n, 5): the step of the loads to equilibrium, and their derivatives by the state; and its motion [m].
 
     With loads p(u) of the object at the rows, springs S = -dp/du and compliance C, one step of Newton's method on
@@ -498,7 +496,8 @@ def _solve_rows(q, compliance, loads, stiffness):
     if size == 0:
         return out, 0.0
     C, A = np.empty((size, size)), np.zeros((size, size))
-    blend(compliance, q[len(loads) :], (first, last), (first, last), C)
+    blend(jaw.compliance, q[len(loads) :], (first, last), (first, last), C)
+    C *= jaw.softness
     for i in range(size):
         A[i, i] = 1.0
         for c in range(5):
@@ -541,7 +540,7 @@ def _find_share(jaw, placed, points, moves, q, step):
     Along a step of the loads that moves the rows by du and contact points (p, 3) by dx, it changes by
     (lambda - p)^T du, all as far as the step has gone.
     """
-    moved = _follow(jaw.moves, jaw.compliance, jaw.loads, q + step)
+    moved = _follow((jaw.moves, jaw.compliance, jaw.loads, jaw.softness), q + step)
     motion = _place_contact(jaw.points, jaw.low, jaw.share, moved) - points
     work = np.zeros(2)
     for k in range(len(moves)):
@@ -577,7 +576,8 @@ def _step_grid(jaw, q, moves, steps, size, contact):
     count, tables = len(moves), (jaw.moves, jaw.compliance, jaw.loads)
     after, change, there = np.empty(count), np.empty(count), np.empty(count)
     for k in range(count):
-        after[k], change[k], there[k] = moves[k], steps[k, 0], q[k] + steps[k, 0]
+        after[k], change[k] = moves[k], jaw.softness * steps[k, 0]
+        there[k] = jaw.softness * q[k] + change[k]
     add_product(jaw.compliance, q[count:], change, WATCHED, after)
     nearest = find_grid_step(jaw.moves, after, q[count:])
     left = approach_grid(tables, there, q[count:], nearest) if size <= _CALM else 0.0
@@ -612,16 +612,16 @@ def linearize_reduced(jaw, pressed, traction, q, x, probe):
         traction: `Traction` as a plain tuple.
         q: unknowns (2 n + 2,).
         x: depth [m], shape and height [m] of the object (3,).
-        probe: points, shapes and compliance of a `_Probe`.
+        probe: points and basis of a `_Probe`, and `ReducedModel.shapes`.
     """
     jaw, pressed, traction = _Jaw(*jaw), PressedObject(*pressed), Traction(*traction)
     count = jaw.loads.shape[2]
-    moves = _follow(jaw.moves, jaw.compliance, jaw.loads, q)
+    moves = _follow((jaw.moves, jaw.compliance, jaw.loads, jaw.softness), q)
     points = _place_contact(jaw.points, jaw.low, jaw.share, moves)
     placed = _PlacedObject(pressed, pose_object(pressed, jaw.face_x, x), traction)
     contact = _gather(jaw, placed, points)
     touches = contact.size > 0.0
-    steps, moved = _solve_rows(q, jaw.compliance, contact.loads, contact.stiffness)
+    steps, moved = _solve_rows(jaw, q, contact.loads, contact.stiffness)
     size = moved / LARGEST_MOVE
     if touches and size > 1.0:
         for k in range(len(steps)):
@@ -650,9 +650,8 @@ def linearize_reduced(jaw, pressed, traction, q, x, probe):
     far = max(nearest[2] / jaw.farthest, left / _LARGEST_LEFT)
     where = contact.point, contact.location
     state = PressedState(touches, correction, modes, force, force_modes, *where, 1.0, size, far)
-    (material, shapes, compliance), q = probe, q + correction
-    places = _move_tables(material, shapes, compliance, jaw.loads, q)
-    return state, places, _move_points(compliance, q, modes)
+    (material, basis, tables), q = probe, q + correction
+    return state, _place_probe(material, basis, tables, q), _move_probe(basis, tables, q, modes)
 
 
 @njit(**_OPTIONS)
@@ -663,6 +662,7 @@ def _hold_base(jaw, q, contact, steps, force, force_modes):
     count = len(steps)
     rows, moved = np.empty((2, count)), np.zeros((2, 5))
     blend(jaw.compliance, q[count:], (0, 2), (0, count), rows)
+    rows *= jaw.softness
     for a in range(2):
         for k in range(count):
             for c in range(5):
@@ -683,7 +683,7 @@ def _approach_reduced(jaw, pressed, q, step, x):
     low, high, pose = 0.0, 1.0, pose_object(pressed, jaw.face_x, x)
     for _ in range(BISECTIONS):
         share = 0.5 * (low + high)
-        moves = _follow(jaw.moves, jaw.compliance, jaw.loads, q + share * step)
+        moves = _follow((jaw.moves, jaw.compliance, jaw.loads, jaw.softness), q + share * step)
         if measure_gap(pressed, pose, _place_contact(jaw.points, jaw.low, jaw.share, moves)) < -TOUCH:
             high = share
         else:

@@ -64,6 +64,27 @@ def test_compiled_code_is_kept_by_the_content_of_all_that_it_depends_on(tmp_path
     assert scale("old Numba", 3.0, "from numba.core import caching; del caching.CacheImpl\n") == ["6.0", "0", "1"]
 
 
+LINK = """from finforce.deep.kernels import njit, scale
+
+assert scale(2.0) == 6.0
+[loaded] = (kept.library for kept in scale.overloads.values())
+print(len(scale.stats.cache_hits), loaded._shared_module is None)
+print(njit(lambda x: scale(x) + 1.0)(2.0))
+"""
+
+
+def test_a_kept_function_is_parsed_when_another_is_compiled_against_it(tmp_path):
+    cache = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_")}
+    cache["FINFORCE_CACHE"] = str(tmp_path / "cache")
+    root = make_sources(tmp_path / "one")
+
+    def link():
+        return subprocess.check_output([sys.executable, "-c", LINK], cwd=root, env=cache, text=True).split()
+
+    assert link() == ["0", "False", "7.0"]
+    assert link() == ["1", "True", "7.0"]
+
+
 @pytest.mark.parametrize(
     "constants",
     [
