@@ -64,7 +64,7 @@ class GivenContactTracker:
 
     @cached_property
     def probe(self) -> Any:
-        """The model's probe of the key points, ten megabytes that few need: most contacts are tracked, not given."""
+        """The model's probe of the key points, which few need: most contacts are tracked, not given."""
         return self.mechanics.model.attach(self.jaw.keypoints, KEYPOINT_DISTANCE)
 
     @cached_property
