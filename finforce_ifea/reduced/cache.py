@@ -98,6 +98,7 @@ def _read(path: Path) -> Manifold | None:
 
 def _map_tables(path: Path, stored: Mapping[str, NDArray]) -> dict[str, NDArray]:
     """Return the tables of a file as they lie there; raises ValueError where its content is not the one stored."""
+    check_plain(path)
     if _sum_up(path) != int(stored["checksum"]):
         raise ValueError(f"{path.name} has another content")
     flat, tables = np.load(path, mmap_mode="c", allow_pickle=False), {}
