@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from finforce.compiled import njit
 from finforce_ifea.contact_mechanics.friction import FRICTIONLESS, POINT_SHAPE, Touch, Traction, add_traction
 from finforce_ifea.errors import ContactError
-from finforce_ifea.observation import Contact, ObjectOutline, are_same_polygons
+from finforce_ifea.observation import Contact, ObjectOutline, are_same_polygons, measure_area
 from finforce_ifea.settings import EstimatorSettings
 
 DEPTH, SHAPE, HEIGHT = 0, 1, 2
@@ -59,13 +59,15 @@ class PressedObject(NamedTuple):
 
 
 def build_outline(polygons: tuple[NDArray, ...]) -> PressedObject:
-    """Return the object with an outline of polygons, (n, 2) [m] each, about its origin.
+    """Return the object with an outline of polygons, (n, 2) [m] each, about its origin; its holes are filled.
 
     Raises:
         ContactError: The polygons span less than a cell of the grid.
     """
+    # a face that is pressed through a thin wall would be held in the hole behind, which it cannot get into
+    outer = [polygon for polygon in polygons if measure_area(polygon) > 0.0] or polygons
     # of one type, so that nothing is compiled anew while a jaw waits
-    segments = np.concatenate([np.hstack([p, np.roll(p, -1, axis=0)]) for p in polygons]).astype(float)
+    segments = np.concatenate([np.hstack([p, np.roll(p, -1, axis=0)]) for p in outer]).astype(float)
     low, high = segments[:, :2].min(0), segments[:, :2].max(0)
     if (high - low < CELL).any():
         raise ContactError(f"the outline spans {1e3 * (high - low)} mm, expected at least {1e3 * CELL:g} mm")

@@ -70,6 +70,16 @@ def test_depth_below_a_circle_is_that_of_the_circle(radius, depth):
     assert np.abs(found - depth).max() < CELL**2 / (5 * (radius - depth)) + 2e-6
 
 
+def test_a_face_that_got_through_a_thin_wall_is_pushed_back_out():
+    """No finger gets into a closed ring; the hole of one would hold what has."""
+    radius, depths = 0.0125, np.array([0.5e-3, 1e-3, 2e-3, 3e-3])
+    [outside], [hole] = circle(radius, 360), circle(radius - 1e-3, 360)
+    points = np.stack([depths - radius, np.zeros(len(depths))], axis=1)
+    np.testing.assert_allclose(depth_at((outside, hole[::-1]), points), depths, atol=0.1e-3)
+    push = push_at((outside, hole[::-1]), points)
+    np.testing.assert_allclose(push[:, 0], -1e4 * depths, rtol=0.05)
+
+
 def test_facets_of_a_mesh_are_smoothed():
     """A 32-gon turns by 11 degrees at each corner; its field turns steadily."""
     push = push_at(circle(0.0125, 32), rim(0.0125, 0.2e-3))
