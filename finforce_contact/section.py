@@ -12,7 +12,6 @@ from finforce.errors import PoseError
 from finforce.optional import import_manifold3d
 from finforce.triangle_surface import chain_loops
 from finforce_contact.mesh.object_mesh import ObjectMesh
-from finforce_ifea.observation import measure_area
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
 # A wall whose far side lies no deeper than this in the jaw is still taken for what the jaw touches [m].
@@ -239,7 +238,12 @@ def _unite(layers: list[list[NDArray]]) -> tuple[NDArray, ...]:
     areas = [manifold3d.CrossSection(loops, manifold3d.FillRule.NonZero) for loops in layers if loops]
     whole = manifold3d.CrossSection.batch_boolean(areas, manifold3d.OpType.Add)
     polygons = [polygon / _SCALE for polygon in whole.simplify(SIMPLIFICATION * _SCALE).to_polygons()]
-    return tuple(polygon for polygon in polygons if abs(measure_area(polygon)) > _SLIVER)
+    return tuple(polygon for polygon in polygons if abs(_signed_area(polygon)) > _SLIVER)
+
+
+def _signed_area(polygon: NDArray) -> float:
+    x, z = polygon.T
+    return 0.5 * float(np.dot(x, np.roll(z, -1)) - np.dot(z, np.roll(x, -1)))
 
 
 def _check_placement(R_jaw_object: ArrayLike, half_width: float, centre_y: float) -> NDArray:

@@ -396,12 +396,6 @@ class ObjectOutline:
         return tuple(p @ turn + self.origin for p in self.polygons)
 
 
-def measure_area(polygon: NDArray) -> float:
-    """Return the area [m^2] of a polygon (n, 2) [m]; negative of one that is clockwise."""
-    (x, z), (after_x, after_z) = polygon.T, np.roll(polygon, -1, axis=0).T
-    return 0.5 * float(x @ after_z - after_x @ z)
-
-
 def are_same_polygons(first: tuple[NDArray, ...], second: tuple[NDArray, ...]) -> bool:
     """Return whether two sets of polygons (n, 2) are equal, so that what was computed from one holds for the other."""
     return first is second or (len(first) == len(second) and all(map(np.array_equal, first, second)))

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from finforce.compiled import njit
 from finforce_ifea.contact_mechanics.friction import FRICTIONLESS, POINT_SHAPE, Touch, Traction, add_traction
 from finforce_ifea.errors import ContactError
-from finforce_ifea.observation import Contact, ObjectOutline, are_same_polygons, measure_area
+from finforce_ifea.observation import Contact, ObjectOutline, are_same_polygons
 from finforce_ifea.settings import EstimatorSettings
 
 DEPTH, SHAPE, HEIGHT = 0, 1, 2
@@ -59,15 +59,13 @@ class PressedObject(NamedTuple):
 
 
 def build_outline(polygons: tuple[NDArray, ...]) -> PressedObject:
-    """Return the object with an outline of polygons, (n, 2) [m] each, about its origin; its holes are filled.
+    """Return the object with an outline of polygons, (n, 2) [m] each, about its origin.
 
     Raises:
         ContactError: The polygons span less than a cell of the grid.
     """
-    # a face that is pressed through a thin wall would be held in the hole behind, which it cannot get into
-    outer = [polygon for polygon in polygons if measure_area(polygon) > 0.0] or polygons
     # of one type, so that nothing is compiled anew while a jaw waits
-    segments = np.concatenate([np.hstack([p, np.roll(p, -1, axis=0)]) for p in outer]).astype(float)
+    segments = np.concatenate([np.hstack([p, np.roll(p, -1, axis=0)]) for p in polygons]).astype(float)
     low, high = segments[:, :2].min(0), segments[:, :2].max(0)
     if (high - low < CELL).any():
         raise ContactError(f"the outline spans {1e3 * (high - low)} mm, expected at least {1e3 * CELL:g} mm")
@@ -84,19 +82,43 @@ def build_outline(polygons: tuple[NDArray, ...]) -> PressedObject:
 
 
 @njit(**_OPTIONS)
-def _measure_depth(segments, low, cell, rows, columns, faces_away):
-    """Return the depth (rows, columns) below the segments that an object turns to the jaw; negative outside."""
+def _is_before(segment, x, z):
+    """Return True if the way from a point at x and z [m] towards the jaw crosses a segment (4,)."""
+    ax, az, bx, bz = segment
+    return (az > z) != (bz > z) and x >= ax + (bx - ax) * (z - az) / (bz - az)
+
+
+@njit(**_OPTIONS)
+def _find_hidden(segments):
+    """Return which segments (s,) lie behind a gap in the object, as seen from the jaw, bool."""
     count = len(segments)
+    hidden = np.zeros(count, dtype=np.bool_)
+    for k in range(count):
+        x, z, before = 0.5 * (segments[k, 0] + segments[k, 2]), 0.5 * (segments[k, 1] + segments[k, 3]), 0
+        for s in range(count):
+            if s != k and _is_before(segments[s], x, z):
+                before += 1
+        hidden[k] = before > 1
+    return hidden
+
+
+@njit(**_OPTIONS)
+def _measure_depth(segments, low, cell, rows, columns, faces_away):
+    """Return the depth (rows, columns) below the segments that an object turns to the jaw; negative outside.
+
+    What lies behind the object is inside, as holes are: the face of a finger gets there through a thin wall only, and
+    would be held there.
+    """
+    count, hidden = len(segments), _find_hidden(segments)
     nearest = np.empty((rows, columns))
     for i in range(rows):
         x = low[0] + cell * i
         for j in range(columns):
             z = low[1] + cell * j
-            inside, best, best_turned = 0, 1e9, 1e9
+            inside, best, best_turned = False, 1e9, 1e9
             for s in range(count):
                 ax, az, bx, bz = segments[s, 0], segments[s, 1], segments[s, 2], segments[s, 3]
-                if (az > z) != (bz > z) and x < ax + (bx - ax) * (z - az) / (bz - az):
-                    inside += 1 if bz > az else -1
+                inside |= _is_before(segments[s], x, z)
                 ex, ez = bx - ax, bz - az
                 square = ex * ex + ez * ez
                 if square <= 0.0:
@@ -105,9 +127,9 @@ def _measure_depth(segments, low, cell, rows, columns, faces_away):
                 gap = (x - ax - t * ex) ** 2 + (z - az - t * ez) ** 2
                 best = min(best, gap)
                 # counterclockwise: the outward normal is (ez, -ex)
-                if ez < faces_away * np.sqrt(square):
+                if ez < faces_away * np.sqrt(square) and not hidden[s]:
                     best_turned = min(best_turned, gap)
-            nearest[i, j] = np.sqrt(best_turned) if inside != 0 else -np.sqrt(best)
+            nearest[i, j] = np.sqrt(best_turned) if inside else -np.sqrt(best)
     return nearest
 
 

@@ -25,6 +25,7 @@ SCENES = ("grasp_cylinder", "hold", "weight_turn", "shifting", "slipping", "rock
 # its jaws, which a leaning object would not touch first
 OBJECTS = ("rod15", "rod25", "rod35", "block", "wedge", "cylinder", "cube", "asymmetric", "mug", "bottle")
 WIDTHS = (0.012, 0.045)  # [m] along the closing axis, to which objects are scaled
+LEAST_WIDTHS = {"mug": 0.035}  # [m], below which a handle is thinner than the outlines of objects are resolved
 SHARES = (0.1, 0.85)  # [-] of the height of the jaw's possible contacts
 PRESSES = (0.002, 0.008)  # [m] of a jaw whose contacts span SPAN; shorter ones are pressed as much less
 SPAN = 0.06  # [m]
@@ -66,7 +67,7 @@ def draw_scene(seed: int, jaw: str = "bench") -> dict[str, Any]:
         "settle": 0.3,
         "record": 0.7,
     }
-    width = rng.uniform(*WIDTHS)
+    width = max(rng.uniform(*WIDTHS), LEAST_WIDTHS.get(shape, 0.0))
     changes["scale"] = _scale_to(changes, width)
     if scene in ("weight_turn", "slipping"):
         changes["mass"] = float(rng.uniform(*WEIGHTS))

@@ -70,14 +70,20 @@ def test_depth_below_a_circle_is_that_of_the_circle(radius, depth):
     assert np.abs(found - depth).max() < CELL**2 / (5 * (radius - depth)) + 2e-6
 
 
-def test_a_face_that_got_through_a_thin_wall_is_pushed_back_out():
-    """No finger gets into a closed ring; the hole of one would hold what has."""
-    radius, depths = 0.0125, np.array([0.5e-3, 1e-3, 2e-3, 3e-3])
-    [outside], [hole] = circle(radius, 360), circle(radius - 1e-3, 360)
-    points = np.stack([depths - radius, np.zeros(len(depths))], axis=1)
-    np.testing.assert_allclose(depth_at((outside, hole[::-1]), points), depths, atol=0.1e-3)
-    push = push_at((outside, hole[::-1]), points)
-    np.testing.assert_allclose(push[:, 0], -1e4 * depths, rtol=0.05)
+THIN = {
+    "can": (*circle(0.0125, 360), circle(0.0122, 360)[0][::-1]),
+    "cup": (np.array([[-12.5, -10], [0, -10], [0, -9.6], [-12.1, -9.6], [-12.1, 10], [-12.5, 10]]) * 1e-3,),
+    "wall before a block": (box(0.2e-3, 0.01)[0] - [0.0123, 0.0], *box(0.005, 0.01)),
+}
+
+
+@pytest.mark.parametrize("name", THIN)
+def test_a_thin_wall_bears_as_much_as_a_solid_however_deep_a_face_is_pressed(name):
+    """No finger gets into a can or behind a wall: it would be held there."""
+    depths = np.array([0.1e-3, 0.5e-3, 0.9e-3, 1.5e-3, 2.5e-3])
+    points = np.stack([depths - 0.0125, np.zeros(len(depths))], axis=1)
+    np.testing.assert_allclose(depth_at(THIN[name], points), depths, atol=0.02e-3)
+    np.testing.assert_allclose(push_at(THIN[name], points), push_at(circle(0.0125, 360), points), atol=0.3)
 
 
 def test_facets_of_a_mesh_are_smoothed():
