@@ -186,7 +186,7 @@ class ContactEstimator:
         if message := self._find_stale_pose(stamp):
             return self._give_up(stamp, "no_pose", message)
         pose = self._poses.at(stamp)
-        section = self._sections.at(pose.T)
+        section = self._sections.at(pose.T, touching=self._touched is not None)
         if self._surrounds_jaw(pose.T, section):
             message = f"this pose puts {self._mesh.name} around the jaw: check its pose, mesh and unit"
             return self._give_up(stamp, "no_pose", message, "surrounded")

@@ -19,6 +19,7 @@ _THROUGH = 2e-3
 _MOST_CROSSINGS = 64
 _RECUT_ANGLE = 0.0175  # [rad], turn out of the finger's plane that needs a new outline
 _RECUT_SHIFT = 1e-3  # [m], shift along the width that needs a new outline
+_RECUT_TILT = 0.35  # [rad], turn in that plane: the solver prepares the side of an outline that faces the jaw
 
 
 def edges_of(polygons: tuple[NDArray, ...]) -> NDArray:
@@ -314,7 +315,10 @@ def find_lateral_contact(mesh: ObjectMesh, T: NDArray, half_width: float, span: 
 
 
 class SectionKeeper:
-    """Cuts an object's outline anew when it turned out of the plane or moved across it, and tilts it in between."""
+    """Cuts an object's outline anew when it turned out of the plane or moved across it, and tilts it in between.
+
+    One that turned far in the plane is cut anew, too, unless it touches: a new outline is a new contact.
+    """
 
     def __init__(self, mesh: ObjectMesh, half_width: float, span: tuple[float, float] = (-1.0, 1.0)) -> None:
         """Keep the mesh, half the width of the finger, which the outline is that of, and its lowest and highest z."""
@@ -322,14 +326,15 @@ class SectionKeeper:
         self._R: NDArray | None = None
         self.cuts = 0
 
-    def at(self, T: NDArray) -> ObjectSection:
-        """Return the outline at T_jaw_object (4, 4)."""
+    def at(self, T: NDArray, *, touching: bool = False) -> ObjectSection:
+        """Return the outline at T_jaw_object (4, 4), of an object that touches the jaw or not."""
         tilt = 0.0
         if self._R is None:
             self._cut(T)
         else:
             tilt, swing = split_turn(T[:3, :3] @ self._R.T)
-            if swing > _RECUT_ANGLE or abs(T[1, 3] - self._y) > _RECUT_SHIFT:
+            is_turned = abs(tilt) > _RECUT_TILT and not touching
+            if swing > _RECUT_ANGLE or abs(T[1, 3] - self._y) > _RECUT_SHIFT or is_turned:
                 self._cut(T)
                 tilt = 0.0
         return ObjectSection(

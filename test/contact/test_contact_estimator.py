@@ -54,6 +54,19 @@ def noisy(T, random, position=0.3 * MM, angle=5.8e-3):
     return T
 
 
+@pytest.mark.parametrize("turn", [1.0, np.pi / 2, 3.0])
+def test_an_object_that_turned_before_it_is_grasped_is_outlined_from_the_side_it_then_turns_to_the_jaw(turn):
+    """The solver prepares that side alone: forces of a box were off by newtons, or there were none."""
+    estimator, turned = estimator_of(box()), estimator_of(box())
+    for frame, tilt in enumerate(np.linspace(turn, 0.0, 60)):
+        for each, angle in ((estimator, tilt), (turned, 0.0)):
+            each.take_pose(frame * FRAME, pose(FACE + 0.04, 0.04, tilt=angle))
+            estimate = each.update(frame * FRAME)
+    found, expected = estimator.update(59 * FRAME).contact.outline, estimate.contact.outline
+    assert abs(found.tilt) < 0.4
+    assert found.nearest == pytest.approx(expected.nearest, abs=0.1 * MM)
+
+
 class TestWhatIsNotKnown:
     def test_without_object_there_are_no_rows_and_the_message_says_what_to_do(self):
         estimator = ContactEstimator(JAW)

@@ -107,6 +107,13 @@ class TestSection:
         keeper.at(T)
         assert keeper.cuts == 3
 
+    def test_outline_is_cut_anew_when_the_object_turned_far_unless_it_touches(self):
+        keeper = SectionKeeper(box(), INNER.half_width)
+        keeper.at(pose(0.03, 0.04))
+        assert keeper.at(pose(0.03, 0.04, tilt=1.0), touching=True).tilt == pytest.approx(1.0)
+        assert keeper.at(pose(0.03, 0.04, tilt=1.0)).tilt == 0.0
+        assert keeper.cuts == 2
+
 
 class TestOutline:
     @pytest.mark.parametrize("x", [FACE + 0.0125 - 3 * MM, FACE + 0.0125, FACE + 0.05])
