@@ -19,7 +19,7 @@ _THROUGH = 2e-3
 _MOST_CROSSINGS = 64
 _RECUT_ANGLE = 0.0175  # [rad], turn out of the finger's plane that needs a new outline
 _RECUT_SHIFT = 1e-3  # [m], shift along the width that needs a new outline
-_RECUT_TILT = 0.35  # [rad], turn in that plane: the solver prepares the side of an outline that faces the jaw
+_RECUT_TILT = 0.35  # [rad], turn in that plane, about half of what the solver allows an outline to turn
 
 
 def edges_of(polygons: tuple[NDArray, ...]) -> NDArray:

@@ -365,6 +365,12 @@ def _follow(tables, q):
 
 
 @njit(**_OPTIONS)
+def _follow_rows(jaw, q):
+    """Return the motions of the rows (2 n,) [m] for unknowns q (2 n + 2,)."""
+    return _follow((jaw.moves, jaw.compliance, jaw.loads, jaw.softness), q)
+
+
+@njit(**_OPTIONS)
 def _place_probe(points, basis, tables, q):
     """Return material points (p, 3) [m], moved as a jaw with unknowns q is bent.
 
@@ -540,7 +546,7 @@ def _find_share(jaw, placed, points, moves, q, step):
     Along a step of the loads that moves the rows by du and contact points (p, 3) by dx, it changes by
     (lambda - p)^T du, all as far as the step has gone.
     """
-    moved = _follow((jaw.moves, jaw.compliance, jaw.loads, jaw.softness), q + step)
+    moved = _follow_rows(jaw, q + step)
     motion = _place_contact(jaw.points, jaw.low, jaw.share, moved) - points
     work = np.zeros(2)
     for k in range(len(moves)):
@@ -616,7 +622,7 @@ def linearize_reduced(jaw, pressed, traction, q, x, probe):
     """
     jaw, pressed, traction = _Jaw(*jaw), PressedObject(*pressed), Traction(*traction)
     count = jaw.loads.shape[2]
-    moves = _follow((jaw.moves, jaw.compliance, jaw.loads, jaw.softness), q)
+    moves = _follow_rows(jaw, q)
     points = _place_contact(jaw.points, jaw.low, jaw.share, moves)
     placed = _PlacedObject(pressed, pose_object(pressed, jaw.face_x, x), traction)
     contact = _gather(jaw, placed, points)
@@ -683,7 +689,7 @@ def _approach_reduced(jaw, pressed, q, step, x):
     low, high, pose = 0.0, 1.0, pose_object(pressed, jaw.face_x, x)
     for _ in range(BISECTIONS):
         share = 0.5 * (low + high)
-        moves = _follow((jaw.moves, jaw.compliance, jaw.loads, jaw.softness), q + share * step)
+        moves = _follow_rows(jaw, q + share * step)
         if measure_gap(pressed, pose, _place_contact(jaw.points, jaw.low, jaw.share, moves)) < -TOUCH:
             high = share
         else:

@@ -56,7 +56,7 @@ def noisy(T, random, position=0.3 * MM, angle=5.8e-3):
 
 @pytest.mark.parametrize("turn", [1.0, np.pi / 2, 3.0])
 def test_an_object_that_turned_before_it_is_grasped_is_outlined_from_the_side_it_then_turns_to_the_jaw(turn):
-    """The solver prepares that side alone: forces of a box were off by newtons, or there were none."""
+    """The solver prepares that side alone."""
     estimator, turned = estimator_of(box()), estimator_of(box())
     for frame, tilt in enumerate(np.linspace(turn, 0.0, 60)):
         for each, angle in ((estimator, tilt), (turned, 0.0)):
