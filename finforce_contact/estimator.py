@@ -100,7 +100,7 @@ class ContactEstimator:
             MissingDependencyError: The mode needs a library that is not installed.
         """
         self._mesh: ObjectMesh | None = None
-        self._symmetry = read_symmetry(self.settings.symmetry, mesh) if mesh is not None else None
+        self._poses.symmetry = read_symmetry(self.settings.symmetry, mesh) if mesh is not None else None
         self._localizer = self._build_localizer(mesh) if mesh is not None else None
         if mesh is not None:
             low, high = mesh.bounds
@@ -150,12 +150,10 @@ class ContactEstimator:
         watched = camera is not None and self._mesh is not None
         if watched and surrounds(self._mesh, (invert_pose(T) @ np.append(camera, 1.0))[:3]):
             raise PoseError("this pose puts the object around the camera: check its pose, mesh and unit")
-        if self._symmetry is not None and self._poses.latest is not None:
-            T = self._symmetry.choose(T, self._poses.at(stamp).T)
-        outcome = self._poses.update(stamp, T, covariance)
+        outcome = self._poses.update(stamp, T, covariance, is_free=self._touched is None)
         if outcome in ("used", "rejected") and self._touched is not None:
             closing = self._poses.at(stamp).speed
-            self._slips.update(stamp, T, self._touched, closing=closing, odd=outcome == "rejected")
+            self._slips.update(stamp, self._poses.latest, self._touched, closing=closing, odd=outcome == "rejected")
         self.counts["late pose"] += outcome == "late"
         self.counts["odd pose"] += outcome == "rejected"
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from finforce.errors import PoseError
 from finforce.transforms import check_pose, move_pose, step_between
 from finforce_contact.parameters import ContactSettings
+from finforce_contact.pose.symmetry import Symmetry
 
 # For translation and rotation: random walk of an object [m/s^0.5, rad/s^0.5], of its speed while it moves [m/s^1.5,
 # rad/s^1.5], and standard deviation of the speed at which it starts [m/s, rad/s].
@@ -19,6 +20,8 @@ _ACCELERATION = np.repeat([2e-3, 0.04], 3) ** 2
 _START = np.repeat([8e-3, 0.15], 3) ** 2
 _RESTS = 20.0  # [s], mean time of rest
 _MOVES = 5.0  # [s], mean time of motion
+_FREE_RESTS = 2.0  # [s], mean time of rest of what nothing holds, as seen from a hand that comes nearer
+_OUTLIERS = 0.08  # [-], largest share of poses that are wrong
 _GATE = 5.0  # [sigma]; a pose farther off is not believed at once
 _JUMP_POSES = 3  # in a row off the trajectory that agree with each other are believed
 _NOISE_MEMORY = 60.0  # samples over which noise is learnt
@@ -124,12 +127,17 @@ class PoseFilter:
     Interacting multiple models (Blom and Bar-Shalom, 1988): objects start and stop at random times. The noise of the
     poses is learnt from the innovations: r = v^2 - p. Poses whose errors are alike from one to the next, by a
     correlation c, tell less: they count as if of the variance r (1 + c) / (1 - c). A pose far off the trajectory is
-    rejected until some in a row agree with each other.
+    rejected until some in a row agree with each other, but that of a free object in motion is believed. Of poses that
+    look alike, that is taken which is turned least from the trajectory; while poses are rejected, from the one before.
+
+    Attributes:
+        symmetry: of the object.
+        latest: the newest pose as it was taken (4, 4).
     """
 
-    def __init__(self, settings: ContactSettings) -> None:
+    def __init__(self, settings: ContactSettings, symmetry: Symmetry | None = None) -> None:
         """Keep what noise is expected."""
-        self._timeout = settings.pose_timeout
+        self._timeout, self.symmetry = settings.pose_timeout, symmetry
         noise = np.repeat([settings.pose_noise, settings.rotation_noise], 3)
         self._assumed = noise**2
         self.reset()
@@ -140,16 +148,17 @@ class PoseFilter:
         self.believed = 0.0
         self.latest: NDArray | None = None
         self._scale, self._alike = np.ones(6), np.zeros(6)
-        self._learnt = _NOISE_PRIOR
+        self._learnt = np.full(6, _NOISE_PRIOR)
         self._rejected: deque[tuple[float, NDArray]] = deque(maxlen=_JUMP_POSES)
 
-    def update(self, stamp: float, T: NDArray, covariance: NDArray | None = None) -> str:
+    def update(self, stamp: float, T: NDArray, covariance: NDArray | None = None, *, is_free: bool = False) -> str:
         """Take a pose and return what became of it: "used", "late", "rejected" or "jump".
 
         Args:
             stamp: image capture time [s].
             T: T_jaw_object (4, 4).
             covariance: (6, 6) of x, y, z [m] and the rotations about the jaw's axes [rad]; None: learn it.
+            is_free: True if nothing holds the object, or what it is seen from: in motion, it may stop and turn at once.
 
         Raises:
             PoseError: Stamp or pose is none, or the covariance has another shape or no positive diagonal.
@@ -160,18 +169,23 @@ class PoseFilter:
         noise = self._noise(covariance)
         if self.stamp is not None and stamp <= self.stamp:
             return "late"
-        self.latest = T
+        before, self.latest = self.latest, T if self.stamp is None else self._choose(T, self.at(stamp).T)
         if self.stamp is None or stamp - self.stamp > self._timeout:
-            self._begin(stamp, T, noise)
+            self._begin(stamp, self.latest, noise)
             return "used"
-        self._tracks = self._tracks.mix(stamp - self.stamp).advance(stamp - self.stamp)
+        dt, moves = stamp - self.stamp, (self._tracks.probability[_MOTION] > 0.5).any()
+        self._tracks = self._tracks.mix(dt).advance(dt)
         self.stamp = stamp
         self._centre()
-        innovation, spread = step_between(self._T, T), self._tracks.variance
+        innovation, spread = step_between(self._T, self.latest), self._tracks.variance
         if (innovation**2 > _GATE**2 * (spread + noise)).any():
+            if is_free and (moves or dt > _OUTLIERS * _FREE_RESTS):  # it rather turned than the pose is wrong
+                self._begin(stamp, self.latest, noise, step_between(before, self.latest) / dt)
+                self._tracks = self._tracks._replace(speed_spread=_START + self._tracks.speed**2)
+                return "jump"
             return self._reject(stamp, T, noise)
         self._rejected.clear()
-        self._learn(innovation, spread, None if covariance is None else noise)
+        self._learn(innovation, spread, noise, is_stated=covariance is not None)
         alike = np.clip(self._alike / self._scale, 0.0, _MOST_ALIKE)
         self._tracks = self._tracks.correct(innovation, noise * (1.0 + alike) / (1.0 - alike))
         self._centre()
@@ -181,7 +195,7 @@ class PoseFilter:
     def carry(self, T: NDArray) -> None:
         """Take the motion of the frame itself: T (4, 4) leads from where it was to where it is."""
         if self.stamp is not None:
-            self._T = T @ self._T
+            self._T, self.latest = T @ self._T, T @ self.latest
             self._rejected = deque(((stamp, T @ pose) for stamp, pose in self._rejected), maxlen=self._rejected.maxlen)
 
     def at(self, stamp: float) -> FilteredPose:
@@ -197,6 +211,9 @@ class PoseFilter:
         stddev = np.sqrt(tracks.variance + _DRIFT * max(ahead - _LONGEST_FORECAST, 0.0))
         speed = float(tracks.probability[_MOTION, 0] * tracks.speed[0])
         return FilteredPose(T=move_pose(self._T, tracks.mean), stddev=stddev, speed=speed)
+
+    def _choose(self, T: NDArray, T_last: NDArray) -> NDArray:
+        return T if self.symmetry is None else self.symmetry.choose(T, T_last)
 
     def _noise(self, covariance: NDArray | None) -> NDArray:
         """Return the variances (6,) of a pose; stated ones are raised when the poses scatter more."""
@@ -230,20 +247,26 @@ class PoseFilter:
         )
         self._rejected.clear()
 
-    def _learn(self, innovation: NDArray, spread: NDArray, stated: NDArray | None) -> None:
-        """Average how much larger the noise (6,) that is seen is than assumed or stated, and how alike at rest."""
-        base = self._assumed if stated is None else stated / np.maximum(self._scale, 1.0)
-        self._learnt = min(self._learnt + 1.0, _NOISE_MEMORY)
-        self._scale = np.clip(
-            self._scale + ((innovation**2 - spread) / base - self._scale) / self._learnt, *_NOISE_RANGE
-        )
+    def _learn(self, innovation: NDArray, spread: NDArray, noise: NDArray, *, is_stated: bool) -> None:
+        """Average how much larger the noise (6,) that is seen is than assumed or stated, and how alike at rest.
+
+        The square of an innovation of the variance p + r tells r with the variance 2 (p + r)^2: of an object whose
+        motion is not known, hardly anything.
+        """
+        base = noise / np.maximum(self._scale, 1.0) if is_stated else self._assumed
+        told = (noise / (noise + spread)) ** 2
+        self._learnt = np.minimum(self._learnt + told, _NOISE_MEMORY)
+        gain = told / self._learnt
+        self._scale = np.clip(self._scale + gain * ((innovation**2 - spread) / base - self._scale), *_NOISE_RANGE)
         alike = innovation * self._innovation / base
-        self._alike += self._tracks.probability[_REST] ** 2 * (alike - self._alike) / self._learnt
+        self._alike += self._tracks.probability[_REST] ** 2 * gain * (alike - self._alike)
         self._innovation = innovation
 
     def _reject(self, stamp: float, T: NDArray, noise: NDArray) -> str:
         """Keep a pose off the trajectory; once enough in a row agree, the trajectory starts anew from them."""
-        self._rejected.append((stamp, T))
+        if self._rejected:
+            self.latest = self._choose(T, self._rejected[-1][1])
+        self._rejected.append((stamp, self.latest))
         if len(self._rejected) < _JUMP_POSES or not self._agree(noise):
             return "rejected"
         (first, T_first), (last, T_last) = self._rejected[0], self._rejected[-1]

@@ -97,7 +97,7 @@ class ContactTracker:
         self._search = ContactSearch(len(keypoints), settings)
         self.response = measure_influence(self._contact, self._probe, len(keypoints))
         self._outline: OutlineIndenter | None = None
-        self._is_apart = False
+        self._is_apart, self._led_stddev = False, np.zeros(2)
         self._unobserved = self._build_unobserved(contact_range[0])
         self._lateral = LateralLoad(
             torsion, len(keypoints), UNSEEN_TRACTION * settings.friction, may_be_held=settings.may_be_held
@@ -331,12 +331,13 @@ class ContactTracker:
 
     def _follow_outline(self, contact: Contact) -> None:
         """Set the prior to the outline's tilt and height; a new section of the same object keeps the contact."""
-        before = self._contact.indenter
+        before, search = self._contact.indenter, self._search
+        is_free, touch = search.state["depth"] < TOUCH_DEPTH, self._contact.find_touch(search.state["x"])
         if contact.outline.across is not None:
             self._lateral.expect(*contact.outline.across)
         expected = expect_object(contact, self.settings, self._outline)
         self._expect(expected.mean, expected.variance)
-        self._lead(contact.outline.stddev[2:0:-1])
+        self._lead(contact.outline.stddev[2:0:-1], is_free=bool(is_free))
         self._outline = after = expected.indenter
         if after is not before:
             self._press(after)
@@ -344,23 +345,29 @@ class ContactTracker:
         self._is_apart = bool(pressed_by_pose < -APART_SIGMAS * contact.outline.stddev[0])
         height = float(expected.mean[1])
         self._given = None
-        self._search.hypotheses.carried.see(height, float(contact.outline.stddev[1]))
-        is_off = abs(self._search.state["x"][HEIGHT] - height) > _FARTHEST_HEIGHT * self.settings.height_stddev
+        search.hypotheses.carried.see(height, float(contact.outline.stddev[1]))
+        is_off = abs(search.state["x"][HEIGHT] - height) > _FARTHEST_HEIGHT * self.settings.height_stddev
         is_same = isinstance(before, OutlineIndenter) and after.resembles(before)
         if isinstance(before, OutlineIndenter) and not is_same:
-            self._search.expect_friction(self._friction)
+            search.expect_friction(self._friction)
         if is_off or not is_same:
             self._begin()
+        elif is_free:  # of what does not touch, the distance from first touch stays
+            search.shift(self._contact.find_touch(search.state["x"]) - touch)
         elif after is not before:
-            self._search.shift(after.pressed.front - before.pressed.front)
+            search.shift(after.pressed.front - before.pressed.front)
 
-    def _lead(self, chance: NDArray) -> None:
-        """Move the contact with an object that slides or tilts, beyond the noise of its pose."""
-        moved = self._mean - self._led
-        change = moved - np.minimum(np.maximum(moved, -chance), chance)
+    def _lead(self, stddev: NDArray, *, is_free: bool) -> None:
+        """Move the contact with an object that slides or tilts: beyond the noise of its pose, now and before.
+
+        What a better pose corrects has not moved, unless nothing holds it.
+        """
+        moved, before = self._mean - self._led, self._led_stddev
+        unsure = stddev if is_free else np.maximum(stddev, before)
+        change = moved - np.clip(moved, -unsure, unsure)
         if change.any():
-            self._led += change
             self._search.lead(change)
+        self._led, self._led_stddev = self._mean - np.clip(moved - change, -stddev, stddev), stddev
 
     def _complete(self, state: ContactState) -> None:
         """Fill in lateral force, unobserved force and largest force."""

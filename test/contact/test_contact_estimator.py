@@ -12,6 +12,7 @@ from finforce_contact.estimator import ContactEstimator
 from finforce_contact.mesh.object_mesh import load_object_mesh
 from finforce_contact.parameters import ContactSettings
 from finforce_contact.pose.filter import PoseFilter
+from finforce_contact.pose.symmetry import read_symmetry
 from finforce_eval.recordings.objects import track_object
 from finforce_eval.recordings.recording import DEMO as RECORDING
 from finforce_eval.recordings.recording import read_recording
@@ -51,6 +52,13 @@ def noisy(T, random, position=0.3 * MM, angle=5.8e-3):
     T = T.copy()
     T[:3, 3] += position * random.standard_normal(3)
     T[:3, :3] = Rotation.from_rotvec(angle * random.standard_normal(3)).as_matrix() @ T[:3, :3]
+    return T
+
+
+def turned(angle, height=0.04):
+    """Pose of an object that is turned about its own z."""
+    T = pose(0.03, height)
+    T[:3, :3] = Rotation.from_rotvec([0.0, 0.0, angle]).as_matrix()
     return T
 
 
@@ -347,13 +355,42 @@ class TestPoseFilter:
         assert verdicts == ["rejected", "rejected", "jump"]
         np.testing.assert_allclose(filtered.at(2.4).T[:3, 3], [0.05, 0.0, 0.04], atol=1e-12)
 
-    def test_wild_poses_that_disagree_are_never_believed(self):
-        filtered, random = PoseFilter(SETTINGS), np.random.default_rng(6)
+    @pytest.mark.parametrize("seed", range(5))
+    def test_wild_poses_that_disagree_are_never_believed(self, seed):
+        filtered, random = PoseFilter(SETTINGS), np.random.default_rng(seed)
         for sample in range(20):
             filtered.update(0.1 * sample, pose(0.03, 0.04))
         for sample in range(20, 29):
-            assert filtered.update(0.1 * sample, pose(0.1 + 0.1 * random.random(), 0.04)) == "rejected"
+            wild = pose(*(0.1 + 0.1 * random.random(2)))
+            assert filtered.update(0.1 * sample, wild) == "rejected"
         assert filtered.believed == pytest.approx(1.9)
+
+    def test_round_object_that_leaves_a_spinning_trajectory_is_believed_where_it_rests(self):
+        """The pose that looks alike and is nearest to the trajectory would be another one each time."""
+        filtered = PoseFilter(SETTINGS, read_symmetry("z_full", cylinder()))
+        for sample in range(20):
+            filtered.update(0.1 * sample, turned(0.3 * sample))
+        verdicts = [filtered.update(2.0 + 0.1 * k, turned(1.0, 0.05)) for k in range(3)]
+        assert verdicts == ["rejected", "rejected", "jump"]
+
+    @pytest.mark.parametrize("seed", range(3))
+    def test_motion_tells_nothing_of_the_noise(self, seed):
+        filtered, random = PoseFilter(SETTINGS), np.random.default_rng(seed)
+        for sample in range(100):
+            share = np.clip((0.1 * sample - 5.0) / 2.0, 0.0, 1.0)
+            T = noisy(pose(0.03 + 0.1 * (3.0 - 2.0 * share) * share**2, 0.04), random)
+            filtered.update(0.1 * sample, T, is_free=True)
+            if sample > 55:
+                assert 0.4 < np.sqrt(filtered._scale[0]) < 1.7
+
+    def test_free_object_that_stops_is_believed_at_once(self):
+        held, free = PoseFilter(SETTINGS), PoseFilter(SETTINGS)
+        for sample in range(20):
+            x = 0.03 + 0.01 * min(max(sample - 5, 0), 8)
+            verdicts = held.update(0.1 * sample, pose(x, 0.04)), free.update(0.1 * sample, pose(x, 0.04), is_free=True)
+            if sample == 14:
+                assert verdicts == ("rejected", "jump")
+        assert free.at(1.4).T[0, 3] == pytest.approx(0.11)
 
     def test_noise_is_learnt(self):
         filtered, random = PoseFilter(SETTINGS), np.random.default_rng(7)

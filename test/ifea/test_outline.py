@@ -335,6 +335,17 @@ def test_wrong_first_outline_is_forgotten_when_the_right_one_comes(polygons, hei
     assert np.mean(np.abs(errors)) < 0.1
 
 
+def test_object_that_turns_and_moves_before_it_touches_is_still_about_to_touch():
+    """Cut anew, its front comes nearer or not, and touches elsewhere: that is no depth."""
+    tracker = make_estimator()._tracked
+    for share in np.linspace(1.0, 0.0, 31):
+        c, s = np.cos(1.5 * share), np.sin(1.5 * share)
+        seen = (box(0.010, 0.025)[0] @ [[c, s], [-s, c]],)
+        tracker.follow(contact_with(seen, 0.040 + 0.040 * share))
+        x = tracker._search.state["x"]
+        assert x[DEPTH] == pytest.approx(tracker._contact.find_touch(x), abs=1e-6)
+
+
 def watch(estimator, course, noise, random):
     """Yield the solutions of images of key points (K, 3) [m], seen with some noise [m], each with its contact."""
     for i, (points, contact) in enumerate(course):
