@@ -26,7 +26,7 @@ from finforce.messages import (
 from finforce.transforms import invert_pose
 from finforce_contact.errors import ReconstructionError
 from finforce_contact.estimator import ContactEstimator
-from finforce_contact.loop import ContactLoop, TimedEstimate
+from finforce_contact.loop import UNMOVED, ContactLoop, TimedEstimate
 from finforce_contact.mesh.object_mesh import ObjectMesh, describe_mesh, load_object_mesh
 from finforce_contact.paper_contact import check_surface
 from finforce_contact.parameters import ContactParameters, ContactSettings, TrackerSettings, load_generated, load_jaws
@@ -48,14 +48,13 @@ class JawContact:
 
     def __init__(self, estimator: ContactEstimator, *, tolerance: int, max_age: int) -> None:
         self.loop, self._pairing, self._max_age = ContactLoop(estimator), PosePairing(tolerance), max_age
-        self._jaw: NDArray | None = None
         self._surface: Stamped | None = None
 
     def reset(self) -> None:
         """Forget everything but the object's mesh."""
         self.loop.reset()
         self._pairing.reset()
-        self._jaw = self._surface = None
+        self._surface = None
 
     def set_object(self, mesh: ObjectMesh | None) -> None:
         """Take another object; its pose is not known yet.
@@ -94,31 +93,17 @@ class JawContact:
 
     def _follow(self, steps: Iterable[PoseStep]) -> list[TimedEstimate]:
         """Hand poses on and update for the images that are due."""
-        estimates = []
+        estimates, loop = [], self.loop
         for step in steps:
-            T_jaw_object = self._carry(step)
-            if T_jaw_object is not None:
+            if step.is_due:
+                loop.follow_jaw(step.T_jaw_camera)
+            if step.T_jaw_object is not None:
                 covariance = turn_covariance(step.covariance, step.T_jaw_camera)
-                self.loop.take_pose(step.stamp, T_jaw_object, covariance, step.T_jaw_camera[:3, 3])
+                T_jaw_object = loop.as_now(step.T_jaw_object, step.T_jaw_camera)
+                loop.take_pose(step.stamp, T_jaw_object, covariance, step.T_jaw_camera[:3, 3])
             if step.is_due:
                 estimates += self._due(step.stamp)
         return estimates
-
-    def _carry(self, step: PoseStep) -> NDArray | None:
-        """Take the jaw's own motion; return the object's pose (4, 4), if there is one, as the jaw is now.
-
-        Between two poses of the object, which may be rare, the jaw goes on: what is known goes with the camera.
-        """
-        if self._jaw is None:
-            self._jaw = step.T_jaw_camera
-        if np.abs(step.T_jaw_camera - self._jaw).max() <= UNMOVED:
-            return step.T_jaw_object
-        motion = step.T_jaw_camera @ invert_pose(self._jaw)
-        if step.is_due:
-            self.loop.estimator.carry(motion)
-            self._jaw = step.T_jaw_camera
-            return step.T_jaw_object
-        return None if step.T_jaw_object is None else invert_pose(motion) @ step.T_jaw_object
 
     def _due(self, stamp: int) -> list[TimedEstimate]:
         kept = self._surface
@@ -138,7 +123,6 @@ def turn_covariance(covariance: NDArray | None, T_jaw_camera: NDArray) -> NDArra
 JAW, PASSED, OBJECT = "jaw", "passed", "object"
 WAITING = 48  # images that may wait for their other pose: half a second of 90 Hz, as poses may be late
 BRIDGED = 250_000_000  # [ns] between two poses of a jaw that stand for the time between, while it does not move
-UNMOVED = 0.2e-3  # [m] and, for its axes, [1]: a jaw that differs by less has not moved
 
 
 class PoseStep(NamedTuple):

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from finforce.errors import FinforceError
 from finforce.messages import SECOND
+from finforce.transforms import invert_pose
 from finforce_contact.estimator import ContactEstimate, ContactEstimator
 from finforce_contact.mesh.object_mesh import ObjectMesh
 from finforce_ifea.observation import Contact, Observation, Solution, is_out_of_reach
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
     from finforce_ifea.estimator import ForceEstimator
 
 Surface = Callable[[], NDArray | None]  # gives the jaw's deformed vertices (n, 3) [m], None where nobody knows them
+
+
+UNMOVED = 0.2e-3  # [m] and, for its axes, [1]: a jaw that differs by less has not moved
 
 
 class TimedEstimate(NamedTuple):
@@ -84,6 +88,7 @@ class ContactLoop:
     def _start(self) -> None:
         self.last: TimedEstimate | None = None
         self._posed: int | None = None
+        self._T_jaw_camera: NDArray | None = None
 
     def reset(self) -> None:
         """Forget everything but the object's mesh."""
@@ -130,6 +135,28 @@ class ContactLoop:
         if self._posed is None or stamp > self._posed:
             self.estimator.take_pose(SECOND * stamp, T_jaw_object, covariance, camera=camera)
             self._posed = stamp
+
+    def follow_jaw(self, T_jaw_camera: NDArray) -> None:
+        """Take the camera's pose (4, 4) in the jaw frame, with which what is known of the object goes.
+
+        Between two poses of the object, which may be rare, the jaw goes on.
+        """
+        if not self._is_moved(T_jaw_camera):
+            return
+        self.estimator.carry(T_jaw_camera @ invert_pose(self._T_jaw_camera))
+        self._T_jaw_camera = T_jaw_camera
+
+    def as_now(self, T_jaw_object: NDArray, T_jaw_camera: NDArray) -> NDArray:
+        """Return the object's pose (4, 4) in the frame of the jaw as it was last followed; both of one image."""
+        if not self._is_moved(T_jaw_camera):
+            return T_jaw_object
+        return self._T_jaw_camera @ invert_pose(T_jaw_camera) @ T_jaw_object
+
+    def _is_moved(self, T_jaw_camera: NDArray) -> bool:
+        """Return whether the jaw has moved since it was last followed; it is followed from here if it never was."""
+        if self._T_jaw_camera is None:
+            self._T_jaw_camera = T_jaw_camera
+        return bool(np.abs(T_jaw_camera - self._T_jaw_camera).max() > UNMOVED)
 
     def update(self, stamp: int, surface: Surface | None = None) -> TimedEstimate | None:
         """Return the contact of an image; None when it is not newer than the last.
@@ -189,6 +216,11 @@ class ForceLoop:
         """Forget what earlier images told of jaw and force; the object's pose stays."""
         self.force.forget()
         self._resting.reset()
+
+    def follow_jaw(self, T_camera_jaw: NDArray) -> None:
+        """Take the jaw's pose (4, 4) in the camera frame, with which the object goes; before the image's `update`."""
+        if isinstance(self.contact, ContactLoop):
+            self.contact.follow_jaw(invert_pose(T_camera_jaw))
 
     def take_pose(self, stamp: float, T_jaw_object: NDArray) -> None:
         """Take the object's pose (4, 4) [m] in the jaw frame, in an image [s].

@@ -70,6 +70,9 @@ class RecordedContact(ContactLoop):
         Raises:
             RecordingError: the estimator refuses a pose.
         """
+        T_jaw_camera = self._track.camera and self._track.camera.at(stamp)
+        if T_jaw_camera is not None:
+            self.follow_jaw(T_jaw_camera)
         while self._next < len(self._arrivals) and self._arrivals[self._next] <= stamp + ROUNDING:
             self._take_recorded(self._next)
             self._next += 1
@@ -85,10 +88,12 @@ class RecordedContact(ContactLoop):
 
     def _take_recorded(self, index: int) -> None:
         """Give one pose to the estimator."""
-        stamp = int(self._track.stamps_ns[index])
-        camera = None if self._track.cameras is None else self._track.cameras[index]
+        stamp, T, camera = int(self._track.stamps_ns[index]), self._track.poses[index], None
+        if self._track.camera is not None:
+            T_jaw_camera = self._track.camera.at(stamp)
+            T, camera = self.as_now(T, T_jaw_camera), T_jaw_camera[:3, 3]
         try:
-            self.take_pose(stamp, self._track.poses[index], camera=camera)
+            self.take_pose(stamp, T, camera=camera)
         except PoseError as error:
             raise RecordingError(f"object pose at {SECOND * stamp:.3f} s: {error}") from error
 

@@ -28,18 +28,36 @@ PAIRED = 50_000_000
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class CameraTrack(Timed):
+    """Poses of the camera in the frame of one jaw.
+
+    Attributes:
+        stamps_ns: (m,) image time [ns], rising.
+        poses: T_jaw_camera (m, 4, 4) [m].
+    """
+
+    stamps_ns: NDArray[np.int64]
+    poses: NDArray[np.float64]
+
+    def at(self, stamp: int) -> NDArray[np.float64] | None:
+        """Return the pose (4, 4) in the image of a stamp [ns], the nearest one; None where there is none nearby."""
+        nearest = int(find_nearest(self.stamps_ns, np.array([stamp]))[0])
+        return self.poses[nearest] if abs(int(self.stamps_ns[nearest]) - stamp) <= PAIRED else None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class ObjectTrack(Timed):
     """Poses of the object in the frame of one jaw.
 
     Attributes:
         stamps_ns: (n,) image time [ns], rising.
         poses: T_jaw_object (n, 4, 4) [m].
-        cameras: (n, 3) position of the camera in the jaw frame [m]; None when it is not known.
+        camera: what the poses were seen from; None when it is not known.
     """
 
     stamps_ns: NDArray[np.int64]
     poses: NDArray[np.float64]
-    cameras: NDArray[np.float64] | None = None
+    camera: CameraTrack | None = None
 
 
 def find_mesh(recording: Recording, object_file: str | None = None) -> Path | None:
@@ -141,11 +159,11 @@ def track_object(recording: Recording, side: str) -> ObjectTrack:
             f"{recording.name}: /object_pose is at least {SECOND * apart.min():.3g} s from any image, or pose of the "
             f"{side} jaw; expected {PAIRED // 10**6} ms at most: have both stamps of one clock?"
         )
-    T_jaw_camera = np.stack([invert_pose(T) for T in T_camera_jaw])[nearest[paired]]
+    T_jaw_camera = np.stack([invert_pose(T) for T in T_camera_jaw])
     return ObjectTrack(
         stamps_ns=stamps[paired],
-        poses=T_jaw_camera @ T_parent_object[paired],
-        cameras=T_jaw_camera[:, :3, 3],
+        poses=T_jaw_camera[nearest[paired]] @ T_parent_object[paired],
+        camera=CameraTrack(stamps_ns=jaw.stamps_ns, poses=T_jaw_camera),
     )
 
 

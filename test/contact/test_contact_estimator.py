@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from finforce.errors import PoseError
 from finforce_contact.errors import ObjectMeshError
 from finforce_contact.estimator import ContactEstimator
+from finforce_contact.loop import ContactLoop
 from finforce_contact.mesh.object_mesh import load_object_mesh
 from finforce_contact.parameters import ContactSettings
 from finforce_contact.pose.filter import PoseFilter
@@ -28,6 +29,7 @@ CONTACT = Contact(points=np.array([[FACE, 0.0, 0.04]]), weights=np.ones(1))
 RADIUS = 0.0125
 MM = 1e-3
 FRAME = 1.0 / 30.0
+SECOND = 10**9  # [ns]
 
 
 def estimator_of(mesh=None, **settings):
@@ -73,6 +75,21 @@ def test_an_object_that_turned_before_it_is_grasped_is_outlined_from_the_side_it
     found, expected = estimator.update(59 * FRAME).contact.outline, estimate.contact.outline
     assert abs(found.tilt) < 0.4
     assert found.nearest == pytest.approx(expected.nearest, abs=0.1 * MM)
+
+
+def test_jaw_that_closes_between_two_poses_of_the_object_comes_nearer_to_it():
+    """Not only where a pose of the object comes with the image, and without taking its way for the object's speed."""
+    loop, T_camera_object = ContactLoop(estimator_of()), pose(0.08, 0.04)
+    for frame in range(40):
+        T_jaw_camera = np.eye(4)
+        T_jaw_camera[0, 3] = -MM * frame
+        loop.follow_jaw(T_jaw_camera)
+        if frame % 10 == 0:
+            loop.take_pose(frame * SECOND // 30, T_jaw_camera @ T_camera_object)
+        found = loop.update(frame * SECOND // 30).estimate.contact.outline
+        assert found.origin[0] == pytest.approx(0.08 - MM * frame, abs=0.05 * MM)
+    # of the jaw as it was
+    np.testing.assert_allclose(loop.as_now(pose(0.08, 0.04), np.eye(4))[:3, 3], [0.041, 0.0, 0.04], atol=1e-12)
 
 
 class TestWhatIsNotKnown:

@@ -7,6 +7,7 @@ import pytest
 from eval_fakes import PERIOD, START, make_poses, make_recording
 from scipy.spatial.transform import Rotation
 
+from finforce.transforms import invert_pose
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.contact_source import parse_contacts
 from finforce_eval.recordings.objects import find_mesh, has_object, mean_pose, require_mesh, track_object
@@ -50,7 +51,8 @@ def test_object_is_found_in_the_jaw_frame_from_two_poses_in_the_camera_frame():
     track = track_object(seen(stamps, stamps), "left")
     np.testing.assert_array_equal(track.stamps_ns, stamps)
     np.testing.assert_allclose(track.poses, np.tile(T_JAW_OBJECT, (5, 1, 1)), atol=1e-12)
-    np.testing.assert_allclose(track.cameras @ T_CAMERA_JAW[:3, :3].T + T_CAMERA_JAW[:3, 3], 0.0, atol=1e-12)
+    np.testing.assert_allclose(track.camera.at(int(stamps[2])), invert_pose(T_CAMERA_JAW), atol=1e-12)
+    assert track.camera.at(int(stamps[-1]) + 60_000_000) is None
 
 
 def test_poses_in_another_frame_than_the_jaws_are_to_be_transformed():
