@@ -12,6 +12,7 @@ from finforce.errors import PoseError
 from finforce.optional import import_manifold3d
 from finforce.triangle_surface import chain_loops
 from finforce_contact.mesh.object_mesh import ObjectMesh
+from finforce_ifea.contact_mechanics.indenter import CELL
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
 # A wall whose far side lies no deeper than this in the jaw is still taken for what the jaw touches [m].
@@ -343,7 +344,9 @@ class SectionKeeper:
 
     def _cut(self, T: NDArray) -> None:
         self._R, self._y = T[:3, :3].copy(), float(T[1, 3])
-        self._polygons = cut_outline(self._mesh, self._R, self._half_width, self._y)
+        polygons = cut_outline(self._mesh, self._R, self._half_width, self._y)
+        is_grazed = bool(polygons) and (np.ptp(np.concatenate(polygons), axis=0) < CELL).any()  # by the finger's edge
+        self._polygons = () if is_grazed else polygons
         self._edges = edges_of(self._polygons)
         self._across = find_lateral_contact(self._mesh, T, self._half_width, self._span)
         self.cuts += 1

@@ -201,14 +201,17 @@ class PoseFilter:
     def at(self, stamp: float) -> FilteredPose:
         """Return the pose at a time [s], continued at its speed for a fifth of a second at most.
 
+        From then on the object may have stopped or not.
+
         Raises:
             PoseError: No pose has come yet.
         """
         if self.stamp is None:
             raise PoseError("no pose of the object has come yet")
         ahead = stamp - self.stamp if stamp > self.stamp else 0.0
-        tracks = self._tracks.advance(min(ahead, _LONGEST_FORECAST))
-        stddev = np.sqrt(tracks.variance + _DRIFT * max(ahead - _LONGEST_FORECAST, 0.0))
+        tracks, beyond = self._tracks.advance(min(ahead, _LONGEST_FORECAST)), max(ahead - _LONGEST_FORECAST, 0.0)
+        goes_on = tracks.probability[_MOTION] * (tracks.speed**2 + tracks.speed_spread)
+        stddev = np.sqrt(tracks.variance + _DRIFT * beyond + goes_on * beyond**2)
         speed = float(tracks.probability[_MOTION, 0] * tracks.speed[0])
         return FilteredPose(T=move_pose(self._T, tracks.mean), stddev=stddev, speed=speed)
 

@@ -23,6 +23,7 @@ from finforce_ifea.jaw.calibration import load_calibration
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.observation import Contact, Observation
 from finforce_ifea.resting import RestingContact
+from finforce_sim.objects import build_object
 
 SETTINGS = ContactSettings()
 CONTACT = Contact(points=np.array([[FACE, 0.0, 0.04]]), weights=np.ones(1))
@@ -100,6 +101,16 @@ class TestWhatIsNotKnown:
         assert (estimate.status, len(estimate.contact.points), estimate.touching) == ("no_object", 0, False)
         assert "load one" in estimate.message
         assert estimator.counts["no_object"] == 1
+
+    def test_object_of_which_the_finger_meets_the_tip_of_a_corner_is_not_before_it(self):
+        estimator, T = estimator_of(build_object("cube")), np.eye(4)
+        T[:3, :3] = Rotation.align_vectors([[0.0, -1.0, 0.0]], [[1.0, 1.0, 1.0]])[0].as_matrix()
+        corner = np.sqrt(3.0) * 30 * MM
+        for depth, rows in ((0.1 * MM, 0), (4 * MM, 1)):
+            T[:3, 3] = FACE + 2 * MM, estimator.face.half_width + corner - depth, 0.04
+            estimator.reset()
+            estimator.take_pose(0.0, T)
+            assert len(estimator.update(0.0).contact.points) == rows
 
     def test_object_taken_away_leaves_no_rows(self):
         estimator = estimator_of()
