@@ -28,6 +28,8 @@ from finforce_ifea.tracking.influence import explain_offsets, measure_influence,
 
 # Images without touch after which another object is expected.
 _IMAGES_RELEASED = 15
+# Images in a row without a contact that fits after which the search begins anew from the unloaded jaw.
+_IMAGES_LOST = 5
 # Standard deviation that an image without information adds to the depth [m].
 _LOST_STDDEV = 1e-3
 # Distance from the given height beyond which the contact is another one [sigma].
@@ -97,7 +99,7 @@ class ContactTracker:
         self._search = ContactSearch(len(keypoints), settings)
         self.response = measure_influence(self._contact, self._probe, len(keypoints))
         self._outline: OutlineIndenter | None = None
-        self._is_apart, self._led_stddev = False, np.zeros(2)
+        self._is_apart, self._led_stddev, self._lost = False, np.zeros(2), 0
         self._unobserved = self._build_unobserved(contact_range[0])
         self._lateral = LateralLoad(
             torsion, len(keypoints), UNSEEN_TRACTION * settings.friction, may_be_held=settings.may_be_held
@@ -229,11 +231,9 @@ class ContactTracker:
         self._fill(planar, tare, tare.point_noise(observation.stddev))
         most = _FULL_ITERATIONS if self._fidelity else self.settings.iterations
         if not search.find(self._contact, self._probe, dt, iterations=most):
-            search.lose(_LOST_STDDEV)
-            if self._fidelity:
-                self._restore_shape()
+            self._lose()
             return None
-        state = search.state
+        state, self._lost = search.state, 0
         self._released = self._released + 1 if state["depth"] < TOUCH_DEPTH else 0
         if self._released == _IMAGES_RELEASED:
             self._forget_contact()
@@ -248,6 +248,17 @@ class ContactTracker:
         self._change_fidelity(state)
         self._has_moved = True
         return state
+
+    def _lose(self) -> None:
+        """Widen the search after an image without a contact that fits; now and then begin anew, knowing nothing."""
+        self._lost += 1
+        if self._lost % _IMAGES_LOST == 0:
+            self._search.expect_friction(self._friction)
+            self._begin()
+            return
+        self._search.lose(_LOST_STDDEV)
+        if self._fidelity:
+            self._restore_shape()
 
     def _follow_posture(self, posture: WristPosture | None) -> WristMove | None:
         """Return the motion of the jaw since the last image."""

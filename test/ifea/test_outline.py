@@ -34,6 +34,7 @@ from finforce_ifea.contact_mechanics.indenter import (
 )
 from finforce_ifea.errors import ContactError
 from finforce_ifea.estimator import ForceEstimator
+from finforce_ifea.filter.search import ContactSearch
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE
 from finforce_ifea.observation import Contact, ObjectOutline, Observation
 from finforce_ifea.settings import EstimatorSettings
@@ -344,6 +345,24 @@ def test_object_that_turns_and_moves_before_it_touches_is_still_about_to_touch()
         tracker.follow(contact_with(seen, 0.040 + 0.040 * share))
         x = tracker._search.state["x"]
         assert x[DEPTH] == pytest.approx(tracker._contact.find_touch(x), abs=1e-6)
+
+
+def test_a_contact_that_is_lost_for_good_is_begun_anew_from_the_unloaded_jaw(monkeypatch):
+    """As after a wrong equilibrium, from which no image leads back."""
+    estimator, results = make_estimator(), press_shape("box", 0.040)
+    find, statuses, is_lost = ContactSearch.find, [], [True]
+
+    def find_none(search, *given, **more):
+        is_lost[0] &= len(statuses) < 150 or search.state["depth"] > 1e-3
+        return not (is_lost[0] and len(statuses) >= 150) and find(search, *given, **more)
+
+    monkeypatch.setattr(ContactSearch, "find", find_none)
+    for observation, force in observe(results):
+        solution = estimator.update(observation, contact_with(SHAPES["box"], 0.040))
+        statuses.append(solution.status)
+    assert statuses[149:155] == ["ok", *["not_enough_points"] * 5]
+    assert statuses[160:] == ["ok"] * len(statuses[160:])
+    assert np.linalg.norm(solution.force) == pytest.approx(force, abs=0.15)
 
 
 def watch(estimator, course, noise, random):
