@@ -345,11 +345,16 @@ class SectionKeeper:
     def _cut(self, T: NDArray) -> None:
         self._R, self._y = T[:3, :3].copy(), float(T[1, 3])
         polygons = cut_outline(self._mesh, self._R, self._half_width, self._y)
-        is_grazed = bool(polygons) and (np.ptp(np.concatenate(polygons), axis=0) < CELL).any()  # by the finger's edge
-        self._polygons = () if is_grazed else polygons
+        is_thin = bool(polygons) and (np.ptp(np.concatenate(polygons), axis=0) < CELL).any()
+        self._polygons = () if is_thin and self._find_overlap() < CELL else polygons
         self._edges = edges_of(self._polygons)
         self._across = find_lateral_contact(self._mesh, T, self._half_width, self._span)
         self.cuts += 1
+
+    def _find_overlap(self) -> float:
+        """Return how far the object lies within the finger's width [m]."""
+        lateral = self._mesh.vertices @ self._R[1] + self._y
+        return min(float(lateral.max()), self._half_width) - max(float(lateral.min()), -self._half_width)
 
 
 def split_turn(R: NDArray) -> tuple[float, float]:

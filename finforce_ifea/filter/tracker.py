@@ -343,12 +343,13 @@ class ContactTracker:
     def _follow_outline(self, contact: Contact) -> None:
         """Set the prior to the outline's tilt and height; a new section of the same object keeps the contact."""
         before, search = self._contact.indenter, self._search
-        is_free, touch = search.state["depth"] < TOUCH_DEPTH, self._contact.find_touch(search.state["x"])
+        is_free = self._is_apart and bool(search.state["depth"] < TOUCH_DEPTH)
+        touch = self._contact.find_touch(search.state["x"])
         if contact.outline.across is not None:
             self._lateral.expect(*contact.outline.across)
         expected = expect_object(contact, self.settings, self._outline)
         self._expect(expected.mean, expected.variance)
-        self._lead(contact.outline.stddev[2:0:-1], is_free=bool(is_free))
+        self._lead(contact.outline.stddev[2:0:-1], is_free=is_free)
         self._outline = after = expected.indenter
         if after is not before:
             self._press(after)

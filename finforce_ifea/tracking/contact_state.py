@@ -95,8 +95,6 @@ _BLANK_BYTES = _BLANK.tobytes()
 
 # Standard deviation beyond which a force is rejected, relative to the force [-].
 _VAGUE_SHARE = 0.25
-# Force along the finger, relative to that across it, which not even rubber holds where the face leans [-].
-_STEEPEST = 2.5
 # Extrapolation from the stored shapes beyond which a force is rejected [-].
 _FARTHEST_SHAPE = 2.0
 # Probability of a wrong location from which a force is rejected [-].
@@ -158,9 +156,6 @@ def _find_ambiguity(state: ContactState, vague: float) -> str:
     if pulled > min(max(_PULLING * sqrt(state["depth_variance"]), _LEAST_PULL), _MOST_PULL):
         bent = f"the jaw is bent towards the object, as if that pulled by {1e3 * pulled:.1f} mm"
         return f"{bent}: open the jaw and tare, or the contact is elsewhere"
-    along, across = np.abs(state["force"][[2, 0]])
-    if along > _STEEPEST * across and along > _STEEPEST * (across + _measure_across(state)):
-        return f"a force of {along:.2g} N along the finger and {across:.2g} N across it is none that friction holds"
     if state["unobserved_stddev"] > vague:
         return "the object may press where key points hardly show a force: next to the clamp, or along its face"
     if state["stddev"] == np.inf:
@@ -168,11 +163,6 @@ def _find_ambiguity(state: ContactState, vague: float) -> str:
     if not state["stddev"] <= vague:
         return f"the visible key points tell the force only within {state['stddev']:.2g} N, expected {vague:.2g} N"
     return ""
-
-
-def _measure_across(state: ContactState) -> float:
-    """Return the standard deviation of the force across the finger [N]."""
-    return float(np.sqrt(state["force_modes"][0] @ state["covariance"] @ state["force_modes"][0]))
 
 
 @njit(**_OPTIONS)

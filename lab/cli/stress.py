@@ -13,7 +13,7 @@ from tqdm import tqdm
 from finforce_eval.cli.parser import MESHES, SOLVERS, CommandResult, whole_number
 from finforce_eval.machine import describe_machine
 from lab.harness import choose_names
-from lab.stress import friction, inputs, objects
+from lab.stress import friction, inputs, objects, regrasp
 from lab.stress.stress import (
     AXES,
     Family,
@@ -27,7 +27,9 @@ from lab.stress.stress import (
 
 WORST, WORST_OF_LEVEL = 5, 2
 LARGEST_SEED, NEW = 2**32, "new"
-FAMILIES = {family.name: family for family in (*inputs.FAMILIES, *friction.FAMILIES, *objects.FAMILIES)}
+FAMILIES = {
+    family.name: family for family in (*inputs.FAMILIES, *friction.FAMILIES, *objects.FAMILIES, *regrasp.FAMILIES)
+}
 
 
 def read_seed(text: str) -> int:

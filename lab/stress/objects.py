@@ -83,13 +83,13 @@ def _frame_of(bench: Bench, T: NDArray, press: PressState | None) -> PressedImag
     return PressedImage(T=T, points=points, force=press.force, torque=press.torque)
 
 
-class _Chain:
+class Chain:
     """Contact estimator and solver of one jaw in their loop, and the camera that sees the jaw with noise."""
 
-    def __init__(self, bench: Bench, scene: HardScene, random: np.random.Generator) -> None:
+    def __init__(self, bench: Bench, mesh: ObjectMesh, random: np.random.Generator) -> None:
         """Start both anew."""
         self._random = random
-        contact = ContactEstimator(bench.jaw, mesh=scene.mesh, settings=ContactSettings(mesh=bench.plan.mesh))
+        contact = ContactEstimator(bench.jaw, mesh=mesh, settings=ContactSettings(mesh=bench.plan.mesh))
         self._loop = ForceLoop(contact, bench.estimator)
         self._offsets = OFFSET * random.normal(size=bench.jaw.keypoints.shape)
         self._stamp = 10.0
@@ -108,11 +108,12 @@ class _Chain:
             torque=frame.torque,
         )
 
-    def solve(self, step: SessionStep, T: NDArray) -> Solution:
-        """Return what both make of an image and a pose T_jaw_object (4, 4)."""
-        T = T.copy()
-        T[:3, 3] += POSE_NOISE * self._random.normal(size=3)
-        self._loop.take_pose(step.stamp, T)
+    def solve(self, step: SessionStep, T: NDArray | None) -> Solution:
+        """Return what both make of an image and a pose T_jaw_object (4, 4), None where it was not seen."""
+        if T is not None:
+            T = T.copy()
+            T[:3, 3] += POSE_NOISE * self._random.normal(size=3)
+            self._loop.take_pose(step.stamp, T)
         return self._loop.update(step.observation)
 
 
@@ -127,7 +128,7 @@ def run_objects(plan: Plan) -> Iterator[Trial]:
 
 def play_scene(bench: Bench, scene: HardScene, frames: list[PressedImage], seed: int) -> Iterator[Trial]:
     """Yield the images of a scene after the tare, each a step of contact estimator and solver."""
-    chain = _Chain(bench, scene, bench.plan.random("objects", scene.name, seed))
+    chain = Chain(bench, scene.mesh, bench.plan.random("objects", scene.name, seed))
     tare = [frames[0]] * bench.estimator.settings.tare_frames
     for index, frame in enumerate([*tare, *frames]):
         step = chain.see(frame)

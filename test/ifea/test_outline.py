@@ -342,7 +342,7 @@ def test_object_that_turns_and_moves_before_it_touches_is_still_about_to_touch()
     for share in np.linspace(1.0, 0.0, 31):
         c, s = np.cos(1.5 * share), np.sin(1.5 * share)
         seen = (box(0.010, 0.025)[0] @ [[c, s], [-s, c]],)
-        tracker.follow(contact_with(seen, 0.040 + 0.040 * share))
+        tracker.follow(replace(contact_with(seen, 0.0), outline=outline(seen, 0.040 + 0.040 * share, x=0.06)))
         x = tracker._search.state["x"]
         assert x[DEPTH] == pytest.approx(tracker._contact.find_touch(x), abs=1e-6)
 

@@ -10,6 +10,7 @@ from finforce_ifea.contact_mechanics.indenter import build_outline, expect_objec
 from finforce_ifea.errors import ContactError
 from finforce_ifea.observation import Contact, ObjectOutline
 from finforce_ifea.settings import EstimatorSettings
+from lab.stress import regrasp
 from lab.stress.objects import CLEAR, build_scenes, plan_depths, play_scene, press_scene
 from lab.stress.session import Bench
 from lab.stress.stress import Plan, summarise
@@ -58,7 +59,8 @@ def test_hard_objects_are_pressed_with_the_right_force(name):
 def test_a_flat_object_is_never_told_to_press_less_than_it_does(jaw, seed, name):
     pressed = Bench(Plan(seed=seed, jaw=jaw))
     trials = [trial for trial in play_scene(pressed, SCENES[name], press_scene(pressed, SCENES[name]), 1) if trial.sure]
-    assert len(trials) > 5 and max(trial.sigmas for trial in trials) < 5.0
+    # across the face: in which image a corner of the bar begins to catch the face along it is chance
+    assert len(trials) > 5 and all(trial.errors[0] <= 5.0 * trial.stated[0] for trial in trials)
 
 
 @pytest.mark.parametrize("name", ["rod 0.3 mm away", "rod far away", "beyond the tip", "engulfing"])
@@ -121,3 +123,13 @@ def test_a_tiny_outline_is_refused_each_time():
     for _ in range(2):
         with pytest.raises(ContactError, match="at least 0.6 mm"):
             expect_object(contact_of(outline("wire of 0.5 mm")), EstimatorSettings())
+
+
+@pytest.mark.parametrize("seed", [0, 9])
+def test_an_object_that_is_moved_turned_about_and_grasped_again_keeps_its_forces(seed):
+    """Where poses are followed badly, 3 to 7 % of these images have no force."""
+    trials = list(regrasp.run_regrasp(Plan(seed=seed, count=3)))
+    summary = summarise("regrasp", trials, timed=False)
+    assert len(trials) == 675
+    assert summary["sure"] > 0.99 and summary["within"] > 0.98
+    assert not any(summary[key] for key in ("crashed", "hung", "nans", "refused"))
