@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from finforce_ifea.estimator import ForceEstimator
 
 Surface = Callable[[], NDArray | None]  # gives the jaw's deformed vertices (n, 3) [m], None where nobody knows them
-
-
 UNMOVED = 0.2e-3  # [m] and, for its axes, [1]: a jaw that differs by less has not moved
 
 

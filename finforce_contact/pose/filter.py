@@ -20,8 +20,9 @@ _ACCELERATION = np.repeat([2e-3, 0.04], 3) ** 2
 _START = np.repeat([8e-3, 0.15], 3) ** 2
 _RESTS = 20.0  # [s], mean time of rest
 _MOVES = 5.0  # [s], mean time of motion
-_FREE_RESTS = 2.0  # [s], mean time of rest of what nothing holds, as seen from a hand that comes nearer
-_OUTLIERS = 0.08  # [-], largest share of poses that are wrong
+# [s] between two poses, from which on what nothing holds has rather started than the second one is wrong: it rests for
+# 2 s in the mean, as seen from a hand that comes nearer, and fewer than 8 % of the poses are wrong.
+_RARE = 0.16
 _GATE = 5.0  # [sigma]; a pose farther off is not believed at once
 _JUMP_POSES = 3  # in a row off the trajectory that agree with each other are believed
 _NOISE_MEMORY = 60.0  # samples over which noise is learnt
@@ -179,7 +180,7 @@ class PoseFilter:
         self._centre()
         innovation, spread = step_between(self._T, self.latest), self._tracks.variance
         if (innovation**2 > _GATE**2 * (spread + noise)).any():
-            if is_free and (moves or dt > _OUTLIERS * _FREE_RESTS):  # it rather turned than the pose is wrong
+            if is_free and (moves or dt > _RARE):
                 self._begin(stamp, self.latest, noise, step_between(before, self.latest) / dt)
                 self._tracks = self._tracks._replace(speed_spread=_START + self._tracks.speed**2)
                 return "jump"
