@@ -205,11 +205,11 @@ class ForceSensor:
     ) -> Solution:
         """Return the force on one jaw, which may not have been found."""
         observation = replace(observe_jaw(seen, stamp, len(loop.force.jaw.keypoints)), posture=posture)
-        if seen is not None:
-            loop.follow_jaw(seen.T_camera_jaw)
-        if seen is None or T_camera_object is None:
+        if seen is None:
             return loop.update(observation)
-        return loop.update(observation, [(stamp, invert_pose(seen.T_camera_jaw) @ T_camera_object)])
+        loop.follow_jaw(seen.T_camera_jaw)
+        known = T_camera_object is not None
+        return loop.update(observation, [(stamp, invert_pose(seen.T_camera_jaw) @ T_camera_object)] if known else ())
 
 
 def observe_jaw(seen: JawKeypoints | None, stamp: float, count: int) -> Observation:

@@ -32,7 +32,7 @@ class CameraTrack(Timed):
     """Poses of the camera in the frame of one jaw.
 
     Attributes:
-        stamps_ns: (m,) image time [ns], rising.
+        stamps_ns: (m,) image time [ns], in any order.
         poses: T_jaw_camera (m, 4, 4) [m].
     """
 

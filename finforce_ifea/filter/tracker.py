@@ -344,7 +344,7 @@ class ContactTracker:
         """Set the prior to the outline's tilt and height; a new section of the same object keeps the contact."""
         before, search = self._contact.indenter, self._search
         is_free = self._is_apart and bool(search.state["depth"] < TOUCH_DEPTH)
-        touch = self._contact.find_touch(search.state["x"])
+        touch = self._contact.find_touch(search.state["x"]) if is_free else 0.0
         if contact.outline.across is not None:
             self._lateral.expect(*contact.outline.across)
         expected = expect_object(contact, self.settings, self._outline)

@@ -48,19 +48,20 @@ def test_hard_objects_are_pressed_with_the_right_force(name):
 
 
 @pytest.mark.parametrize(
-    ("jaw", "seed", "name"),
+    ("jaw", "seed", "name", "axes"),
     [
-        # where the face tilts by a few mrad, the key points would agree with an object that pulls at its other end
-        ("xlerobot", 889972, "coplanar face, deeper"),
+        # where the face tilts by a few mrad, the key points would agree with an object that pulls at its other end;
+        # across the face, for in which image a corner of the bar begins to catch the face along it is chance
+        ("xlerobot", 889972, "coplanar face, deeper", 1),
         # 4 N anywhere along this stiff finger move key points by less than their noise
-        ("ssg48_fin_ray_1", 8824351, "coplanar face"),
+        ("ssg48_fin_ray_1", 8824351, "coplanar face", 5),
     ],
 )
-def test_a_flat_object_is_never_told_to_press_less_than_it_does(jaw, seed, name):
+def test_a_flat_object_is_never_told_to_press_less_than_it_does(jaw, seed, name, axes):
     pressed = Bench(Plan(seed=seed, jaw=jaw))
     trials = [trial for trial in play_scene(pressed, SCENES[name], press_scene(pressed, SCENES[name]), 1) if trial.sure]
-    # across the face: in which image a corner of the bar begins to catch the face along it is chance
-    assert len(trials) > 5 and all(trial.errors[0] <= 5.0 * trial.stated[0] for trial in trials)
+    errors, stated = (np.array([getattr(trial, side)[:axes] for trial in trials]) for side in ("errors", "stated"))
+    assert len(trials) > 5 and (errors <= 5.0 * stated).all()
 
 
 @pytest.mark.parametrize("name", ["rod 0.3 mm away", "rod far away", "beyond the tip", "engulfing"])
