@@ -3,11 +3,10 @@
 import os
 import signal
 import sys
+from os import cpu_count
 
 import pytest
 from hypothesis import settings
-
-from finforce.ros import transport
 
 settings.register_profile("finforce", deadline=None)  # a machine under load is not a counterexample
 settings.load_profile("finforce")
@@ -17,9 +16,10 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
-# A process takes seconds to show that a domain is taken: workers draw from different ones.
-if worker := os.environ.get("PYTEST_XDIST_WORKER"):
-    transport.DOMAINS = transport.DOMAINS[int(worker[2:]) :: int(os.environ["PYTEST_XDIST_WORKER_COUNT"])]
+
+def pytest_xdist_auto_num_workers(config):
+    """One worker more than cores: tests of real nodes wait a third of their time."""
+    return cpu_count() + 1
 
 
 @pytest.fixture(autouse=True)

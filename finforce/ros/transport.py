@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import random
 import socket
+from collections import deque
 from pathlib import Path
 
 from finforce.camera_topics import ENDS
@@ -44,19 +45,35 @@ def describe_domain(domain: str) -> str:
     return "" if can_be else f"ROS_DOMAIN_ID={domain}: expected 0 to {LAST_DOMAIN}"
 
 
+_RESERVED = 8  # domains at a time, of one process
+
+
 def free_domain() -> int:
     """Return a ROS_DOMAIN_ID of `DOMAINS` on which no participant of this machine is, by chance.
 
-    The first participant of a domain holds the UDP port 7410 + 250 times its number (DDSI-RTPS 2.3, 9.6.1.1).
+    It is reserved for this process until it ends or has drawn eight more.
     """
     domains = random.sample(DOMAINS, len(DOMAINS))
-    return next((domain for domain in domains if _is_free(7410 + 250 * domain)), domains[0])
+    return next(filter(_reserve, domains), domains[0])
 
 
-def _is_free(port: int) -> bool:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+_reservations: deque[int] = deque()  # file descriptors
+
+
+def _reserve(domain: int) -> bool:
+    """Reserve a domain, and return whether it was free.
+
+    The first participant of a domain holds the UDP port 7410 + 250 times its number (DDSI-RTPS 2.3, 9.6.1.1), seconds
+    after the domain was drawn; the last port of a domain, which no participant gets to, holds it until then.
+    """
+    first = 7400 + 250 * domain
+    with socket.socket(type=socket.SOCK_DGRAM) as participant, socket.socket(type=socket.SOCK_DGRAM) as reservation:
         try:
-            probe.bind(("", port))
+            participant.bind(("", first + 10))
+            reservation.bind(("", first + 249))
         except OSError:
             return False
-        return True
+        _reservations.append(reservation.detach())
+    while len(_reservations) > _RESERVED:
+        os.close(_reservations.popleft())
+    return True
