@@ -143,11 +143,16 @@ def compute_rays(camera: CameraIntrinsics) -> NDArray:
     Returns:
         (h, w, 3) directions in the camera frame with z = 1, so that a ray times its depth is a point.
     """
-    pixels = np.empty((camera.height, camera.width, 2))
-    pixels[..., 0], pixels[..., 1] = np.arange(camera.width), np.arange(camera.height)[:, None]
-    rays = rays_from_pixels(pixels.reshape(-1, 2), camera).reshape(camera.height, camera.width, 3)
+    rays = rays_of_window(camera, range(camera.height), range(camera.width))
     rays.flags.writeable = False
     return rays
+
+
+def rays_of_window(camera: CameraIntrinsics, rows: range, columns: range) -> NDArray:
+    """Return the viewing rays (len(rows), len(columns), 3), z = 1, of the pixels in some rows and columns."""
+    pixels = np.empty((len(rows), len(columns), 2))
+    pixels[..., 0], pixels[..., 1] = columns, np.asarray(rows)[:, None]
+    return rays_from_pixels(pixels.reshape(-1, 2), camera).reshape(*pixels.shape[:2], 3)
 
 
 def rays_from_pixels(pixels: NDArray, camera: CameraIntrinsics) -> NDArray:

@@ -8,7 +8,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce.camera import CameraIntrinsics, compute_rays, project
+from finforce.camera import CameraIntrinsics, project, rays_of_window
 from finforce.optional import import_open3d
 from finforce_contact.mesh.object_mesh import ObjectMesh
 
@@ -66,7 +66,7 @@ class MeshView:
         """
         T = np.asarray(T_camera_object, dtype=float)
         rows, columns = self._window(T, camera, step)
-        rays = compute_rays(camera)[rows, columns]
+        rays = rays_of_window(camera, rows, columns)
         depth = np.full((-(-camera.height // step), -(-camera.width // step)), np.nan)
         if rays.size == 0:
             nothing = np.empty((0, 3))
@@ -85,7 +85,7 @@ class MeshView:
     def render_back(self, T_camera_object: NDArray, camera: CameraIntrinsics, step: int = 1) -> NDArray:
         """Return the depths (ceil(h / step), ceil(w / step)) [m] at which the rays leave the mesh, NaN beside it."""
         T = np.asarray(T_camera_object, dtype=float)
-        rays = compute_rays(camera)[::step, ::step]
+        rays = rays_of_window(camera, range(0, camera.height, step), range(0, camera.width, step))
         corners = self._corners @ T[:3, :3].T + T[:3, 3]
         beyond = float(corners[:, 2].max()) + 1.0
         distance, _ = self._cast(T, -rays.reshape(-1, 3), rays.reshape(-1, 3) * beyond)
@@ -104,7 +104,7 @@ class MeshView:
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
         return SurfacePoints(points=answer["points"].numpy().astype(float) @ T[:3, :3].T + T[:3, 3], normals=normals)
 
-    def _window(self, T: NDArray, camera: CameraIntrinsics, step: int) -> tuple[slice, slice]:
+    def _window(self, T: NDArray, camera: CameraIntrinsics, step: int) -> tuple[range, range]:
         """Return the rows and columns, multiples of `step`, that the mesh can be in."""
         corners = self._corners @ T[:3, :3].T + T[:3, 3]
         size = np.array([camera.width, camera.height])
@@ -114,7 +114,7 @@ class MeshView:
             low = np.clip(np.floor(pixels.min(axis=0)) - MARGIN, 0, size).astype(int)
             high = np.clip(np.ceil(pixels.max(axis=0)) + MARGIN + 1, 0, size).astype(int)
         low = -(-low // step) * step
-        return slice(low[1], max(high[1], low[1]), step), slice(low[0], max(high[0], low[0]), step)
+        return range(low[1], high[1], step), range(low[0], high[0], step)
 
     def _cast(self, T: NDArray, rays: NDArray, origins: NDArray | float = 0.0) -> tuple[NDArray, NDArray]:
         """Return lengths (n,), NaN without hit, and normals (n, 3) in the object frame of camera rays (n, 3)."""

@@ -6,7 +6,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce.camera import CameraIntrinsics, check_depth, check_mask, compute_rays, project, rays_from_pixels
+from finforce.camera import CameraIntrinsics, check_depth, check_mask, project, rays_from_pixels
 from finforce.transforms import invert_pose, move_pose
 from finforce_contact.mesh.object_mesh import ObjectMesh
 from finforce_contact.mesh.views import MeshView
@@ -96,7 +96,6 @@ class DepthImage:
             check_mask(mask, self.depth, least=LEAST_PIXELS)
             mask = np.asarray(mask, bool)
         self.mask, self.camera = mask, camera
-        self._rays = compute_rays(camera)
 
     def ray(self, pixel: NDArray) -> NDArray:
         """Return the viewing ray (3,) with z = 1 of one pixel (2,), which may lie outside the image."""
@@ -128,7 +127,8 @@ class DepthImage:
         pixels = project(surface.points, self.camera)
         nearest, inside = self._nearest(pixels)
         depth = np.where(inside, self.depth[nearest], np.nan)
-        measured = self._rays[nearest] * depth[:, None]
+        rows, columns = nearest
+        measured = rays_from_pixels(np.column_stack((columns, rows)), self.camera) * depth[:, None]
         residuals = np.einsum("ij,ij->i", surface.directions, measured - surface.points)
         foreign = self.is_masked_out(pixels)
         visibility = np.where(depth < surface.points[:, 2], Visibility.HIDDEN, Visibility.ABSENT)

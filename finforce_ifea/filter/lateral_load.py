@@ -87,6 +87,10 @@ def _find_narrowest(jaw: Jaw, heights: NDArray, half: float) -> float:
     return 0.5 * float(jaw.section.read_width(places).min())
 
 
+# Of the last finger, for its other jaw and later estimators.
+_LAST: dict[tuple, Torsion | None] = {}
+
+
 def measure_torsion(jaw: Jaw, mesh: VolumeMesh) -> Torsion | None:
     """Return the torsion and lateral bending of a jaw; None if it is no solid, or its mesh too large.
 
@@ -96,40 +100,14 @@ def measure_torsion(jaw: Jaw, mesh: VolumeMesh) -> Torsion | None:
     """
     side = "" if jaw.mesh_file is None else jaw.side  # a drawn finger is its own mirror image
     stiffness = jaw.material.young_modulus, jaw.material.poisson_ratio
-    key = (jaw.digest, side, jaw.inner_face_x, *stiffness, len(mesh.nodes))
+    key = (jaw.digest, side, jaw.inner_face_x, *stiffness, len(mesh.nodes), jaw.keypoints.tobytes())
     if key not in _LAST:
         _LAST.clear()
-        _LAST[key] = _answer_at_rest(jaw, mesh)
-    answers = _LAST[key]
-    if answers is None:
-        return None
-    model, rest = answers.model, np.zeros(answers.model.size)
-    by = np.moveaxis(model.project(model.attach(jaw.keypoints, KEYPOINT_DISTANCE), rest, answers.steps), 2, 0)
-    return Torsion(
-        heights=answers.heights,
-        half_width=answers.half_width,
-        by_moment=np.ascontiguousarray(by[::2]),
-        by_force=np.ascontiguousarray(by[1::2]),
-        roll=answers.roll,
-    )
+        _LAST[key] = _solve_at_rest(jaw, mesh)
+    return _LAST[key]
 
 
-class _Answers(NamedTuple):
-    """The motion of a model at rest, (size, 2 m), by a moment and a lateral force at each height; see `Torsion`."""
-
-    model: SolidModel
-    steps: NDArray
-    heights: NDArray
-    half_width: float
-    roll: NDArray
-
-
-# Answers of the last finger, for its other jaw and later estimators.
-_LAST: dict[tuple, _Answers | None] = {}
-
-
-def _answer_at_rest(jaw: Jaw, mesh: VolumeMesh) -> _Answers | None:
-    """Return the answers of a jaw; None where it is no solid, or its mesh too large."""
+def _solve_at_rest(jaw: Jaw, mesh: VolumeMesh) -> Torsion | None:
     is_solid = jaw.drawing is None or jaw.drawing.is_solid
     mesh = mesh if jaw.section is None else jaw.build_mesh("coarse")
     if not is_solid or len(mesh.nodes) > _MOST_NODES:
@@ -151,7 +129,14 @@ def _answer_at_rest(jaw: Jaw, mesh: VolumeMesh) -> _Answers | None:
         (moved[2, 0] - moved[0, 0]) / (2.0 * arm)
         for moved in (model.project(probe, rest, steps[:, [2 * row]])[:, :, 0] for row, probe in enumerate(probes))
     ]
-    return _Answers(model=model, steps=steps, heights=heights, half_width=half, roll=np.array(roll))
+    by = np.moveaxis(model.project(model.attach(jaw.keypoints, KEYPOINT_DISTANCE), rest, steps), 2, 0)
+    return Torsion(
+        heights=heights,
+        half_width=half,
+        by_moment=np.ascontiguousarray(by[::2]),
+        by_force=np.ascontiguousarray(by[1::2]),
+        roll=np.array(roll),
+    )
 
 
 # Standard deviation of the pressure centre, relative to that of an even pressure over what touches [-].
