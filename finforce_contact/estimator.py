@@ -2,14 +2,14 @@
 
 from collections import Counter
 from dataclasses import dataclass
-from math import isfinite
+from math import inf, isfinite
 
 import numpy as np
 from numpy.typing import NDArray
 
 from finforce.errors import ObservationError, PoseError
 from finforce.transforms import check_pose, invert_pose
-from finforce_contact.location import ClosestLocalizer, Localizer, OutlineLocalizer, build_inner_face
+from finforce_contact.location import ClosestLocalizer, ContactLocation, Localizer, OutlineLocalizer, build_inner_face
 from finforce_contact.mesh.object_mesh import ObjectMesh, surrounds
 from finforce_contact.paper_contact import IntersectionLocalizer
 from finforce_contact.parameters import ContactSettings
@@ -52,8 +52,9 @@ class ContactEstimate:
 _JAW_SAMPLES = 300  # vertices compared
 _BACK = 1.0 / 3.0  # [-], fraction of the vertices farthest behind the face, which no pressed object reaches
 _SURROUNDED = 0.5  # share of these that lies within an object around the jaw
-# An object with its origin farther off [m] is out of reach.
-_OUT_OF_REACH = 1.0
+_OUT_OF_REACH = 1.0  # [m], distance of the origin of an object
+_CERTAIN = 3.0  # sigma of the gap between jaw and object
+_HELD = 10.0  # how much older the pose of a held object may be, which the jaws hide and keep where it is
 CONTRADICTED = "contradicted"  # status of an image whose object is not where mesh and pose say
 _REASONS = ("solved", "no_object", "no_pose", CONTRADICTED, "surrounded", "out_of_reach", "late pose", "odd pose")
 
@@ -119,6 +120,7 @@ class ContactEstimator:
         self.counts: Counter[str] = Counter(dict.fromkeys(_REASONS, 0))
         self._slips.reset()
         self._touched: TouchedFace | None = None
+        self._held_since = inf
 
     def _build_localizer(self, mesh: ObjectMesh) -> Localizer:
         if self.settings.mode == "paper":
@@ -183,7 +185,7 @@ class ContactEstimator:
             return self._give_up(stamp, CONTRADICTED, self.contradiction)
         if message := self._find_stale_pose(stamp):
             return self._give_up(stamp, "no_pose", message)
-        pose = self._poses.at(stamp)
+        pose = self._poses.at(stamp, self._held_since)
         section = self._sections.at(pose.T, touching=self._touched is not None)
         if self._surrounds_jaw(pose.T, section):
             message = f"this pose puts {self._mesh.name} around the jaw: check its pose, mesh and unit"
@@ -197,7 +199,7 @@ class ContactEstimator:
             )
             return self._give_up(stamp, "apart", message, "out_of_reach")
         self.counts["solved"] += 1
-        self._follow_face(location.height, location.touching)
+        self._follow_face(stamp, location, pose)
         contact = Contact(
             points=np.array([[self.jaw.face.read(location.height), 0.0, location.height]]),
             weights=np.ones(1),
@@ -216,6 +218,8 @@ class ContactEstimator:
     def _find_stale_pose(self, stamp: float) -> str:
         """Return why no pose tells of the image of a stamp [s]; empty if one does."""
         name, timeout, age = self._mesh.name, self.settings.pose_timeout, stamp - self._poses.believed
+        if self._held_since < inf:
+            timeout *= _HELD
         if age < -timeout:
             return f"the last pose of {name} lies {-age:.1f} s ahead; reset after time has jumped back"
         if age <= timeout:
@@ -232,11 +236,22 @@ class ContactEstimator:
         points = np.ascontiguousarray(self._back[:, ::2])
         return count_inside(points, section.edges) > _SURROUNDED * len(points)
 
-    def _follow_face(self, height: float, touching: bool) -> None:
-        """Keep the face at a height [m] where the object touches, for the slip of the next pose."""
-        if touching:
-            self._touched = face_at(self.face.line, self._slips.follow(height))
-            return
+    def _follow_face(self, stamp: float, location: ContactLocation, pose: FilteredPose) -> None:
+        """Keep the face where the object touches in an image [s], for the slip of the next pose.
+
+        The object is held once it may touch as far as poses err, until it has parted from the jaw for certain.
+        """
+        if location.touching:
+            self._touched = face_at(self.face.line, self._slips.follow(location.height))
+        else:
+            self._let_go()
+        if location.gap < _CERTAIN * self.settings.pose_bias:
+            self._held_since = min(self._held_since, stamp)
+        elif location.gap > _CERTAIN * pose.stddev[0]:
+            self._held_since = inf
+
+    def _let_go(self) -> None:
+        """Forget the face that the object touched."""
         self._touched = None
         self._slips.release()
 
@@ -256,8 +271,8 @@ class ContactEstimator:
         self.counts[reason or status] += 1
         if self._localizer is not None:
             self._localizer.reset()
-        self._touched = None
-        self._slips.release()
+        self._let_go()
+        self._held_since = inf
         nothing = Contact(points=np.empty((0, 3)), weights=np.empty(0), touching=False)
         return ContactEstimate(
             stamp=stamp,

@@ -72,10 +72,12 @@ class ContactLocation:
     Attributes:
         height: on the undeformed inner surface [m].
         touching: True if the meshes of object and jaw intersect.
+        gap: from that surface to the object along x [m], negative where they intersect.
     """
 
     height: float
     touching: bool
+    gap: float
 
 
 class Localizer(Protocol):
@@ -115,7 +117,8 @@ class OutlineLocalizer(Localizer):
         if not np.isfinite(nearest):
             return None
         overlap = np.maximum(0.0, _OVERLAP + nearest - gaps)
-        return ContactLocation(height=float(self._face.heights @ overlap / overlap.sum()), touching=bool(nearest < 0.0))
+        height = float(self._face.heights @ overlap / overlap.sum())
+        return ContactLocation(height=height, touching=bool(nearest < 0.0), gap=float(nearest))
 
 
 class ClosestLocalizer(Localizer):
@@ -135,8 +138,8 @@ class ClosestLocalizer(Localizer):
         gaps = compute_gaps(self._face.line, section.edges)
         if not np.isfinite(gaps).any():
             return None
-        touching = bool(gaps.min() < 0.0)
-        nearest = gaps if touching else distances_to(self._face.line, section.edges)
+        gap = float(gaps.min())
+        nearest = gaps if gap < 0.0 else distances_to(self._face.line, section.edges)
         height = self._face.heights[nearest.argmin()]
         candidate = self._candidates[np.abs(self._candidates - height).argmin()]
-        return ContactLocation(height=float(candidate), touching=touching)
+        return ContactLocation(height=float(candidate), touching=gap < 0.0, gap=gap)

@@ -77,7 +77,7 @@ class IntersectionLocalizer(Localizer):
             self._height = float(self._candidates[chosen, 1])
         if self._height is None:
             return None
-        return ContactLocation(height=self._height, touching=bool(self._status and shift >= 0.0))
+        return ContactLocation(height=self._height, touching=bool(self._status and shift >= 0.0), gap=-shift)
 
     def _slight_contact(self, T: NDArray) -> float:
         """Return t_x = l_0 + l_bd / 2 [m] (Eq. 2), corrected for objects whose origin is not in their middle."""

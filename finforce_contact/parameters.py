@@ -46,7 +46,7 @@ class ContactSettings(Bounded):
     symmetry: str = setting(
         "auto", "Object symmetry: auto, none, or turns such as 'x_180 z_full' about the axes of the mesh's frame"
     )
-    pose_timeout: float = setting(1.0, "Maximum object pose age", "s", 0.01, 60.0)
+    pose_timeout: float = setting(1.0, "Maximum object pose age, a tenth of that of a held object", "s", 0.01, 60.0)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,7 +2,7 @@
 
 from collections import deque
 from dataclasses import dataclass
-from math import exp, isfinite
+from math import exp, inf, isfinite
 from typing import NamedTuple
 
 import numpy as np
@@ -14,10 +14,11 @@ from finforce_contact.parameters import ContactSettings
 from finforce_contact.pose.symmetry import Symmetry
 
 # For translation and rotation: random walk of an object [m/s^0.5, rad/s^0.5], of its speed while it moves [m/s^1.5,
-# rad/s^1.5], and standard deviation of the speed at which it starts [m/s, rad/s].
+# rad/s^1.5], standard deviations of the speed at which it starts [m/s, rad/s], and of the motion of one that is held.
 _DRIFT = np.repeat([0.1e-3, 2e-3], 3) ** 2
 _ACCELERATION = np.repeat([2e-3, 0.04], 3) ** 2
 _START = np.repeat([8e-3, 0.15], 3) ** 2
+_SHIFT = np.repeat([2e-3, 0.05], 3) ** 2
 _RESTS = 20.0  # [s], mean time of rest
 _MOVES = 5.0  # [s], mean time of motion
 # [s] between two poses, from which on what nothing holds has rather started than the second one is wrong: it rests for
@@ -199,10 +200,10 @@ class PoseFilter:
             self._T, self.latest = T @ self._T, T @ self.latest
             self._rejected = deque(((stamp, T @ pose) for stamp, pose in self._rejected), maxlen=self._rejected.maxlen)
 
-    def at(self, stamp: float) -> FilteredPose:
+    def at(self, stamp: float, held_since: float = inf) -> FilteredPose:
         """Return the pose at a time [s], continued at its speed for a fifth of a second at most.
 
-        From then on the object may have stopped or not.
+        From then on the object may have stopped or not, until it is held [s]: then it hardly moves.
 
         Raises:
             PoseError: No pose has come yet.
@@ -212,7 +213,9 @@ class PoseFilter:
         ahead = stamp - self.stamp if stamp > self.stamp else 0.0
         tracks, beyond = self._tracks.advance(min(ahead, _LONGEST_FORECAST)), max(ahead - _LONGEST_FORECAST, 0.0)
         goes_on = tracks.probability[_MOTION] * (tracks.speed**2 + tracks.speed_spread)
-        stddev = np.sqrt(tracks.variance + _DRIFT * beyond + goes_on * beyond**2)
+        free = min(beyond, max(held_since - self.stamp - _LONGEST_FORECAST, 0.0))
+        moved = goes_on * free**2 + np.minimum(goes_on * (beyond - free) ** 2, _SHIFT)
+        stddev = np.sqrt(tracks.variance + _DRIFT * beyond + moved)
         speed = float(tracks.probability[_MOTION, 0] * tracks.speed[0])
         return FilteredPose(T=move_pose(self._T, tracks.mean), stddev=stddev, speed=speed)
 
