@@ -248,7 +248,7 @@ def build_loop(pressed: PressedGrasp, side: str) -> ForceLoop:
     """Return the loop of contact and force of one jaw."""
     solver = ForceEstimator(
         pressed.jaws[side],
-        settings=EstimatorSettings(held="yes"),  # as the nodes have it for two jaws
+        settings=EstimatorSettings().resolve_held(both=True),  # as the nodes have it
         calibration=load_calibration("twin"),
     )
     solver.warm_up()
@@ -277,11 +277,14 @@ class EstimatorSensor:
     def measure(self, stamp: float, force: float, opening: float) -> float | None:
         """Return min(|F_left|, |F_right|), None unless both are trusted."""
         state = self._pressed.state(opening, stamp)
+        jaws = {side: jaw_in_gripper(side, jaw.origin_x) for side, jaw in state.jaws.items()}
+        for side, loop in self._loops.items():
+            loop.follow_jaw(jaws[side])
         if stamp >= self._next_pose:
             self._next_pose = stamp + POSE_PERIOD
             pose = disturb_pose(state.T_gripper_object, self._random)
             for side, loop in self._loops.items():
-                loop.take_pose(stamp, invert_pose(jaw_in_gripper(side, state.jaws[side].origin_x)) @ pose)
+                loop.take_pose(stamp, invert_pose(jaws[side]) @ pose)
         seen = self._look(state)
         solutions = {side: loop.update(seen[side]) for side, loop in self._loops.items() if side in seen}
         silent = {side: "not found in the image" for side in self._loops if side not in solutions}
