@@ -278,8 +278,8 @@ class EstimatorSensor:
         """Return min(|F_left|, |F_right|), None unless both are trusted."""
         state = self._pressed.state(opening, stamp)
         jaws = {side: jaw_in_gripper(side, jaw.origin_x) for side, jaw in state.jaws.items()}
-        for side, loop in self._loops.items():
-            loop.follow_jaw(jaws[side])
+        for side, T in jaws.items():
+            self._loops[side].follow_jaw(T)
         if stamp >= self._next_pose:
             self._next_pose = stamp + POSE_PERIOD
             pose = disturb_pose(state.T_gripper_object, self._random)

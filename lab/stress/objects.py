@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce.transforms import invert_pose
 from finforce_contact.estimator import ContactEstimator
 from finforce_contact.loop import ForceLoop
 from finforce_contact.mesh.object_mesh import ObjectMesh
@@ -107,6 +108,10 @@ class Chain:
             force=frame.force,
             torque=frame.torque,
         )
+
+    def follow(self, T_before: NDArray, T: NDArray) -> None:
+        """Take the motion of the jaw, by which an object that rests has come from one pose (4, 4) to another."""
+        self._loop.contact.estimator.carry(T @ invert_pose(T_before))
 
     def solve(self, step: SessionStep, T: NDArray | None) -> Solution:
         """Return what both make of an image and a pose T_jaw_object (4, 4), None where it was not seen."""

@@ -26,7 +26,7 @@ DEPTHS = (0.001, 0.006)
 AWAY = 0.03  # [m], standard deviation of the way between two grasps, in its middle
 TUMBLE = 1.0  # [rad], of the turn there
 TRAVEL = (15, 60)  # images that the way takes
-HIDDEN = 0.3  # share of the ways on which no pose is seen
+HIDDEN = 0.3  # share of the ways on which no pose is seen, and of the grasps in which none is from the first load on
 POSE_IMAGES = (1, 3, 10)  # images from one pose to the next
 MOST_DRAWS = 20
 
@@ -87,9 +87,15 @@ def play_grasps(
             is_seen = random.random() >= HIDDEN
             images += [(image, False, is_seen) for image in draw_way(grasps[number - 1][-1], grasp[0], random)]
             images += [(grasp[0], False, True)] * POSE_IMAGES[-1]  # where it lies before it is grasped
-        images += [(image, True, True) for image in grasp]
+        is_hidden = random.random() < HIDDEN
+        loaded = np.cumsum([bool(image.force.any()) for image in grasp]) > 0
+        images += [(image, True, not (is_hidden and pressed)) for image, pressed in zip(grasp, loaded, strict=True)]
+    before = images[0][0].T
     for index, (image, is_counted, is_seen) in enumerate(images):
         step, T = chain.see(image), image.T if is_seen and index % period == 0 else None
+        if is_counted:  # the jaw moves, and the object does elsewhere
+            chain.follow(before, image.T)
+        before = image.T
         level = f"{name}, a pose in {period}"
         trial = attempt(seed, lambda s=step, at=T: chain.solve(s, at), lambda got, s=step: judge(got, s), level=level)
         if is_counted:

@@ -89,7 +89,7 @@ def run_in_time(name, domain, *arguments):
     """Run an example until the machine is in time for it."""
     for _ in range(5):
         done = run(name, domain, *arguments)
-        if not any(words in done.stdout + done.stderr for words in LATE):
+        if not done.returncode or not any(words in done.stdout + done.stderr for words in LATE):
             break
         sleep(3.0)
     return done

@@ -234,6 +234,9 @@ class ScriptedJaw:
         self._words = iter(pressed.script[side])
         self.contact = SimpleNamespace(estimate=SimpleNamespace(touching=True))
 
+    def follow_jaw(self, T_camera_jaw):
+        pass
+
     def update(self, observation):
         status, message = next(self._words)
         force = np.array([3.0, 0.0, 0.0])
