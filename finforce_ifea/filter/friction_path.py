@@ -117,8 +117,9 @@ class TractionHypotheses:
         return self._join(self._prior)
 
     def reweigh(self, log_weights: NDArray) -> NDArray:
-        """Return log probabilities (N,) with "held" at its prior and the coefficients as they are."""
-        return self._join(self._share(np.exp(log_weights)) if self.follows_path else self._prior)
+        """Return log probabilities (N,) with "held" at its prior and the coefficients as they are known."""
+        self._prior = self._find_coefficients(np.exp(log_weights))
+        return self._join(self._prior)
 
     def _join(self, shares: NDArray) -> NDArray:
         """Return log probabilities (N,) for those of the coefficients (M,), given that the object is not held."""
@@ -146,9 +147,20 @@ class TractionHypotheses:
         """Return the estimated coefficient of friction for weights of the hypotheses (N,)."""
         if not self.follows_path:
             return Coefficient(0.0, np.inf)
-        if len(self.mu) == 1:
-            return Coefficient(float(self.mu[0]), self.unweighed)
-        return Coefficient(*_estimate(self.mu, weights, self._cell**2 / 12.0 + self.unweighed**2))
+        shares, variance = self._find_coefficients(weights), self._cell**2 / 12.0 + self.unweighed**2
+        mean = float(shares @ self.mu)
+        return Coefficient(mean, sqrt(max(float(shares @ self.mu**2) - mean**2, 0.0) + variance))
+
+    def _find_coefficients(self, weights: NDArray) -> NDArray:
+        """Return the probabilities of the coefficients (M,) for weights of the hypotheses (N,).
+
+        An object that only the jaws hold tells no more of its friction than that it bears its traction ratio.
+        """
+        if not self.follows_path:
+            return self._prior
+        own, held = self._share(weights), float(weights[-1]) if self._held > 0.0 else 0.0
+        bears = self._prior * np.clip((self.mu - abs(self.upright)) / max(self._cell, 1e-9) + 0.5, 1e-6, 1.0)
+        return (1.0 - held) * own + held * bears / bears.sum()
 
     def _share(self, weights: NDArray) -> NDArray:
         """Return the probabilities of the coefficients (M,) where one of them holds, for all weights (N,)."""
@@ -263,14 +275,6 @@ def _share(weights, count):
     """Return the probabilities (M,) of the first `count` hypotheses, given one of them, for all weights (N,)."""
     own = weights[:count]
     return own / max(own.sum(), 1e-300)
-
-
-@njit(**_OPTIONS)
-def _estimate(mu, weights, variance):
-    """Return mean and standard deviation of coefficients (M,) for weights (N,), each with a variance of its own."""
-    own = _share(weights, len(mu))
-    mean = (own * mu).sum()
-    return mean, np.sqrt(max((own * mu**2).sum() - mean**2, 0.0) + variance)
 
 
 @njit(**_OPTIONS)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from finforce.kalman import Track
 from finforce_ifea.contact_mechanics.friction import Coefficient, constant_traction
 from finforce_ifea.contact_mechanics.pressed_jaw import RigidContact
-from finforce_ifea.filter.friction_path import TractionHypotheses, find_places
+from finforce_ifea.filter.friction_path import TractionHypotheses, expect_coefficient, find_places
 from finforce_ifea.filter.image_update import (
     DEPTH_NOISE,
     EXPECTATION,
@@ -193,7 +193,8 @@ class ContactSearch:
 
     def _expect(self) -> Expectation:
         """Return the prior that the state returns to."""
-        return find_expectation(self.expectation, self._told, self._detector_errors.variance, self.friction.mean)
+        friction = expect_coefficient(self.hypotheses.packed, self.weights)
+        return find_expectation(self.expectation, self._told, self._detector_errors.variance, friction)
 
     def _start(self) -> None:
         """Begin with the first image."""

@@ -397,6 +397,18 @@ class TestHypotheses:
         mean, stddev = stated.estimate(np.exp(stated.prior))
         assert (mean, stddev) == (pytest.approx(0.5), pytest.approx(0.1, rel=0.1))
 
+    def test_an_object_that_only_the_jaws_hold_tells_of_its_friction_what_it_bears(self):
+        either = TractionHypotheses(Coefficient(0.5, 0.2), "either")
+        lowest = np.where(either.mu == either.mu.min(), 0.1, 0.0)  # what no traction would mean of any other object
+        weights = np.append(lowest, 0.9)
+        mean, stddev = either.estimate(weights)
+        assert (mean, stddev) == (pytest.approx(0.45, abs=0.01), pytest.approx(0.24, abs=0.03))
+        again = np.exp(either.reweigh(np.log(weights + 1e-300)))
+        assert again[-1] == pytest.approx(0.5)
+        assert again[:-1] @ either.mu / again[:-1].sum() == pytest.approx(mean)
+        either.upright = 0.6
+        assert either.estimate(np.append(0.0 * lowest, 1.0)).mean > 0.65
+
     def test_what_friction_cannot_bear_only_something_else_can_hold(self):
         smooth, rough = (TractionHypotheses(Coefficient(mean, 0.03), "either") for mean in (0.0, 0.6))
         held = []
