@@ -54,7 +54,7 @@ _BACK = 1.0 / 3.0  # [-], fraction of the vertices farthest behind the face, whi
 _SURROUNDED = 0.5  # share of these that lies within an object around the jaw
 _OUT_OF_REACH = 1.0  # [m], distance of the origin of an object
 _CERTAIN = 3.0  # sigma of the gap between jaw and object
-_HELD = 10.0  # how much older the pose of a held object may be, which the jaws hide and keep where it is
+_HELD = 10.0  # factor on the age of the pose of a held object, which the jaws hide and keep where it is
 CONTRADICTED = "contradicted"  # status of an image whose object is not where mesh and pose say
 _REASONS = ("solved", "no_object", "no_pose", CONTRADICTED, "surrounded", "out_of_reach", "late pose", "odd pose")
 
@@ -218,10 +218,10 @@ class ContactEstimator:
     def _find_stale_pose(self, stamp: float) -> str:
         """Return why no pose tells of the image of a stamp [s]; empty if one does."""
         name, timeout, age = self._mesh.name, self.settings.pose_timeout, stamp - self._poses.believed
-        if self._held_since < inf:
-            timeout *= _HELD
         if age < -timeout:
             return f"the last pose of {name} lies {-age:.1f} s ahead; reset after time has jumped back"
+        if self._held_since < inf:
+            timeout *= _HELD
         if age <= timeout:
             return ""
         if stamp - self._poses.stamp > timeout:
