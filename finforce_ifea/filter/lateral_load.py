@@ -87,7 +87,7 @@ def _find_narrowest(jaw: Jaw, heights: NDArray, half: float) -> float:
     return 0.5 * float(jaw.section.read_width(places).min())
 
 
-# Of the last finger, for its other jaw and later estimators.
+# Of the last two jaws, for later estimators.
 _LAST: dict[tuple, Torsion | None] = {}
 
 
@@ -102,7 +102,8 @@ def measure_torsion(jaw: Jaw, mesh: VolumeMesh) -> Torsion | None:
     stiffness = jaw.material.young_modulus, jaw.material.poisson_ratio
     key = (jaw.digest, side, jaw.inner_face_x, *stiffness, len(mesh.nodes), jaw.keypoints.tobytes())
     if key not in _LAST:
-        _LAST.clear()
+        for last in list(_LAST)[:-1]:
+            del _LAST[last]
         _LAST[key] = _solve_at_rest(jaw, mesh)
     return _LAST[key]
 
