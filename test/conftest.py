@@ -19,7 +19,7 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 def pytest_xdist_auto_num_workers(config):
     """One worker more than cores: tests of real nodes wait a third of their time."""
-    return cpu_count() + 1
+    return (cpu_count() or 1) + 1
 
 
 @pytest.fixture(autouse=True)

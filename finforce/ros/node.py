@@ -354,19 +354,16 @@ _MOST_FREE = 32 << 20  # bytes on top of the heap, above which they are returned
 _LARGE = 4 << 20  # bytes, greater than an image that is worked on: such blocks are returned as soon as they are freed
 
 
-@contextmanager
-def _returning_memory() -> Iterator[None]:
-    """Have glibc return what the `with` block has freed, some 30 MB, and then what a search for the jaws frees.
+def _return_memory() -> None:
+    """Have glibc return what the start has freed, some 30 MB, and from now on what a search for the jaws frees.
 
     By default it adapts both limits to the largest blocks ever freed, and keeps 15 MB more.
     """
     with suppress(OSError, AttributeError):  # another C library
         libc = ctypes.CDLL(None)
+        libc.malloc_trim(0)
         libc.mallopt(_M_TRIM_THRESHOLD, _MOST_FREE)
         libc.mallopt(_M_MMAP_THRESHOLD, _LARGE)
-    yield
-    with suppress(OSError, AttributeError):
-        ctypes.CDLL(None).malloc_trim(0)
 
 
 def run_nodes(
@@ -381,10 +378,11 @@ def run_nodes(
     # an executor that is made after a signal cannot be taken down quietly; a node takes long to build
     executor, nodes = TolerantExecutor(), ()
     try:
-        with _ending_with_context(), _returning_memory():
+        with _ending_with_context():
             nodes = build()
-            gc.collect()
-            gc.freeze()  # what was built stays, and would be looked through for garbage again and again
+        gc.collect()
+        gc.freeze()  # what was built stays, and would be looked through for garbage again and again
+        _return_memory()
         work(nodes, executor)
     except (KeyboardInterrupt, ExternalShutdownException):
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # a launch sends it again after the terminal

@@ -46,6 +46,7 @@ def describe_domain(domain: str) -> str:
 
 
 _RESERVED = 8  # domains at a time, of one process
+_reservations: deque[int] = deque()  # file descriptors
 
 
 def free_domain() -> int:
@@ -55,9 +56,6 @@ def free_domain() -> int:
     """
     domains = random.sample(DOMAINS, len(DOMAINS))
     return next(filter(_reserve, domains), domains[0])
-
-
-_reservations: deque[int] = deque()  # file descriptors
 
 
 def _reserve(domain: int) -> bool:

@@ -159,8 +159,13 @@ class TractionHypotheses:
         if not self.follows_path:
             return self._prior
         own, held = self._share(weights), float(weights[-1]) if self._held > 0.0 else 0.0
-        bears = self._prior * np.clip((self.mu - abs(self.upright)) / max(self._cell, 1e-9) + 0.5, 1e-6, 1.0)
+        bears = _bear(self.mu, self._prior, self._step, self.upright) + _LEAST_PROBABILITY * self._prior
         return (1.0 - held) * own + held * bears / bears.sum()
+
+    @property
+    def _step(self) -> float:
+        """Width over which a coefficient of the grid comes to bear a ratio [-]."""
+        return max(self._cell, 2.0 * self.unweighed)
 
     def _share(self, weights: NDArray) -> NDArray:
         """Return the probabilities of the coefficients (M,) where one of them holds, for all weights (N,)."""
@@ -180,8 +185,9 @@ class TractionHypotheses:
             return log_weights
         parting = min(self._parted + (_AT_REST if self._is_at_rest else 0.0), _PARTED)
         parting += 0.0 if self._parted else self.carried.log_odds
-        step, known = max(self._cell, 2.0 * self.unweighed), (self._bears, parting - self._parting)
-        weighed, self._bears = _bound_held(log_weights, self.mu, self._prior, step, self.upright, known)
+        known = self._bears, parting - self._parting
+        bears = _bear(self.mu, self._prior, self._step, self.upright)
+        weighed, self._bears = _bound_held(log_weights, bears, known)
         self._parting = parting
         return weighed
 
@@ -318,23 +324,31 @@ def find_places(x, shift):
 
 
 @njit(**_OPTIONS)
-def _bound_held(log_weights, mu, prior, step, upright, known):
-    """Return log weights (N,) and log P(mu > |upright|); see `TractionHypotheses.bound_held`.
+def _bear(mu, prior, step, upright):
+    """Return the probabilities (M,) that a coefficient holds and bears a ratio; their sum is P(mu > |upright|).
 
     Args:
-        log_weights: before (N,).
         mu: coefficients of friction (M,).
         prior: their probabilities (M,).
         step: distance of the coefficients.
         upright: traction ratio of an object that only the jaws hold.
+    """
+    return prior * np.minimum(np.maximum((mu + 0.5 * step - abs(upright)) / step, 0.0), 1.0)
+
+
+@njit(**_OPTIONS)
+def _bound_held(log_weights, bears, known):
+    """Return log weights (N,) and log P(mu > |upright|); see `TractionHypotheses.bound_held`.
+
+    Args:
+        log_weights: before (N,).
+        bears: see `_bear`.
         known: the log probability that is counted already, and log odds by moves that are not.
     """
-    bears, (before, parting) = 0.0, known
-    for i in range(len(mu)):
-        bears += prior[i] * min(max((mu[i] + 0.5 * step - abs(upright)) / step, 0.0), 1.0)
-    bears, weighed = np.log(max(bears, _LEAST_PROBABILITY)), log_weights.copy()
-    weighed[-1] += bears - before + parting
-    return weighed - np.log(np.exp(weighed).sum()), bears
+    before, parting = known
+    bearing, weighed = np.log(max(bears.sum(), _LEAST_PROBABILITY)), log_weights.copy()
+    weighed[-1] += bearing - before + parting
+    return weighed - np.log(np.exp(weighed).sum()), bearing
 
 
 @njit(**_OPTIONS)

@@ -109,6 +109,7 @@ def measure_torsion(jaw: Jaw, mesh: VolumeMesh) -> Torsion | None:
 
 
 def _solve_at_rest(jaw: Jaw, mesh: VolumeMesh) -> Torsion | None:
+    """Return what `measure_torsion` does, by the finger's model at rest."""
     is_solid = jaw.drawing is None or jaw.drawing.is_solid
     mesh = mesh if jaw.section is None else jaw.build_mesh("coarse")
     if not is_solid or len(mesh.nodes) > _MOST_NODES:
